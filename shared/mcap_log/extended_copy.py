@@ -8,23 +8,21 @@ from __future__ import annotations
 
 import contextlib
 import os
-import struct
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, McapRecord, Metadata, Schema
+from mcap.records import Channel, McapRecord, Metadata, Schema
 
 from shared.exceptions import RunError
 from shared.mcap_log.reader import LogReader, LogRecord, open_log
-from shared.mcap_log.records import PREFIX, ChunkMessage, encode
+from shared.mcap_log.records import MESSAGE_RECORD, PREFIX, ChunkMessage, encode
 from shared.mcap_log.recovered_copy import LogCopy
 
 NOTE: Final = "export"
 """Metadata of the copy: where it comes from."""
 
-_HEAD: Final = struct.Struct("<HIQQ")  # of a message: channel, sequence, log and publish time
 _FIRST_ID: Final = 60_000  # of new schemas and channels: far beyond those of a recorder
 
 
@@ -111,8 +109,11 @@ class _Additions:
         number = _FIRST_ID + message.channel
         seq = self._sent[message.channel]
         self._sent[message.channel] += 1
-        body = _HEAD.pack(number, seq, message.log_ns, message.log_ns) + message.payload
-        row = ChunkMessage(number, seq, message.log_ns, message.log_ns, _HEAD.size, len(body))
+        start = MESSAGE_RECORD.size
+        head = (number, seq, message.log_ns, message.log_ns)
+        length = start - PREFIX.size + len(message.payload)
+        body = MESSAGE_RECORD.pack(Opcode.MESSAGE, length, *head) + message.payload
+        row = ChunkMessage(*head, start, len(body))
         self._copy.take(LogRecord(Opcode.MESSAGE, 0, 0, body, rows=(row,)))
 
 
@@ -137,8 +138,9 @@ def _copied(
             if isinstance(value, Channel) and value.topic in topics:
                 raise RunError(f"{path}: has {value.topic} already; export the original")
         copy.take(record)
-        if isinstance(record.value, Chunk):
-            while following is not None and following.log_ns <= record.value.message_end_time:
+        if record.rows:
+            last_ns = max(row.log_ns for row in record.rows)
+            while following is not None and following.log_ns <= last_ns:
                 additions.add(following)
                 following = next(waiting, None)
     if not defined:

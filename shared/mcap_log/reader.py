@@ -1,8 +1,9 @@
 """Reads an MCAP file that is finished, cut off anywhere, or damaged.
 
-Every whole record is given, in the order of the file. Where the file ends inside a chunk, so are
-the messages that can be read of its start. After damage, reading continues at the next chunk that
-proves to be one.
+Every whole record is given, in the order of the file; messages outside of chunks that follow each
+other are one, as those of a chunk are. Records of kinds that the format does not define yet, and
+private ones, are passed over. Where the file ends inside a chunk, the messages that can be read of
+its start are given. After damage, reading continues at the next chunk that proves to be one.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from shared.exceptions import RunError
 from shared.mcap_log.records import (
     CHUNK_TIMES,
     DECOMPRESSED_MAX,
+    EXPANSION_MAX,
     KNOWN,
     MAGIC,
     PREFIX,
@@ -35,6 +37,7 @@ from shared.mcap_log.records import (
     decompressed,
     decompressed_start,
     split_chunk,
+    split_messages,
 )
 
 _FOOTER_LENGTH: Final = 20
@@ -44,29 +47,27 @@ _MARK_AT: Final = PREFIX.size + CHUNK_TIMES.size
 """Offset of a chunk's compression from its start."""
 IN_LINE_NS: Final = 10 * NS_PER_S
 """A recorder flushes four times a second: a chunk with longer times, or so far off, is opened."""
-_CHANNEL: Final = struct.Struct("<H")  # of a message index
-_LOOSE_HEAD: Final = struct.Struct("<HIQQ")  # of a message that is in no chunk
+_INDEX_HEAD: Final = struct.Struct("<HI")  # of a message index: channel, size of its entries
+LOOSE_MAX: Final = 1 << 20
+"""Messages outside of chunks are given, and copied, in pieces of this size, bytes."""
 
-
-EXPANSION_MAX: Final = 50
-"""A run's chunks are four to ten times as large as they are compressed."""
 EXPANDED_MIN: Final = 1 << 28
 """Bytes that any file may expand to."""
 
 
 class LogRecord(NamedTuple):
-    """One record that could be read."""
+    """One record that could be read, or messages outside of chunks that follow each other."""
 
     opcode: int
     start: int
     """Offset of the record in the file."""
     end: int
     body: bytes
-    """Content of the record; of a chunk, its decompressed data."""
+    """Content of the record; of a chunk, its decompressed data; of messages, their records."""
     value: McapRecord | None = None
     """The record decoded; None for a message or an index."""
     rows: Sequence[ChunkMessage] = ()
-    """Messages of the chunk, or the message itself: `body[row.start:row.end]` is the payload."""
+    """The messages: `body[row.start:row.end]` is the payload of one."""
     definitions: Sequence[LogRecord] = ()
     """Schemas and channels inside the chunk."""
     whole: bool = True
@@ -90,7 +91,7 @@ class LostBytes(NamedTuple):
 
 
 class ChunkPlace(NamedTuple):
-    """A chunk that was found and not opened, or a message that is in no chunk."""
+    """A chunk that was found and not opened, or messages outside of chunks."""
 
     start: int
     """Offset of its record in the file."""
@@ -117,7 +118,15 @@ class LogReader:
         """What follows the last whole record of an unfinished file."""
         self.damage: list[LostBytes] = []
         """Places in the middle that could not be read."""
+        self.passed_over = 0
+        """Records of unknown kinds."""
+        self.chunk_indices = 0
+        """Chunks that the summary says the place of."""
+        self.message_count: int | None = None
+        """What the summary's statistics say; None without any."""
         self._encodings: dict[int, str] = {}
+        self._vouched = 0
+        """Up to here, records of unknown kinds are known to lead to a known one."""
         self._marks = list(_CHUNK_MARKS)
         self._expanded = 0
         self._end = self.size
@@ -140,18 +149,24 @@ class LogReader:
                 yield record
 
     def skim(self) -> Iterator[LogRecord | ChunkPlace]:
-        """Yield what iteration does, but the places of the chunks in place of their contents.
+        """Yield what iteration does, but the places of messages in place of the messages.
 
         Only the heads of chunks are touched: damage within one shows when it is read. No CRC
         covers the times in a head, so a chunk with times out of line is opened for those of its
-        messages.
+        messages; so is one whose channels nothing before it has described.
         """
         yield from self._summary()
+        described = bool(self._encodings)
         at = len(MAGIC)
         last_ns: int | None = None
         while at < self._end:
             place, following = self._place(at)
-            if place is not None and _is_in_line(place, last_ns):
+            known = (
+                described
+                if place is None or place.channels is None
+                else (place.channels <= self._encodings.keys())
+            )
+            if place is not None and known and _is_in_line(place, last_ns):
                 yield place
                 at, last_ns = following, place.last_ns
                 continue
@@ -166,6 +181,7 @@ class LogReader:
                 channels = frozenset(row.channel_id for row in record.rows)
                 times = [row.log_ns for row in record.rows]
                 last_ns = max(times)
+                yield from record.definitions
                 yield ChunkPlace(start, min(times), last_ns, channels)
             else:
                 yield record
@@ -201,7 +217,9 @@ class LogReader:
             opcode, end = self._head(following)
             if opcode != Opcode.MESSAGE_INDEX or end > self._end:
                 break
-            channels.add(_CHANNEL.unpack_from(self._data, following + PREFIX.size)[0])
+            number, size = _INDEX_HEAD.unpack_from(self._data, following + PREFIX.size)
+            if size:
+                channels.add(number)
             following = end
         return ChunkPlace(at, first_ns, last_ns, frozenset(channels) or None), following
 
@@ -228,34 +246,63 @@ class LogReader:
                 return self._cut_chunk(at, start), self._end
             return None, self._lost(at, following)
         try:
-            return self._record(opcode, at, start, end), end
+            record = self._record(opcode, at, start, end)
         except Malformed:
             # Either its content is wrong, or its length: then no record follows it.
             following = end if self._plausible(end) else self._chunk_after(at + 1)
             return None, self._lost(at, following, *_times(self._data[start:end], opcode))
+        return record, record.end
 
     def _record(self, opcode: int, at: int, start: int, end: int) -> LogRecord:
+        # an index of messages follows a chunk only: anything else there is a damaged one
+        index_follows = self._prefix(end)[0] == Opcode.MESSAGE_INDEX
+        if opcode == Opcode.MESSAGE:
+            rows, end = split_messages(self._data, at, self._end, LOOSE_MAX)
+            if not rows or (len(rows) == 1 and index_follows):
+                raise Malformed
+            return LogRecord(opcode, at, end, self._data[at:end], rows=rows)
+        if opcode not in KNOWN:
+            if not opcode or index_follows or not self._leads_on(end):
+                raise Malformed
+            self.passed_over += 1
+            return LogRecord(opcode, at, end, b"")
         body = self._data[start:end]
         if opcode == Opcode.CHUNK:
-            chunk = decode_chunk(body)
+            chunk, size = decode_chunk(body)
             content = decompressed(chunk)
             rows, others = split_chunk(content)
-            return LogRecord(opcode, at, end, content, chunk, rows, _definitions(others))
-        if opcode == Opcode.MESSAGE:
-            if len(body) < _LOOSE_HEAD.size:
-                raise Malformed
-            row = ChunkMessage._make((*_LOOSE_HEAD.unpack_from(body), _LOOSE_HEAD.size, len(body)))
-            if row.channel_id not in self._encodings:
-                raise Malformed
-            return LogRecord(opcode, at, end, body, rows=(row,))
-        return LogRecord(opcode, at, end, body, decode(opcode, body))
+            record = LogRecord(opcode, at, end, content, chunk, rows, _definitions(others))
+        else:
+            value, size = decode(opcode, body)
+            record = LogRecord(opcode, at, end, body, value)
+        if size < len(body) and not self._leads_on(end):
+            raise Malformed  # no later version's field: the length is wrong
+        return record
+
+    def _leads_on(self, at: int) -> bool:
+        """Return True if a known record follows here, maybe behind unknown ones, or the data ends.
+
+        What is only passed over has no other proof of its length.
+        """
+        at = max(at, self._vouched)
+        while self._end - at >= PREFIX.size:
+            opcode, length = self._prefix(at)
+            if opcode in KNOWN:
+                break
+            if not opcode:
+                return False
+            at += PREFIX.size + length
+        if not self._plausible(at):
+            return False
+        self._vouched = at
+        return True
 
     def _cut_chunk(self, at: int, start: int) -> LogRecord | None:
         """Return the messages at the start of the chunk in which the file ends."""
         self.cut = LostBytes(at, self.size)
         body = self._data[start : self.size]
         try:
-            chunk = decode_chunk(body, cut=True)
+            chunk, _ = decode_chunk(body, cut=True)
             content = decompressed_start(chunk)
         except Malformed:
             return None
@@ -303,11 +350,18 @@ class LogReader:
 
     def _plausible(self, at: int) -> bool:
         """Return True if a record may begin here, or the data ends here."""
-        head = self._data[at : at + PREFIX.size]
-        if at >= self._end or len(head) < PREFIX.size:
+        if self._end - at < PREFIX.size:
             return at <= self._end
-        opcode, length = PREFIX.unpack(head)
-        return opcode in KNOWN and length <= DECOMPRESSED_MAX
+        opcode, length = self._prefix(at)
+        fits = at + PREFIX.size + length <= self._end
+        return opcode in KNOWN and (fits or length <= DECOMPRESSED_MAX)
+
+    def _prefix(self, at: int) -> tuple[int, int]:
+        """Return opcode and length of the record at a place; 0 if the data ends before."""
+        if self._end - at < PREFIX.size:
+            return 0, 0
+        opcode, length = PREFIX.unpack_from(self._data, at)
+        return opcode, length
 
     def _chunk_after(self, at: int) -> int | None:
         """Return where the next chunk is that is whole and right, or None."""
@@ -348,9 +402,15 @@ class LogReader:
             start, at = at, at + PREFIX.size + length
             if at > end:
                 return
+            self.chunk_indices += opcode == Opcode.CHUNK_INDEX
+            if opcode == Opcode.STATISTICS:
+                count = self._data[start + PREFIX.size : start + PREFIX.size + 8]
+                self.message_count = int.from_bytes(count, "little")
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 with contextlib.suppress(Malformed):
-                    yield self._record(opcode, start, start + PREFIX.size, at)
+                    record = self._record(opcode, start, start + PREFIX.size, at)
+                    self._learn(record)
+                    yield record
 
 
 def _definitions(records: Sequence[tuple[int, bytes]]) -> tuple[LogRecord, ...]:
@@ -359,7 +419,7 @@ def _definitions(records: Sequence[tuple[int, bytes]]) -> tuple[LogRecord, ...]:
     for opcode, body in records:
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             with contextlib.suppress(Malformed):
-                found.append(LogRecord(opcode, 0, 0, body, decode(opcode, body)))
+                found.append(LogRecord(opcode, 0, 0, body, decode(opcode, body)[0]))
     return tuple(found)
 
 
@@ -367,7 +427,8 @@ def _is_in_line(place: ChunkPlace, before_ns: int | None) -> bool:
     """Return True for a chunk whose times are believed: it follows the one before it closely."""
     began_ns = place.first_ns if before_ns is None else before_ns
     return (
-        place.first_ns <= place.last_ns <= place.first_ns + IN_LINE_NS
+        place.last_ns > 0  # else it has no messages
+        and place.first_ns <= place.last_ns <= place.first_ns + IN_LINE_NS
         and abs(place.first_ns - began_ns) <= IN_LINE_NS
     )
 

@@ -1,13 +1,15 @@
 """MCAP records as bytes, decoded without trusting one of them. Pure.
 
 The records are the classes of the mcap package; its own readers trust each length: a wrong one
-makes them read on, allocate or raise (docs/logs.md). Here a record counts only if it fits its
-length to the byte; everything else is `Malformed`.
+makes them read on, allocate or raise (docs/logs.md). Here a record counts only if its fields fit
+into its length; everything else is `Malformed`. Bytes behind the last field are a later version's,
+which the format lets a reader skip.
 """
 
 from __future__ import annotations
 
 import contextlib
+import mmap
 import struct
 import zlib
 from collections.abc import Callable, Mapping
@@ -41,9 +43,12 @@ MESSAGE_RECORD: Final = struct.Struct("<BQHIQQ")
 """Opcode, length, channel, sequence, log time, publish time; then the payload."""
 CHUNK_TIMES: Final = struct.Struct("<QQQI")
 """First log time, last log time, size and CRC before compression."""
+CRC: Final = struct.Struct("<I")
 
 DECOMPRESSED_MAX: Final = 1 << 26
-"""Larger chunks are refused: a flipped bit in a size asks for exabytes."""
+"""A larger chunk is read only if its bytes can hold so much: a flipped bit asks for exabytes."""
+EXPANSION_MAX: Final = 50
+"""A run's chunks are four to ten times as large as they are compressed."""
 _WINDOW_MAX: Final = 1 << 27
 _STEP: Final = 1 << 16
 
@@ -58,7 +63,7 @@ _TYPES: Final[Mapping[int, type[McapRecord]]] = MappingProxyType(
     }
 )
 KNOWN: Final = frozenset({*_TYPES, Opcode.MESSAGE_INDEX, Opcode.CHUNK, Opcode.MESSAGE})
-"""Records of a file's data section; others are damage."""
+"""Records of a file's data section."""
 
 
 class Malformed(Exception):  # noqa: N818 - a finding about a file, never shown as an error
@@ -91,7 +96,7 @@ def with_prefix(opcode: int, body: bytes) -> bytes:
     return PREFIX.pack(opcode, len(body)) + body
 
 
-def decode(opcode: int, body: bytes) -> McapRecord | None:
+def decode(opcode: int, body: bytes) -> tuple[McapRecord | None, int]:
     """Decode a record of the data section that is neither chunk nor message.
 
     Args:
@@ -99,15 +104,17 @@ def decode(opcode: int, body: bytes) -> McapRecord | None:
         body: its content.
 
     Returns:
-        The record; None for a message index, of which only the length is checked.
+        The record, None for a message index, of which only the length is checked; and the size of
+        its fields, which a later version's may follow.
 
     Raises:
         Malformed: the content does not fit the opcode or the length, or its CRC is wrong.
     """
     if opcode == Opcode.MESSAGE_INDEX:
-        if len(body) < 6 or len(body) - 6 != int.from_bytes(body[2:6], "little"):
+        size = 6 + int.from_bytes(body[2:6], "little")
+        if len(body) < size:
             raise Malformed
-        return None
+        return None, size
     kind = _TYPES.get(opcode)
     if kind is None:
         raise Malformed
@@ -117,23 +124,23 @@ def decode(opcode: int, body: bytes) -> McapRecord | None:
     except UnicodeDecodeError:
         raise Malformed from None
     if isinstance(found, Attachment):
-        crc = int.from_bytes(body[-4:], "little")
-        if fields.count != len(body) or crc not in (0, zlib.crc32(body[:-4])):
+        crc_at = fields.count - CRC.size
+        if CRC.unpack_from(body, crc_at)[0] not in (0, zlib.crc32(body[:crc_at])):
             raise Malformed
-    elif not isinstance(found, Header) and encode(found) != with_prefix(opcode, body):
-        raise Malformed  # bytes behind the last field, or a map's length that its pairs do not have
-    return found
+    elif not isinstance(found, Header) and not body.startswith(encode(found)[PREFIX.size :]):
+        raise Malformed  # a map's length that its pairs do not have
+    return found, fields.count
 
 
-def decode_chunk(body: bytes, *, cut: bool = False) -> Chunk:
-    """Decode a chunk's head; its data stays compressed.
+def decode_chunk(body: bytes, *, cut: bool = False) -> tuple[Chunk, int]:
+    """Decode a chunk's head; its data stays compressed. Return it, and the size of its fields.
 
     Args:
         body: content of the record.
         cut: the file ends inside the chunk, so `data` is only its start.
 
     Raises:
-        Malformed: the data does not have the length that the head gives.
+        Malformed: the data is shorter than the head says.
     """
     fields = _Fields(body)
     first_ns, last_ns, size, crc = CHUNK_TIMES.unpack(fields.read(CHUNK_TIMES.size))
@@ -142,10 +149,10 @@ def decode_chunk(body: bytes, *, cut: bool = False) -> Chunk:
     except UnicodeDecodeError:
         raise Malformed from None
     length = fields.read8()
-    data = body[fields.count :]
-    if length < len(data) or (length > len(data) and not cut):
+    data = body[fields.count : fields.count + length]
+    if len(data) < length and not cut:
         raise Malformed
-    return Chunk(
+    chunk = Chunk(
         compression=compression,
         data=data,
         message_start_time=first_ns,
@@ -153,6 +160,7 @@ def decode_chunk(body: bytes, *, cut: bool = False) -> Chunk:
         uncompressed_size=size,
         uncompressed_crc=crc,
     )
+    return chunk, fields.count + length
 
 
 def decompressed(chunk: Chunk) -> bytes:
@@ -162,7 +170,7 @@ def decompressed(chunk: Chunk) -> bytes:
         Malformed: size or CRC are not as the head gives them, or nothing here reads the
             compression.
     """
-    if chunk.uncompressed_size > DECOMPRESSED_MAX:
+    if chunk.uncompressed_size > max(DECOMPRESSED_MAX, EXPANSION_MAX * len(chunk.data)):
         raise Malformed
     if chunk.compression == "":
         data = bytes(chunk.data)
@@ -229,6 +237,33 @@ class ChunkMessage(NamedTuple):
     publish_ns: int
     start: int
     end: int
+
+
+def split_messages(
+    data: bytes | mmap.mmap, begin: int, end: int, enough: int
+) -> tuple[list[ChunkMessage], int]:
+    """Return the messages that follow each other from a place of a file on.
+
+    Args:
+        data: the file.
+        begin: where the first one is.
+        end: of what may be read.
+        enough: size, bytes, at which no further message is taken.
+
+    Returns:
+        The messages, with places counted from `begin`, and where they end. A message that does not
+        fit before `end`, or is too short, is left out with all behind it.
+    """
+    rows: list[ChunkMessage] = []
+    at, new, message, head = begin, ChunkMessage._make, int(Opcode.MESSAGE), MESSAGE_RECORD
+    while at < begin + enough and at + head.size <= end and data[at] == message:
+        _, length, *fields = head.unpack_from(data, at)
+        start, following = at + head.size, at + PREFIX.size + length
+        if not start <= following <= end:
+            break
+        rows.append(new((*fields, start - begin, following - begin)))
+        at = following
+    return rows, at
 
 
 def split_chunk(data: bytes) -> tuple[list[ChunkMessage], list[tuple[int, bytes]]]:

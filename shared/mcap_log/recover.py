@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import BinaryIO, Final, TypeAlias
 
 import msgspec
+from mcap.opcode import Opcode
 from mcap.records import Metadata
 
 from shared.clock import NS_PER_S
@@ -45,6 +46,8 @@ class RecoveryResult(msgspec.Struct, frozen=True, kw_only=True):
     last_ns: int
     orphans: int
     """Messages of undefined channels; left out."""
+    passed_over: int
+    """Records of kinds that the format does not define; left out."""
     cut: LostBytes | None
     damage: tuple[LostBytes, ...]
 
@@ -57,6 +60,23 @@ def is_finished(path: Path) -> bool:
     """
     with open_log(path) as reader:
         return reader.finished
+
+
+def is_whole(path: Path) -> bool:
+    """Return True if a file is finished, undamaged, and has an index of all its messages.
+
+    Raises:
+        RunError: it cannot be read.
+    """
+    with open_log(path) as reader:
+        if not reader.finished:
+            return False
+        chunks = 0
+        for record in reader:
+            if record.rows and record.opcode == Opcode.MESSAGE:
+                return False
+            chunks += bool(record.rows)
+        return not reader.damage and reader.chunk_indices >= chunks
 
 
 def recover(path: Path, out: Path, stop: Stop = lambda: False) -> RecoveryResult:
@@ -100,6 +120,7 @@ def recover(path: Path, out: Path, stop: Stop = lambda: False) -> RecoveryResult
         first_ns=copy.first_ns,
         last_ns=copy.last_ns,
         orphans=copy.orphans,
+        passed_over=reader.passed_over,
         cut=reader.cut,
         damage=tuple(reader.damage),
     )
@@ -115,7 +136,14 @@ def describe(outcome: RecoveryResult) -> list[str]:
     lines += describe_lost(outcome.cut, outcome.damage, finished=outcome.finished)
     if outcome.orphans:
         lines.append(f"lost: {outcome.orphans} messages of undefined channels")
+    if outcome.passed_over:
+        lines.append(f"left out: {describe_passed_over(outcome.passed_over)}")
     return lines
+
+
+def describe_passed_over(count: int) -> str:
+    """Return words for records of unknown kinds."""
+    return f"{count} private record{'s' * (count != 1)}, or of a later version of MCAP"
 
 
 def describe_lost(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import BinaryIO, Final
+from typing import BinaryIO
 
 from mcap.opcode import Opcode
 from mcap.records import (
@@ -21,7 +21,7 @@ from mcap.records import (
 )
 
 from shared.mcap_log.encoding import compressed_chunk, file_end, message_index
-from shared.mcap_log.reader import LogRecord
+from shared.mcap_log.reader import LOOSE_MAX, LogRecord
 from shared.mcap_log.records import (
     MAGIC,
     MESSAGE_RECORD,
@@ -30,9 +30,6 @@ from shared.mcap_log.records import (
     split_chunk,
     with_prefix,
 )
-
-LOOSE_MAX: Final = 1 << 20
-"""Messages outside of chunks are put into chunks of this size, bytes."""
 
 
 class LogCopy:
@@ -169,8 +166,7 @@ class LogCopy:
             self._write(self._definitions[key])
 
     def _take_chunk(self, chunk: Chunk, record: LogRecord) -> None:
-        rows = [row for row in record.rows if row.channel_id in self.channels]
-        self.orphans += len(record.rows) - len(rows)
+        rows = self._described(record)
         if not rows:
             return
         times = [row.log_ns for row in rows]
@@ -179,22 +175,24 @@ class LogCopy:
         if record.whole and right and described:
             self._write_chunk(chunk, self._raw(record.start, record.end), rows)
         else:
-            begin = MESSAGE_RECORD.size
-            self._write_rows([record.body[row.start - begin : row.end] for row in rows])
+            self._write_rows(_cut_out(record, rows))
 
     def _take_loose(self, record: LogRecord) -> None:
-        if any(row.channel_id not in self.channels for row in record.rows):
-            self.orphans += len(record.rows)
-            return
-        self._loose.append(with_prefix(Opcode.MESSAGE, record.body))
+        self._loose += _cut_out(record, self._described(record))
         self._loose_size += len(record.body)
         if self._loose_size > LOOSE_MAX:
             self._write_loose()
 
+    def _described(self, record: LogRecord) -> list[ChunkMessage]:
+        """Return the messages of known channels; the others are counted."""
+        rows = [row for row in record.rows if row.channel_id in self.channels]
+        self.orphans += len(record.rows) - len(rows)
+        return rows
+
     def _write_loose(self) -> None:
         if self._loose:
             self._write_rows(self._loose)
-            self._loose, self._loose_size = [], 0
+        self._loose, self._loose_size = [], 0
 
     def _write_rows(self, records: list[bytes]) -> None:
         """Write message records as a chunk of their own."""
@@ -253,3 +251,9 @@ class LogCopy:
         self._file.write(data)
         self._position += len(data)
         return self._position - len(data), len(data)
+
+
+def _cut_out(record: LogRecord, rows: list[ChunkMessage]) -> list[bytes]:
+    """Return the records of some of the messages."""
+    begin = MESSAGE_RECORD.size
+    return [record.body[row.start - begin : row.end] for row in rows]

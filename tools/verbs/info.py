@@ -15,7 +15,7 @@ from shared.bus import topics
 from shared.clock import NS_PER_S
 from shared.exceptions import XrlError
 from shared.mcap_log.reader import LostBytes
-from shared.mcap_log.recover import clock_time, describe_lost
+from shared.mcap_log.recover import clock_time, describe_lost, describe_passed_over
 from shared.mcap_log.writer import SCHEMA_VERSION
 from tools.analysis.logs.survey import FileFacts, Survey, TopicFacts
 from tools.guarded_streams import printable
@@ -157,6 +157,8 @@ def _show_file(file: FileFacts, console: Console) -> None:
             console.print(f"  {line}", style="yellow", soft_wrap=True)
     if file.orphans:
         console.print(f"  {file.orphans} messages of channels that are nowhere described")
+    if file.passed_over:
+        console.print(f"  passed over: {describe_passed_over(file.passed_over)}")
     flush_ms = file.metadata.get("recorder", {}).get("flush_ms", "")
     if not file.finished and not file.in_use:
         if flush_ms:
@@ -302,6 +304,7 @@ def _file_as_json(file: FileFacts) -> dict[str, Any]:
         "start_ns": file.first_ns if file.messages else None,
         "end_ns": file.last_ns if file.messages else None,
         "orphans": file.orphans,
+        "passed_over": file.passed_over,
         "cut": _loss_as_json(file.cut),
         "damage": [_loss_as_json(loss) for loss in file.damage],
         "attachments": file.attachments,

@@ -8,7 +8,6 @@ from pathlib import Path
 from shared.exceptions import RunError
 from shared.mcap_log import recover
 from shared.mcap_log.files import in_use, recovered_name
-from shared.mcap_log.reader import open_log
 from tools.guarded_streams import printable
 from tools.runs.run_files import MetadataByName, head_of
 from tools.terminal import Console, marked
@@ -37,12 +36,13 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Recover it; 0 also if there was nothing to recover."""
+    """Recover it; 0 also if it lacks nothing."""
     console = Console()
     path: Path = args.file
-    if args.out is None and _is_whole(path):
+    if args.out is None and recover.is_whole(path):
         console.print(
-            f"{printable(str(path))}: finished and whole; nothing to recover", soft_wrap=True
+            f"{printable(str(path))}: finished, whole and indexed; nothing to recover",
+            soft_wrap=True,
         )
         return 0
     out: Path = args.out or recovered_name(path)
@@ -64,16 +64,6 @@ def run(args: argparse.Namespace) -> int:
             soft_wrap=True,
         )
     return 0
-
-
-def _is_whole(path: Path) -> bool:
-    """Return True if a file is finished and every record of it can be read."""
-    with open_log(path) as reader:
-        if not reader.finished:
-            return False
-        for _ in reader:
-            pass
-        return not reader.damage
 
 
 def _in_use(path: Path) -> bool:

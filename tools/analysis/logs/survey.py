@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -57,6 +58,8 @@ class FileFacts(msgspec.Struct, kw_only=True):
     last_ns: int = _NEVER
     orphans: int = 0
     """Messages of channels that are nowhere described."""
+    passed_over: int = 0
+    """Records of kinds that the format does not define."""
     attachments: dict[str, int] = msgspec.field(default_factory=dict)
     """Sizes by name."""
     metadata: MetadataByName = msgspec.field(default_factory=dict)
@@ -102,14 +105,16 @@ class Survey:
         Raises:
             RunError: it is missing, empty, or no MCAP file.
         """
-        with open_log(path) as reader:
-            facts = FileFacts(
-                path=path, size=reader.size, finished=reader.finished, in_use=_in_use(path)
-            )
-            reading = _Reading(facts, self.topics)
-            if not (by_index and reader.finished and reading.skim(reader)):
-                reading.read(reader)
-            facts.cut, facts.damage = reader.cut, reader.damage
+        for take in (_Reading.skim, _Reading.read) if by_index else (_Reading.read,):
+            with open_log(path) as reader:
+                facts = FileFacts(
+                    path=path, size=reader.size, finished=reader.finished, in_use=_in_use(path)
+                )
+                taken = take(_Reading(facts, self.topics), reader)
+                facts.cut, facts.damage = reader.cut, reader.damage
+                facts.passed_over = reader.passed_over
+            if taken:
+                break
         self.files.append(facts)
         return facts
 
@@ -122,15 +127,17 @@ class _Reading:
         self._schemas: dict[int, str] = {0: ""}
         self._channels: dict[int, TopicFacts] = {}
 
-    def read(self, reader: LogReader) -> None:
+    def read(self, reader: LogReader) -> bool:
+        """Read every message; return True."""
         for record in reader:
             for value in record.values():
                 self._take(value)
             if record.rows:
                 self._count(record)
+        return True
 
     def skim(self, reader: LogReader) -> bool:
-        """Take the recorder's own counts; return False if there are none, and nothing is taken."""
+        """Take the recorder's own counts; return False if there are none that fit."""
         places: list[ChunkPlace] = []
         others: list[McapRecord] = []
         for found in reader.skim():
@@ -138,21 +145,22 @@ class _Reading:
                 places.append(found)
             else:
                 others += found.values()
-        counts = next(
-            (m.metadata for m in others if isinstance(m, Metadata) and m.name == COUNTS), None
-        )
-        if counts is None:
+        names = {value.topic: value.id for value in others if isinstance(value, Channel)}
+        counted = _counted(others, names, reader.message_count)
+        if (
+            not reader.finished
+            or counted is None
+            or any(place.channels is None for place in places)
+        ):
             return False
         for value in others:
             self._take(value)
         if places:
             self._facts.first_ns = min(place.first_ns for place in places)
             self._facts.last_ns = max(place.last_ns for place in places)
-        names = {value.topic: value.id for value in others if isinstance(value, Channel)}
-        for key, text in counts.items():
+        for key, count in counted.items():
             topic = self._channels[names[key]]
             within = [place for place in places if names[key] in (place.channels or ())]
-            count = msgspec.json.decode(text, type=KeyCount)
             self._facts.messages += count.count
             topic.sequence.join(count)
             topic.bytes = topic.longest_gap_ns = None
@@ -210,6 +218,28 @@ class _Reading:
             elif gap_ns > (topic.longest_gap_ns or 0):
                 topic.longest_gap_ns = gap_ns
             topic.last_ns = time_ns
+
+
+def _counted(
+    records: list[McapRecord], names: Mapping[str, int], total: int | None
+) -> dict[str, KeyCount] | None:
+    """Return what the recorder counted, by key; None if it does not fit the file any more.
+
+    Another program may have left out messages, and copied the recorder's counts.
+
+    Args:
+        records: of the file.
+        names: of its channels.
+        total: messages, as the file's statistics say.
+    """
+    texts = next((m.metadata for m in records if isinstance(m, Metadata) and m.name == COUNTS), {})
+    try:
+        counts = {key: msgspec.json.decode(text, type=KeyCount) for key, text in texts.items()}
+    except msgspec.DecodeError:
+        return None
+    counted = {key: count for key, count in counts.items() if count.count or key in names}
+    fits = total is None or total == sum(count.count for count in counted.values())
+    return counted if counted and fits and counted.keys() <= names.keys() else None
 
 
 def _in_use(path: Path) -> bool:
