@@ -9,7 +9,7 @@ import os
 import time
 from typing import Final
 
-from services.ros2_gateway.conversions import Conversions
+from services.ros2_gateway.conversions import TIME_LAST_NS, Conversions
 from services.ros2_gateway.gateway import INPUTS, Gateway
 from services.ros2_gateway.inbound import Inbound, acceptable, inbound_topics
 from services.ros2_gateway.loop import PERIOD_NS, GatewayLoop, Input
@@ -87,6 +87,8 @@ def main() -> int:
             " and ".join(arguments.accept) or "nothing",
         )
         process.freeze_garbage()
+        if time.time_ns() > TIME_LAST_NS:
+            logger.warning("this host's clock is beyond 2038-01-19: every stamp will be that day")
         offset_ns = time.time_ns() - now_ns()
         deadline_ns = now_ns()
         while not stop:

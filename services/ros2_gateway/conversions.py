@@ -50,6 +50,9 @@ MODE_LEVEL: Final = {
 }
 NOT_STOPPED: Final = "emergency stop"
 """Key of the gateway's figures: the stop that ROS 2 asked for was given up."""
+TIME_FIRST_NS: Final = 0
+TIME_LAST_NS: Final = (2**31 - 1) * NS_PER_S
+"""Times of ROS 2 are 32-bit seconds since 1970: they end on 2038-01-19."""
 _UNKNOWN_POSITION: Final = (DriveStatus.LOST, DriveStatus.UNZEROED)
 
 
@@ -61,7 +64,8 @@ def knows_position(state: JointState) -> bool:
 class Conversions:
     """Makes the messages of one robot. Each method returns a message in CDR.
 
-    Times are in ns since 1970, or of the log's clock.
+    Times are in ns since 1970, or of the log's clock; one that ROS 2 cannot say becomes the first
+    or the last that it can.
     """
 
     def __init__(self, config: RobotConfig, types: RosTypes) -> None:
@@ -238,7 +242,7 @@ class Conversions:
         return self._types.make("std_msgs/msg/Header", stamp=self._time(ns), frame_id=frame)
 
     def _time(self, ns: int) -> Any:
-        seconds, rest = divmod(ns, NS_PER_S)
+        seconds, rest = divmod(min(max(ns, TIME_FIRST_NS), TIME_LAST_NS), NS_PER_S)
         return self._types.make("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
 
     def _encode(self, type_name: str, /, **fields: Any) -> bytes:

@@ -152,3 +152,14 @@ def test_bytes_that_are_no_message_are_none(payload: bytes) -> None:
 def test_angles_of_a_drive_that_lost_its_zero_are_not_shown(drive: DriveStatus) -> None:
     assert not conversions.knows_position(joint_state(drive=int(drive)))
     assert conversions.knows_position(joint_state())
+
+
+@pytest.mark.parametrize(
+    ("ns", "sec", "nanosec"),
+    [(-1, 0, 0), (4_000_000_000_500_000_000, 2**31 - 1, 0), (1 << 80, 2**31 - 1, 0)],
+)
+def test_a_time_that_ros_2_cannot_say_becomes_the_nearest_that_it_can(
+    convert: Conversions, ns: int, sec: int, nanosec: int
+) -> None:
+    stamp = read(conversions.JOINT_STATE, convert.joint_states(ns, all_states())).header.stamp
+    assert (stamp.sec, stamp.nanosec) == (sec, nanosec)

@@ -19,7 +19,7 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-from services.ros2_gateway.conversions import Conversions
+from services.ros2_gateway.conversions import TIME_FIRST_NS, TIME_LAST_NS, Conversions
 from services.ros2_gateway.gateway import INPUTS, Gateway
 from services.ros2_gateway.rmw import RosTopic
 from services.ros2_gateway.ros_types import RosTypes
@@ -27,6 +27,8 @@ from shared.bus.messages import Message
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
+from shared.exceptions import RunError
+from shared.mcap_log.recover import clock_time
 from shared.robot.joints import MODULES
 from tools.export.stamps import stamped
 from tools.runs.run_index import RunIndex
@@ -52,7 +54,16 @@ def write_bag(
         folder: of the bag; must not exist.
         rate_hz: of joint states, transforms and wrench.
         done: is told how much of the run is written, s.
+
+    Raises:
+        RunError: the times are beyond those of ROS 2.
     """
+    if not TIME_FIRST_NS <= index.began_ns <= index.ended_ns <= TIME_LAST_NS:
+        raise RunError(
+            f"{index.path}: its times, {clock_time(index.began_ns)} to "
+            f"{clock_time(index.ended_ns)}, are beyond those of ROS 2, which end on 2038-01-19; "
+            "take --csv or --parquet"
+        )
     rates = {"joint_states_hz": rate_hz, "tf_hz": rate_hz, "wrench_hz": rate_hz}
     ros2 = msgspec.structs.replace(robot.ros2, **rates)
     config = msgspec.structs.replace(robot, ros2=ros2)
@@ -66,7 +77,7 @@ def write_bag(
         description = gateway.description()
         for log in parts_of(index, part):
             for at_ns, topic, module, message in _in_order(log):
-                unix_ns = at_ns + log.offset_ns
+                unix_ns = max(at_ns + log.offset_ns, TIME_FIRST_NS)
                 if not count:
                     writer.write(connections[description.topic], unix_ns, description.payload)
                     count += 1

@@ -12,7 +12,7 @@ from shared.mcap_log.reader import ChunkPlace, LogRecord, LostBytes, open_log
 from shared.mcap_log.records import Attachment, Channel, Metadata
 from tools.runs.run_files import MetadataByName
 
-_OFFSET: Final = re.compile(r"-?[0-9]{1,19}")
+_OFFSET: Final = re.compile(r"-?[0-9]{1,20}")
 _EVER: Final = 1 << 64
 _CLOCK_MAX_NS: Final = 1 << 62
 """More than any monotonic clock shows."""

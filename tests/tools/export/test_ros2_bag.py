@@ -16,6 +16,7 @@ from shared.bus.messages import JointState, PlannerStatus
 from shared.robot.joints import JOINTS, MODULES
 from tests.ros2_gateway.others import TYPES, read
 from tools import cli
+from tools.analysis.reexecution import rewritten
 from tools.runs.run_log import read_run
 
 KNOWN = topics_of("")
@@ -89,3 +90,20 @@ def test_when_the_planner_is_dead_the_diagnostics_say_so(bag: Path, run_file: Pa
                 said.append(rows["xrl: planner"].message)
     assert said
     assert set(said) == {"silent: each module holds by itself"}
+
+
+@pytest.mark.parametrize("years", [80, 540])
+def test_a_run_after_2038_is_refused_as_a_bag_and_has_its_other_exports(
+    run_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], years: int
+) -> None:
+    log = read_run(run_file)
+    log.offset_ns += years * 365 * 86_400 * 10**9
+    log.metadata["clock"]["offset_ns"] = str(log.offset_ns)
+    path = tmp_path / "late.mcap"
+    rewritten.write(log, path, {}, {})
+    bag = tmp_path / "bag"
+    assert cli.main(["export", str(path), "--ros2bag", str(bag)]) == 2
+    assert "are beyond those of ROS 2, which end on 2038-01-19" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == [path]
+    words = ["--scene", "--csv", str(tmp_path / "tables")]
+    assert cli.main(["export", str(path), *words]) == 0

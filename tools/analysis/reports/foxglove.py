@@ -128,8 +128,13 @@ def _arrow(arrow: Arrow) -> well_known.ArrowPrimitive:
     )
 
 
+_TIME_LAST_NS: Final = (2**32 - 1) * NS_PER_S
+"""Stamps of Foxglove are unsigned 32-bit seconds since 1970: they end in 2106."""
+
+
 def _time(ns: int) -> well_known.Timestamp:
-    return well_known.Timestamp(*divmod(ns, NS_PER_S))
+    seconds, rest = divmod(min(max(ns, 0), _TIME_LAST_NS), NS_PER_S)
+    return well_known.Timestamp(seconds, rest)
 
 
 def _pose(position: Vector3, rotation: Quaternion = UPRIGHT) -> well_known.Pose:
