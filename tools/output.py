@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.progress import Progress
 
+from shared.atomic_file import atomic_file, replace_file
 from shared.exceptions import RunError
 from tools.terminal import Console
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @contextlib.contextmanager
@@ -56,25 +60,11 @@ def write_atomically(out: Path, content: bytes, *, private: bool = False) -> Non
         raise RunError(f"{out}: cannot be written: {error.strerror}; give another -o") from None
 
 
-def replace_file(path: Path, content: bytes, *, private: bool = False) -> None:
-    """Write a file whole or not at all.
-
-    Args:
-        path: the file.
-        content: of it.
-        private: for this user alone.
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a picture of Matplotlib whole or not at all; the suffix names its format.
 
     Raises:
         OSError: it cannot be written.
     """
-    part = path.with_name(f".{path.name}.part")
-    try:
-        part.unlink(missing_ok=True)  # of an earlier try, with whatever rights
-        mode = 0o600 if private else 0o666
-        with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
-            file.write(content)
-        part.replace(path)
-    except OSError:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
-        raise
+    with atomic_file(path) as file:
+        figure.savefig(file, format=path.suffix.removeprefix("."))

@@ -6,8 +6,6 @@ so that a viewer finds what belongs together close by.
 
 from __future__ import annotations
 
-import contextlib
-import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
@@ -15,6 +13,7 @@ from typing import BinaryIO, Final, NamedTuple
 from mcap.opcode import Opcode
 from mcap.records import Channel, McapRecord, Metadata, Schema
 
+from shared.atomic_file import atomic_file
 from shared.exceptions import RunError
 from shared.mcap_log.reader import LogReader, LogRecord, open_log
 from shared.mcap_log.records import MESSAGE_RECORD, PREFIX, ChunkMessage, encode
@@ -65,22 +64,14 @@ def write_extended(
     Raises:
         RunError: the log cannot be read or has such a topic, or the copy cannot be written.
     """
-    part = out.with_name(f".{out.name}.part")
     try:
-        with open_log(path) as reader, part.open("wb") as file:
+        with open_log(path) as reader, atomic_file(out, lasting=True) as file:
             copy = _copied(path, reader, file, channels, messages)
             copy.finish(Metadata(name=NOTE, metadata={"from": path.name}))
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(out)
     except OSError as error:
-        _remove(part)
         raise RunError(
             f"{out}: cannot be written: {error.strerror or error}; give another -o"
         ) from None
-    except BaseException:
-        _remove(part)
-        raise
     return copy.messages
 
 
@@ -153,8 +144,3 @@ def _copied(
 
 def _as_read(opcode: int, value: McapRecord) -> LogRecord:
     return LogRecord(opcode, 0, 0, encode(value)[PREFIX.size :], value)
-
-
-def _remove(part: Path) -> None:
-    with contextlib.suppress(OSError):
-        part.unlink(missing_ok=True)

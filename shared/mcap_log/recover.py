@@ -6,8 +6,6 @@ recovery that is killed leaves the original as it was, and the next one starts o
 
 from __future__ import annotations
 
-import contextlib
-import os
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
@@ -17,6 +15,7 @@ import msgspec
 from mcap.opcode import Opcode
 from mcap.records import Metadata
 
+from shared.atomic_file import atomic_file
 from shared.clock import NS_PER_S
 from shared.exceptions import RunError
 from shared.mcap_log.reader import LogReader, LostBytes, open_log
@@ -91,25 +90,16 @@ def recover(path: Path, out: Path, stop: Stop = lambda: False) -> RecoveryResult
         RunError: the file cannot be read, or the copy cannot be written.
         Interrupted: `stop` returned True.
     """
-    part = out.with_name(f".{out.name}.part")
     with open_log(path) as reader:
         try:
-            with part.open("wb") as file:
+            with atomic_file(out, lasting=True) as file:
                 copy = _copied(reader, file, stop)
                 copy.finish(_note(path, copy, reader))
-                file.flush()
-                os.fsync(file.fileno())
-            part.replace(out)
-            _sync_directory(out.parent)
         except OSError as error:
-            part.unlink(missing_ok=True)
             raise RunError(
                 f"{out}: cannot be written: {error.strerror or error}; {path} is as it was; "
                 "free space there, or recover elsewhere with -o"
             ) from None
-        except BaseException:
-            part.unlink(missing_ok=True)
-            raise
     return RecoveryResult(
         source=path,
         out=out,
@@ -198,13 +188,3 @@ def _when(loss: LostBytes) -> str:
         return ""
     seconds = (loss.last_ns - loss.first_ns) / NS_PER_S
     return f": {seconds:.3f} s up to {clock_time(loss.last_ns)}"
-
-
-def _sync_directory(directory: Path) -> None:
-    """Write the new name to the disk: the directory holds it, not the file."""
-    with contextlib.suppress(OSError):  # not every file system can
-        descriptor = os.open(directory, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)

@@ -14,6 +14,7 @@ from typing import Any
 
 import msgspec
 
+from shared.atomic_file import replace_file
 from shared.config.robot_config import RobotConfig
 from shared.config.toml_file import check_ranges
 from shared.exceptions import ConfigError
@@ -143,10 +144,8 @@ def write(path: Path, schedule: GainSchedule) -> None:
     )
     parts.append(f'"D": [\n{rows}\n]')
     text = "{" + ",\n".join(parts) + "}\n"
-    temporary = path.with_suffix(".tmp")
     try:
-        temporary.write_text(text, encoding="utf-8")
-        temporary.replace(path)
+        replace_file(path, text.encode())
     except OSError as error:
         found = f"cannot be written: {error.strerror}"
         raise ConfigError(str(path), "(file)", found, "a folder that you may write to") from None

@@ -7,6 +7,7 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from shared.atomic_file import replace_file
 from tools.number_arguments import count
 
 
@@ -34,7 +35,7 @@ def add_flags(parser: argparse.ArgumentParser, rounds: int, *, nested: bool = Fa
 def write_rows(file: Path | None, rows: Sequence[Mapping[str, object]]) -> None:
     """Write a table's rows to the file of `--json`, if there is one."""
     if file is not None:
-        file.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+        replace_file(file, json.dumps(rows, indent=2).encode() + b"\n")
 
 
 def _writable(text: str) -> Path:

@@ -9,6 +9,7 @@ from typing import Final
 
 import msgspec
 
+from shared.atomic_file import atomic_file
 from shared.exceptions import DriveError
 from shared.text_file import read_text
 from tools.bringup.boards import Value
@@ -63,7 +64,7 @@ def write(path: Path, boards: Sequence[BoardBackup], *, time: str, robot_file: s
     backup = Backup(time=time, robot_file=robot_file, boards=tuple(boards))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("xb") as file:
+        with atomic_file(path, exclusive=True, lasting=True) as file:
             file.write(msgspec.json.format(msgspec.json.encode(backup)) + b"\n")
     except OSError as error:
         raise DriveError(

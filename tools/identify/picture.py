@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from tools.identify.body_fit import BodyFit
 from tools.identify.estimates import JointResult, ParameterEstimate, Verdict
 from tools.identify.quasi_static import SLOT_S
+from tools.output import save_figure
 
 mpl.use("Agg")
 
@@ -51,7 +52,7 @@ def draw_body(estimates: Sequence[ParameterEstimate], fit: BodyFit, path: Path) 
         axis.set_ylabel(label)
         axis.legend(loc="upper right", fontsize=8)
     axes[-1].set_xlabel("quasi-static time, s")
-    figure.savefig(path)
+    save_figure(figure, path)
 
 
 def _draw_intervals(estimates: Sequence[ParameterEstimate], axis: Any) -> None:
@@ -91,4 +92,4 @@ def draw_joints(
         axis.set_ylabel(f"{joint}\ntorque, N m")
         axis.legend(loc="upper right", fontsize=8, markerscale=4)
     axes[-1].set_xlabel("angle from its mean, mrad")
-    figure.savefig(path)
+    save_figure(figure, path)

@@ -9,11 +9,11 @@ from typing import Any
 import tomlkit
 from tomlkit.exceptions import TOMLKitError
 
+from shared.atomic_file import atomic_file, replace_file
 from shared.config import files as config_file
 from shared.exceptions import RunError
 from shared.text_file import read_text
 from tools.identify.estimates import Value
-from tools.output import replace_file
 
 
 def edited(text: str, file: str, values: Mapping[str, Value], measured: Collection[str]) -> str:
@@ -63,8 +63,8 @@ def apply(path: Path, values: Mapping[str, Value], measured: Collection[str], st
         text = read_text(path)
         new = edited(text, str(path), values, measured)
         backup = path.with_name(f"{path.name}.{stamp}.bak")
-        with backup.open("x", encoding="utf-8") as file:
-            file.write(text)
+        with atomic_file(backup, exclusive=True) as file:
+            file.write(text.encode())
         replace_file(path, new.encode())
     except (OSError, UnicodeError) as error:
         raise RunError(f"{path}: not changed: {error}") from None

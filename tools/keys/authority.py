@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
+from shared.atomic_file import replace_file
 from shared.bus import credentials
 from shared.bus.access import PRINCIPALS, common_name
 from shared.bus.credentials import Names, certificate_file, key_file
@@ -21,7 +22,6 @@ from shared.exceptions import BusError
 from shared.user import in_home
 from tools.keys import certificates
 from tools.keys.certificates import Issued
-from tools.output import replace_file
 
 _KEY: Final = "authority.key"
 

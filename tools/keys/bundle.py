@@ -7,11 +7,11 @@ import tarfile
 from collections.abc import Iterable
 from pathlib import Path
 
+from shared.atomic_file import replace_file
 from shared.bus import credentials
 from shared.bus.credentials import certificate_file, key_file
 from shared.exceptions import BusError
 from tools.keys.authority import Authority
-from tools.output import replace_file
 
 
 def bundle(authority: Authority, names: Iterable[str]) -> dict[str, bytes]:

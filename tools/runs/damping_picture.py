@@ -19,6 +19,7 @@ from services.planner.dynamic_certificate import (
 )
 from services.planner.sampled_loop import NO_HAND, NOMINAL
 from shared.config.robot_config import RobotConfig
+from tools.output import save_figure
 
 mpl.use("Agg")
 
@@ -70,4 +71,4 @@ def draw(robot: RobotConfig, nodes: list[StiffnessNode], design: Design, path: P
         x=0.01,
         ha="left",
     )
-    figure.savefig(path)
+    save_figure(figure, path)

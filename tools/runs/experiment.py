@@ -15,6 +15,7 @@ import msgspec
 
 from services.simulator import plant
 from services.simulator.plant import NAMED, PlantConfig
+from shared.atomic_file import replace_file
 from shared.config import checks as config_check
 from shared.config import files as config_file
 from shared.config import scenarios
@@ -346,9 +347,9 @@ def write_inputs(
     """
     robot_path, scenario_path = out / "robot.toml", out / "scenario.toml"
     plant_path = out / PLANT_FILE
-    plant_path.write_text(plant.to_toml(true_plant), encoding="utf-8")
-    robot_path.write_text(config_file.to_toml(robot), encoding="utf-8")
-    scenario_path.write_text(scenarios.to_toml(scenario), encoding="utf-8")
+    replace_file(plant_path, plant.to_toml(true_plant).encode())
+    replace_file(robot_path, config_file.to_toml(robot).encode())
+    replace_file(scenario_path, scenarios.to_toml(scenario).encode())
     if robot.gain_schedule is None:
         return robot_path, scenario_path, plant_path
     schedule_path = gain_schedule.path_beside(robot_path)

@@ -19,6 +19,7 @@ from shared.config import files as config_file
 from shared.exceptions import ConfigError
 from shared.robot.joints import MODULES
 from shared.text_file import decoded
+from tools.output import save_figure
 from tools.runs.impairment_intervals import Impaired, impairments
 from tools.runs.run_log import RunLog
 from tools.runs.verdict import Summary, course
@@ -92,7 +93,7 @@ def draw(log: RunLog, name: str, summary: Summary, path: Path) -> None:
     if summary["unsound"]:
         verdict = "stood, but not soundly"
     figure.suptitle(f"{name}: {verdict}", fontsize=12, x=0.01, ha="left")
-    figure.savefig(path)
+    save_figure(figure, path)
 
 
 def _lines(axis: Any, t: Any, columns: Any, names: Sequence[str], label: str) -> None:

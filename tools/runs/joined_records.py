@@ -7,6 +7,7 @@ one already has is left out: the same bytes on the same key at about the same ti
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -134,8 +135,10 @@ def join(
     for record in records:
         paths.setdefault(record.host, []).append(str(record.run.path))
     metadata["joined"] = {host: ", ".join(those) for host, those in paths.items()}
+    aside = out / ".join.part"
+    shutil.rmtree(aside, ignore_errors=True)
     writer = RunWriter(
-        out,
+        aside,
         topics.all_keys(fleets.robot),
         offset_ns=fleets.offset_ns,
         metadata=metadata,
@@ -144,9 +147,9 @@ def join(
     )
     try:
         _join(writer, fleets, records, gained, progress)
-    except BaseException:
-        writer.path.unlink(missing_ok=True)
-        raise
+        writer.path.replace(out / writer.path.name)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
     return gained
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from shared.atomic_file import replace_file
 from shared.exceptions import RunError
 from shared.mcap_log.sequence_stats import KeyCount
 from tools.runs import figure, verdict
@@ -40,7 +41,7 @@ def judge_run(
     else:
         summary = verdict.summarise(log, duration_s)
     summary |= figures or {}
-    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    replace_file(out / "summary.json", json.dumps(summary, indent=2).encode() + b"\n")
     figure.draw(log, title, summary, out / "run.png")
     return summary
 

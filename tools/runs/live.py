@@ -10,6 +10,7 @@ from typing import TypeVar
 
 from services.planner.controller_file import ATTACHED, absolute, split_spec
 from services.simulator.plant import PlantConfig
+from shared.atomic_file import replace_file
 from shared.bus.session import Session, open_session
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Scenario
@@ -92,7 +93,7 @@ def _run_once(
         out, robot, scenario, true_plant
     )
     model_path = out / "model.xml"
-    model_path.write_text(mjcf(robot), encoding="utf-8")
+    replace_file(model_path, mjcf(robot).encode())
     attached = {"model.xml": model_path, PLANT_FILE: plant_path}
     if controller is not None:
         attached[ATTACHED] = split_spec(controller)[0]

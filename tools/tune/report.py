@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from rich import box
 from rich.table import Table
 
+from tools.output import save_figure
 from tools.tune.excitation import HOLD_S, REST_S
 from tools.tune.pose_probe import ProbeCourse
 from tools.tune.response import ResponseFit
@@ -85,7 +86,7 @@ def draw(
     phase.set_xscale("log")
     phase.set_ylabel("phase, degrees")
     phase.set_xlabel("Hz (points measured, lines second order)")
-    figure.savefig(path)
+    save_figure(figure, path)
 
 
 def _fitted(answer: ResponseFit, value: float) -> float:

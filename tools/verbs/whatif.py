@@ -11,6 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.text import Text
 
 from services.simulator.plant import PlantConfig
+from shared.atomic_file import replace_file
 from shared.config import scenarios
 from shared.config.scenarios import Scenario
 from shared.config.toml_file import parse_toml
@@ -107,11 +108,8 @@ def run(args: argparse.Namespace) -> int:
     out = args.out or log.files[0].parent
     out.mkdir(parents=True, exist_ok=True)
     names = " and ".join(kill)
-    (out / "whatif.json").write_bytes(
-        msgspec.json.format(
-            msgspec.json.encode({"kill": kill, "for_s": args.for_s, "fates": counterfactuals})
-        )
-    )
+    content = msgspec.json.encode({"kill": kill, "for_s": args.for_s, "fates": counterfactuals})
+    replace_file(out / "whatif.json", msgspec.json.format(content))
     picture.draw(
         log, counterfactuals, f"{names} killed at each moment", args.every, out / "whatif.png"
     )

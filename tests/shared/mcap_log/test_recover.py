@@ -190,7 +190,7 @@ def test_a_full_disk_while_recovering_leaves_the_original_and_one_line(
     def full(*_arguments: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("shared.mcap_log.recover.os.fsync", full)
+    monkeypatch.setattr("os.fsync", full)
     with pytest.raises(RunError, match="cannot be written: No space left") as caught:
         recover.recover(path, tmp_path / "out.mcap")
     assert "\n" not in str(caught.value)

@@ -95,7 +95,7 @@ def test_a_panel_for_the_network_is_there_only_if_something_was_done_to_it(
     monkeypatch.setattr(figure, "impairments", lambda _: [])
     labels: list[str] = []
     monkeypatch.setattr(
-        Figure, "savefig", lambda self, _: labels.extend(a.get_ylabel() for a in self.axes)
+        Figure, "savefig", lambda self, *_, **__: labels.extend(a.get_ylabel() for a in self.axes)
     )
     figure.draw(log, "x", summary, tmp_path / "run.png")
     assert "network" not in labels

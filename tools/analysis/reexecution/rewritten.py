@@ -10,6 +10,7 @@ import msgspec
 from mcap.well_known import MessageEncoding
 from mcap.writer import CompressionType, Writer
 
+from shared.atomic_file import atomic_file
 from shared.bus import topics
 from shared.bus.messages import Message
 from shared.exceptions import RunError
@@ -44,7 +45,7 @@ def write(
     rows.sort(key=lambda row: row[0])
     types = topics.all_keys(log.robot)
     try:
-        with path.open("xb") as file:
+        with atomic_file(path, exclusive=True) as file:
             writer = Writer(file, compression=CompressionType.ZSTD)
             writer.start(profile=PROFILE)
             for name, entries in {**log.metadata, "resim": dict(note)}.items():

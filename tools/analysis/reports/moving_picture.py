@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageColor, ImageDraw
 
+from shared.atomic_file import atomic_file
 from shared.bus import topics
 from shared.bus.messages import Mode, RunEvent, RunEventKind
 from shared.clock import NS_PER_S
@@ -95,15 +96,16 @@ def write_gif(
     palette = _palette()
     flat = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     try:
-        flat[0].save(
-            path,
-            format="GIF",
-            save_all=True,
-            append_images=flat[1:],
-            duration=round(1000.0 / FRAMES_S),
-            loop=0,
-            optimize=True,
-        )
+        with atomic_file(path) as file:
+            flat[0].save(
+                file,
+                format="GIF",
+                save_all=True,
+                append_images=flat[1:],
+                duration=round(1000.0 / FRAMES_S),
+                loop=0,
+                optimize=True,
+            )
     except OSError as error:
         raise RunError(f"{path}: cannot be written: {error.strerror or error}") from None
     return len(flat)

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from shared.bus import topics
 from shared.clock import NS_PER_S
+from tools.output import save_figure
 from tools.runs.run_log import RunLog
 from tools.studies.counterfactual.run import Counterfactual
 
@@ -50,4 +51,4 @@ def draw(
         if event.scenario_s > 0.0 and event.t_ns < truth[-1].t_ns + NS_PER_S:
             height.axvline(event.scenario_s, color="#7f7f7f", lw=0.6, ls=":")
     figure.suptitle(title, fontsize=11, x=0.01, ha="left")
-    figure.savefig(path)
+    save_figure(figure, path)

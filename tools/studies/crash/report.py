@@ -11,6 +11,7 @@ import msgspec
 from rich.table import Table
 from rich.text import Text
 
+from shared.atomic_file import replace_file
 from tools.studies.crash.cases import BACK_S, CRASH_S, CrashCase, CrashVerdict, scenario_of
 from tools.studies.crash.outcome import CrashResult, as_expected
 from tools.terminal import Console, marked
@@ -150,8 +151,8 @@ def write(results: Sequence[Result], out: Path, about: Mapping[str, str], *, pla
         about: code, machine and robot.
         planned: the selected cases.
     """
-    _replace(out / RESULTS, as_json(results, about, planned=planned))
-    _replace(out / JUNIT, as_junit(results, about))
+    replace_file(out / RESULTS, as_json(results, about, planned=planned))
+    replace_file(out / JUNIT, as_junit(results, about))
 
 
 def as_json(results: Sequence[Result], about: Mapping[str, str], *, planned: int) -> bytes:
@@ -217,12 +218,6 @@ def as_junit(results: Sequence[Result], about: Mapping[str, str]) -> bytes:
     ET.indent(suites)
     text: bytes = ET.tostring(suites, encoding="utf-8", xml_declaration=True)
     return text + b"\n"
-
-
-def _replace(path: Path, content: bytes) -> None:
-    temporary = path.with_suffix(".tmp")
-    temporary.write_bytes(content)
-    temporary.replace(path)
 
 
 def _remarks(outcome: CrashResult) -> tuple[str, ...]:

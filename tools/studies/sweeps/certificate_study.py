@@ -38,6 +38,7 @@ from shared.config.scenarios import Keyframe, Push, Scenario
 from shared.exceptions import RunError
 from shared.robot.joints import MODULES, N_JOINTS, N_LEG
 from shared.robot.robot_model import stand_pose
+from tools.output import save_figure
 
 mpl.use("Agg")
 
@@ -360,4 +361,4 @@ def draw_picture(rows: Sequence[Mapping[str, str]], title: str, path: Path) -> N
     axis.grid(visible=True, lw=0.3, color="#bbbbbb")
     axis.legend(fontsize=8, framealpha=0.8)
     figure.suptitle(title, fontsize=11, x=0.01, ha="left")
-    figure.savefig(path)
+    save_figure(figure, path)

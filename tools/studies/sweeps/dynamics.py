@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from services.planner.dynamic_certificate import HALF_NAMES
 from shared.config.robot_config import RobotConfig
 from tools.number_arguments import count, natural
+from tools.output import save_figure
 from tools.runs import experiment
 from tools.studies.sweeps import study
 from tools.studies.sweeps.dynamics_trial import (
@@ -128,7 +129,7 @@ def draw_picture(rows: Sequence[Row], title: str, path: Path) -> None:
     axis.grid(visible=True, lw=0.3, color="#bbbbbb")
     axis.legend(fontsize=8, framealpha=0.8)
     figure.suptitle(title, fontsize=11, x=0.01, ha="left")
-    figure.savefig(path)
+    save_figure(figure, path)
 
 
 def _begin(trial: DynamicsTrial) -> dict[str, object]:

@@ -12,6 +12,7 @@ import matplotlib as mpl
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
+from tools.output import save_figure
 from tools.studies.sweeps.latency_report import (
     Falls,
     chosen,
@@ -94,7 +95,7 @@ def _draw_falls(rows: Sequence[Row], what: str, path: Path) -> None:
         "on the way down.\nCells: falls/trials, 95 % interval of the share (Wilson)",
         fontsize=10, x=0.01, ha="left",
     )  # fmt: skip
-    figure.savefig(path)
+    save_figure(figure, path)
 
 
 def _draw_map(axis: Any, rows: Sequence[Row], name: str) -> None:
@@ -216,7 +217,7 @@ def _draw_effort(rows: Sequence[Row], force_max: float, what: str, path: Path) -
         f"What the hand meets: squats under {PUSHES} pushes; {mix(rows)}; {len(rows)} runs, {what}",
         fontsize=11, x=0.01, ha="left",
     )  # fmt: skip
-    figure.savefig(path)
+    save_figure(figure, path)
 
 
 def _draw_control(effort: Any, hold: Any, rows: Sequence[Row], name: str) -> None:

@@ -15,6 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
 from shared.config.robot_config import RobotConfig
+from tools.output import save_figure
 from tools.studies.sweeps.cases import PUSHES_MAX, payloads
 from tools.studies.sweeps.figures import Ending
 from tools.studies.sweeps.table import Row
@@ -40,7 +41,7 @@ def draw(rows: Sequence[Row], robot: RobotConfig, title: str, path: Path) -> Non
     )
     bar.set_label("payload in kg")
     figure.suptitle(title, fontsize=13, x=0.01, ha="left")
-    figure.savefig(path)
+    save_figure(figure, path)
 
 
 def _norm(levels: Sequence[float]) -> BoundaryNorm:

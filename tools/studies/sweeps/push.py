@@ -20,6 +20,7 @@ from services.simulator.plant import PlantConfig, plant_from
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from tools.number_arguments import degrees, finite
+from tools.output import save_figure
 from tools.runs import experiment
 from tools.studies.sweeps import study
 from tools.studies.sweeps.push_trial import MODES, POSES, PushResult, PushTrial, run_trial
@@ -143,7 +144,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
         axis.set_title(f"{pose}, {float(duration):g} s, N")
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     figure.suptitle("Hardest push that it stood, by direction (up: forwards)", x=0.01, ha="left")
-    figure.savefig(path)
+    save_figure(figure, path)
 
 
 def _curve(

@@ -18,6 +18,7 @@ from scipy.stats import spearmanr
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from tools.number_arguments import count, finite, natural
+from tools.output import save_figure
 from tools.runs import experiment
 from tools.studies.sweeps import plants, push_range, study
 from tools.studies.sweeps.figures import ENDINGS, Ending
@@ -195,7 +196,7 @@ def _draw(rows: Sequence[Row], args: argparse.Namespace, path: Path) -> None:
         x=0.01,
         ha="left",
     )
-    figure.savefig(path)
+    save_figure(figure, path)
 
 
 def _show(rows: Sequence[Row], command: str, console: Console) -> int:

@@ -11,6 +11,7 @@ import ast
 import csv
 import fcntl
 import hashlib
+import io
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
@@ -18,6 +19,7 @@ from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import IO, Final, TypeAlias
 
+from shared.atomic_file import atomic_file
 from shared.exceptions import RunError
 from shared.process import CHECKOUT
 
@@ -151,14 +153,12 @@ class CaseTable:
 
     def _write(self) -> None:
         """Rewrite all rows atomically."""
-        temporary = self._path.with_suffix(".tmp")
-        with temporary.open("w", encoding="utf-8", newline="") as file:
+        with atomic_file(self._path, lasting=True) as raw:
+            file = io.TextIOWrapper(raw, encoding="utf-8", newline="", write_through=True)
             writer = csv.DictWriter(file, self._columns)
             writer.writeheader()
             writer.writerows(row for _, row in sorted(self._rows.items()))
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(self._path)
+            file.detach()
 
 
 def _refuse_foreign(folder: Path, table: Path) -> None:

@@ -1,0 +1,68 @@
+"""An export that is ended half-way leaves nothing that looks whole, and the next one works."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tools import cli
+
+WAIT_S = 60.0
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("flag", ["--ros2bag", "--csv"])
+def test_a_folder_that_is_ended_half_way_is_not_there_and_is_written_the_next_time(
+    run_file: Path, tmp_path: Path, flag: str, number: signal.Signals
+) -> None:
+    out = tmp_path / "out"
+    words = ["export", str(run_file), flag, str(out)]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tools.cli", *words],
+        cwd=Path(__file__).parents[3],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    part, deadline = tmp_path / ".out.part", time.monotonic() + WAIT_S
+    while not part.exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.001)
+    process.send_signal(number)
+    code = process.wait(WAIT_S)
+    if code == 0:
+        pytest.skip("the machine stalled: it was written before the signal came")
+    assert code == (130 if number == signal.SIGINT else 143 if number == signal.SIGTERM else -9)
+    assert not out.exists()
+    assert part.exists() == (number == signal.SIGKILL)
+    assert cli.main(words) == 0
+    assert list(tmp_path.iterdir()) == [out]
+    assert list(out.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("words", "within"),
+    [
+        (["--gif", "out.gif"], "PIL.Image.Image.save"),
+        (["--scene", "-o", "out.mcap"], "tools.analysis.reports.scene.frames"),
+    ],
+)
+def test_a_file_that_is_ended_half_way_leaves_the_one_that_was_there(
+    run_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], within: str
+) -> None:
+    def interrupted(*_arguments: object, **_more: object) -> None:
+        (part,) = (path for path in tmp_path.iterdir() if path.name.endswith(".part"))
+        part.write_bytes(b"half")
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    out = tmp_path / words[-1]
+    out.write_bytes(b"old")
+    monkeypatch.setattr(within, interrupted)
+    assert cli.main(["export", str(run_file), *words, "--force"]) == 130
+    assert out.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [out]
