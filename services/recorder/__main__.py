@@ -107,11 +107,22 @@ def main() -> int:
                 _record(recording, stop, asked, roster, floods)
         except RunError as error:
             logger.error("%s", error)
-            return 1
+            return error.exit_code
         finally:
             auto_recovery.halt()
-    what = f"finished {writer.path}" if writer.begun else "nothing written"
-    logger.info("%s: %s", what, summary(writer, snapshot))
+    return _tell_end(writer, recording, summary(writer, snapshot), logger)
+
+
+def _tell_end(writer: RunWriter, recording: Recorder, counts: str, logger: logging.Logger) -> int:
+    """Say what was recorded; return the exit code: 2 if a file of it is not there."""
+    what = f"finished {writer.path}" if writer.path.exists() else "nothing written"
+    logger.info("%s: %s", what, counts)
+    if recording.removed_files:
+        logger.error(
+            "%d of %d files were removed while they were written, with %d of the messages",
+            recording.removed_files, writer.begun, recording.removed_messages,
+        )  # fmt: skip
+        return RunError.exit_code
     return 0
 
 

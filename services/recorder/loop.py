@@ -12,7 +12,8 @@ from services.recorder.disk_guard import MIB, DiskChange, SpaceGuard
 from services.recorder.snapshot import SnapshotRing
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import RecorderConfig
-from shared.mcap_log.writer import MessageSource, RunWriter
+from shared.exceptions import RunError
+from shared.mcap_log.writer import FilePlace, MessageSource, RunWriter
 
 CAPACITY: Final = 65_536
 """Messages that may wait while the disk is slow: 13 s of the fleet."""
@@ -76,6 +77,11 @@ class Recorder:
         self._sync = Deadline(int(config.fsync_s * NS_PER_S), now_ns)
         self._report = Deadline(int(REPORT_PERIOD_S * NS_PER_S), now_ns)
         self._begun_ns = now_ns
+        self.removed_files = self.removed_messages = 0
+        """Files that somebody removed while they were written, and what was in them."""
+        self._why_next = ""
+        """Why a file is to be begun as soon as one can be; "" if none is."""
+        self._told_unwritable = False
         self._watch_space(now_ns)
         if snapshot is None:
             self._begin(now_ns, {})
@@ -97,6 +103,7 @@ class Recorder:
         elif flush:
             self._writer.flush()
         if flush:
+            self._watch_file(now_ns)
             self._split_if_due(now_ns)
         if self._report.passed(now_ns):
             self._logger.info("%s", summary(self._writer, self._snapshot))
@@ -137,6 +144,40 @@ class Recorder:
             self._begin(now_ns, {"why": "time" if old else "size"})
             self._logger.info("%s is finished; going on in %s", before, self._writer.path)
 
+    def _watch_file(self, now_ns: int) -> None:
+        """Go on in the next file, if there can be one, where this one is not at its path."""
+        self._leave_if_gone()
+        if not self._why_next or not self._guard.enough:
+            return
+        try:
+            self._begin(now_ns, {"why": self._why_next})
+        except RunError as error:
+            if not self._told_unwritable:
+                self._logger.error("%s; it is tried again", error)
+            self._told_unwritable = True
+            return
+        self._why_next, self._told_unwritable = "", False
+        left_out = self._writer.left_out
+        self._logger.warning(
+            "recording goes on in %s; %d messages were left out", self._writer.path, left_out
+        )
+
+    def _leave_if_gone(self) -> None:
+        """Tell that the file is not at its path any more; one that was moved is finished there."""
+        place = self._writer.where_is_file
+        if place is FilePlace.THERE:
+            return
+        path, count = self._writer.path, self._writer.messages_in_file
+        self._writer.finish()
+        if place is FilePlace.REMOVED:
+            self.removed_files += 1
+            self.removed_messages += count
+        self._logger.error(
+            "%s was %s while it was written, with %d messages", path, place.value, count
+        )
+        if self._snapshot is None:
+            self._why_next = f"the file before was {place.value}"
+
     def _watch_space(self, now_ns: int) -> None:
         """Stop before the disk is full, and go on when it no longer is."""
         try:
@@ -158,7 +199,7 @@ class Recorder:
                     where, free // MIB, least,
                 )  # fmt: skip
             case DiskChange.BACK:
-                if self._snapshot is None:
+                if self._snapshot is None and not self._why_next:
                     self._begin(now_ns, {"why": "space again"})
                 self._logger.warning(
                     "%s: %d MiB free: recording goes on; %d messages were left out",
@@ -175,10 +216,11 @@ class Recorder:
         """
         if self._snapshot is None:
             self._writer.take_from(self._source, CAPACITY)
-            return
-        self._snapshot.take_from(self._source, CAPACITY)
-        while self._writer.recording and self._writer.take_from(self._snapshot, SLICE):
-            pass
+        else:
+            self._snapshot.take_from(self._source, CAPACITY)
+            while self._writer.recording and self._writer.take_from(self._snapshot, SLICE):
+                pass
+        self._leave_if_gone()
 
 
 def free_bytes_at(directory: Path) -> int:
@@ -207,7 +249,7 @@ def summary(writer: RunWriter, snapshot: SnapshotRing | None = None) -> str:
         if keys:
             line += f"; {sum(keys.values())} left out, {what}: {', '.join(sorted(keys))}"
     if writer.left_out:
-        line += f"; {writer.left_out} left out while the disk was full"
+        line += f"; {writer.left_out} left out while no file could be written"
     if snapshot is not None:
         line += f"; {len(snapshot)} in memory, {snapshot.memory // MIB} MiB"
         if snapshot.dropped:

@@ -20,8 +20,10 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import os
 import secrets
 from collections.abc import Callable, Iterator, Mapping
+from enum import Enum
 from pathlib import Path
 from types import TracebackType
 from typing import Annotated, BinaryIO, Final, Protocol
@@ -62,6 +64,14 @@ class MessageSource(Protocol):
 
     def take(self) -> tuple[str, bytes, int] | None:
         """Return (key, payload, monotonic ns of this call), or None if there is none now."""
+
+
+class FilePlace(Enum):
+    """Where the file is that is being written."""
+
+    THERE = "at its path"
+    MOVED = "moved away"
+    REMOVED = "removed"
 
 
 class MessageHead(msgspec.Struct, gc=False):
@@ -116,7 +126,7 @@ class RunWriter:
         self.malformed: dict[str, int] = {}
         """Messages without a readable `t_ns` and `seq`; not written."""
         self.left_out = 0
-        """Messages that came while no file was open; not written."""
+        """Messages that came while no file could be written."""
         self._directory, self._topics = directory, topics
         self._offset_ns, self._chunk_size = offset_ns, chunk_kib * 1024
         self._metadata, self._attachments = metadata, attachments
@@ -169,6 +179,27 @@ class RunWriter:
     def size(self) -> int:
         """Bytes of the open file up to its last whole chunk; 0 if none is open."""
         return self._file.tell() if self._file is not None else 0
+
+    @property
+    def messages_in_file(self) -> int:
+        """Messages written to the newest file so far."""
+        return self.messages - sum(count.count for count in self._before.values())
+
+    @property
+    def where_is_file(self) -> FilePlace:
+        """Look whether the open file is still at its path."""
+        if self._file is None:
+            return FilePlace.THERE
+        own = os.fstat(self._file.fileno())
+        try:
+            there = os.path.samestat(own, self.path.stat())
+        except (FileNotFoundError, NotADirectoryError):
+            there = False
+        except OSError:  # nobody can tell
+            there = True
+        if there:
+            return FilePlace.THERE
+        return FilePlace.MOVED if own.st_nlink else FilePlace.REMOVED
 
     def begin(self, note: Mapping[str, str] | None = None) -> None:
         """Start the run's next file, with all metadata and attachments.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import logging
 import random
+import shutil
 from pathlib import Path
 
 import pytest
@@ -204,3 +205,62 @@ def test_free_space_is_that_of_the_nearest_directory_that_exists(tmp_path: Path)
     here = free_bytes_at(tmp_path)
     assert here > 0
     assert free_bytes_at(tmp_path / "not" / "yet") == pytest.approx(here, rel=0.5)
+
+
+def test_a_folder_that_is_removed_is_told_at_once_and_recording_goes_on_in_the_next_file(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    out = tmp_path / "out"
+    run = rig(out)
+    run.run(1.0)
+    shutil.rmtree(out)
+    run.run(0.5)
+    assert "run.mcap was removed while it was written, with" in caplog.text
+    run.run(1.0)
+    run.finish()
+    log = read_run(out / "run_1.mcap")
+    assert log.metadata["split"]["why"] == "the file before was removed"
+    kept, lost = log.count(STATE_KEY), run.recording.removed_messages
+    assert (kept + lost, run.recording.removed_files) == (run.sent, 1)
+    assert lost <= 1.3 * 500
+
+
+def test_a_file_that_is_moved_away_is_finished_there(tmp_path: Path) -> None:
+    run = rig(tmp_path / "out")
+    run.run(1.0)
+    run.writer.path.rename(tmp_path / "mine.mcap")
+    run.run(1.0)
+    run.finish()
+    logs = [read_run(path) for path in (tmp_path / "mine.mcap", tmp_path / "out" / "run_1.mcap")]
+    assert all(log.complete for log in logs)
+    assert sum(log.count(STATE_KEY) for log in logs) == run.sent
+    assert run.recording.removed_files == 0
+
+
+def test_without_a_place_for_a_folder_it_is_told_once_and_tried_again(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    out = tmp_path / "out"
+    run = rig(out)
+    run.run(1.0)
+    shutil.rmtree(out)
+    out.write_bytes(b"in the way")
+    run.run(2.0)
+    assert caplog.text.count("cannot be created") == 1
+    out.unlink()
+    run.run(1.0)
+    run.finish()
+    assert run.writer.left_out > 500
+    kept = read_run(out / "run_1.mcap").count(STATE_KEY)
+    assert kept + run.writer.left_out + run.recording.removed_messages == run.sent
+
+
+def test_a_folder_that_is_removed_at_the_end_is_told_too(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    run = rig(tmp_path / "out")
+    run.run(1.0)
+    shutil.rmtree(tmp_path / "out")
+    run.finish()
+    assert run.recording.removed_files == 1
+    assert "was removed while it was written, with" in caplog.text

@@ -224,14 +224,26 @@ def test_a_snapshot_that_makes_no_sense_is_one_line(tmp_path: Path, seconds: str
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_a_write_error_ends_with_exit_code_1_and_one_line(rig: Rig) -> None:
+def test_a_folder_removed_under_a_recorder_is_told_and_the_exit_code_is_2(rig: Rig) -> None:
+    shutil.rmtree(rig.out)
+    wait_for(lambda: rig.hears("run_1.mcap"), doing=lambda: rig.send(20))
+    output = rig.stop(signal.SIGTERM)
+    assert rig.process.returncode == 2, output
+    assert "run.mcap was removed while it was written" in output
+    assert "1 of 2 files were removed while they were written" in output
+    log = rig.read("run_1.mcap")
+    assert log is not None
+    assert log.complete
+
+
+def test_a_write_error_ends_with_exit_code_2_and_one_line(rig: Rig) -> None:
     before = rig.path.stat().st_size
     limit = before + 3000
     resource.prlimit(rig.process.pid, resource.RLIMIT_FSIZE, (limit, limit))
     wait_for(lambda: rig.process.poll() is not None, doing=lambda: rig.send(200))
     assert rig.process.stderr
     output = rig.process.stderr.read()
-    assert rig.process.returncode == 1
+    assert rig.process.returncode == 2
     assert "Traceback" not in output
     assert "Exception ignored" not in output
     (error,) = [line for line in output.splitlines() if "ERROR" in line]
