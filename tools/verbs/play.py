@@ -34,6 +34,7 @@ from tools.terminal import Console
 from tools.verb_table import Subparsers, add_verb
 
 _POLL_S: Final = 0.01
+_SETTLED_S: Final = 0.1
 _FLUSH_S: Final = 1.0
 """A closing session gives queued messages a quarter of a second, then drops them."""
 
@@ -217,6 +218,7 @@ def _play(
         keyboard,
         now_ns=now_ns,
         show=show,
+        listening=lambda: any(port.matched for port in ports),
         clock=clock,
         clock_hz=args.clock_hz,
     )
@@ -227,20 +229,20 @@ def _play(
         return INTERRUPTED
     finally:
         display.clear()
-        print(
-            summary(player, (now_ns() - began_ns) / NS_PER_S, subscribers=display.subscribers),
-            flush=True,
-        )
-    if patient and display.subscribers:
+        print(summary(player, (now_ns() - began_ns) / NS_PER_S), flush=True)
+    if patient and player.heard:
         time.sleep(_FLUSH_S)
-    return 1 if player.stats.failed else 0
+    return RunError.exit_code if player.stats.failed or player.stats.dropped else 0
 
 
 def _await_subscriber(
     ports: Sequence[RawPublisher], wait_s: float, keyboard: Keyboard[Press]
 ) -> None:
-    deadline = time.monotonic() + wait_s
-    while time.monotonic() < deadline and not any(port.matched for port in ports):
+    """Wait for the first subscriber, and until its subscriptions are all there."""
+    deadline, matched, since = time.monotonic() + wait_s, 0, time.monotonic()
+    while time.monotonic() < deadline and not (matched and time.monotonic() > since + _SETTLED_S):
+        before, matched = matched, sum(port.matched for port in ports)
+        since = since if matched == before else time.monotonic()
         if Press.QUIT in keyboard.wait(_POLL_S):
             return
 

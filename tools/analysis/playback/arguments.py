@@ -49,7 +49,9 @@ or any Zenoh 1.x peer or client that connects there. The services of a fleet tha
 In a terminal: space pauses and goes on; right puts the next message of a paused play (or
 goes on by 100 ms); up and down change the rate by a tenth; q ends.
 
-Exit code: 0 played; 1 messages could not be sent; 2 refused; 130 Ctrl-C.
+Exit code: 0 played; 2 refused, messages could not be sent, or a subscriber that took nothing for
+5 s was dropped; 130 Ctrl-C. A subscriber that links up later misses what went out before: the
+summary says how many messages nobody heard.
 """
 
 

@@ -52,7 +52,7 @@ def _common(keys: Sequence[str]) -> str:
     return first[: first.rfind("/", 0, same) + 1]
 
 
-def summary(player: Player, took_s: float, *, subscribers: bool) -> str:
+def summary(player: Player, took_s: float) -> str:
     """Return how it went, in one line."""
     stats = player.stats
     keys = sum(1 for count in stats.counts if count)
@@ -64,21 +64,24 @@ def summary(player: Player, took_s: float, *, subscribers: bool) -> str:
         line += f"; late by {mean_ms:.2f} ms on average, {stats.late_max_ns / NS_PER_MS:.1f} ms "
         line += "at most"
     line += f"; {stats.failed} not sent: the session is closed" if stats.failed else "; all sent"
-    return line if subscribers else f"{line}; nobody listened"
+    if stats.dropped:
+        line += "; NOT ALL ARRIVED: a subscriber took nothing for 5 s and its link was dropped"
+    if not player.heard:
+        return f"{line}; nobody listened"
+    if stats.unheard:
+        line += f"; nobody listened to the first {stats.unheard}: --wait S waits longer"
+    return line
 
 
 class Display:
     """One line on a terminal that is rewritten; nothing on a pipe."""
 
     def __init__(self, ports: Sequence[RawPublisher]) -> None:
-        self.subscribers = False
-        """Somebody has subscribed to a key, as far as has been looked."""
         self._ports = ports
         self._terminal = sys.stdout.isatty()
 
     def show(self, player: Player) -> None:
         """Write the line."""
-        self.subscribers = self.subscribers or any(port.matched for port in self._ports)
         if not self._terminal:
             return
         head, schedule, stats = player.head, player.schedule, player.stats
@@ -90,7 +93,7 @@ class Display:
         if schedule.passes:
             line += f", pass {schedule.passes + 1}"
         line += ", paused" if head.paused else ""
-        line += "" if self.subscribers else ", nobody listens"
+        line += "" if player.heard else ", nobody listens"
         sys.stdout.write(f"\r\x1b[2K{line}")
         sys.stdout.flush()
 

@@ -14,6 +14,8 @@ from tools.analysis.playback.schedule import Playhead, Schedule
 BURST: Final = 256
 """Messages put in one go, when they are late; keys and clock come in between."""
 SHOW_NS: Final = 200 * NS_PER_MS
+DROPPED_NS: Final = round(4.9 * NS_PER_S)
+"""A patient `put` that takes 5 s has dropped the link of a subscriber that takes nothing."""
 STEP_NS: Final = 100 * NS_PER_MS
 """A step where no message comes sooner."""
 RATE_STEP: Final = 1.1
@@ -39,6 +41,10 @@ class PlaybackStats(msgspec.Struct):
     put: int = 0
     failed: int = 0
     """Not sent: the session is closed."""
+    unheard: int = 0
+    """Put before anybody had subscribed."""
+    dropped: int = 0
+    """Times that a subscriber took nothing for so long that its link was dropped."""
     late_max_ns: int = 0
     """Longest time after its moment that a message went out."""
     late_sum_ns: int = 0
@@ -66,6 +72,7 @@ class Player:
         *,
         now_ns: Callable[[], int],
         show: Callable[[], None],
+        listening: Callable[[], bool] = lambda: True,
         clock: Port | None = None,
         clock_hz: float = 0.0,
     ) -> None:
@@ -78,6 +85,7 @@ class Player:
             hand: waits and returns keys.
             now_ns: the clock of `head`.
             show: called five times a second; an exception from it ends the playback.
+            listening: says whether somebody has subscribed; asked until somebody has.
             clock: receives the recorded time; None: not published.
             clock_hz: rate of that, also while paused.
         """
@@ -85,6 +93,9 @@ class Player:
         self.stats = PlaybackStats(counts=[0] * len(ports))
         self._puts = [port.put for port in ports]
         self._hand, self._now_ns, self._show = hand, now_ns, show
+        self._listening = listening
+        self.heard = False
+        """Somebody has subscribed, as far as has been looked."""
         self._clock = clock
         self._clock_period_ns = round(NS_PER_S / clock_hz) if clock_hz else 0
         self._clock_due_ns = self._show_due_ns = now_ns()
@@ -110,6 +121,7 @@ class Player:
     def _put_due(self) -> None:
         """Publish what is due; late messages go at once, in order."""
         schedule, head, stats = self.schedule, self.head, self.stats
+        self.heard = self.heard or self._listening()
         for _ in range(BURST):
             position = schedule.next_ns()
             due_ns = None if position is None else head.due_ns(position)
@@ -123,12 +135,14 @@ class Player:
             self._put_next()
 
     def _put_next(self) -> None:
-        entry = self.schedule.pop()
+        entry, stats, began_ns = self.schedule.pop(), self.stats, self._now_ns()
         if self._puts[entry.key](entry.payload):
-            self.stats.put += 1
-            self.stats.counts[entry.key] += 1
+            stats.put += 1
+            stats.counts[entry.key] += 1
+            stats.unheard += not self.heard
+            stats.dropped += self._now_ns() - began_ns > DROPPED_NS
         else:
-            self.stats.failed += 1
+            stats.failed += 1
 
     def _tell_time(self) -> None:
         """Put the recorded time if it is due; moments that were missed are left out."""

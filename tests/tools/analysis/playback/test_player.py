@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from shared.clock import NS_PER_MS, NS_PER_S
 from tests.tools.analysis.playback.schedules import schedule_of
+from tools.analysis.playback.display import summary
 from tools.analysis.playback.player import BURST, STEP_NS, ClockMessage, Player
 from tools.analysis.playback.press import Press
 from tools.analysis.playback.schedule import Entry, Playhead, window
@@ -50,10 +51,11 @@ class World:
 
 
 class Port:
-    def __init__(self, world: World, *, works: bool = True) -> None:
-        self.world, self.works = world, works
+    def __init__(self, world: World, *, works: bool = True, stalls_ns: int = 0) -> None:
+        self.world, self.works, self.stalls_ns = world, works, stalls_ns
 
     def put(self, payload: bytes) -> bool:
+        self.world.now += self.stalls_ns
         if self.works:
             self.world.put.append((self.world.now, payload))
         return self.works
@@ -72,16 +74,19 @@ def player(
     paused: bool = False,
     clock: Port | None = None,
     works: bool = True,
+    listens_after_s: float = 0.0,
+    stalls_ns: int = 0,
 ) -> Player:
     rows = entries(times_s)
     schedule = schedule_of(rows, window(rows[0].time_ns, rows[-1].time_ns, 0, None), loop=loop)
     return Player(
         schedule,
         Playhead(world.now, rate, paused=paused),
-        [Port(world, works=works)],
+        [Port(world, works=works, stalls_ns=stalls_ns)],
         world,
         now_ns=lambda: world.now,
         show=world.show,
+        listening=lambda: world.now >= BEGAN + round(listens_after_s * NS_PER_S),
         clock=clock,
         clock_hz=100.0 if clock else 0.0,
     )
@@ -201,3 +206,26 @@ def test_what_the_display_raises_ends_the_play() -> None:
     with pytest.raises(InterruptedError):
         play.run()
     assert world.now < BEGAN + 2 * NS_PER_S
+
+
+@pytest.mark.parametrize(
+    ("listens_after_s", "words"),
+    [(0.0, "all sent"), (0.45, "nobody listened to the first 5:"), (9.0, "nobody listened")],
+)
+def test_what_went_out_before_anybody_listened_is_told(listens_after_s: float, words: str) -> None:
+    play = player(World(), [0.1 * n for n in range(10)], listens_after_s=listens_after_s)
+    play.run()
+    said = summary(play, 1.0)
+    assert words in said
+    assert ("nobody" in said) == ("nobody" in words)
+    assert said.endswith("nobody listened") == (words == "nobody listened")
+
+
+@pytest.mark.parametrize(("stall_s", "dropped"), [(0.5, 0), (5.0, 2)])
+def test_a_subscriber_that_takes_nothing_for_five_seconds_is_told(
+    stall_s: float, dropped: int
+) -> None:
+    play = player(World(), [0.0, 0.1], stalls_ns=round(stall_s * NS_PER_S))
+    play.run()
+    assert play.stats.dropped == dropped
+    assert ("NOT ALL ARRIVED" in summary(play, 1.0)) == bool(dropped)
