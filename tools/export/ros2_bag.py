@@ -32,7 +32,7 @@ from shared.mcap_log.recover import clock_time
 from shared.robot.joints import MODULES
 from tools.export.stamps import stamped
 from tools.runs.run_index import RunIndex
-from tools.runs.run_log import RunLog, RunPart, parts_of
+from tools.runs.run_log import SEE_INFO, RunLog, RunPart, parts_of
 
 _EVER: Final = QosTime(9223372036, 854775807)
 
@@ -56,7 +56,7 @@ def write_bag(
         done: is told how much of the run is written, s.
 
     Raises:
-        RunError: the times are beyond those of ROS 2.
+        RunError: the times are beyond those of ROS 2, or there is no message.
     """
     if not TIME_FIRST_NS <= index.began_ns <= index.ended_ns <= TIME_LAST_NS:
         raise RunError(
@@ -86,6 +86,8 @@ def write_bag(
                     writer.write(connections[outgoing.topic], unix_ns, outgoing.payload)
                     count += 1
             done((log.end_ns - log.began_ns()) / NS_PER_S)
+    if not count:
+        raise RunError(f"{index.path}: has no message for a bag in this part; {SEE_INFO}")
     return count
 
 

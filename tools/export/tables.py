@@ -20,7 +20,7 @@ from shared.clock import NS_PER_S
 from shared.exceptions import RunError
 from tools.export.stamps import stamped
 from tools.runs.run_index import RunIndex
-from tools.runs.run_log import RunLog, RunPart, parts_of
+from tools.runs.run_log import SEE_INFO, RunLog, RunPart, parts_of
 from tools.runs.run_parts import zero_ns
 from tools.topic_keys import TopicKey
 
@@ -160,7 +160,7 @@ def write_grid(
         done: as for `write_tables`.
 
     Raises:
-        RunError: no key has a rate.
+        RunError: no key has a rate, or none a message.
     """
     steady = [key for key in keys if key.topic.rate_hz]
     if not steady:
@@ -169,7 +169,7 @@ def write_grid(
     kinds = {
         f"{key.name}.{name}": row.kind for key in steady for name, row in readers[key.topic].items()
     }
-    zero, step_ns, count = zero_ns(index), NS_PER_S / rate_hz, 0
+    zero, step_ns, count, heard = zero_ns(index), NS_PER_S / rate_hz, 0, False
     file = make(path, {TIME: float, **kinds})
     try:
         for log in parts_of(index, part):
@@ -179,6 +179,7 @@ def write_grid(
             cells: dict[str, Sequence[Any]] = {TIME: [(at - zero) / NS_PER_S for at in grid]}
             for key in steady:
                 newest = _newest_at(log, key, grid)
+                heard = heard or any(message is not None for message in newest)
                 for name, row in readers[key.topic].items():
                     cells[f"{key.name}.{name}"] = [
                         None if message is None else row.read(message) for message in newest
@@ -189,6 +190,8 @@ def write_grid(
             done((log.end_ns - log.began_ns()) / NS_PER_S)
     finally:
         file.close()
+    if not heard:
+        raise RunError(f"{index.path}: has no message of these topics in this part; {SEE_INFO}")
     return count
 
 

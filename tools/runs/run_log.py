@@ -38,6 +38,10 @@ PICTURE_MAX_S: Final = 120.0
 """Longest time in one picture of a run."""
 
 
+SEE_INFO: Final = "`xrl info` shows what the file holds"
+"""What to do about a part without messages."""
+
+
 class RunPart(NamedTuple):
     """A part of a run's time, s since its first message."""
 

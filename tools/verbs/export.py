@@ -32,7 +32,7 @@ from tools.number_arguments import rate
 from tools.output import progress_along, write_atomically
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_index import RunIndex
-from tools.runs.run_log import RunLog, RunPart, parts_of, read_part
+from tools.runs.run_log import SEE_INFO, RunLog, RunPart, parts_of, read_part
 from tools.runs.run_parts import add_part, part_of
 from tools.terminal import Console, marked
 from tools.topic_keys import keys_named
@@ -191,7 +191,7 @@ def _write_tables(
             grid = write_grid(index, part, keys, args.rate, folder / GRID_NAME, kind, done)
             rows = {GRID_NAME: grid}
         if not any(rows.values()):
-            raise RunError(f"{index.path}: has no message of these topics in this part")
+            raise RunError(f"{index.path}: has no message of these topics in this part; {SEE_INFO}")
     told = f"{len(rows)} table{'s' * (len(rows) != 1)}, {sum(rows.values())} rows"
     console.print(marked("[bold]{}[/]: {}", out, told), soft_wrap=True)
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from shared.clock import NS_PER_S
+from shared.exceptions import RunError
 from tools.analysis.reports import network, panels, summary, times, torques
 from tools.analysis.reports.page_model import PageModel, PageWindow, TimelineEvent
 from tools.analysis.reports.run_data import RunData, TimeAxis
@@ -18,7 +19,7 @@ from tools.analysis.reports.summary import RunVerdict, TopicLoss
 from tools.analysis.reports.timeline import Timeline
 from tools.runs import verdict_table
 from tools.runs.run_index import RunIndex
-from tools.runs.run_log import PART_S, WHOLE, RunLog, RunPart, parts_of
+from tools.runs.run_log import PART_S, SEE_INFO, WHOLE, RunLog, RunPart, parts_of
 from tools.runs.run_parts import zero_ns
 
 HERE: Final = Path(__file__).parent
@@ -142,16 +143,20 @@ def render_parts(
         done: takes the time of the run that is done, s.
 
     Raises:
-        RunError: a message has another version.
+        RunError: a message has another version, or there is none.
     """
     zero = zero_ns(index)
     began_ns = index.began_ns - index.offset_ns
     offset_s = (began_ns - zero) / NS_PER_S
     begin_s, end_s = max(part.begin_s, 0.0), min(part.end_s, index.length_s)
     page = Page(TimeAxis(zero, Span(begin_s + offset_s, end_s + offset_s)))
+    heard = False
     for log in parts_of(index, part, part_s=part_s):
+        heard = heard or bool(log.keys())
         page.take(log)
         done((log.end_ns - began_ns) / NS_PER_S)
+    if not heard:
+        raise RunError(f"{index.path}: has no message in this part; {SEE_INFO}")
     return page.html()
 
 
