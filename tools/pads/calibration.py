@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable
 from typing import Final
 
+from shared.atomic_file import replace_file
 from shared.exceptions import FleetError
-from tools.output import replace_file
 from tools.pads.controls import (
     BUTTONS,
     EV_ABS,
