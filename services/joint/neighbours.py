@@ -1,6 +1,8 @@
 """Shared memory between the six joint services of one host, without a bus.
 
-After an emergency stop the knees sink. Hips that only damp are dragged along by the thighs: the
+After an emergency stop the knees sink. Ankles that only hold let the COM go back as the knees fold:
+from nearly straight legs (1.28 m) the robot fell over backwards. An ankle that knows the angle of
+its knee keeps the hip joint where it was. Hips that only damp are dragged along by the thighs: the
 torso turned back by 1.5 rad, and with its COM 5 cm back and 10 cm up the robot fell over. A hip
 that knows the angles of its ankle and knee holds the torso's attitude. A knee that sinks beside a
 knee whose service is dead tips the robot sideways: it fell within 4 s. So each knee must know
@@ -57,8 +59,9 @@ class NeighbourRow(NamedTuple):
 class NeighbourView(NamedTuple):
     """View of a module's neighbours."""
 
-    below: Pair | None = None
-    """For a hip: theta and rate of ankle and knee together, rad, rad/s; None: not known now."""
+    leg: Pair | None = None
+    """Theta and rate of its leg, rad, rad/s: for a hip ankle and knee together, for an ankle the
+    knee; None: not known now."""
     sinks: bool = True
     """For a knee: False if the robot would tip unless it holds where it is."""
     stiffen: bool = False
@@ -100,7 +103,10 @@ def view_of(module: str, rows: Sequence[NeighbourRow | None], now_ns: int) -> Ne
     if kind == "knee":
         other = rows[(own + _LEG) % N_MODULES]
         return NeighbourView(sinks=other is None or not _stays(other, now_ns), stiffen=stiffen)
-    return NeighbourView(stiffen=stiffen)
+    knee = rows[own + 1]
+    if knee is None or not _is_fresh(knee, now_ns):
+        return NeighbourView(stiffen=stiffen)
+    return NeighbourView((knee.theta, knee.rate), stiffen=stiffen)
 
 
 def _is_fresh(row: NeighbourRow, now_ns: int) -> bool:

@@ -40,7 +40,8 @@ class CycleTrace(msgspec.Struct, gc=False, frozen=True):
     tau: Pair
     """Joint torques of this cycle, N m, after the limiter."""
     below: Pair = (0.0, 0.0)
-    """For a hip: theta and rate of ankle and knee together, rad, rad/s; valid if `knows_below`."""
+    """Theta and rate of its leg, rad, rad/s: for a hip ankle and knee together, for an ankle the
+    knee; valid if `knows_below`."""
     knows_below: bool = False
     """True if `below` is valid."""
     sinks: bool = True

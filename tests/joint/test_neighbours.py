@@ -36,15 +36,24 @@ def test_a_hip_knows_how_its_own_leg_has_turned() -> None:
     assert view_of("hip_left", rows(), T0) == NeighbourView(pytest.approx((0.3 + 0.4, 0.03 + 0.04)))
 
 
+@pytest.mark.parametrize("age_ns", [0, STALE_NS, STALE_NS + 1, -STALE_NS - 1])
+def test_an_ankle_knows_how_its_own_knee_has_turned_lately(age_ns: int) -> None:
+    knee = NeighbourRow(T0 - age_ns, -0.7, -0.1, Mode.DAMP)
+    known = abs(age_ns) <= STALE_NS
+    assert view_of("ankle_left", rows(knee_left=knee), T0).leg == ((-0.7, -0.1) if known else None)
+    assert view_of("ankle_right", rows(knee_left=knee), T0).leg == pytest.approx((0.1, 0.01))
+    assert view_of("ankle_left", rows(knee_left=None), T0).leg is None
+
+
 @pytest.mark.parametrize("age_ns", [-STALE_NS - 1, STALE_NS + 1])
 @pytest.mark.parametrize("kind", ["ankle", "knee"])
 def test_what_is_old_or_of_another_clock_is_not_known(kind: str, age_ns: int) -> None:
     name = f"{kind}_left"
     old = rows(**{name: NeighbourRow(T0 - age_ns, 0.5, 0.0, Mode.DAMP)})
-    assert view_of("hip_left", old, T0).below is None
-    assert view_of("hip_right", old, T0).below is not None, "it is no business of the other leg"
+    assert view_of("hip_left", old, T0).leg is None
+    assert view_of("hip_right", old, T0).leg is not None, "it is no business of the other leg"
     just = rows(**{name: NeighbourRow(T0 - STALE_NS, 0.5, 0.0, Mode.DAMP)})
-    assert view_of("hip_left", just, T0).below is not None
+    assert view_of("hip_left", just, T0).leg is not None
 
 
 @pytest.mark.parametrize("kind", ["ankle", "knee"])
@@ -98,7 +107,7 @@ def test_what_one_writes_the_others_read(tmp_path: Path, six: dict[str, Neighbou
         assert six["hip_left"].view(T0 + cycle) == NeighbourView(
             pytest.approx((0.7 + 2 * cycle, 0.07))
         )
-    assert six["ankle_left"].view(T0) == UNKNOWN
+    assert six["ankle_left"].view(T0) == NeighbourView(pytest.approx((0.4 + 299, 0.04)))
     assert six["knee_left"].view(T0 + 299).sinks
     assert not six["knee_left"].view(T0 + 300 + GONE_NS).sinks, "the others are dead"
     assert Neighbours.mode_of(tmp_path, "hip_left") is Mode.DAMP
@@ -109,13 +118,13 @@ def test_a_row_that_its_writer_died_over_is_not_read(
 ) -> None:
     for name in MODULES:
         six[name].write(NeighbourRow(T0, 0.1, 0.0, Mode.DAMP))
-    assert six["hip_left"].view(T0).below is not None
+    assert six["hip_left"].view(T0).leg is not None
     whole = path_of(tmp_path).read_bytes()
     row_of_the_knee = len(whole) // 6 * MODULES.index("knee_left")
     with path_of(tmp_path).open("r+b") as file:
         file.seek(row_of_the_knee)
         file.write(bytes([whole[row_of_the_knee] | 1]))
-    assert six["hip_left"].view(T0).below is None
+    assert six["hip_left"].view(T0).leg is None
     successor = Neighbours(tmp_path, "knee_left")
     successor.write(NeighbourRow(T0, 0.3, 0.0, Mode.DAMP))
     assert six["hip_left"].view(T0) == NeighbourView(pytest.approx((0.4, 0.0)))

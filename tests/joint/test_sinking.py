@@ -79,10 +79,52 @@ def test_a_leg_without_fresh_states_is_taken_to_stay(robot: RobotConfig) -> None
     assert found.v_ref[1] == 0.0
 
 
+def hip_ahead(robot: RobotConfig, ankle: float, knee: float) -> float:
+    """Return how far ahead of its ankle a leg's hip joint is, m."""
+    return robot.geometry.l2 * math.sin(ankle) + robot.geometry.l1 * math.sin(ankle + knee)
+
+
+@pytest.mark.parametrize("ankle", [0.03, 0.14, 0.3])
+@pytest.mark.parametrize("knee", [-0.2, -0.37, -1.0, -2.0])
+def test_an_ankle_keeps_the_hip_joint_where_it_was_as_its_knee_folds(
+    robot: RobotConfig, ankle: float, knee: float
+) -> None:
+    """Held stiffly, it let the robot fall over backwards from nearly straight legs."""
+    sinking, frozen = begun(robot, "ankle_left", (0.02, ankle))
+    first = sinking.law(frozen, frozen, LONG_NS, (0.02, ankle), NeighbourView((knee, -0.3)))
+    assert first.q_ref[1] == pytest.approx(frozen.q_ref[1]), "its spring goes on carrying its load"
+    spring = frozen.q_ref[1] - ankle
+    for turned in (-0.001, -0.05, -0.2, -0.4):
+        near = NeighbourView((knee + turned, -0.3))
+        found = sinking.law(frozen, frozen, LONG_NS, (0.02, ankle), near)
+        place = found.q_ref[1] - spring
+        assert hip_ahead(robot, place, knee + turned) == pytest.approx(
+            hip_ahead(robot, ankle, knee)
+        )
+        if turned == -0.001:
+            assert found.v_ref[1] == pytest.approx(0.3 * (place - ankle) / 0.001, rel=5e-3)
+        assert (found.k_p, found.tau_ff) == (first.k_p, first.tau_ff)
+
+
+def test_an_ankle_that_does_not_see_its_knee_stays_within_its_limits_and_where_it_was(
+    robot: RobotConfig,
+) -> None:
+    sinking, frozen = begun(robot, "ankle_left", (0.02, 0.14))
+    unseen = sinking.law(frozen, frozen, LONG_NS, (0.02, 0.14), UNKNOWN)
+    assert unseen.q_ref == frozen.q_ref
+    for knee in (-0.4, -2.9, 50.0, -1e6):
+        seen = sinking.law(frozen, frozen, LONG_NS, (0.02, 0.14), NeighbourView((knee, 1.0)))
+        low, high = robot.limits.ankle.theta
+        assert low <= seen.q_ref[1] - frozen.q_ref[1] + 0.14 <= high
+        lost = sinking.law(frozen, frozen, LONG_NS, (0.02, 0.14), UNKNOWN)
+        assert (lost.q_ref, lost.v_ref[1]) == (seen.q_ref, 0.0)
+
+
 BELOW_ITS_STOP = -2.6
 """rad, of a knee."""
 PLACES = {
     "ankle": ("ankle_right", -0.4, UNKNOWN),
+    "an ankle that follows its knee": ("ankle_right", 0.2, NeighbourView((-1.0, -0.2))),
     "a knee that sinks": ("knee_right", -0.4, UNKNOWN),
     "a knee at its stop": ("knee_right", BELOW_ITS_STOP, UNKNOWN),
     "a knee that was caught": ("knee_right", -0.5, UNHEARD),
@@ -116,10 +158,11 @@ def test_for_a_limp_module_it_holds_where_it_is_with_the_load_it_has(
     assert half_way.k_p[1] == pytest.approx(0.5 * (before.k_p[1] + k_p[1]))
     for later_ns in (blend_ns, LONG_NS):
         found = sinking.law(frozen, half_way, now_ns + later_ns, Q, UNKNOWN)
-        assert found.q_ref == (before.q_ref[0], before.q_ref[1] if place == "ankle" else theta)
+        holds = module.startswith("ankle")
+        assert found.q_ref == (before.q_ref[0], before.q_ref[1] if holds else theta)
         assert found.v_ref == found.tau_coupled == pd_law.ZERO
         assert (found.k_p, found.k_d) == (k_p, k_d)
-        if place != "ankle":
+        if not holds:
             spring = before.k_p[1] * (before.q_ref[1] - theta)
             assert found.tau_ff[1] == pytest.approx(before.tau_ff[1] + spring)
 

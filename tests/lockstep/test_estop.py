@@ -64,6 +64,8 @@ def test_a_stop_without_a_planner_sinks_as_well(robot: RobotConfig) -> None:
 COM_BACK_AND_UP = {"body.com_offset": [-0.05, 0.0, 0.1]}
 STOPPED: list[tuple[float, float, dict[str, Any]]] = [
     (1.188, 0.0, {}),
+    (1.28, 0.0, {}),
+    (1.295, 0.0, {"body.com_offset": [-0.02, 0.0, 0.03]}),
     (0.95, 0.0, {}),
     (0.9, 0.6, {}),
     (0.79, 1.2, {}),
@@ -73,6 +75,10 @@ STOPPED: list[tuple[float, float, dict[str, Any]]] = [
     (1.1, 0.3, {"body.payload_scale": 0.0, "drivetrain.stiffness": 3000.0}),
     (1.0, 0.0, {"drivetrain.stiffness": 2000.0, "drivetrain.play": 0.005}),
 ]
+
+
+BEGUN_S = 3.8 + 5.0
+"""The stop and its fade: from straight legs a light robot sinks by less than 1 mm until its end."""
 
 
 class Stopped(NamedTuple):
@@ -111,7 +117,7 @@ def stop(
             fleet.world.let_go()
         if fleet.estop:
             rows.append(truth)
-        rests = truth.scenario_s > happens_until_s + 1.5 and at_rest(rows)
+        rests = truth.scenario_s > max(happens_until_s + 1.5, BEGUN_S) and at_rest(rows)
         if truth.fallen or rests:
             break
     pitches, heights = ([row.angles[1] for row in rows], [row.torso[2] for row in rows])
