@@ -24,7 +24,7 @@ from typing import Final
 
 from services.recorder.auto_recover import AutoRecovery
 from services.recorder.disk_guard import MIB
-from services.recorder.flood_watch import FloodWatch
+from services.recorder.host_watch import HostWatch
 from services.recorder.loop import CAPACITY, Recorder, free_bytes_at, summary
 from services.recorder.roster import Roster
 from services.recorder.snapshot import SnapshotRing
@@ -103,8 +103,8 @@ def main() -> int:
                 logger.info("%s, priority %s", _about(writer, snapshot, len(recorded)), granted)
                 auto_recovery.start()
                 roster = None if arguments.of else Roster(session)
-                floods = FloodWatch(Arrivals(ports_here(config)), logger, now_ns())
-                _record(recording, stop, asked, roster, floods)
+                host = HostWatch(Arrivals(ports_here(config)), arguments.run_dir, logger, now_ns())
+                _record(recording, stop, asked, roster, host)
         except RunError as error:
             logger.error("%s", error)
             return error.exit_code
@@ -143,7 +143,7 @@ def _record(
     stop: StopFlag,
     asked: SnapshotRequest,
     roster: Roster | None,
-    floods: FloodWatch,
+    host: HostWatch,
 ) -> None:
     """Record until `stop`, then the queued rest.
 
@@ -155,9 +155,9 @@ def _record(
             recording.trigger("requested by SIGUSR1", now_ns())
         now = now_ns()
         if roster is not None:
-            roster.put_if_due(now)
+            roster.put_if_due(now, tuple(filter(None, (recording.trouble, host.trouble))))
         recording.cycle(now)
-        floods.look_if_due(now)
+        host.look_if_due(now)
         time.sleep(DRAIN_PERIOD_S)
     recording.close()
     time.sleep(LAST_WORDS_S)

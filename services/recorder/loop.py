@@ -82,6 +82,8 @@ class Recorder:
         self._why_next = ""
         """Why a file is to be begun as soon as one can be; "" if none is."""
         self._told_unwritable = False
+        self.trouble = ""
+        """Why nothing is recorded now, in words; "" if it is."""
         self._watch_space(now_ns)
         if snapshot is None:
             self._begin(now_ns, {})
@@ -154,9 +156,9 @@ class Recorder:
         except RunError as error:
             if not self._told_unwritable:
                 self._logger.error("%s; it is tried again", error)
-            self._told_unwritable = True
+            self._told_unwritable, self.trouble = True, f"not recorded: {error}"
             return
-        self._why_next, self._told_unwritable = "", False
+        self._why_next, self._told_unwritable, self.trouble = "", False, ""
         left_out = self._writer.left_out
         self._logger.warning(
             "recording goes on in %s; %d messages were left out", self._writer.path, left_out
@@ -193,12 +195,13 @@ class Recorder:
                 )  # fmt: skip
             case DiskChange.FULL:
                 self._writer.finish()
-                self._logger.error(
-                    "%s: %d MiB free, less than recorder.free_min_mib = %d: recording has stopped, "
-                    "what there is is finished; it goes on when there is space again",
-                    where, free // MIB, least,
-                )  # fmt: skip
+                self.trouble = (
+                    f"{where}: {free // MIB} MiB free, less than recorder.free_min_mib = {least}: "
+                    "recording has stopped; it goes on when there is space again"
+                )
+                self._logger.error("%s", self.trouble)
             case DiskChange.BACK:
+                self.trouble = ""
                 if self._snapshot is None and not self._why_next:
                     self._begin(now_ns, {"why": "space again"})
                 self._logger.warning(

@@ -378,10 +378,12 @@ class TareRequest(Message, frozen=True):
 
 
 class ToolRoster(Message, frozen=True):
-    """The tools that are linked with the recorder."""
+    """The tools that are linked with the recorder, and what it finds wrong."""
 
     tools: tuple[str, ...]
     """Each as NAME.HOST.PID, as it names itself."""
+    trouble: tuple[str, ...] = ()
+    """What keeps it from recording, and what is wrong with its host's disk, a line each."""
 
 
 class PlannerStatus(Message, frozen=True):

@@ -123,12 +123,14 @@ def test_short_of_space_it_warns_stops_with_a_finished_file_and_goes_on_later(
     errors = [r.getMessage() for r in caplog.records if r.levelno == logging.ERROR]
     assert len(errors) == 1
     assert "recorder.free_min_mib = 100" in errors[0]
+    assert run.recording.trouble == errors[0], "for as long as it lasts"
     first = seqs(tmp_path / "run.mcap")
     assert first == list(range(len(first)))
     run.run(2.0)
     assert list(tmp_path.iterdir()) == [tmp_path / "run.mcap"], "nothing written, nothing deleted"
     run.free = 1000 * MIB
     run.run(2.0)
+    assert run.recording.trouble == ""
     run.finish()
     second = seqs(tmp_path / "run_1.mcap")
     assert second == list(range(second[0], run.sent))

@@ -277,13 +277,15 @@ def look(
         for module in MODULES
         if module in monitors
     }
+    roster = monitors[ROSTER].newest if ROSTER in fresh else None
+    recorder = roster.trouble if isinstance(roster, ToolRoster) else ()
     lead = lead_status(monitors[PLANNER].newest if PLANNER in fresh else None)
-    tools = tools_of(monitors[ROSTER].newest if ROSTER in fresh else None)
+    tools = tools_of(roster)
     config, network = fleet.manifest.config, impairments(fleet)
     faults = bus.told({name: row.pid for name, row in services.items() if row.pid is not None})
     return FleetStatus(
         str(fleet.run.path), config, services, modules, lead, network, pace(), security, tools,
-        trouble_of(fleet, infos), faults,
+        (*trouble_of(fleet, infos), *recorder), faults,
     )  # fmt: skip
 
 
