@@ -5,7 +5,7 @@ Run it: xrl sim --out out/first && python examples/read_a_run.py out/first/run.m
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +27,6 @@ def main(path: Path) -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 2:
-        sys.exit("usage: read_a_run.py RUN.mcap")
-    main(Path(sys.argv[1]))
+    parser = argparse.ArgumentParser()
+    parser.add_argument("run", type=Path, metavar="RUN.mcap")
+    main(parser.parse_args().run)

@@ -21,9 +21,15 @@ class XrlError(Exception):
     exit_code = 2
 
 
+DECLINED_EXIT_CODE: Final = XrlError.exit_code
+"""Exit code of a verb that asked a person, who said no."""
+FELL_EXIT_CODE: Final = 1
+"""Exit code of a run in which a robot fell, or is about to at its end; of nothing else."""
+FAULT_EXIT_CODE: Final = 3
+"""Exit code of a check that found something not as it should be: a fault, a difference, nothing."""
 BUG_EXIT_CODE: Final = 70
 """Exit code of a process that an unforeseen exception ended: a fault of this project (EX_SOFTWARE
-of sysexits.h). Python's own would be 1, and here that is a robot that fell."""
+of sysexits.h). Python's own would be `FELL_EXIT_CODE`."""
 
 
 class ConfigError(XrlError):

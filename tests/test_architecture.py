@@ -348,6 +348,83 @@ def test_no_controller_can_see_the_plant() -> None:
     assert believing == []
 
 
+def bare_exit_codes(source: str) -> list[int]:
+    """Return the lines at which a function of type int, or an exit, gives a code without its name.
+
+    A truth that is made an int is code 1 as well, and so is an exit with a text.
+    """
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.FunctionDef) and ast.unparse(node.returns or node) == "int":
+            found += _bare_codes_of(node)
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) in EXITS:
+            found += [node.lineno for value in node.args if _is_bare_code(value, texts=True)]
+    return found
+
+
+EXITS = ("sys.exit", "os._exit", "SystemExit")
+CODES = (1, 2, 3, 70)
+
+
+def _bare_codes_of(function: ast.FunctionDef) -> list[int]:
+    nodes = list(ast.walk(function))
+    values = [node.value for node in nodes if isinstance(node, ast.Return) and node.value]
+    names = {value.id for value in values if isinstance(value, ast.Name)}
+    values += [
+        node.value
+        for node in nodes
+        if isinstance(node, ast.Assign)
+        and any(isinstance(target, ast.Name) and target.id in names for target in node.targets)
+    ]
+    return [value.lineno for value in values if _is_bare_code(value)]
+
+
+def _is_bare_code(value: ast.expr, *, texts: bool = False) -> bool:
+    match value:
+        case ast.Constant(value=str()):
+            return texts
+        case ast.Constant(value=constant):
+            return constant in CODES
+        case ast.IfExp():
+            return any(_is_bare_code(one, texts=texts) for one in (value.body, value.orelse))
+        case ast.Call(func=ast.Name(id="int"), args=[truth]):
+            called = ast.unparse(truth.func) if isinstance(truth, ast.Call) else ""
+            is_not = isinstance(truth, ast.UnaryOp) and isinstance(truth.op, ast.Not)
+            is_truth = isinstance(truth, ast.Compare | ast.BoolOp) or is_not
+            return is_truth or called in ("all", "any", "bool")
+    return False
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "return 1",
+        "return 0 if good else 1",
+        "code = 0 if good else 1; return code",
+        "code = 2; return code",
+        "return 3 if bad else (2 if worse else 0)",
+        "return int(any(bad))",
+        "return int(not good)",
+        "sys.exit(1)",
+        "sys.exit('usage')",
+        "raise SystemExit(1 if bad else 0)",
+    ],
+)
+def test_an_exit_code_without_its_name_is_found(line: str) -> None:
+    assert bare_exit_codes(f"def run(args) -> int:\n    {line}") == [2]
+
+
+def test_an_exit_code_is_given_by_its_name() -> None:
+    """1 is a robot that fell, and nothing else: whoever means a fall says `FELL_EXIT_CODE`."""
+    sources = {file: text for file, text in SOURCES.items() if not file.startswith("shared/")}
+    sources |= {
+        path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8")
+        for path in (ROOT / "examples").glob("*.py")
+    }
+    found = {file: lines for file, text in sources.items() if (lines := bare_exit_codes(text))}
+    assert found == {}
+
+
 def test_no_two_classes_have_the_same_name() -> None:
     """There were fourteen `Outcome`s: a name is to say which one is meant."""
     found: dict[str, set[str]] = {}

@@ -98,5 +98,5 @@ def test_without_a_log_the_reader_names_its_usage() -> None:
     done = subprocess.run(
         [sys.executable, EXAMPLES / "read_a_run.py"], capture_output=True, text=True, check=False
     )
-    assert done.returncode == 1
-    assert "usage: read_a_run.py RUN.mcap" in done.stderr
+    assert done.returncode == 2
+    assert "usage: read_a_run.py [-h] RUN.mcap" in done.stderr

@@ -28,7 +28,7 @@ from services.simulator.drivetrain import step_graph
 from services.simulator.plant import PlantConfig
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import RunError
+from shared.exceptions import FAULT_EXIT_CODE, RunError
 from shared.process import DEFAULT_CONFIG
 from shared.robot.compiled_graph import FLAGS, FOLDER, Array, library_of
 
@@ -127,7 +127,7 @@ def compare(function: ca.Function, translated: ca.Function) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Build what is missing; without a compiler say so. 1 if a graph could not be built."""
+    """Build what is missing; without a compiler say so. 0 if no graph failed."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -145,7 +145,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         except RunError as error:
             failed += 1
             print(f"{error}; CasADi interprets this graph", file=sys.stderr)
-    return 1 if failed else 0
+    return FAULT_EXIT_CODE if failed else 0
 
 
 def _is_same(one: Array, other: Array) -> bool:

@@ -23,7 +23,7 @@ import msgspec
 import tomli_w
 
 from shared.config.toml_file import Section, read_toml
-from shared.exceptions import RunError, XrlError
+from shared.exceptions import FAULT_EXIT_CODE, RunError, XrlError
 from tools.number_arguments import count
 from tools.terminal import Console, marked
 
@@ -89,7 +89,7 @@ class GroupResult(NamedTuple):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the groups; 1 if too many live, or one that is not in the file."""
+    """Run the groups; 0 if few live, and each of them is in the file."""
     args = _parser().parse_args(argv)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as Ctrl-C does
     console = Console(highlight=False)
@@ -103,7 +103,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _judge([_run(known[name], args, console) for name in names], listed, args, console)
     except XrlError as error:
         console.print(f"mutants: {error}", style="red")
-        return 2
+        return error.exit_code
     except KeyboardInterrupt:
         console.print("stopped; go on with: ./deploy/mutants --resume")
         return 130
@@ -270,7 +270,7 @@ def _judge(
     low = dead < LEAST_SHARE * total and not (args.only or args.survivors)
     if low:
         console.print(f"at least {LEAST_SHARE:.0%} are to fail one", style="red")
-    return 1 if unlisted or stale or low else 0
+    return FAULT_EXIT_CODE if unlisted or stale or low else 0
 
 
 if __name__ == "__main__":

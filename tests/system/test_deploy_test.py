@@ -107,7 +107,7 @@ def test_failures_are_listed_last_and_the_other_parts_are_run(root: Path, status
     write_tool(root, "mypy", "exit 1")
     write_tool(root, "pytest", f"echo ERROR tests/test_x.py; echo one of $*; exit {status}")
     code, said = run(root)
-    assert code == 1
+    assert code == 3
     assert said.count("== pytest -m") == 3
     last = said[said.index("== failed:") :]
     assert "== failed: mypy" in last

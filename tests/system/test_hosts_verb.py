@@ -145,7 +145,7 @@ def lead_through(place: Place, watch: Watch, capsys: Any) -> None:
     assert "body: planner" in said
     assert "left: knee_left" in said
     assert all(f"\n  {module} " in said for module in MODULES)
-    assert place.xrl("update") == 1
+    assert place.xrl("update") == 3
     assert "`xrl hosts down` first" in " ".join(capsys.readouterr().out.split())
 
     assert place.xrl("records", "-o", str(place.base / "so far")) == 2
@@ -165,7 +165,7 @@ def lead_through(place: Place, watch: Watch, capsys: Any) -> None:
     assert wait_for(lambda: None not in watch.states(), timeout_s=60.0)
     assert watch.all_in(Mode.DAMP), "the stop holds on"
     capsys.readouterr()
-    assert place.xrl("up") == 1
+    assert place.xrl("up") == 3
     said = " ".join(capsys.readouterr().out.split())
     assert "an emergency stop by xrl estop by" in said
     assert watch.all_in(Mode.DAMP)

@@ -46,7 +46,7 @@ def test_a_node_of_another_finds_the_robot_reads_it_all_leads_it_a_little_and_st
     assert up.returncode == 0, up.stderr
     try:
         absent = xrl("ros2", "check", *asked, "--wait", "1")
-        assert absent.returncode == 1, "the router comes later"
+        assert absent.returncode == 3, "the router comes later"
         assert "does not answer" in absent.stdout
         with router(port), session("peer", connect__endpoints=[f"tcp/127.0.0.1:{port}"]) as opened:
             node = OtherNode(opened, DOMAIN)

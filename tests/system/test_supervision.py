@@ -441,7 +441,7 @@ def test_top_hz_and_echo_show_what_the_services_send(
     row = next(line for line in capsys.readouterr().out.splitlines() if "ankle_right" in line)
     assert row.split()[1].endswith("/250"), "the rate, and the nominal one"
     assert 20 < float(row.split()[1].removesuffix("/250")) < 150
-    assert cli.main(["hz", "planner/status", "--for", "0.2", *place]) == 1, "nothing came"
+    assert cli.main(["hz", "planner/status", "--for", "0.2", *place]) == 3, "nothing came"
     capsys.readouterr()
 
     words = ["echo", "joint/*/state", "--count", "2", "--field", "mode", "--field", "seq"]

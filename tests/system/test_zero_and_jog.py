@@ -172,7 +172,7 @@ def test_on_the_emulated_robot_a_small_limit_an_interrupt_and_a_service_stop_it(
     fleet = SupervisedFleet.start(DEFAULT_CONFIG, run_dir, services=["simulator", "ankle_left"])
     try:
         weak = xrl("jog", MODULE, "--torque-limit", "4", "--yes", run_dir=run_dir)
-        assert weak.returncode == 1, weak.stdout + weak.stderr
+        assert weak.returncode == 3, weak.stdout + weak.stderr
         assert "torque limit of 4 N m" in weak.stdout
         process = subprocess.Popen(
             [

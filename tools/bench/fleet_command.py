@@ -12,6 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from shared.config import files as config_file
+from shared.exceptions import FAULT_EXIT_CODE
 from shared.process import CHECKOUT
 from shared.robot import gain_schedule
 from tools.bench import fleet
@@ -66,13 +67,13 @@ def add_parser(others: Subparsers) -> None:
         "--strict",
         action="store_true",
         default=argparse.SUPPRESS,
-        help="exit 1 if a target is missed",
+        help=f"exit code {FAULT_EXIT_CODE} if a target is missed",
     )
     parser.set_defaults(bench=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Lead each tree in turn and print the medians; with --strict 1 if a target is missed."""
+    """Lead each tree in turn and print the medians; with --strict a missed target is a fault."""
     robot = config_file.load(args.config)
     gain_schedule.require(robot, args.config)
     check_pace(args.pace, simulated=True)
@@ -99,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
         style="dim",
     )
     write_rows(args.json, [row.as_dict() for row in rows])
-    return 1 if args.strict and not all(row.ok for row in rows) else 0
+    return FAULT_EXIT_CODE if args.strict and not all(row.ok for row in rows) else 0
 
 
 def _table(rows: list[FleetRow], against: str | None) -> Table:

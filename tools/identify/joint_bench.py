@@ -17,7 +17,7 @@ from services.joint.drivers.base import Drive
 from shared.clock import now_ns
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import DriveError
+from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, DriveError
 from shared.robot.joints import AXES, MODULES
 from tools.bringup import bench, jog_drive, limits
 from tools.bringup.jogging import MotionPlan, Sample, outside
@@ -53,7 +53,7 @@ class Stopped(NamedTuple):
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    """Measure the joints that are asked for; 1 if a motion was stopped, 2 if none was wanted."""
+    """Measure the joints that are asked for; 0 if no motion was stopped."""
     modules, axes = _asked(args)
     path = bench.robot_file(args)
     robot = config_file.load_without_schedule(path)
@@ -88,11 +88,11 @@ def tell_stopped(stopped: Stopped, console: Console) -> int:
     """Print why a motion ended, a danger last; return the exit code."""
     if stopped.declined:
         console.print(stopped.why)
-        return 2
+        return DECLINED_EXIT_CODE
     console.print(marked("[bold red]STOPPED[/]: {}", stopped.why))
     for module in stopped.not_idle:
         console.print(marked("[bold red]{}: {}[/]", module, jog_drive.NOT_IDLE))
-    return 1
+    return FAULT_EXIT_CODE
 
 
 def _asked(args: argparse.Namespace) -> tuple[Sequence[str], Sequence[int]]:

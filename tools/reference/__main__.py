@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
+from shared.exceptions import FAULT_EXIT_CODE
 from tools.reference import faults, modes, robot_file, topics, verbs
 
 FOLDER: Final = Path(__file__).resolve().parents[2] / "docs" / "reference"
@@ -23,12 +24,14 @@ PAGES: Final[dict[str, Callable[[], str]]] = {
 
 
 def main() -> int:
-    """Write the pages; with `--check` say which differ and exit with 1."""
+    """Write the pages; with `--check` say which differ: a fault."""
     parser = argparse.ArgumentParser(
         prog="python -m tools.reference",
         description="Write docs/reference from the code. A test holds that it is up to date.",
     )
-    parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 if old")
+    parser.add_argument(
+        "--check", action="store_true", help=f"write nothing; exit code {FAULT_EXIT_CODE} if old"
+    )
     args = parser.parse_args()
     old = []
     for name, make in PAGES.items():
@@ -40,7 +43,7 @@ def main() -> int:
                 path.write_text(text, encoding="utf-8")
     for name in old:
         print(f"{'out of date' if args.check else 'written'}: docs/reference/{name}")
-    return 1 if args.check and old else 0
+    return FAULT_EXIT_CODE if args.check and old else 0
 
 
 if __name__ == "__main__":

@@ -20,8 +20,9 @@ the environment made first. `xrl --version` prints version and commit, `xrl help
 | exit code | meaning |
 |---|---|
 | 0 | good |
-| 1 | the robot fell, or something is not as it should be |
-| 2 | bad input, a fleet that cannot be started, or what the system refuses: a full disk |
+| 1 | a robot fell, or is about to; nothing else |
+| 2 | bad input, a person who said no, a fleet that cannot be started, or what the system refuses |
+| 3 | something is not as it should be: a check found a fault, a difference, or nothing came |
 | 70 | a fault of `xrl` itself: please report its traceback |
 | 130, 141, 143 | interrupted; its reader has gone (`xrl ... \\| head`); SIGTERM |
 

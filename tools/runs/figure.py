@@ -22,7 +22,7 @@ from shared.text_file import decoded
 from tools.output import save_figure
 from tools.runs.impairment_intervals import Impaired, impairments
 from tools.runs.run_log import RunLog
-from tools.runs.verdict import Summary, course
+from tools.runs.verdict import Summary, course, fell
 
 mpl.use("Agg")
 
@@ -88,8 +88,7 @@ def draw(log: RunLog, name: str, summary: Summary, path: Path) -> None:
         _shade(plots, network, zero_ns, end_s)
     axes[-1].set_xlabel("scenario time in s" if began else "time since the hoist let go in s")
     axes[-1].set_xlim(0.0, end_s)
-    fell = summary["fallen_at_s"] is not None or summary["why_not"]
-    verdict = "stood" if summary["stood"] else "FELL" if fell else "not finished"
+    verdict = "stood" if summary["stood"] else "FELL" if fell(summary) else "not finished"
     if summary["unsound"]:
         verdict = "stood, but not soundly"
     figure.suptitle(f"{name}: {verdict}", fontsize=12, x=0.01, ha="left")

@@ -6,7 +6,7 @@ Everything is read from the MCAP file, so that a run can be judged again at any 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
@@ -26,7 +26,7 @@ from shared.bus.messages import (
 )
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import ConfigError, RunError
+from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE, ConfigError, RunError
 from shared.mcap_log.sequence_stats import KeyCount
 from shared.robot.joints import MODULES
 from tools.runs.impairment_intervals import Impaired, impairments, touches
@@ -147,6 +147,18 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
     summary["messages_recorded"] = sum(log.count(key) for key in log.keys())  # noqa: SIM118 - not a dict
     summary["sequence_gaps"] = sum(count.missing for count in log.gaps().values())
     return summary
+
+
+def fell(summary: Mapping[str, Any]) -> bool:
+    """Return True if the robot of a run is down, or cannot recover."""
+    return summary["fallen_at_s"] is not None or bool(summary["why_not"])
+
+
+def exit_code(summary: Mapping[str, Any]) -> int:
+    """Return the exit code of a run that was judged: standing, but not soundly, is a fault."""
+    if summary["stood"]:
+        return 0
+    return FELL_EXIT_CODE if fell(summary) else FAULT_EXIT_CODE
 
 
 LAST_COUNTS: Final = ("world_time_lost_s", "real_time_factor", "duration_s", "pace", "began")

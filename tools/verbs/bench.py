@@ -17,6 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from shared.config import files as config_file
+from shared.exceptions import FAULT_EXIT_CODE
 from shared.process import CHECKOUT
 from shared.robot import gain_schedule
 from tools.bench import bus_command, fleet_command, revisions, table
@@ -59,7 +60,11 @@ def add_parser(subparsers: Subparsers) -> None:
         "in this environment",
     )
     add_flags(parser, ROUNDS)
-    parser.add_argument("--strict", action="store_true", help="exit 1 if a target is missed")
+    parser.add_argument(
+        "--strict",
+        action="store_true",
+        help=f"exit code {FAULT_EXIT_CODE} if a target is missed",
+    )
     others = parser.add_subparsers(metavar="WHAT", title="something else to measure")
     bus_command.add_parser(others)
     fleet_command.add_parser(others)
@@ -72,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def run_parts(args: argparse.Namespace) -> int:
-    """Measure the parts and print; with --strict 1 if a target is missed."""
+    """Measure the parts and print; with --strict a missed target is a fault."""
     gain_schedule.require(config_file.load(args.config), args.config)
     console = Console()
     rows, missing = measure(args.config.resolve(), args.against, args.rounds or ROUNDS, console)
@@ -86,7 +91,7 @@ def run_parts(args: argparse.Namespace) -> int:
         style="dim",
     )
     write_rows(args.json, [row._asdict() for row in rows])
-    return 1 if args.strict and not all(row.ok for row in rows) else 0
+    return FAULT_EXIT_CODE if args.strict and not all(row.ok for row in rows) else 0
 
 
 def measure(

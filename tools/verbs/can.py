@@ -16,7 +16,7 @@ from shared.can.cansimple import AxisState
 from shared.config.files import load
 from shared.config.robot_config import RobotConfig, expand
 from shared.config.sections import CanConfig
-from shared.exceptions import DriveError, FleetError
+from shared.exceptions import FAULT_EXIT_CODE, DriveError, FleetError
 from tools.bringup import check_robot
 from tools.bringup.can_monitor import (
     BusTraffic,
@@ -70,7 +70,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do it; 1 if a drive or sensor is missing, or a command failed."""
+    """Do it; a drive or sensor that is missing, or a command that failed, is a fault."""
     robot = load(args.config)
     if args.action == "setup":
         return _set_up(robot, apply=args.apply)
@@ -110,7 +110,7 @@ def _set_up(robot: RobotConfig, *, apply: bool) -> int:
         for words in setup_commands(name):
             print(shlex.join(words))
             if apply and not _ran(words):
-                return 1
+                return FAULT_EXIT_CODE
     if not apply:
         print(
             "# printed only; --apply runs them, as root. deploy/udev/92-can.rules does it at boot"
@@ -155,7 +155,7 @@ def _listen(
         if robot.imu.fitted and name == robot.imu.bus:
             console.print("  IMU:", _rate(traffic.attitudes_s, traffic.seconds))
             complete &= bool(traffic.attitudes_s)
-    return 0 if complete else 1
+    return 0 if complete else FAULT_EXIT_CODE
 
 
 def _heading(name: str, bus: CanConfig, traffic: BusTraffic) -> Text:
@@ -225,7 +225,7 @@ def _measure(
             table.add_row(name, str(node), *_percentiles(trips), str(trips.lost or ""))
             complete &= bool(trips.times_ms)
     Console().print(table)
-    return 0 if complete else 1
+    return 0 if complete else FAULT_EXIT_CODE
 
 
 def _percentiles(trips: RoundTrips) -> tuple[str, str, str]:

@@ -13,7 +13,7 @@ from typing import Final
 from shared.can import drive_settings
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import DriveError, FleetError
+from shared.exceptions import FAULT_EXIT_CODE, DriveError, FleetError
 from shared.robot.joints import MODULES
 from tools.bringup import backup, bench, changes
 from tools.bringup.boards import FIRMWARE, Board, FoundBoards, describe_firmware, is_known
@@ -51,7 +51,8 @@ def add_parser(subparsers: Subparsers) -> None:
     what.add_argument(
         "--dry-run",
         action="store_true",
-        help="show the difference only, as without --apply; exit code 1 if there is one",
+        help="show the difference only, as without --apply; "
+        f"exit code {FAULT_EXIT_CODE} if there is one",
     )
     what.add_argument("--apply", action="store_true", help="write and save it; the boards restart")
     parser.add_argument(
@@ -107,7 +108,7 @@ def look_and_write(
         if not args.apply or not difference:
             if difference:
                 console.print("\nnothing was written; `--apply` writes it")
-            return 1 if difference else 0
+            return FAULT_EXIT_CODE if difference else 0
         for module, board in boards.items():
             changes.refuse_armed(module, board)
         kept = keep(args.out, boards, path)
@@ -284,4 +285,4 @@ def conclude(
         console.print(f"restarted, and so without a zero: {', '.join(restarted)}; `xrl zero`")
     if emulated and is_simulated(robot):
         console.print(bench.GONE)
-    return 1 if bad else 0
+    return FAULT_EXIT_CODE if bad else 0

@@ -13,7 +13,7 @@ from typing import Final
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import RunError
+from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE, RunError
 from shared.mcap_log import provenance
 from shared.process import CHECKOUT
 from tools.fleet import procfs
@@ -27,8 +27,6 @@ from tools.studies.crash.runner import run_case
 from tools.terminal import Console, marked
 from tools.verb_table import Subparsers, add_config, add_verb
 
-EXIT_FELL: Final = 1
-EXIT_UNJUDGED: Final = 2
 CASE_S: Final = 14.0
 """First estimate of a case's duration, s, until some have run."""
 UNJUDGED_MAX: Final = 3
@@ -128,11 +126,13 @@ def select(
 
 
 def exit_code(results: Sequence[Result]) -> int:
-    """Return 0, 1 if a case came out worse than it has to, 2 if one could not be judged."""
+    """Return the exit code of what came out worse than it has to, a fall before all else."""
     bad = {result.outcome.verdict for result in results if not result.good}
-    if bad - {CrashVerdict.UNJUDGED}:
-        return EXIT_FELL
-    return EXIT_UNJUDGED if bad else 0
+    if CrashVerdict.FELL in bad:
+        return FELL_EXIT_CODE
+    if CrashVerdict.SANK in bad:
+        return FAULT_EXIT_CODE
+    return RunError.exit_code if bad else 0
 
 
 def _run_all(

@@ -20,7 +20,7 @@ from shared.config.scenarios import Scenario
 from tools.fleet.others import warn_of_others
 from tools.fleet.pace import add_pace
 from tools.fleet.supervise import SupervisedFleet
-from tools.runs import experiment, verdict_table
+from tools.runs import experiment, verdict, verdict_table
 from tools.runs.judgement import judge_run
 from tools.runs.live import run_live
 from tools.runs.live_view import LiveView
@@ -29,7 +29,6 @@ from tools.terminal import Console, marked
 from tools.verb_table import Subparsers, add_verb
 from tools.view.serving import add_port, served_beside
 
-EXIT_FELL = 1
 VIEW_S = 3600.0
 """Longest run that a page leads, s of scenario time."""
 
@@ -154,4 +153,4 @@ def judge(out: Path, scenario: Scenario, ended: EndOfRun, console: Console) -> i
     summary = judge_run(out, scenario.name, ended.scenario_s, figures)
     verdict_table.show(summary, console)
     console.print(f"{out}/run.mcap, run.png, summary.json, logs/", style="dim", highlight=False)
-    return 0 if summary["stood"] else EXIT_FELL
+    return verdict.exit_code(summary)

@@ -8,6 +8,7 @@ import msgspec
 from rich.text import Text
 
 from shared.config import files as config_file
+from shared.exceptions import FAULT_EXIT_CODE
 from tools.bringup import bench
 from tools.bringup.reach import add_plant, check_plants
 from tools.bringup.report import report_of, show
@@ -36,7 +37,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Look at everything; 0 if nothing is wrong, 1 if something is."""
+    """Look at everything; 0 if nothing is wrong."""
     path = bench.robot_file(args)
     robot = config_file.load(path)
     check_plants(robot, args.run_dir, args.plant)
@@ -53,4 +54,4 @@ def run(args: argparse.Namespace) -> int:
         print(msgspec.json.format(msgspec.json.encode(report)).decode())
     else:
         show(Console(), groups, verbose=args.verbose)
-    return 0 if report.ok else 1
+    return 0 if report.ok else FAULT_EXIT_CODE

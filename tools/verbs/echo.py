@@ -14,7 +14,7 @@ import msgspec
 from shared.bus.messages import Message
 from shared.bus.session import Session, open_session
 from shared.config.files import load
-from shared.exceptions import RunError
+from shared.exceptions import FAULT_EXIT_CODE, RunError
 from shared.mcap_log.schema import ENUMERATIONS
 from shared.process import StopFlag
 from tools.fleet.supervise import SupervisedFleet
@@ -53,7 +53,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print until the end that was asked for; 1 if nothing came."""
+    """Print until the end that was asked for; 0 if anything came."""
     keys = keys_named(args.topic)
     for name in args.field:
         without = [key.name for key in keys if name not in key.topic.type.__struct_fields__]
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     fleet = SupervisedFleet.attach(args.run_dir)
     robot = load(Path(fleet.manifest.config))
     with open_session(robot, "echo", fleet.run.path) as session:
-        return 0 if _print(session, keys, args) else 1
+        return 0 if _print(session, keys, args) else FAULT_EXIT_CODE
 
 
 def _print(session: Session, keys: list[TopicKey], args: argparse.Namespace) -> int:

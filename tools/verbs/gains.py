@@ -13,7 +13,7 @@ from rich.table import Table
 from services.planner.push_limit import DIRECTIONS, equivalent_slope
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import ConfigError
+from shared.exceptions import FAULT_EXIT_CODE, ConfigError
 from shared.robot import gain_schedule
 from shared.robot.gain_table import GainSchedule
 from tools.terminal import Console
@@ -61,13 +61,13 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the schedule beside the robot file; with --check 1 if it would have to be."""
+    """Write the schedule beside the robot file; with --check only say if it would have to be."""
     path = gain_schedule.path_beside(args.config)
     console = Console()
     if args.check:
         stale = gain_schedule.why_stale(config_file.load(args.config))
         console.print(f"{path}: {stale or 'fits the robot'}", soft_wrap=True)
-        return 1 if stale else 0
+        return FAULT_EXIT_CODE if stale else 0
     robot = config_file.load_without_schedule(args.config)
     schedule = compute(robot, console, args.damping_of)
     gain_schedule.write(path, schedule)

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import FleetError, RunError
+from shared.exceptions import FAULT_EXIT_CODE, FleetError, RunError
 from shared.robot import gain_schedule
 from tools.fleet.status_table import tables
 from tools.hosts import hosts_file, installation, records, running
@@ -181,7 +181,7 @@ def _up(given: _Given) -> int:
         words = f"an emergency stop by {who} holds {', '.join(stopped)}: nothing is armed; "
         _tell("", FleetError(f"{words}`xrl hosts down`, then `up`, ends it"))
     if failed or stopped:
-        return 1
+        return FAULT_EXIT_CODE
     return _each(given, lambda r: running.arm(given.hosts, r, statuses[r.host.name]))
 
 
@@ -204,7 +204,7 @@ def _status(given: _Given) -> int:
     for name, one in found.items():
         if isinstance(one, FleetError):
             _tell(name, one)
-    return 0 if len(good) == len(found) else 1
+    return 0 if len(good) == len(found) else FAULT_EXIT_CODE
 
 
 def _records(given: _Given) -> int:
@@ -236,7 +236,7 @@ def _records(given: _Given) -> int:
     for why in left_out:
         _tell("", FleetError(why))
     print(f"{joined}: one run, {gained} messages more than the recorder had")
-    return 1 if failed or left_out else 0
+    return FAULT_EXIT_CODE if failed or left_out else 0
 
 
 def _check(given: _Given) -> int:
@@ -254,13 +254,14 @@ def _check(given: _Given) -> int:
     others = installation.disagreements(rows)
     for text in others:
         console.print(marked("[bold red]{}[/]", text))
-    return 1 if others or any(row.wrong for row in rows) else 0
+    return FAULT_EXIT_CODE if others or any(row.wrong for row in rows) else 0
 
 
 def _each(given: _Given, work: Callable[[Remote], str]) -> int:
-    """Do the same on all hosts, and say of each how it went as soon as it has; 1 if one failed."""
+    """Do the same on all hosts, and say of each how it went as soon as it has; 0 if all did it."""
     found = on_all(given.remotes, work, _tell)
-    return int(any(isinstance(result, FleetError) for result in found.values()))
+    failed = any(isinstance(result, FleetError) for result in found.values())
+    return FAULT_EXIT_CODE if failed else 0
 
 
 def _tell(name: str, result: str | FleetError) -> None:

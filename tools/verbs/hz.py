@@ -9,7 +9,7 @@ from typing import Final
 from shared.bus.session import open_session
 from shared.clock import pace
 from shared.config.files import load
-from shared.exceptions import FleetError
+from shared.exceptions import FAULT_EXIT_CODE, FleetError
 from shared.process import StopFlag
 from tools.fleet.process_table import services_elsewhere
 from tools.fleet.supervise import SupervisedFleet
@@ -43,7 +43,7 @@ def add_parser(subparsers: Subparsers) -> None:
         dest="for_s",
         type=finite,
         metavar="S",
-        help="measure for S seconds and print once; exit code 1 if nothing came",
+        help=f"measure for S seconds and print once; exit code {FAULT_EXIT_CODE} if nothing came",
     )
 
 
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
         if args.for_s is not None:
             window_s = traffic.listen(args.for_s, lambda: bool(stop))
             console.print(traffic_table(traffic, window_s * pace()))
-            return 0 if any(one.count for one in traffic.keys.values()) else 1
+            return 0 if any(one.count for one in traffic.keys.values()) else FAULT_EXIT_CODE
         with renewed(console) as show:
             while not stop:
                 window_s = traffic.listen(WINDOW_S, lambda: bool(stop))

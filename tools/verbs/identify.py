@@ -21,7 +21,7 @@ from shared.config import files as config_file
 from shared.config import scenarios
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Lead, Scenario
-from shared.exceptions import RunError
+from shared.exceptions import DECLINED_EXIT_CODE, RunError
 from shared.robot.joints import AXES, MODULES
 from tools.bringup.bench import confirm
 from tools.bringup.jog_drive import Interrupts
@@ -140,7 +140,7 @@ def run(args: argparse.Namespace) -> int:
         led = _led(robot, fleet, scenario, args, console)
         if led is None:
             console.print("nothing was moved")
-            return 2
+            return DECLINED_EXIT_CODE
         moments = [led]
     records = [Record(part, kg) for part, kg in zip(moments, added, strict=True)]
     payload_sd = WEIGHED_SD if args.weighed else None

@@ -14,7 +14,7 @@ from services.joint.__main__ import open_drive
 from services.joint.differential import joint_from_motor
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import DriveError
+from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, DriveError
 from shared.robot.joints import AXES, MODULES
 from tools.bringup import bench, limits
 from tools.bringup.jog_drive import NOT_IDLE, Interrupts, JogResult, first_reading, jog_drive
@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
         outcome = confirm_and_move(args, console, limited, plan, interrupts)
         if outcome is None:
             console.print("nothing was moved")
-            return 2
+            return DECLINED_EXIT_CODE
         why = limits.not_given_back(robot, args.module, args.run_dir) if outcome.is_idle else ""
         if why:
             console.print(marked("[yellow]{}[/]", why))
@@ -178,8 +178,8 @@ def progress(sample: Sample, plan: JogPlan) -> str:
 
 
 def report(outcome: JogResult, module: str, plan: JogPlan, console: Console) -> int:
-    """Print how it went; return 0 if the joint followed, else 1."""
-    code = 1
+    """Print how it went; return 0 if the joint followed."""
+    code = FAULT_EXIT_CODE
     if outcome.trouble:
         console.print(marked("[bold red]STOPPED[/]: {}", outcome.trouble))
     else:
@@ -191,7 +191,7 @@ def report(outcome: JogResult, module: str, plan: JogPlan, console: Console) -> 
             verdict = Text("ok") if row.good else Text("not good", "bold red")
             table.add_row(row.what, row.value, row.wanted, verdict if row.wanted else "")
         console.print(table)
-        code = 0 if all(row.good for row in rows) else 1
+        code = 0 if all(row.good for row in rows) else FAULT_EXIT_CODE
         words = "[bold red]DID NOT FOLLOW[/]" if code else "[bold green]FOLLOWED[/]"
         console.print(marked(f"{words}: {{}} {{}}", module, AXES[plan.axis]))
         console.print(
@@ -202,7 +202,7 @@ def report(outcome: JogResult, module: str, plan: JogPlan, console: Console) -> 
         console.print("both axes are idle")
         return code
     console.print(marked("[bold red]{}[/]", NOT_IDLE))
-    return 1
+    return FAULT_EXIT_CODE
 
 
 def _introduce(robot: RobotConfig, module: str, plan: JogPlan, console: Console) -> None:

@@ -14,7 +14,7 @@ from shared.bus.credentials import keys_folder
 from shared.config import files as config_file
 from shared.config.endpoints import ROBOT, filled
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import BusError
+from shared.exceptions import FAULT_EXIT_CODE, BusError
 from tools.hosts import hosts_file
 from tools.hosts.layout import robot_on_hosts
 from tools.keys.authority import Authority, default_folder, make, principals_of
@@ -144,7 +144,7 @@ def _check(args: argparse.Namespace, robot: RobotConfig) -> int:
     folder = keys_folder(robot) if args.authority is None else args.authority
     rows = look(folder, robot)
     Console().print(_table(folder, rows))
-    return 0 if all(not row.wrong for row in rows) else 1
+    return 0 if all(not row.wrong for row in rows) else FAULT_EXIT_CODE
 
 
 def _renew(args: argparse.Namespace, robot: RobotConfig) -> int:

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from services.planner.controller_file import controller_maker
 from shared.bus.messages import Message
-from shared.exceptions import RunError
+from shared.exceptions import FAULT_EXIT_CODE, RunError
 from shared.mcap_log.provenance import machine
 from shared.robot.joints import MODULES
 from tools.analysis.reexecution import rewritten
@@ -146,7 +146,7 @@ def run(args: argparse.Namespace) -> int:
         number = rewritten.write(whole, path, recomputed, {"params": ", ".join(args.param)})
         console.print(f"{number} messages, the recomputed ones among them, in {path}")
         return 0
-    return 0 if all(outcome.equal for outcome in outcomes if outcome.ticks) else 1
+    return 0 if all(outcome.equal for outcome in outcomes if outcome.ticks) else FAULT_EXIT_CODE
 
 
 def _side_by_side(

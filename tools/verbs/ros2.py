@@ -10,6 +10,7 @@ import msgspec
 from services.ros2_gateway.rmw import domain
 from shared.config import checks
 from shared.config.files import load
+from shared.exceptions import FAULT_EXIT_CODE
 from tools.fleet.ros2_check import check
 from tools.number_arguments import finite
 from tools.terminal import Console, marked
@@ -51,7 +52,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Look, and print what was found; 1 if something is missing."""
+    """Look, and print what was found; 0 if nothing is missing."""
     robot = load(args.config)
     if args.router is not None:
         ros2 = msgspec.structs.replace(robot.ros2, router=args.router)
@@ -64,4 +65,4 @@ def run(args: argparse.Namespace) -> int:
         console.print(marked("{}  {}: {}", mark, row.what, row.found), soft_wrap=True)
         if not row.good:
             console.print(f"      {row.fix}", soft_wrap=True)
-    return 0 if all(row.good for row in rows) else 1
+    return 0 if all(row.good for row in rows) else FAULT_EXIT_CODE

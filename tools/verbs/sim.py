@@ -15,7 +15,7 @@ from shared.bus.messages import SimTruth
 from shared.exceptions import RunError
 from shared.network.impairment import Impairment
 from tools.number_arguments import finite
-from tools.runs import experiment, recorded_lockstep, verdict_table
+from tools.runs import experiment, recorded_lockstep, verdict, verdict_table
 from tools.runs.centralised.fleet import CONTROLS, SHIPPED
 from tools.runs.hand_path import HandRow, hand_path
 from tools.runs.run_log import read_run
@@ -121,7 +121,7 @@ def run(args: argparse.Namespace) -> int:
     summary = recorded_lockstep.judge_in_lockstep(scenario, out, speed=factor)
     verdict_table.show(summary, console)
     console.print(f"{factor:.1f} x real time; {out}/run.mcap, run.png, summary.json", style="dim")
-    return 0 if summary["stood"] else 1
+    return verdict.exit_code(summary)
 
 
 def _path_of(record: Path) -> tuple[HandRow, ...]:

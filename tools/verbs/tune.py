@@ -15,7 +15,7 @@ from shared.bus.operator_key import require_operator
 from shared.bus.session import open_session
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import RunError
+from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, RunError
 from shared.robot import gain_schedule
 from shared.robot.joints import AXES, MODULES
 from tools.bringup import bench, jog_drive
@@ -76,7 +76,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, compare with what the model predicts, and propose; 1 if it was stopped."""
+    """Measure, compare with what the model predicts, and propose; 0 if it was not stopped."""
     console = Console()
     if args.what not in (*DIRECTIONS, *MODULES):
         raise RunError(f"{args.what[:40]}: one of {', '.join((*DIRECTIONS, *MODULES))} is right")
@@ -142,11 +142,11 @@ def _tune_direction(args: argparse.Namespace, console: Console) -> int:
         live = _live(args, robot, fleet, row, plan, console)
         if live is None:
             console.print("nothing was moved")
-            return 2
+            return DECLINED_EXIT_CODE
         course = live
     if course.ended:
         console.print(marked("[bold red]STOPPED[/]: {}", course.ended))
-        return 1
+        return FAULT_EXIT_CODE
     answer = _answer(course, plan)
     courses, answers = {"measured": course}, {"measured": answer}
     _simulate("predicted", robot, row, plan, IDEAL, courses, answers, console)

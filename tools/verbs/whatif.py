@@ -15,7 +15,7 @@ from shared.atomic_file import replace_file
 from shared.config import scenarios
 from shared.config.scenarios import Scenario
 from shared.config.toml_file import parse_toml
-from shared.exceptions import RunError
+from shared.exceptions import FELL_EXIT_CODE, RunError
 from shared.robot.joints import MODULES
 from tools.number_arguments import count, finite
 from tools.runs.experiment import PLANT_FILE
@@ -115,7 +115,7 @@ def run(args: argparse.Namespace) -> int:
     )
     show(counterfactuals, names, args.for_s, console)
     console.print(f"{out}/whatif.json, whatif.png", style="dim")
-    return 0 if all(one.stood for one in counterfactuals) else 1
+    return 0 if all(one.stood for one in counterfactuals) else FELL_EXIT_CODE
 
 
 def _name(task: Task) -> str:

@@ -23,7 +23,7 @@ from shared.bus.messages import JointState, Mode, Pair
 from shared.bus.session import open_session
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import DriveError, FleetError
+from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, DriveError, FleetError
 from shared.robot.joints import MODULES
 from tools.bringup import bench
 from tools.bringup.stops import within_stops
@@ -105,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
             question = "Are the joints at these angles now?" if by is None else "Correct the zero?"
             if not bench.confirm(question, yes=args.yes):
                 console.print("nothing was changed")
-                return 1
+                return DECLINED_EXIT_CODE
             refuse_services(robot, holders)  # a person may take minutes to answer
             now = _look_all(robot, drives)
             if by is not None:  # from where it hangs now: it may have been touched meanwhile
@@ -232,7 +232,7 @@ def _set_all(
             console.print(marked("[bold red]{}[/]: {}", module, error))
             back = None
         good = is_right(back, q)
-        code = code if good else 1
+        code = code if good else FAULT_EXIT_CODE
         read = "nothing" if back is None else _angles(back.q)
         outcome = Text("zeroed") if good else Text("NOT zeroed", "bold red")
         table.add_row(module, _angles(q), read, outcome)

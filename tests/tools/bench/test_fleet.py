@@ -153,7 +153,7 @@ def test_two_trees_take_turns_and_a_missed_target_is_told_by_the_exit_code(
     monkeypatch.setattr(fleet_command, "unpacked", unpacked)
     file = tmp_path / "fleet.json"
     words = ["bench", "fleet", "--against", "old", "--rounds", "2", "--strict", "--json", file]
-    assert exit_code(words) == 1
+    assert exit_code(words) == 3
     assert trees == [CHECKOUT, tmp_path] * 2
     printed = capsys.readouterr().out
     assert "missed" in printed

@@ -153,15 +153,15 @@ def _another_key(place: Place) -> None:
 
 
 FAULTS: dict[str, tuple[Callable[[Place], object], int, str]] = {
-    "not valid yet": (lambda p: _issue(p, "planner.1", "127.0.0.1", 40, 10), 1, "not valid before"),
-    "expired": (lambda p: _issue(p, "planner.1", "127.0.0.1", -40, 10), 1, "expired"),
+    "not valid yet": (lambda p: _issue(p, "planner.1", "127.0.0.1", 40, 10), 3, "not valid before"),
+    "expired": (lambda p: _issue(p, "planner.1", "127.0.0.1", -40, 10), 3, "expired"),
     "expires soon": (lambda p: _issue(p, "planner.1", "127.0.0.1", 0, 20), 0, "expires in 19 days"),
-    "an earlier generation": (lambda p: _issue(p, "planner.0", "127.0.0.1", 0, 90), 1, "planner.0"),
-    "another host's": (lambda p: _issue(p, "planner.1", "10.1.1.1", 0, 90), 1, "not for 127.0.0.1"),
-    "another authority's": (_another_authority, 1, "another authority"),
-    "another's key": (_another_key, 1, "its key is another's"),
-    "readable": (lambda p: (p.keys / "planner.key").chmod(0o644), 1, "chmod 600"),
-    "no certificate": (lambda p: (p.keys / "planner.pem").write_bytes(b"x"), 1, "planner"),
+    "an earlier generation": (lambda p: _issue(p, "planner.0", "127.0.0.1", 0, 90), 3, "planner.0"),
+    "another host's": (lambda p: _issue(p, "planner.1", "10.1.1.1", 0, 90), 3, "not for 127.0.0.1"),
+    "another authority's": (_another_authority, 3, "another authority"),
+    "another's key": (_another_key, 3, "its key is another's"),
+    "readable": (lambda p: (p.keys / "planner.key").chmod(0o644), 3, "chmod 600"),
+    "no certificate": (lambda p: (p.keys / "planner.pem").write_bytes(b"x"), 3, "planner"),
 }
 
 

@@ -92,13 +92,29 @@ def test_motors_at_their_limit_are_no_sound_standing(
 ) -> None:
     """A knee limp, the other carries all: it stands, and not as it is to."""
     flags = ("--fault", "knee_left:disarmed@1.5", "--duration", "4")
-    assert cli.main(["sim", *flags, "--out", str(tmp_path)]) == 1
+    assert cli.main(["sim", *flags, "--out", str(tmp_path)]) == 3
     summary = verdict.summarise(read_run(tmp_path / "run.mcap"), 4.0)
     assert (summary["stood"], summary["fallen_at_s"], summary["why_not"]) == (False, None, "")
     assert "torque at its limit" in summary["unsound"]
     output = capsys.readouterr().out
     assert "STOOD, BUT NOT SOUNDLY" in output
     assert "(limit 50)" in output
+
+
+@pytest.mark.parametrize(
+    ("changes", "code"),
+    [
+        ({"stood": True}, 0),
+        ({"fallen_at_s": 2.0}, 1),
+        ({"why_not": "a sole is up, by 0.06 rad"}, 1),
+        ({"unsound": "torque at its limit: 90 ms (limit 50)"}, 3),
+        ({}, 3),
+    ],
+    ids=["stood", "fell", "tips at the end", "not soundly", "not finished"],
+)
+def test_only_a_fall_is_exit_code_1(changes: dict[str, object], code: int) -> None:
+    summary = {"stood": False, "fallen_at_s": None, "why_not": "", "unsound": ""}
+    assert verdict.exit_code(summary | changes) == code
 
 
 @pytest.mark.parametrize("key", SOUND)

@@ -67,7 +67,7 @@ def verb(run_dir: Path, out: Path, *arguments: str) -> subprocess.CompletedProce
 @pytest.mark.timeout(180)
 def test_the_difference_is_shown_and_nothing_is_written(run_dir: Path, tmp_path: Path) -> None:
     result = verb(run_dir, tmp_path / "b", f"--plant={MODULE}.{VEL_LIMIT}=2")
-    assert result.returncode == 1, result.stderr
+    assert result.returncode == 3, result.stderr
     assert "vel_limit" in result.stdout
     assert "OVERSPEED" in result.stdout
     assert "nothing was written" in result.stdout

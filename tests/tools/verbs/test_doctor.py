@@ -149,7 +149,7 @@ def test_a_board_that_is_not_set_up_as_the_others_is_named(run_dir: Path) -> Non
 
 def test_a_current_that_counts_the_other_way_is_wrong_over_can(run_dir: Path) -> None:
     result = doctor(run_dir, "--json", f"--plant={AXIS}.encoder.config.direction=-1")
-    assert result.returncode == 1, result.stderr
+    assert result.returncode == 3, result.stderr
     (row,) = [row for row in rows_of(result) if row["verdict"] == "wrong"]
     assert (row["subject"], row["what"], row["found"]) == (AXIS, "encoder.config.direction", "-1")
     assert "two of the motor's phases" in row["fix"]
@@ -158,7 +158,7 @@ def test_a_current_that_counts_the_other_way_is_wrong_over_can(run_dir: Path) ->
 def test_three_planted_traps_are_named_all_three(run_dir: Path) -> None:
     plants = [f"--plant={AXIS}.{name}={found}" for name, (found, _) in TRAPS.items()]
     result = doctor(run_dir, "--json", *plants)
-    assert result.returncode == 1, result.stderr
+    assert result.returncode == 3, result.stderr
     wrong = [row for row in rows_of(result) if row["verdict"] == "wrong"]
     assert {(row["subject"], row["what"]): (row["found"], row["wanted"]) for row in wrong} == {
         (AXIS, name): values for name, values in TRAPS.items()
@@ -170,7 +170,7 @@ def test_three_planted_traps_are_named_all_three(run_dir: Path) -> None:
 
 def test_the_terminal_ends_in_what_is_wrong(run_dir: Path) -> None:
     result = doctor(run_dir, f"--plant={AXIS}.motor.config.pre_calibrated=false")
-    assert result.returncode == 1
+    assert result.returncode == 3
     words = " ".join(result.stdout.split())
     last = words[words.rindex("2 wrong:") :]
     assert last.startswith(f"2 wrong: {AXIS} pre_calibrated, {AXIS} calibrated")

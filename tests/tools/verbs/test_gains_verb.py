@@ -109,15 +109,15 @@ def test_check_reports_a_fit_until_the_robot_changes(unladen: tuple[Path, str]) 
         stale = gains("--check", "--config", str(path))
     finally:
         path.write_text(heavier.replace("payload = 3.0 ", "payload = 0.0 "), encoding="utf-8")
-    assert (stale.returncode, stale.stderr) == (1, "")
+    assert (stale.returncode, stale.stderr) == (3, "")
     assert "was made for mass.payload = 0.0, not 3.0" in stale.stdout
     assert path.with_name("lab.gains.json").read_bytes() == before
 
 
-def test_check_without_a_schedule_is_exit_code_1_and_writes_none(tmp_path: Path) -> None:
+def test_check_without_a_schedule_is_exit_code_3_and_writes_none(tmp_path: Path) -> None:
     path = robot_file(tmp_path)
     done = gains("--check", "--config", str(path))
-    assert (done.returncode, done.stderr) == (1, "")
+    assert (done.returncode, done.stderr) == (3, "")
     assert "there is no gain schedule" in done.stdout
     assert list(tmp_path.iterdir()) == [path]
 

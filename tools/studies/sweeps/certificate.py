@@ -10,6 +10,7 @@ from services.planner.certificate import DIRECTIONS
 from services.simulator.plant import IDEAL, PlantConfig
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
+from shared.exceptions import FELL_EXIT_CODE
 from tools.number_arguments import count
 from tools.studies.sweeps import certificate_study, study
 from tools.studies.sweeps.certificate_study import CertificateCases, CertificateResult
@@ -58,7 +59,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the study; 1 if a case fell that was said to stand."""
+    """Run the study; 0 if no case fell that was said to stand."""
     executor = study.executor_of(args, CODE)
     robot = config_file.load(args.config)
     plant = IDEAL if args.friction else certificate_study.FRICTIONLESS
@@ -104,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
     title = f"{len(rows)} random postures and gains, seed {args.seed}"
     certificate_study.draw_picture(rows, title, finished.out / PICTURE)
     finished.show_files(f"{TABLE}, {PICTURE}", "case", console)
-    return 1 if found.stand_fell else 0
+    return FELL_EXIT_CODE if found.stand_fell else 0
 
 
 def row_of(outcome: CertificateResult) -> dict[str, object]:

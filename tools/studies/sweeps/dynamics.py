@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final, TypeAlias
 
@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from services.planner.dynamic_certificate import HALF_NAMES
 from shared.config.robot_config import RobotConfig
+from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE
 from tools.number_arguments import count, natural
 from tools.output import save_figure
 from tools.runs import experiment
@@ -58,7 +59,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the study; 1 if anything grew that was said to fade."""
+    """Run the study; 0 if nothing grew that was said to fade."""
     executor = study.executor_of(args, CODE)
     robot = experiment.load_robot(args.config)
     console = Console()
@@ -66,8 +67,9 @@ def run(args: argparse.Namespace) -> int:
         trial = draw(args.seed, args.only)
         study.show(f"Case {trial.number}", msgspec.structs.asdict(trial), console)
         outcome = run_trial(trial, robot)
-        study.show("came out", _row((trial, robot), outcome), console)
-        return 1 if outcome.said_stable and outcome.grew else 0
+        alone = _row((trial, robot), outcome)
+        study.show("came out", alone, console)
+        return exit_code([alone])
     trials = [draw(args.seed, number) for number in range(args.n)]
     begins = [_begin(trial) for trial in trials]
     columns = [*begins[0], *DynamicsResult.__struct_fields__, "said_stable", "grew"]
@@ -109,7 +111,15 @@ def run(args: argparse.Namespace) -> int:
                 soft_wrap=True,
             )
     finished.show_files(f"{TABLE}, {PICTURE}", "case", console)
-    return 1 if counts[True, True] else 0
+    return exit_code(rows)
+
+
+def exit_code(rows: Iterable[Mapping[str, object]]) -> int:
+    """Return the exit code of cases: motion that grew against the certificate may also fall."""
+    ended = {row["ended"] for row in rows if _grew(row)}
+    if "fell" in ended:
+        return FELL_EXIT_CODE
+    return FAULT_EXIT_CODE if ended else 0
 
 
 def draw_picture(rows: Sequence[Row], title: str, path: Path) -> None:

@@ -11,6 +11,7 @@ import msgspec
 
 from shared.bus.messages import JointEvent, SimTruth
 from shared.config.robot_config import RobotConfig
+from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE
 from tools.runs.lockstep import Watch
 from tools.runs.standing import is_tipping
 
@@ -42,6 +43,14 @@ class Ended(msgspec.Struct, frozen=True, kw_only=True):
     def stood(self) -> bool:
         """True if the robot stood to the end."""
         return self.ending == Ending.STOOD
+
+
+def exit_code(endings: Iterable[str]) -> int:
+    """Return the exit code of cases that ended so: a robot that tips has as good as fallen."""
+    not_stood = set(endings) - {Ending.STOOD}
+    if not_stood - {Ending.UNREADY}:
+        return FELL_EXIT_CODE
+    return FAULT_EXIT_CODE if not_stood else 0
 
 
 def that_count(

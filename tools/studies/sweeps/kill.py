@@ -12,7 +12,7 @@ from shared.config.robot_config import RobotConfig
 from tools.number_arguments import count, natural
 from tools.runs import experiment
 from tools.studies.sweeps import cases, picture, plants, push_range, report, study
-from tools.studies.sweeps.figures import ENDINGS, Ending
+from tools.studies.sweeps.figures import ENDINGS, Ending, exit_code
 from tools.studies.sweeps.outcome import KillResult, plant_of, run_case
 from tools.studies.sweeps.prepare import needs_schedule, prepare
 from tools.studies.sweeps.record import run_alone
@@ -60,7 +60,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the study, or one case of it; 1 if any fell."""
+    """Run the study, or one case of it; 0 if none fell."""
     push_range.check(args)
     executor = study.executor_of(args, CODE)
     robot = experiment.make_robot(args)
@@ -100,7 +100,7 @@ def _run_all(
     picture.draw(rows, robot, title, finished.out / PICTURE)
     report.show(rows, _command(args), console)
     finished.show_files(f"{TABLE}, {PICTURE}", "case", console)
-    return 1 if fallen else 0
+    return exit_code(row["ending"] for row in rows)
 
 
 def _robots(

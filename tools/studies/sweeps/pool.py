@@ -15,7 +15,7 @@ from concurrent.futures.process import BrokenProcessPool
 from threading import Thread
 from typing import TypeVar
 
-from shared.exceptions import RunError, os_error_in_words
+from shared.exceptions import FAULT_EXIT_CODE, RunError, os_error_in_words
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -89,4 +89,4 @@ def _follow_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
-        os._exit(1)
+        os._exit(FAULT_EXIT_CODE)

@@ -15,7 +15,7 @@ from tools.runs import experiment
 from tools.runs.lockstep import Record, Watch
 from tools.runs.recorded_lockstep import AFTER_FALL_S, judge_in_lockstep, record_run
 from tools.studies.sweeps import study
-from tools.studies.sweeps.figures import Ended
+from tools.studies.sweeps.figures import Ended, exit_code
 from tools.terminal import Console, marked
 
 Outcome_co = TypeVar("Outcome_co", bound=Ended, covariant=True)
@@ -55,7 +55,7 @@ def run_alone(
         true_plant: that `run` simulates.
 
     Returns:
-        0 if the robot stood, else 1.
+        The exit code.
 
     Raises:
         RunError: the log cannot be written.
@@ -84,4 +84,4 @@ def run_alone(
     if out is not None:
         console.print(f"{out}/run.mcap, run.png, summary.json", style="dim", soft_wrap=True)
     console.print(marked("[bold]{}[/]", outcome.ending))
-    return 0 if outcome.stood else 1
+    return exit_code([outcome.ending])

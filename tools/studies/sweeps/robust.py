@@ -21,7 +21,7 @@ from tools.number_arguments import count, finite, natural
 from tools.output import save_figure
 from tools.runs import experiment
 from tools.studies.sweeps import plants, push_range, study
-from tools.studies.sweeps.figures import ENDINGS, Ending
+from tools.studies.sweeps.figures import ENDINGS, Ending, exit_code
 from tools.studies.sweeps.push_range import PushRange
 from tools.studies.sweeps.record import run_alone
 from tools.studies.sweeps.robust_trial import (
@@ -100,7 +100,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the study, or one trial of it; 1 if any fell."""
+    """Run the study, or one trial of it; 0 if none fell."""
     if not 0.0 <= args.slope <= SLOPE_MAX_DEG:
         raise RunError(f"--slope {args.slope:g}: 0 to {SLOPE_MAX_DEG:g} degrees")
     push_range.check(args)
@@ -128,9 +128,9 @@ def run(args: argparse.Namespace) -> int:
     )  # fmt: skip
     rows = finished.rows
     _draw(rows, args, finished.out / PICTURE)
-    fell = _show(rows, _command(args), console)
+    _show(rows, _command(args), console)
     finished.show_files(f"{TABLE}, {PICTURE}", "trial", console)
-    return 1 if fell else 0
+    return exit_code(row["ending"] for row in rows)
 
 
 def _run_one(args: argparse.Namespace, robot: RobotConfig, console: Console) -> int:
@@ -199,8 +199,8 @@ def _draw(rows: Sequence[Row], args: argparse.Namespace, path: Path) -> None:
     save_figure(figure, path)
 
 
-def _show(rows: Sequence[Row], command: str, console: Console) -> int:
-    """Print what came of the study; return how many fell."""
+def _show(rows: Sequence[Row], command: str, console: Console) -> None:
+    """Print what came of the study."""
     fallen = [row for row in rows if row["ending"] != Ending.STOOD]
     for row in fallen[:FALLS_SHOWN]:
         console.print(
@@ -243,7 +243,6 @@ def _show(rows: Sequence[Row], command: str, console: Console) -> int:
         ),
         highlight=False,
     )
-    return len(fallen)
 
 
 def _run_task(task: Task) -> RobustResult:

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from shared.bus.messages import Cause, Trip
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import RunError
+from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE, RunError
 from tools.runs import experiment
 from tools.studies.sweeps import study
 from tools.studies.sweeps.table import Row, code_of
@@ -44,7 +44,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the study; 1 if a trip did not come, came for nothing, or did not save the robot.
+    """Run the study; 0 if each trip came where it is to, and saved the robot.
 
     Raises:
         RunError: on this robot nothing trips.
@@ -84,7 +84,14 @@ def run(args: argparse.Namespace) -> int:
     if not wrong:
         console.print("what was to trip did, and stood; nothing tripped for nothing", style="green")
     finished.show_files(TABLE, "case", console)
-    return 1 if wrong else 0
+    return exit_code(rows)
+
+
+def exit_code(rows: Sequence[Row]) -> int:
+    """Return the exit code of a table: a trip that did not save the robot before all else."""
+    if any(row["fell_at_s"] for row in rows):
+        return FELL_EXIT_CODE
+    return FAULT_EXIT_CODE if any(map(wrong_with, rows)) else 0
 
 
 def wrong_with(row: Mapping[str, str]) -> str:

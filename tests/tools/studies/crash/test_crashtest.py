@@ -30,6 +30,7 @@ PLANNER = BY_NAME["kill-planner"]
 KNEE = BY_NAME["kill-knee_left"]
 STOOD = CrashResult(verdict=CrashVerdict.STOOD, wall_s=13.0)
 FELL = CrashResult(verdict=CrashVerdict.FELL, fell_after_s=0.7, wall_s=9.0)
+SANK = CrashResult(verdict=CrashVerdict.SANK, sank_mm=60.0, wall_s=13.0)
 LOST = CrashResult(verdict=CrashVerdict.UNJUDGED, remarks=("no fleet",))
 
 
@@ -129,6 +130,9 @@ def test_the_exit_code_distinguishes_a_forbidden_fall_from_a_run_that_failed() -
     assert crashtest.exit_code([stood, allowed_fall]) == 0
     assert crashtest.exit_code([stood, lost]) == 2
     assert crashtest.exit_code([lost, bad_fall]) == 1
+    sank = Result(PLANNER, SANK)
+    assert crashtest.exit_code([lost, sank]) == 3, "it sank, and did not fall"
+    assert crashtest.exit_code([sank, bad_fall]) == 1
 
 
 def test_json_holds_what_was_done_and_what_came_of_it(tmp_path: Path) -> None:

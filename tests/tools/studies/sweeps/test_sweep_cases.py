@@ -25,7 +25,7 @@ from tools.runs.lockstep import Lockstep
 from tools.runs.standing import is_tipping
 from tools.studies.sweeps import cases
 from tools.studies.sweeps.cases import KillCase, KillCases
-from tools.studies.sweeps.figures import Ending
+from tools.studies.sweeps.figures import Ending, exit_code
 from tools.studies.sweeps.outcome import FootLoads, run_case
 from tools.studies.sweeps.push_range import PushRange
 
@@ -45,6 +45,19 @@ def diagonal(robot: RobotConfig) -> RobotConfig:
 
 def frames(scenario: Scenario, case: KillCase) -> Iterator[tuple[cases.LeadPose, Keyframe]]:
     return zip(case.poses, scenario.keyframe[1:], strict=True)
+
+
+@pytest.mark.parametrize(
+    ("endings", "code"),
+    [
+        ([Ending.STOOD], 0),
+        ([Ending.STOOD, Ending.UNREADY], 3),
+        ([Ending.UNREADY, Ending.TIPPING], 1),
+        ([Ending.UNREADY, Ending.FELL, Ending.STOOD], 1),
+    ],
+)
+def test_a_case_that_never_began_is_a_fault_and_no_fall(endings: list[Ending], code: int) -> None:
+    assert exit_code(map(str, endings)) == code
 
 
 def test_a_case_is_the_same_without_the_others(robot: RobotConfig, drawn: list[KillCase]) -> None:

@@ -68,6 +68,18 @@ def test_motion_that_rises_stays_large_or_ends_the_lead_has_grown(
     assert outcome(**changes).grew is grew
 
 
+@pytest.mark.parametrize(
+    ("said", "ended", "code"),
+    [("True", "tracked", 3), ("True", "left", 3), ("True", "fell", 1), ("False", "fell", 0)],
+)
+def test_motion_that_grew_against_the_certificate_is_a_fault_and_a_fall_if_it_fell(
+    said: str, ended: str, code: int
+) -> None:
+    as_said = {"said_stable": "True", "grew": "False", "ended": "tracked"}
+    row = {"said_stable": said, "grew": "True", "ended": ended}
+    assert dynamics.exit_code([as_said, row]) == code
+
+
 def test_drawn_gains_change_the_schedule_and_nothing_else(robot: RobotConfig) -> None:
     trial = draw(1, 0)
     other = drawn(robot, trial)

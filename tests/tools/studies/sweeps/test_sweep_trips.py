@@ -13,7 +13,7 @@ from shared.config.robot_config import RobotConfig
 from shared.process import DEFAULT_CONFIG
 from shared.robot.trip_table import JOINT_TRIPS, PLANNER_TRIPS
 from tools import cli
-from tools.studies.sweeps.trips import wrong_with
+from tools.studies.sweeps.trips import exit_code, wrong_with
 from tools.studies.sweeps.trips_trial import PLANTS, TROUBLES, TripResult, run_trial
 
 HARD_PLANT = "small errors"
@@ -61,6 +61,17 @@ def test_on_a_plant_of_many_errors_what_is_to_trip_trips_and_stands(
 )
 def test_it_names_what_is_wrong_with_a_row(given: dict[str, str], words: str) -> None:
     assert wrong_with(given) == words
+
+
+@pytest.mark.parametrize(
+    ("changes", "code"),
+    [({"tripped": "SAGGING"}, 0), ({}, 3), ({"tripped": "SAGGING", "fell_at_s": "2.1"}, 1)],
+    ids=["tripped", "never tripped", "fell"],
+)
+def test_a_trip_that_did_not_come_is_a_fault_and_one_that_did_not_save_a_fall(
+    changes: dict[str, str], code: int
+) -> None:
+    assert exit_code([row("sags", tripped="SAGGING"), row("sags", **changes)]) == code
 
 
 def test_what_is_to_trip_is_in_the_table_of_trips() -> None:
