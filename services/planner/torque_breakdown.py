@@ -93,7 +93,7 @@ def torque_breakdown(
 
     Raises:
         ConfigError: the gain split needs a schedule, and the robot's is missing or stale.
-        RunError: the pose is singular: a leg is straight.
+        RunError: the pose is singular: a leg is straight, or the legs turn the torso opposite ways.
     """
     measured, reference = Measured(config), Reference(config)
     measured.stance[:] = reference.stance[:] = stance
@@ -106,6 +106,11 @@ def torque_breakdown(
     reference.evaluate(q_ref)
     at_ref = reference.kinematics()
     _require_bent(at_ref)
+    if not np.isfinite(reference.J).all():
+        raise RunError(
+            "singular pose: the two legs turn the torso opposite ways, and nothing lies between; "
+            "angles of legs that agree are right"
+        )
     hessian_weight = at_ref.hessian_times(F_O, np.zeros(3)).copy()
     e_p, e_pdot = reference.p - measured.p, reference.J @ v_ref - measured.pdot
     terms = LawAtReference(law, split).evaluate(reference, e_p, e_pdot)

@@ -144,7 +144,7 @@ def lead_through(place: Place, watch: Watch, capsys: Any) -> None:
     said = capsys.readouterr().out
     assert "body: planner" in said
     assert "left: knee_left" in said
-    assert all(f"\n  {module} " in said for module in MODULES)
+    assert all(f"\n{module} " in said for module in MODULES)
     assert place.xrl("update") == 3
     assert "`xrl hosts down` first" in " ".join(capsys.readouterr().out.split())
 

@@ -153,15 +153,20 @@ def parse(flag: str, text: str, count: int, largest: float, unit: str) -> Array:
         RunError: it is something else.
     """
     try:
-        path = Path(text)
-        text = read_text(path) if path.is_file() else text
-        return np.array(finite_numbers(text, count, largest))
+        return np.array(finite_numbers(_content(text), count, largest))
     except OSError as error:
-        raise RunError(
-            f"{flag} {text[:40]!r}: {error.strerror}; {count} numbers are right"
-        ) from None
+        raise RunError(f"{flag} {text}: {error.strerror}") from None
     except ValueError as error:
         raise RunError(f"{flag}: {error}; {unit}, separated by commas, or a file of them") from None
+
+
+def _content(text: str) -> str:
+    """Return a text, or what the file holds that it names; many digits are no file's name."""
+    try:
+        named = Path(text).is_file()
+    except OSError:
+        named = False
+    return read_text(Path(text)) if named else text
 
 
 def at_pose(robot: RobotConfig, text: str) -> Array:

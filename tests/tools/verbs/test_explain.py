@@ -9,7 +9,7 @@ import re
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from services.planner.kinematics import Kinematics
@@ -179,6 +179,7 @@ def test_a_time_without_ticks_names_the_times_with_some(
 
 @settings(max_examples=20)
 @given(q=st.lists(st.floats(-2 * math.pi, 2 * math.pi), min_size=N_JOINTS, max_size=N_JOINTS))
+@example(q=[2.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 3.0, 0.0])
 def test_every_pose_within_a_turn_is_explained_or_called_singular(q: list[float]) -> None:
     with contextlib.redirect_stderr(io.StringIO()) as told:
         code = cli.main(["explain", f"--q={','.join(map(str, q))}"])

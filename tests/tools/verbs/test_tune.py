@@ -30,7 +30,7 @@ def test_a_direction_is_measured_beside_the_model_and_gains_are_proposed_that_do
     told = capsys.readouterr().out
     rows = {
         match[1].strip(): [float(one) for one in match[2].split()]
-        for match in re.finditer(r"^ +(\w[\w ,]*?)  +((?:[\d.]+ +)+)", told, re.M)
+        for match in re.finditer(r"^(\w[\w ,]*?)  +((?:[\d.]+ +)+)", told, re.M)
     }
     measured, predicted, proposed = rows["natural frequency"]
     assert 3.0 < measured < 8.0
