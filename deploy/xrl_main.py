@@ -11,8 +11,9 @@ import sys
 from importlib.machinery import PathFinder
 from pathlib import Path
 
-HERE = Path(__file__).resolve().parent
 PACKAGES = ("services", "shared", "tools")
+HERE = next(p for p in Path(__file__).resolve().parents if (p / PACKAGES[0]).is_dir())
+"""Folder of our packages: a checkout's top, or beside this file where they are installed."""
 
 
 def main() -> int:
