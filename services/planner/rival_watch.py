@@ -30,7 +30,7 @@ class RivalWatch(msgspec.Struct):
     """What a planner knows of another one."""
 
     yields: bool = False
-    """True while this planner sends nothing."""
+    """True while this planner leads no module."""
     session: int = 0
     """Session of the other planner; 0 if none was seen."""
     announced_ns: int = 0

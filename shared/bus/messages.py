@@ -178,7 +178,8 @@ class PlannerMode(IntEnum):
     """The load is farther from the robot file than `law.load_correction`, or not yet weighed after
     hanging on a hoist: all hold."""
     YIELDING = 8
-    """Another planner leads: this one sends nothing until that one has ended."""
+    """Another planner leads: this one sends no command that a module could use until that one has
+    ended."""
 
 
 class SplitSource(IntEnum):

@@ -8,6 +8,7 @@ from services.planner.planner import Planner
 from shared.bus import topics
 from shared.bus.messages import JointState, Message, Mode, PlannerMode, SimTruth
 from shared.bus.topics import Topic
+from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Keyframe, Kill, Restart, Scenario
 from shared.robot.joints import MODULE_INDEX
@@ -48,8 +49,8 @@ class TwoPlanners(Lockstep):
         super().__init__(robot, scenario, record=self._hear)
         self.second: Planner | None = None
         self.begin_s, self.end_s = begin_s, end_s
-        self.sent = 0
-        """Commands of the second planner."""
+        self.sent = self.announced = 0
+        """Commands of the second planner that a module might use, and those that none can."""
         self.accepted: list[tuple[float, tuple[int, ...]]] = []
         """Scenario time and each module's session, whenever one changes."""
 
@@ -65,7 +66,10 @@ class TwoPlanners(Lockstep):
         if self.second is not None and self.second.is_due(self.now_ns):
             for index, command in enumerate(self.second.tick(self.now_ns)):
                 self.network.commands()[index].put(self.now_ns, command)
-                self.sent += 1
+                age_ms = (self.now_ns - command.echo_t_ns) / NS_PER_MS
+                usable = age_ms <= self.config.joint_service.max_command_age_ms
+                self.sent += usable
+                self.announced += not usable
         sessions = tuple(controller._state.failsafe.session for controller in self.controllers)
         if not self.accepted or self.accepted[-1][1] != sessions:
             self.accepted.append((at_s, sessions))
@@ -102,6 +106,7 @@ def test_60_ms_of_loss_give_the_second_planner_no_module(robot: RobotConfig, lin
     fleet = TwoPlanners(robot, scenario, 0.5, 4.0)
     run(fleet)
     assert fleet.sent == 0
+    assert 0 < fleet.announced <= 6 * 5 * 3.6, "it makes itself known five times a second"
     assert changes_after(fleet, 0.1) == []
     assert fleet.modes == {Mode.TRACK}
 
