@@ -1,5 +1,6 @@
 # Sourced by the scripts beside it: sets `root` and, through `environment`, makes `.venv`.
-# Needs Python 3.11 (with venv), flock and sha256sum; everything else comes with pip.
+# Needs a Python that the lock was tried with (and its venv module, or uv), flock and sha256sum, and
+# libgomp; everything else comes with pip.
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd -P)
 venv=$root/.venv
@@ -12,6 +13,8 @@ unset PYTHONDONTWRITEBYTECODE
 
 say() { printf '%s\n' "deploy: $*" >&2; }
 die() { say "$*"; exit 2; }  # 1 is a robot that fell
+
+tried="3.14 3.13 3.12 3.11"  # Pythons that the lock files were tried with, the preferred one first
 
 full=$root/requirements.lock
 runtime=$root/requirements.runtime.lock  # what a robot runs: no test tools
@@ -33,32 +36,75 @@ is_current() {  # full, runtime, or any: as it is
   esac
 }
 
-# Not the first of its name only: a version manager's shim may stand before the real one.
+# The newest Python that the lock was tried with, of those that can make an environment. Not the first
+# of its name only: a version manager's shim may stand before the real one.
 find_python() {
-  local candidate
-  while read -r candidate; do
-    if "$candidate" -c 'import sys, venv, ensurepip; sys.exit(sys.version_info[:2] != (3, 11))' \
-      2>/dev/null; then
-      printf '%s\n' "$candidate"
-      return
-    fi
-  done < <(type -aP python3.11 python3 python)
-  die "no Python 3.11 with its venv module on PATH; install it (Debian, Ubuntu: python3.11 and" \
-    "python3.11-venv) and try again"
+  local version candidate
+  for version in $tried; do
+    while read -r candidate; do
+      if [ "$("$candidate" -c 'import sys, venv, ensurepip; print("%d.%d" % sys.version_info[:2])' \
+        2>/dev/null)" = "$version" ]; then
+        printf '%s\n' "$candidate"
+        return
+      fi
+    done < <(type -aP "python$version" python3 python)
+  done
+  return 1
+}
+
+no_python() {
+  local found
+  found=$(python3 --version 2>/dev/null) || found="no python3"
+  die "no Python of $tried with its venv module on PATH ($found); install it, for example by" \
+    "$(how_to_install "python3-venv" "python3")"
+}
+
+# The command that brings a package of the system: Debian's name, Fedora's name.
+how_to_install() {
+  if command -v apt-get >/dev/null; then printf '%s\n' "'apt-get install $1'"
+  elif command -v dnf >/dev/null; then printf '%s\n' "'dnf install $2'"
+  else printf '%s\n' "your package manager (Debian: $1, Fedora: $2)"
+  fi
+}
+
+# Wheels bring all but one library of the system. Without it the first import would be a traceback.
+check_libraries() {  # PYTHON
+  "$1" -c 'import ctypes; ctypes.CDLL("libgomp.so.1")' 2>/dev/null ||
+    die "the library libgomp.so.1 is missing, which Pinocchio needs; install it:" \
+      "$(how_to_install libgomp1 libgomp)"
+}
+
+make_venv() {
+  local python
+  if python=$(find_python); then
+    say "making .venv with $("$python" --version), $python (once; a minute or two)"
+    check_libraries "$python"
+    fresh_folder
+    "$python" -m venv "$venv" || die "$python -m venv failed, see above"
+  elif command -v uv >/dev/null; then
+    say "making .venv with uv and Python ${tried%% *} (once; a minute or two)"
+    fresh_folder
+    uv venv --quiet --seed --allow-existing --python "${tried%% *}" "$venv" ||
+      die "uv venv failed, see above"
+    check_libraries "$venv/bin/python"
+  else
+    no_python
+  fi
+}
+
+fresh_folder() {
+  mkdir -p "$venv" && : >"$half_made"  # the mark stands while what was there before goes
+  find "$venv" -mindepth 1 ! -path "$half_made" -delete
 }
 
 venv_is_sound() { [ ! -e "$half_made" ] && "$venv/bin/python" -m pip --version >/dev/null 2>&1; }
 
 make_environment() {  # LOCK
-  local python lock=$1 compiled=--no-compile  # where it is first imported, 14 s of the 50 are saved
+  local lock=$1 compiled=--no-compile  # where it is first imported, 14 s of the 50 are saved
   [ "$lock" != "$runtime" ] || compiled=--compile  # who runs it may not write there
   rm -f "$stamp"
   if [ "$lock" = "$runtime" ] || ! venv_is_sound; then  # nothing else is left in a robot's
-    python=$(find_python) || exit 2
-    say "making .venv with $("$python" --version) (once; a minute or two)"
-    mkdir -p "$venv" && : >"$half_made"  # the mark stands while what was there before goes
-    find "$venv" -mindepth 1 ! -path "$half_made" -delete
-    "$python" -m venv "$venv" || die "$python -m venv failed, see above"
+    make_venv
   else
     say "bringing .venv up to date"
     : >"$half_made"
