@@ -1,0 +1,102 @@
+"""What the deploy scripts choose and say, with stand-ins for a system's programs."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+TOOLS = ("bash", "cat", "dirname", "sha256sum", "find", "mkdir")
+
+
+def run(system: Path, script: str) -> subprocess.CompletedProcess[str]:
+    """Run a piece of shell with deploy/lib.sh, on a system that has these programs only."""
+    words = ["bash", "-c", f"set -euo pipefail; source {ROOT}/deploy/lib.sh; {script}"]
+    environment = {"PATH": str(system), "HOME": str(system)}
+    return subprocess.run(
+        words, env=environment, capture_output=True, text=True, check=False, timeout=30
+    )
+
+
+@pytest.fixture
+def system(tmp_path: Path) -> Path:
+    for name in TOOLS:
+        found = next(p for p in os.defpath.split(":") if (Path(p) / name).exists())
+        (tmp_path / name).symlink_to(Path(found) / name)
+    return tmp_path
+
+
+def program(system: Path, name: str, text: str) -> None:
+    path = system / name
+    path.write_text(f"#!{system}/bash\n{text}\n", encoding="utf-8")
+    path.chmod(0o755)
+
+
+def tried(system: Path) -> list[str]:
+    return run(system, 'printf %s "$tried"').stdout.split()
+
+
+def test_the_package_names_the_pythons_that_the_lock_was_tried_with(system: Path) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    named = [c.rpartition(" ")[2] for c in project["classifiers"] if "Python :: 3." in c]
+    assert sorted(named) == sorted(tried(system))
+    assert project["requires-python"] == ">=3.11"
+
+
+@pytest.mark.parametrize(
+    ("there", "taken"),
+    [
+        ({"python3": "3.11"}, "python3"),
+        ({"python3": "3.13", "python3.11": "3.11"}, "python3"),
+        ({"python3": "3.10", "python3.12": "3.12"}, "python3.12"),
+        ({"python3.13": "no module named venv", "python3.12": "3.12"}, "python3.12"),
+        ({"python3": "3.99"}, None),
+        ({}, None),
+    ],
+)
+def test_the_newest_python_that_was_tried_and_can_make_an_environment_is_taken(
+    system: Path, there: dict[str, str], taken: str | None
+) -> None:
+    for name, version in there.items():
+        program(system, name, f"echo {version}")
+    done = run(system, "find_python")
+    assert done.stdout.strip() == ("" if taken is None else str(system / taken))
+    assert (done.returncode == 0) == (taken is not None)
+
+
+@pytest.mark.parametrize(
+    ("manager", "command"),
+    [
+        ("apt-get", "apt-get install libgomp1"),
+        ("dnf", "dnf install libgomp"),
+        ("", "Fedora: libgomp"),
+    ],
+)
+def test_a_library_that_the_system_lacks_is_named_with_the_command_that_brings_it(
+    system: Path, manager: str, command: str
+) -> None:
+    program(system, "python3", "exit 1")
+    if manager:
+        program(system, manager, "exit 0")
+    done = run(system, f"check_libraries {system}/python3")
+    assert done.returncode == 2
+    assert "libgomp.so.1 is missing" in done.stderr
+    assert command in done.stderr
+
+
+def test_without_a_python_uv_makes_the_environment(system: Path) -> None:
+    program(system, "uv", 'printf "%s " uv "$@"')
+    done = run(
+        system,
+        f"venv={system}/venv half_made={system}/venv/m; fresh_folder() {{ :; }};"
+        " check_libraries() { :; }; make_venv",
+    )
+    assert done.stdout.startswith("uv venv --quiet --seed --allow-existing --python 3.14")
+    (system / "uv").unlink()
+    done = run(system, "make_venv")
+    assert done.returncode == 2
+    assert "no Python of 3.14 3.13 3.12 3.11 with its venv module" in done.stderr
