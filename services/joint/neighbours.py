@@ -36,6 +36,8 @@ GONE_NS: Final = round(LOST_S * NS_PER_S)
 _ROW: Final = struct.Struct("<QQddQQ")
 """A number that is odd while it is written, then a `NeighbourRow`."""
 _NUMBER: Final = struct.Struct("<Q")
+READS: Final = 5
+"""Reads of a row until it is whole; its writer may have died over it."""
 _LEG: Final = N_MODULES // 2
 """From a module to its like of the other leg."""
 _SIZE: Final = N_MODULES * _ROW.size
@@ -139,20 +141,29 @@ class Neighbours:
         """Write down where this module is."""
         self._written += 2
         memory, at = self._memory, self._at
-        _ROW.pack_into(memory, at, self._written - 1, *row)
+        # not `pack_into`, which first writes zeros: a reader took a module for one that never was
+        memory[at : at + _ROW.size] = _ROW.pack(self._written - 1, *row)
         _NUMBER.pack_into(memory, at, self._written)  # even again: whole
 
     @staticmethod
     def mode_of(run_dir: Path, module: str) -> Mode | None:
-        """Return the mode last written by a module's service on this host; None if none."""
-        try:
-            with path_of(run_dir).open("rb") as file:
-                file.seek(MODULES.index(module) * _ROW.size)
-                number, *row = _ROW.unpack(file.read(_ROW.size))
-        except (OSError, struct.error):
-            return None
-        mode = NeighbourRow(*row).mode
-        return Mode(mode) if number and mode in tuple(Mode) else None
+        """Return the mode last written by a module's service on this host; None if none.
+
+        A row that is being written is read again.
+        """
+        found: Mode | None = None
+        for _ in range(READS):
+            try:
+                with path_of(run_dir).open("rb", buffering=0) as file:
+                    file.seek(MODULES.index(module) * _ROW.size)
+                    number, *row = _ROW.unpack(file.read(_ROW.size))
+            except (OSError, struct.error):
+                return None
+            mode = NeighbourRow(*row).mode
+            found = Mode(mode) if number and mode in tuple(Mode) else None
+            if number and not number & 1:
+                break
+        return found
 
     def view(self, now_ns: int) -> NeighbourView:
         """Return what this module knows of the others."""

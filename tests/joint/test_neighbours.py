@@ -94,6 +94,25 @@ def test_a_clock_far_ahead_is_of_another_host() -> None:
     assert view_of("knee_right", ahead, T0).sinks
 
 
+def test_a_row_that_is_being_written_is_read_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`xrl estop` read one half written, and said that a module had not stopped."""
+    Neighbours(tmp_path, "hip_right").write(NeighbourRow(T0, 0.1, 0.0, Mode.DAMP))
+    unpacked = []
+
+    class HalfWritten(Struct):
+        def unpack(self, data: bytes) -> tuple[Any, ...]:
+            unpacked.append(data)
+            return super().unpack(bytes(len(data)) if len(unpacked) < 3 else data)
+
+    monkeypatch.setattr(neighbours, "_ROW", HalfWritten(neighbours._ROW.format))
+    assert Neighbours.mode_of(tmp_path, "hip_right") is Mode.DAMP
+    assert len(unpacked) == 3
+    unpacked.clear()
+    assert Neighbours.mode_of(tmp_path, "hip_left") is None, "it never wrote"
+
+
 @pytest.fixture
 def six(tmp_path: Path) -> dict[str, Neighbours]:
     return {name: Neighbours(tmp_path, name) for name in MODULES}

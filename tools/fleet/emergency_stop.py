@@ -65,10 +65,12 @@ def wait_here(run_dir: Path, here: list[str], wanted: Sequence[str] = MODULES) -
     Returns:
         One line for each of them that has not stopped, or was not asked.
     """
-    deadline = time.monotonic() + GIVE_UP_S
-    while time.monotonic() < deadline and not all(_is_stopped(run_dir, m) for m in here):
-        time.sleep(REPEAT_S)
-    going = [module for module in here if not _is_stopped(run_dir, module)]
+    deadline, going = time.monotonic() + GIVE_UP_S, list(here)
+    while going and time.monotonic() < deadline:
+        # one that has stopped stays so: it is not asked again, as its row might be half written
+        going = [module for module in going if not _is_stopped(run_dir, module)]
+        if going:
+            time.sleep(REPEAT_S)
     absent = [module for module in wanted if module not in here]
     return going + [f"{module} has no service on this host" for module in absent]
 
