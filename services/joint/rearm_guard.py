@@ -210,4 +210,5 @@ class Pendant:
 
     def _write_beats(self, beats: int) -> None:
         for memory in self._memories.values():
-            _BEATS.pack_into(memory, _BEATS_AT, beats)
+            # not `pack_into`, which first writes zeros: for a reader there would be no pendant
+            memory[_BEATS_AT : _BEATS_AT + _BEATS.size] = _BEATS.pack(beats)
