@@ -37,6 +37,8 @@ DOUBT_NS: Final = 100 * NS_PER_MS
 services pause."""
 LOW_M: Final = 0.1
 """A hip joint that is lower above its ankle is on the floor."""
+LEAST_M: Final = 1e-6
+"""A leg folded onto itself has no direction."""
 LEVEL_MAX: Final = 0.1
 """rad; a torso that is farther off is brought back no harder than that."""
 
@@ -200,7 +202,8 @@ class Sinking:
         """Return the law of an ankle; if its knee is no longer seen, its last angle holds."""
         rate = 0.0
         if near.leg is not None:
-            self.leg, rate = near.leg
+            knee, rate = near.leg
+            self.leg = clamp(knee, -math.pi, math.pi)  # the cosine of an infinity would raise
         if self.leg is None:
             return sunk
         if self.ahead is None:
@@ -209,7 +212,7 @@ class Sinking:
         # from ankle to hip joint: a link of this length, at this angle from the shank
         along = self._shank + self._thigh * math.cos(self.leg)
         across = self._thigh * math.sin(self.leg)
-        length = max(math.hypot(along, across), abs(self.ahead))
+        length = max(math.hypot(along, across), abs(self.ahead), LEAST_M)
         place = math.asin(self.ahead / length) - math.atan2(across, along)
         low, high = self._limits
         place = clamp(place, min(low, self.start), max(high, self.start))

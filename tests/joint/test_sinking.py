@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import pytest
 
 from services.joint import pd_law
@@ -112,12 +113,22 @@ def test_an_ankle_that_does_not_see_its_knee_stays_within_its_limits_and_where_i
     sinking, frozen = begun(robot, "ankle_left", (0.02, 0.14))
     unseen = sinking.law(frozen, frozen, LONG_NS, (0.02, 0.14), UNKNOWN)
     assert unseen.q_ref == frozen.q_ref
-    for knee in (-0.4, -2.9, 50.0, -1e6):
+    for knee in (-0.4, -2.9, 50.0, -1e6, math.inf, -math.inf):
         seen = sinking.law(frozen, frozen, LONG_NS, (0.02, 0.14), NeighbourView((knee, 1.0)))
         low, high = robot.limits.ankle.theta
         assert low <= seen.q_ref[1] - frozen.q_ref[1] + 0.14 <= high
         lost = sinking.law(frozen, frozen, LONG_NS, (0.02, 0.14), UNKNOWN)
         assert (lost.q_ref, lost.v_ref[1]) == (seen.q_ref, 0.0)
+
+
+def test_a_leg_of_equal_links_that_folds_onto_itself_divides_by_nothing(
+    robot: RobotConfig,
+) -> None:
+    alike = msgspec.structs.replace(robot.geometry, l1=robot.geometry.l2)
+    sinking, frozen = begun(msgspec.structs.replace(robot, geometry=alike), "ankle_left")
+    for knee in (-math.pi, -3.0):
+        found = sinking.law(frozen, frozen, LONG_NS, Q, NeighbourView((knee, 0.0)))
+        assert all(map(math.isfinite, (*found.q_ref, *found.v_ref)))
 
 
 BELOW_ITS_STOP = -2.6

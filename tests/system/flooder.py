@@ -36,7 +36,7 @@ STRANGER: Final = "127.0.0.66"
 """Address of somebody without a key, where the fleet is at 127.0.0.1."""
 CONNECTS_PER_S: Final = 640
 CONNECTS_MAX: Final = 60_000
-"""Of one flood; it then ends by itself."""
+"""Connections of one flood; it then ends by itself."""
 LARGE: Final = 200_000_000
 VICTIMS: Final = ("planner", *MODULES, "recorder")
 

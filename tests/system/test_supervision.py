@@ -22,7 +22,7 @@ from shared.exceptions import FleetError
 from shared.process import DEFAULT_CONFIG
 from tests.system.waiting import wait_for
 from tools import cli
-from tools.fleet import procfs
+from tools.fleet import procfs, supervise
 from tools.fleet import run_dir as run_dir_module
 from tools.fleet.run_dir import MARKER
 from tools.fleet.supervise import ServiceInfo, SupervisedFleet
@@ -284,6 +284,14 @@ def test_the_wait_before_another_start_is_bounded() -> None:
     waiting.config = SimpleNamespace(name="planner")
     waiting.change_state(ProcessStates.BACKOFF)
     assert waiting.delay <= time.time() + BACKOFF_MAX_S
+
+
+def test_a_start_with_too_few_open_files_says_so(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(supervise.resource, "getrlimit", lambda _limit: (100, 100))
+    with pytest.raises(FleetError, match="100 files may be open, and a fleet needs 128"):
+        start()
 
 
 def test_a_start_on_a_full_disk_says_so(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:

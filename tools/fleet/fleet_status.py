@@ -293,7 +293,7 @@ def trouble_of(fleet: SupervisedFleet, services: Iterable[ServiceInfo]) -> tuple
     """Return what is wrong with supervision, logs and disk, a line each."""
     fault = fleet.supervision_fault()
     lines = [fault] if fault else []
-    lost, why = fleet.lost_lines()
+    lost, why = (0, "") if fault else fleet.lost_lines()  # it would only be waited for again
     if lost:
         lines.append(f"{lost} log lines are lost: {why}: {fleet.run.logs}")
     try:

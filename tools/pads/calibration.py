@@ -59,7 +59,7 @@ class _Movement:
         self._off = dict.fromkeys(self._range, 0.0)
         self._down: set[int] = set()
         self.farthest: dict[int, float] = {}
-        """Of each axis that moved, in shares of its range, with its sign."""
+        """Return how far each axis moved, in shares of its range, with its sign."""
         self.pressed: list[int] = []
 
     def watch(self, timeout_s: float) -> bool:
