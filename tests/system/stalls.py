@@ -2,7 +2,7 @@
 
 The robot stands, but after each the planner waits for longer: a scenario that begins once all six
 have tracked for a second may then never begin. A test is let off only where the stall was measured,
-by a real-time thread that does nothing else (`tests.system.stall_watch`).
+by a real-time thread that does nothing else (`tools.fleet.stall_watch`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from shared.bus import topics
 from shared.bus.messages import Mode
 from shared.clock import NS_PER_S
 from shared.robot.joints import MODULES
-from tests.system.stall_watch import gaps_in
+from tools.fleet import stall_watch
+from tools.fleet.stall_watch import gaps_in
 from tools.runs.run_log import read_run
 
 NEVER_READY: Final = "not all six modules track after"
@@ -36,8 +37,7 @@ def start_watch() -> None:
     os.close(handle)
     atexit.register(Path(path).unlink)
     os.environ[FILE_VARIABLE] = path
-    program = Path(__file__).with_name("stall_watch.py")
-    subprocess.Popen([sys.executable, str(program), path])
+    subprocess.Popen([sys.executable, "-I", "-S", stall_watch.__file__, path])
 
 
 def has_stalled(since_ns: int) -> bool:

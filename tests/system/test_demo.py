@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -17,6 +20,7 @@ from shared.robot.joints import MODULES
 from tests.system.stalls import stalled_before_it_began
 from tools.fleet import procfs
 from tools.runs.run_log import read_run
+from tools.runs.stalls import stalls_of
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 
@@ -118,3 +122,33 @@ def test_an_interrupted_demo_leaves_nothing_behind(tmp_path: Path) -> None:
     process.stdout.close()
     assert set(fleet_processes()) <= before
     assert set(Path("/tmp").glob("xrl-demo-*")) <= folders
+
+
+def test_a_stall_of_all_services_is_told_in_line_record_and_verdict(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "tools.cli", "demo", "--out", str(tmp_path)]
+    command += ["--duration", "5", "--kill", "planner@4.5"]
+    before, said = procfs.fleets(), []
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if re.match(r" +1\.\d+ s ", line):
+                (run_dir,) = procfs.fleets() - before
+                stop_all(run_dir, 0.15)
+            said.append(line)
+    text = "".join(said)
+    if stalled_before_it_began(process.returncode, text, tmp_path):
+        pytest.skip("this machine stalled so often that the scenario could not begin")
+    assert process.returncode == 0, text
+    live, _, verdict = text.partition("Verdict")
+    assert re.search(r"stood still for \d+ ms: all six h[eo]ld", live), text
+    assert re.search(r"\d s: .* stood still for \d+ ms: all six held", verdict), text
+    log = read_run(tmp_path / "run.mcap")
+    assert max(row.lasted_ms for row in stalls_of(log.messages(topics.RUN_EVENT))) > 100.0
+
+
+def stop_all(run_dir: str, for_s: float) -> None:
+    """Have every service of a fleet stand still."""
+    pids = procfs.service_pids(Path(run_dir)).values()
+    procfs.signal_all(pids, signal.SIGSTOP)
+    time.sleep(for_s)
+    procfs.signal_all(pids, signal.SIGCONT)

@@ -57,7 +57,7 @@ FIGURES: Final = (
     Figure("first_use_ms", "age at first use, median", "ms", None),
     Figure("first_use_p99_ms", "age at first use, p99", "ms", 3.0),
     Figure("hand_n", "hand's peak", "N", 40.0),
-    Figure("com_x_mm", "COM x, before any kill", "mm", 20.0),
+    Figure("com_x_mm", "COM x, led", "mm", 20.0),
 )
 
 

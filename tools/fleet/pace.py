@@ -102,10 +102,14 @@ class IdleMeter:
         self._looks.append((now_s, *idle_and_total()))
         while len(self._looks) > 1 and now_s - self._looks[1][0] >= WINDOW_S:
             self._looks.popleft()
-        (begin_s, idle, total), (_, idle_now, total_now) = self._looks[0], self._looks[-1]
-        if now_s - begin_s < WINDOW_S or total_now == total:
-            return None
-        return (idle_now - idle) / (total_now - total)
+        begin_s, *before = self._looks[0]
+        return None if now_s - begin_s < WINDOW_S else idle_share((before[0], before[1]))
+
+
+def idle_share(before: tuple[int, int]) -> float:
+    """Return the idle fraction of all cores since `idle_and_total()` returned `before`."""
+    (idle, total), (idle_now, total_now) = before, idle_and_total()
+    return (idle_now - idle) / max(1, total_now - total)
 
 
 def idle_and_total() -> tuple[int, int]:

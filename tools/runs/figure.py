@@ -36,6 +36,7 @@ MODE_COLOURS: Final[dict[int, str]] = {
 LINES: Final = ("#1f4e79", "#c8553d", "#5b8c5a")
 MODULE_LINES: Final = ("#1f4e79", "#4a90c4", "#7fc4d8", "#8c2d19", "#c8553d", "#e09f5b")
 IMPAIRED_COLOUR: Final = "#8f7fc8"
+STALLED_COLOUR: Final = "#6b6b6b"
 IMPAIRED_TEXT: Final = "#3f2f6f"
 LEADS_COLOUR: Final = MODE_COLOURS[Mode.TRACK]
 WAITS_COLOUR: Final = "#b9c4cf"
@@ -83,6 +84,7 @@ def draw(log: RunLog, name: str, summary: Summary, path: Path) -> None:
     _modes(axes[-1], log, zero_ns, end_s)
     plots = [*axes[:4], *axes[-2:]]
     _events(plots, log.messages(topics.RUN_EVENT))
+    _stalls(plots, summary["stalls"])
     if network:
         _network(axes[4], network, zero_ns, end_s)
         _shade(plots, network, zero_ns, end_s)
@@ -207,6 +209,23 @@ def _events(axes: Any, events: list[RunEvent]) -> None:
             fontsize=8,
             color=colour,
         )
+
+
+def _stalls(axes: Any, stalls: Sequence[dict[str, Any]]) -> None:
+    """Shade stalls, and the time for which modules held because of them."""
+    for row in stalls:
+        begin, end = row["at_s"], row["at_s"] + row["lasted_ms"] / 1e3
+        for axis in axes:
+            axis.axvspan(begin, end, color=STALLED_COLOUR, alpha=0.8, lw=0.0, zorder=0)
+            if row["modules_held"]:
+                axis.axvspan(begin, row["held_until_s"] or axis.get_xlim()[1], alpha=0.15,
+                             color=STALLED_COLOUR, lw=0.0, zorder=0)  # fmt: skip
+        if row["modules_held"]:
+            axes[0].annotate(
+                f"{row['who']} stood still, {row['lasted_ms']:.0f} ms", (begin, 1.0),
+                xycoords=("data", "axes fraction"), xytext=(0, 13), textcoords="offset points",
+                ha="left", fontsize=8, color=STALLED_COLOUR,
+            )  # fmt: skip
 
 
 def _shade(axes: Any, network: Sequence[Impaired], zero_ns: int, end_s: float) -> None:

@@ -10,7 +10,7 @@ import math
 import os
 import signal
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Final, NamedTuple
 
 from shared.bus import topics
@@ -30,9 +30,11 @@ from shared.config.scenarios import Fault, Inject, Kill, Push, Restart, Scenario
 from shared.exceptions import RunError
 from shared.robot.joints import MODULES
 from tools.fleet import procfs
-from tools.fleet.pace import IDLE_LEAST, CoresFullError, IdleMeter
+from tools.fleet.pace import IDLE_LEAST, CoresFullError, IdleMeter, idle_and_total, idle_share
 from tools.fleet.proxy_client import ProxyClient
+from tools.fleet.stall_watch import StallWatch
 from tools.fleet.supervise import SupervisedFleet
+from tools.runs.stalls import STALL_SHOWN_NS, Stall, StallFinder
 
 READY_TIMEOUT_S: Final = 45.0
 """Longer than all that a planner waits after the first five drop-outs: a machine may stall."""
@@ -51,6 +53,8 @@ POLL_S: Final = 0.004
 UNHEARD_S: Final = 0.5
 """A module that says nothing for so long is shown as silent."""
 PIDS_EVERY_S: Final = 1.0
+STALLS_FILE: Final = "stalls"
+"""In the run directory: what `StallWatch` finds."""
 ENDING_S: Final = 3.0
 """s; a service that was told to end has done so by then, or was killed by its supervisor."""
 
@@ -117,11 +121,22 @@ class ScenarioRunner:
         scenario: Scenario,
         show: Callable[[LiveSnapshot], None],
         triggered_kill: TriggeredKill | None = None,
+        tell: Callable[[str], None] = lambda _text: None,
     ) -> None:
-        """Take the scenario's kills, and perhaps one that the modules' modes trigger."""
+        """Take the scenario's kills, and perhaps one that the modules' modes trigger.
+
+        Args:
+            fleet: that runs.
+            session: on its bus.
+            scenario: what is to be done.
+            show: shows how the run is.
+            triggered_kill: besides those of the scenario.
+            tell: takes what is to be known of the machine before the scenario starts.
+        """
         self._fleet = fleet
         self._scenario = scenario
         self._show = show
+        self._tell = tell
         self._triggered_kill = triggered_kill
         self._dropped_out = False
         self._triggered_kill_at_s = math.inf
@@ -143,6 +158,12 @@ class ScenarioRunner:
         self._note = ""
         self._pids: dict[str, int] = {}
         self._next_pids_s = 0.0
+        self._watch = StallWatch(fleet.run.path / STALLS_FILE)
+        self._finder = StallFinder(len(os.sched_getaffinity(0)), self._watch.take)
+        self._stalls: list[Stall] = []
+        self._shown_stall: Stall | None = None
+        self._stall_held = 0
+        self._killed = False
 
     def run(self, is_over: Callable[[], bool] = lambda: False) -> EndOfRun:
         """Wait until the robot stands, run the scenario to its end.
@@ -156,6 +177,10 @@ class ScenarioRunner:
             RunError: the robot did not come to stand, or the simulated world went silent.
             FleetError: a service that was to be restarted could not be.
         """
+        with self._watch:
+            return self._run(is_over)
+
+    def _run(self, is_over: Callable[[], bool]) -> EndOfRun:
         if not self._wait_until_tracking(is_over):
             self._say(RunEventKind.FINISHED, self._scenario.name, "fell before the start")
             time.sleep(LAST_WORDS_S)
@@ -219,7 +244,7 @@ class ScenarioRunner:
         begin_s = time.monotonic()
         deadline, next_look_s = begin_s + machine_s(READY_TIMEOUT_S), begin_s
         meter, idle = IdleMeter(), None
-        since = None
+        since, before = None, idle_and_total()
         self._note = "waiting for six modules to track"
         while since is None or time.monotonic() - since < machine_s(SETTLE_S):
             self._listen()
@@ -236,7 +261,8 @@ class ScenarioRunner:
             if self._truth is not None and self._truth.fallen:
                 return False
             if all(tracking) and standing:
-                since = since or time.monotonic()
+                if since is None:
+                    since, before = time.monotonic(), idle_and_total()
                 self._note = "standing, settling"
             else:
                 since = None
@@ -249,6 +275,7 @@ class ScenarioRunner:
                 )
             time.sleep(POLL_S)
         self._check_cores(idle)  # tracking for a moment is not being carried through a scenario
+        self._tell(_describe_machine(idle_share(before), self._stalls))
         self._note = ""
         return True
 
@@ -280,11 +307,34 @@ class ScenarioRunner:
         self._start_ns = self._truth.t_ns - round(self._truth.scenario_s * NS_PER_S)
         self._say(RunEventKind.STARTED, self._scenario.name, "")
 
+    def _look_for_stalls(self) -> None:
+        for stall in self._finder.take(now_ns(), pace()):
+            self._stalls.append(stall)
+            self._shown_stall, self._stall_held = stall, 0
+            self._said += 1
+            event = stall.event(self._said, self._start_ns or stall.begin_ns + NS_PER_S)
+            self.said.append(event)
+            self._events.put(event)
+
+    def _stall_words(self) -> str:
+        """Return what to show of the newest stall; empty if it was a while ago."""
+        stall = self._shown_stall
+        if stall is None or now_ns() - stall.end_ns > STALL_SHOWN_NS:
+            return ""
+        held = 0 if self._killed else list(self._modes.values()).count(Mode.HOLD)
+        self._stall_held = max(self._stall_held, held)
+        if not self._stall_held:
+            return stall.words
+        who = "all six" if self._stall_held == len(MODULES) else self._stall_held
+        return f"{stall.words}: {who} {'hold' if held else 'held'}"
+
     def _listen(self) -> None:
         """Receive new messages and show them."""
+        self._look_for_stalls()
         for module, latest in self._states.items():
             state = latest.take()
             if state is not None:
+                self._finder.hear(module, state)
                 self._modes[module] = state.mode
                 self._heard_s[module] = time.monotonic()
             elif time.monotonic() - self._heard_s.get(module, 0.0) > UNHEARD_S:
@@ -296,7 +346,8 @@ class ScenarioRunner:
                 name_of(Mode, self._modes[module])[0] if module in self._modes else "-"
                 for module in MODULES
             )
-            self._show(LiveSnapshot(truth, modes, self._note))
+            note = "; ".join(word for word in (self._note, self._stall_words()) if word)
+            self._show(LiveSnapshot(truth, modes, note))
         elif time.monotonic() - self._truth_at_s > SILENT_S and self._start_ns:
             raise RunError(f"the simulator has said nothing for {SILENT_S:.0f} s; see its log")
 
@@ -304,6 +355,7 @@ class ScenarioRunner:
         """Do what is due; the simulator does pushes and faults, and they are only recorded here."""
         if isinstance(row, Kill):
             self._say(RunEventKind.KILLED, row.service, row.signal)
+            self._killed = True
             number = signal.Signals[f"SIG{row.signal}"]
             try:
                 os.kill(self._pids[row.service], number)
@@ -363,3 +415,14 @@ class ScenarioRunner:
         )
         self.said.append(event)
         self._events.put(event)
+
+
+def _describe_machine(idle: float, stalls: Sequence[Stall]) -> str:
+    """Return how the machine carries the fleet, before the scenario starts."""
+    words = f"{len(os.sched_getaffinity(0))} cores, {100 * idle:.0f} % idle beside the fleet"
+    if idle < IDLE_LEAST:
+        words += f": too little, modules may hold; `--pace {pace() / 2:g}` asks for half of it"
+    if not stalls:
+        return words
+    most_ms = max(stall.lasted_ms for stall in stalls)
+    return f"{words}; {len(stalls)} stalls so far, {most_ms:.0f} ms at most"

@@ -33,6 +33,7 @@ from tools.runs.impairment_intervals import Impaired, impairments, touches
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog
 from tools.runs.soundness import soundness, why_not_sound
+from tools.runs.stalls import Disturbance, as_dicts, disturbances, drop_outs, inside, stalls_of
 from tools.runs.standing import why_not_standing
 
 Array = NDArray[np.float64]
@@ -114,25 +115,34 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
         "pace": _pace(log),
         "real_time_factor": last.real_time_factor,
         "world_time_lost_s": last.late_s,
-        "in_real_time": last.real_time_factor >= REAL_TIME_FACTOR_MIN and last.late_s <= LATE_MAX_S,
+        "in_real_time": last.real_time_factor >= REAL_TIME_FACTOR_MIN
+        and last.late_s - _stood_still_s(events) <= LATE_MAX_S,
     }
-    alive = leading(log, np.array([row.t_ns for row in truth]))
+    times_ns = np.array([row.t_ns for row in truth])
+    disturbed = disturbances(log, truth[0].t_ns, last.t_ns)
+    apart = inside(disturbed, times_ns)
+    led = leading(log, times_ns)
+    led, held = led & ~apart, ~led & ~apart
     poses = np.array([(*row.over, row.com[2], *row.angles) for row in truth])
-    for prefix, mask in (("", t >= 0.0), ("hold_", ~alive)):
+    for prefix, mask in (("", t >= 0.0), ("hold_", held)):
         summary |= _extent(prefix, poses[mask])
-    summary |= _extent("alive_", (poses - _asked(log, truth))[alive])
+    summary |= _extent("alive_", (poses - _asked(log, truth))[led])
     heights = [row.torso[2] for row in truth]
     summary["torso_height_min_m"] = min(heights)
     summary["torso_height_max_m"] = max(heights)
     tilt = np.array([max(row.foot_right_tilt, row.foot_left_tilt) for row in truth])
     summary["sole_tilt_max_rad"] = _max(tilt)
     summary |= sound
-    summary["alive_sole_tilt_max_rad"] = _max(tilt[alive])
+    summary["alive_sole_tilt_max_rad"] = _max(tilt[led])
     force = np.array([abs(row.operator_force[2]) for row in truth])
-    summary["operator_peak_n"] = _max(force[alive])
-    summary["hold_operator_peak_n"] = _max(force[~alive])
+    summary["operator_peak_n"] = _max(force[led])
+    summary["hold_operator_peak_n"] = _max(force[held])
     summary["assist_error_n"] = _assist_error(
-        [row for s, row in zip(t, truth, strict=True) if s < kill_s]
+        [
+            row
+            for s, row, is_apart in zip(t, truth, apart, strict=True)
+            if s < kill_s and not is_apart
+        ]
     )
     summary |= _handover(log, kills)
     summary["reengage_s"] = _reengage(log, events)
@@ -141,12 +151,41 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
     summary |= _command_age(log, truth[0].t_ns, network)
     summary["links_impaired"] = len(network)
     summary["impairments"] = [row.as_dict(zero_ns) for row in network]
-    summary["pd_cycles_late_pct"] = _late_share(log, truth[0].t_ns)
+    summary["pd_cycles_late_pct"] = _late_share(log, truth[0].t_ns, disturbed)
     summary["planner_tick_us"] = _tick(log, truth[0].t_ns)
     summary["stopped"] = sorted({row.subject for row in kills if row.detail == "STOP"})
     summary["messages_recorded"] = sum(log.count(key) for key in log.keys())  # noqa: SIM118 - not a dict
     summary["sequence_gaps"] = sum(count.missing for count in log.gaps().values())
+    summary["stalls"] = as_dicts(log, disturbed, truth, zero_ns)
+    summary["across_stalls"] = _across(summary, events, disturbed)
+    kill_ns = kills[0].t_ns if kills else last.t_ns
+    summary["drop_outs"] = [] if network else drop_outs(log, disturbed, zero_ns, kill_ns)
     return summary
+
+
+def _stood_still_s(events: Sequence[RunEvent]) -> float:
+    return sum(stall.lasted_ms for stall in stalls_of(events)) / 1e3
+
+
+def _across(
+    summary: Summary, events: Sequence[RunEvent], disturbed: Sequence[Disturbance]
+) -> list[str]:
+    """Return the keys of the figures that a stall made what they are."""
+    lost = sum(row["messages_lost"] for row in summary["stalls"])
+    found = ["sequence_gaps"] if lost and lost >= summary["sequence_gaps"] else []
+    handover_s = (summary["handover_max_ms"] or 0.0) / 1e3
+    for kind, lasted_s, keys in (
+        (RunEventKind.KILLED, handover_s, ("handover_max_ms", "handover_torque_step_nm")),
+        (RunEventKind.RESTARTED, summary["reengage_s"] or 0.0, ("reengage_s",)),
+    ):
+        begins_ns = [event.t_ns for event in events if event.kind == kind][:1]
+        if any(
+            row.begin_ns <= begin_ns + lasted_s * NS_PER_S and row.stall.end_ns >= begin_ns
+            for row in disturbed
+            for begin_ns in begins_ns
+        ):
+            found += keys
+    return found
 
 
 def fell(summary: Mapping[str, Any]) -> bool:
@@ -194,6 +233,7 @@ def joined(parts: Sequence[Summary], counts: Iterable[KeyCount]) -> Summary:
                 }
         elif not isinstance(found[0], bool):
             summary[key] = min(found) if key in LEAST else max(found)
+    summary["stalls"] = [row for part in parts for row in part["stalls"]]
     totals = sum(one.count for one in counted), sum(one.missing for one in counted)
     summary |= dict(zip(COUNTED, totals, strict=True))
     fallen = [part["fallen_at_s"] for part in parts if part["fallen_at_s"] is not None]
@@ -374,15 +414,19 @@ def _hold_entries(log: RunLog, start_ns: int) -> int:
     )
 
 
-def _late_share(log: RunLog, start_ns: int) -> float | None:
-    """Return the fraction of late PD cycles, %; a service that restarts counts from 0."""
+def _late_share(log: RunLog, start_ns: int, disturbed: Sequence[Disturbance]) -> float | None:
+    """Return the fraction of late PD cycles outside of stalls, %.
+
+    A service that restarts counts from 0.
+    """
     late = cycles = 0
     for module in MODULES:
         states: list[JointState] = [
             row for row in log.messages(topics.JOINT_STATE, module) if row.t_ns >= start_ns
         ]
-        for before, after in pairwise(states):
-            if after.cycle > before.cycle:
+        apart = inside(disturbed, np.array([row.t_ns for row in states]))
+        for (before, after), is_apart in zip(pairwise(states), apart[1:], strict=True):
+            if after.cycle > before.cycle and not is_apart:
                 late += after.late - before.late
                 cycles += after.cycle - before.cycle
     return 100.0 * late / cycles if cycles else None

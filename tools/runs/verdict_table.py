@@ -15,6 +15,8 @@ OK: Final = "ok"
 OVER: Final = "over"
 OF_THE_MACHINE: Final = ("pd_cycles_late_pct", "fleet_cpu_pct", "sequence_gaps")
 """Figures that no impairment of a link explains."""
+STALLS_MAX: Final = 6
+"""Lines about single stalls."""
 NOTHING: Final = 5e-4
 """Less than this is shown as 0.00: no limit is near it."""
 
@@ -44,7 +46,7 @@ def show(summary: Summary, console: Console) -> None:
             f"and {decide}.",
             style="dim",
         )
-    for line in network(summary):
+    for line in (*stalls(summary), *network(summary)):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     if summary.get("pace", 1.0) != 1.0:
         console.print(
@@ -71,12 +73,33 @@ def mark(row: VerdictLimit, summary: Summary) -> str:
         return OK
     if row.key == "sequence_gaps" and summary["stopped"]:
         return "of a service that was stopped"
-    impaired = summary.get("links_impaired") and row.key not in OF_THE_MACHINE
-    return f"{OVER}, links impaired" if impaired else OVER
+    if row.key in summary["across_stalls"]:
+        return "the machine stood still"
+    if row.key in OF_THE_MACHINE:
+        return f"{OVER}, a busy machine" if row.key != "sequence_gaps" else OVER
+    return f"{OVER}, links impaired" if summary.get("links_impaired") else OVER
 
 
 def _is_over(row: VerdictLimit, summary: Summary) -> bool:
     return summary.get(row.key) is not None and mark(row, summary).startswith(OVER)
+
+
+def stalls(summary: Summary) -> list[str]:
+    """Return a line for each stall that made something of the run, and one for the others.
+
+    After them each drop-out that no stall explains.
+    """
+    rows = summary["stalls"]
+    told = [row for row in rows if row["modules_held"] or row["messages_lost"]][:STALLS_MAX]
+    rest = [row["lasted_ms"] for row in rows if row not in told]
+    lines = [row["said"] for row in told]
+    if rest:
+        lines.append(f"{len(rest)} {'more ' if told else ''}stalls without consequence, "
+                     f"{max(rest):.0f} ms at most")  # fmt: skip
+    if told:
+        lines.append("The figures above leave out what a stall made of the run.")
+    lines += summary["drop_outs"]
+    return lines
 
 
 def network(summary: Summary) -> list[str]:

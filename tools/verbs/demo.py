@@ -101,6 +101,9 @@ def lead_run(
         style="dim",
     )
 
+    def tell_of_machine(text: str) -> None:
+        console.print(text, style="dim", highlight=False, soft_wrap=True)
+
     def lead(fleet: SupervisedFleet, session: Session) -> EndOfRun:
         planner = session.latest(topics.PLANNER_STATUS, PlannerStatus)
         with contextlib.ExitStack() as stack:
@@ -110,7 +113,8 @@ def lead_run(
                 console.print(f"{address}  (Ctrl-C ends the run)", soft_wrap=True)
                 stack.enter_context(_interrupts_set(ended))
             view = stack.enter_context(LiveView(console, scenario.inject, planner))
-            return ScenarioRunner(fleet, session, scenario, view.show).run(ended.is_set)
+            runner = ScenarioRunner(fleet, session, scenario, view.show, tell=tell_of_machine)
+            return runner.run(ended.is_set)
 
     if args.controller is not None:
         controller_maker(args.controller, robot)  # refused before anything is started

@@ -18,6 +18,8 @@ from shared.bus.messages import (
     Message,
     PlannerMode,
     PlannerStatus,
+    RunEvent,
+    RunEventKind,
     SimTruth,
     Vector3,
     Wrench,
@@ -28,8 +30,11 @@ from shared.config.robot_config import RobotConfig
 from shared.robot.capture_point import capture_point
 from shared.robot.joints import MODULE_INDEX, MODULES
 from tools.fleet.fleet_status import module_status
+from tools.runs.stalls import STALL_SHOWN_NS, stalls_of
 from tools.view.sole_estimate import SoleEstimate
 
+SHOWN: Final = (topics.PLANNER_STATUS, topics.WRENCH, topics.SIM_TRUTH, topics.RUN_EVENT)
+SHOWN_OF_MODULES: Final = (topics.JOINT_STATE, topics.JOINT_COMMAND)
 STALE_NS: Final = NS_PER_S // 2
 """An older message is not shown: its sender is dead, stopped or cut off."""
 DIGITS: Final = 5
@@ -105,6 +110,8 @@ class Frame(msgspec.Struct, frozen=True):
     """Processes of a live fleet on this host; empty for the other sources."""
     network: tuple[str, ...] = ()
     """Active impairments of a live fleet's network, in words."""
+    stall: str = ""
+    """The last stall of the machine, in words, for some moments after it."""
 
 
 class Newest:
@@ -121,6 +128,7 @@ class Newest:
         self._status: PlannerStatus | None = None
         self._wrench: Wrench | None = None
         self._truth: SimTruth | None = None
+        self._stall: RunEvent | None = None
         self._first_ns: int | None = None
 
     def take(self, topic: Topic, module: str, message: Message) -> None:
@@ -135,6 +143,8 @@ class Newest:
             self._wrench = message
         elif isinstance(message, SimTruth):
             self._truth = message
+        elif isinstance(message, RunEvent) and message.kind == RunEventKind.STALLED:
+            self._stall = message
 
     @property
     def scenario_s(self) -> float:
@@ -193,7 +203,14 @@ class Newest:
                 for state, here, name in zip(states, heard, MODULES, strict=True)
             ),
             planner=_shown(status) if isinstance(status, PlannerStatus) else None,
+            stall=self._stall_words(now_ns),
         )
+
+    def _stall_words(self, now_ns: int) -> str:
+        stall = self._stall
+        if stall is None or not 0 <= now_ns - stall.t_ns < STALL_SHOWN_NS:
+            return ""
+        return "".join(found.words for found in stalls_of([stall]))
 
     def _soles_of(
         self, truth: Message | None, states: list[JointState]

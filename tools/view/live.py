@@ -7,7 +7,6 @@ from typing import Any, Final
 
 import msgspec
 
-from shared.bus import topics
 from shared.bus.session import Latest, Session, open_session
 from shared.bus.topics import Topic
 from shared.clock import now_ns
@@ -15,7 +14,7 @@ from shared.config.robot_config import RobotConfig
 from shared.robot.joints import MODULES
 from tools.fleet.fleet_status import impairments
 from tools.fleet.supervise import SupervisedFleet
-from tools.view.frame import Frame, Newest, ShownProcess
+from tools.view.frame import SHOWN, SHOWN_OF_MODULES, Frame, Newest, ShownProcess
 from tools.view.live_orders import LiveOrders
 from tools.view.source import Order, Source
 
@@ -64,8 +63,8 @@ class LiveSource(Source):
             return
         session = self._session = open_session(self.robot, "view", self._fleet.run.path)
         self._newest.clear()
-        wanted = [(topic, "") for topic in (topics.PLANNER_STATUS, topics.WRENCH, topics.SIM_TRUTH)]
-        wanted += [(t, m) for t in (topics.JOINT_STATE, topics.JOINT_COMMAND) for m in MODULES]
+        wanted = [(topic, "") for topic in SHOWN]
+        wanted += [(t, m) for t in SHOWN_OF_MODULES for m in MODULES]
         self._latest = [(t, m, session.latest(t, t.type, m)) for t, m in wanted]
         if self._acting is not None:
             self._acting.begin(session)

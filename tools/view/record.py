@@ -7,7 +7,6 @@ from typing import Any
 
 import msgspec
 
-from shared.bus import topics
 from shared.bus.messages import Message
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_S
@@ -16,11 +15,8 @@ from shared.robot.joints import MODULES
 from tools.analysis.reports.run_data import RunData
 from tools.analysis.reports.timeline import timeline_events
 from tools.runs.run_log import RunLog
-from tools.view.frame import Frame, Newest
+from tools.view.frame import SHOWN, SHOWN_OF_MODULES, Frame, Newest
 from tools.view.source import Mark, Model, Source
-
-_SHOWN = (topics.PLANNER_STATUS, topics.WRENCH, topics.SIM_TRUTH)
-_SHOWN_OF_MODULES = (topics.JOINT_STATE, topics.JOINT_COMMAND)
 
 
 class _Key:
@@ -51,8 +47,8 @@ class RecordSource(Source):
         self.title = str(log.path)
         self._data = RunData(log)
         self._newest = Newest(robot)
-        wanted = [(topic, "") for topic in _SHOWN]
-        wanted += [(topic, module) for topic in _SHOWN_OF_MODULES for module in MODULES]
+        wanted = [(topic, "") for topic in SHOWN]
+        wanted += [(topic, module) for topic in SHOWN_OF_MODULES for module in MODULES]
         self._keys = [_Key(topic, m, log.messages(topic, m)) for topic, m in wanted]
         self._marks = tuple(
             Mark(event.t, event.kind, event.text) for event in timeline_events(self._data)

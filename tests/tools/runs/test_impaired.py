@@ -82,7 +82,8 @@ def test_a_module_is_touched_by_its_own_links_only() -> None:
 
 def judged(**figures: object) -> Summary:
     return {
-        "stood": True, "duration_s": 8.0, "in_real_time": True, "stopped": [], **figures,
+        "stood": True, "duration_s": 8.0, "in_real_time": True, "stopped": [], "stalls": [],
+        "drop_outs": [], "across_stalls": [], **figures,
     }  # fmt: skip
 
 
@@ -98,8 +99,8 @@ def test_a_limit_passed_with_links_impaired_is_marked_and_otherwise_not() -> Non
     assert verdict_table.mark(row, over) == "over"
     assert verdict_table.mark(row, over | {"links_impaired": 1}) == "over, links impaired"
     cpu = next(row for row in LIMITS if row.key == "fleet_cpu_pct")
-    busy = {cpu.key: cpu.limit + 1.0, "links_impaired": 1}
-    assert verdict_table.mark(cpu, busy) == "over", "no link makes a machine busy"
+    busy = judged(fleet_cpu_pct=cpu.limit + 1.0, links_impaired=1)
+    assert verdict_table.mark(cpu, busy) == "over, a busy machine", "no link makes it busy"
     good = judged(alive_com_y_max_mm=row.limit, links_impaired=1)
     assert verdict_table.mark(row, good) == "ok"
 

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from shared.bus import topics
 from shared.bus.messages import JointState, SimTruth
 from shared.robot.joints import MODULES
-from tests.tools.analysis.reports.runs import make
+from tests.tools.analysis.reports.runs import make, rewritten
 from tests.tools.runs.split_runs import recorded_in_parts
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run
+from tools.runs.stalls import MACHINE, Stall
 from tools.view.record import RecordSource
 from tools.view.source import Order
 
@@ -50,6 +52,20 @@ def test_a_frame_holds_the_newest_messages_at_its_time(log: RunLog, source: Reco
             assert frame.modes[index] == newest.mode
     assert model.begin_s <= 0.0 < model.end_s
     assert {"kill", "push", "fault"} <= {mark.kind for mark in model.marks}
+
+
+def test_a_stall_of_the_machine_is_shown_for_moments_after_it_and_marked(
+    log: RunLog, tmp_path: Path
+) -> None:
+    zero_ns = next(row.t_ns for row in log.messages(topics.SIM_TRUTH) if row.scenario_s >= 0.0)
+    event = Stall(zero_ns + 2_430_000_000, zero_ns + 2_493_000_000, MACHINE).event(99, zero_ns)
+    more = [(event.t_ns, "run/event", msgspec.json.encode(event))]
+    found = rewritten(log, tmp_path, more=more)
+    source = RecordSource(found, robot_of(found))
+    shown = [source.frame(t_s) for t_s in (2.4, 2.6, 3.1, 2.6)]
+    words = "the machine stood still for 63 ms"
+    assert [frame and frame.stall for frame in shown] == ["", words, words, words]
+    assert [mark.text for mark in source.model().marks if mark.kind == "stall"] == [words]
 
 
 def test_an_unfinished_record_is_shown_as_far_as_it_goes(

@@ -1,7 +1,7 @@
 // What uPlot does not draw: event marks, limits, state bars. All in CSS pixels.
 
 const MARK_COLOURS = {
-  kill: "--bad", fall: "--bad", estop: "--bad", fault: "--warn", network: "--warn", restart: "--good", push: "--muted",
+  kill: "--bad", fall: "--bad", estop: "--bad", fault: "--warn", stall: "--warn", network: "--warn", restart: "--good", push: "--muted",
 };
 const MARKS_ROOM = 44, ROW = 18, ROW_NARROW = 30;
 

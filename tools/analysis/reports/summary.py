@@ -88,7 +88,9 @@ class Judge:
         if not whole:
             return RunVerdict("A part of a run, and its figures: no verdict", None, _rows(summary))
         lines = _verdict_lines(summary)
-        caution = "" if summary["in_real_time"] else lines[-2]
+        cautions = verdict_table.stalls(summary)
+        cautions += [] if summary["in_real_time"] else [lines[-2]]
+        caution = "; ".join(cautions)
         return RunVerdict(lines[-1], bool(summary["stood"]), _rows(summary), caution)
 
 

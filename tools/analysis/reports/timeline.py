@@ -32,6 +32,7 @@ from tools.analysis.reports.page_model import TimelineEvent
 from tools.analysis.reports.run_data import RunData, module_of
 from tools.analysis.reports.signals import GAP_S, Span, message_times
 from tools.runs.impairment_intervals import impairments
+from tools.runs.stalls import stalls_of
 
 TOGETHER_S: Final = 0.1
 """Equal changes of several modules within this time share one row."""
@@ -48,6 +49,7 @@ KINDS: Final = {
     RunEventKind.RESTARTED: "restart",
     RunEventKind.PUSHED: "push",
     RunEventKind.FAULTED: "fault",
+    RunEventKind.STALLED: "stall",
     RunEventKind.STARTED: "note",
     RunEventKind.FINISHED: "note",
 }
@@ -114,6 +116,8 @@ def _run_events(run: RunData) -> Iterator[TimelineEvent]:
             mark = mark or f"{event.subject} back"
         if kind == "push":
             mark = f"push {event.detail.partition(' for ')[0]}"
+        if kind == "stall":
+            mark = "stall"
         yield TimelineEvent(run.at(event.t_ns), kind, text, mark)
     last = None
     for stop in run.log.messages(topics.ESTOP):
@@ -145,6 +149,7 @@ def _describe_run_event(event: RunEvent) -> str:
         RunEventKind.PUSHED: f"push {event.detail}",
         RunEventKind.FINISHED: f"{event.subject} ends {event.detail}".strip(),
         RunEventKind.FAULTED: f"{event.subject}: fault {event.detail} begins",
+        RunEventKind.STALLED: "".join(stall.words for stall in stalls_of([event])),
     }
     other = f"{event.subject} {name_of(RunEventKind, event.kind)} {event.detail}"
     return texts.get(_member(RunEventKind, event.kind), other.strip())

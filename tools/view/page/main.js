@@ -161,6 +161,7 @@ function show(frame) {
   newest = frame;
   $("time").textContent = frame.t_s.toFixed(1);
   $("height").textContent = frame.torso[2].toFixed(3);
+  $("stall").textContent = frame.stall;
   $("hand").textContent = Math.round(frame.force[2]) || 0;  // never -0
   const planner = frame.planner, age = Math.max(...frame.ages_ms);
   $("age").textContent = age >= 0 ? age.toFixed(0) : "–";

@@ -1,0 +1,267 @@
+"""A machine that stands still: found, told once, recorded, and judged apart."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shared.bus import topics
+from shared.bus.messages import Cause, JointEvent, JointState, Mode, RunEvent, RunEventKind
+from shared.bus.topics import Topic
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.robot.joints import MODULES
+from tests.shared.mcap_log.runs import sample
+from tests.tools.runs.test_impaired import judged, shown
+from tools import cli
+from tools.fleet.stall_watch import ANY_CORE, Gap
+from tools.runs import verdict, verdict_table
+from tools.runs.run_log import RunLog, read_run
+from tools.runs.stalls import (
+    CATCH_UP_NS,
+    MACHINE,
+    MERGE_NS,
+    SERVICES,
+    CommonSilence,
+    Stall,
+    StallFinder,
+    disturbances,
+    drop_outs,
+    merged,
+    stalls_of,
+)
+from tools.runs.verdict_limits import LIMITS
+
+CYCLE_MS = 4
+
+
+def ms(value: float) -> int:
+    return round(value * NS_PER_MS)
+
+
+def states_of(stops_ms: Sequence[tuple[float, float]], until_ms: int = 400) -> list[JointState]:
+    """Return the states of a module that sends every 4 ms, except while it is stopped."""
+    sent, t = [], 0.0
+    while t < until_ms:
+        stop = next(((a, b) for a, b in stops_ms if a <= t < b), None)
+        t = stop[1] if stop else t
+        sent.append(sample(JointState, t_ns=ms(t), seq=len(sent) + 1))
+        t += CYCLE_MS
+    return sent
+
+
+def found_in(states: dict[str, list[JointState]], every: int = 1) -> list[Stall]:
+    silences = CommonSilence()
+    rows = sorted(
+        (state.t_ns, module, state) for module, sent in states.items() for state in sent[::every]
+    )
+    stalls = (silences.feed(module, state) for _, module, state in rows)
+    return [stall for stall in stalls if stall is not None]
+
+
+@pytest.mark.parametrize("every", [1, 3], ids=["each state is seen", "one of three is seen"])
+def test_a_time_in_which_no_module_sends_is_a_stall_of_the_services(every: int) -> None:
+    states = {module: states_of([(100 + i, 180 + i)]) for i, module in enumerate(MODULES)}
+    (stall,) = found_in(states, every)
+    assert stall.who == SERVICES
+    assert stall.lasted_ms == pytest.approx(80, abs=3 * CYCLE_MS)
+    assert stall.begin_ns == pytest.approx(ms(100), abs=ms(2 * every * CYCLE_MS))
+
+
+@pytest.mark.parametrize(
+    "silent", [MODULES[:5], MODULES[:1], ()], ids=["all but one", "one", "none"]
+)
+def test_while_one_module_sends_nothing_stands_still(silent: Sequence[str]) -> None:
+    states = {module: states_of([(100, 180)] if module in silent else []) for module in MODULES}
+    assert found_in(states) == []
+
+
+def test_a_module_that_died_long_before_has_no_part_in_a_stall() -> None:
+    states = {module: states_of([(1900, 1980)], 2400) for module in MODULES[1:]}
+    states[MODULES[0]] = states_of([], 400)
+    assert len(found_in(states)) == 1
+
+
+def test_silences_of_modules_one_after_the_other_are_no_stall() -> None:
+    states = {m: states_of([(100 + 50 * i, 140 + 50 * i)]) for i, m in enumerate(MODULES)}
+    assert found_in(states) == []
+
+
+def test_a_service_that_starts_again_and_counts_from_one_is_no_stall() -> None:
+    states = {module: states_of([]) for module in MODULES}
+    for module in MODULES:
+        later = [sample(JointState, t_ns=ms(900 + 4 * i), seq=i + 1) for i in range(20)]
+        states[module] = states[module][:50] + later
+    assert found_in(states) == []
+
+
+A = Stall(ms(100), ms(160), "core 0")
+
+
+@pytest.mark.parametrize(
+    ("others", "cores", "who"),
+    [
+        ([], 2, "core 0"),
+        ([A._replace(who="core 1")], 2, MACHINE),
+        ([A._replace(who="core 1")], 4, "core 0 and core 1"),
+        ([A._replace(who=SERVICES, end_ns=ms(190))], 2, "core 0"),
+        ([A._replace(who=MACHINE)], 2, MACHINE),
+    ],
+)
+def test_what_overlaps_is_one_stall_of_all_that_stood_still(
+    others: list[Stall], cores: int, who: str
+) -> None:
+    (stall,) = merged([A, *others], cores)
+    assert stall.who == who
+    assert stall.end_ns == max(row.end_ns for row in [A, *others])
+
+
+def test_what_does_not_overlap_are_stalls_of_their_own() -> None:
+    later = A._replace(begin_ns=ms(170), end_ns=ms(200))
+    assert merged([later, A], 2) == [A, later]
+
+
+def test_a_live_stall_is_told_once_whatever_finds_it() -> None:
+    gaps = [Gap(ms(180), ms(76), core, ms(70)) for core in (0, 1)]
+    finder = StallFinder(2, lambda: [gaps.pop()] if gaps else [])
+    told = []
+    for state in states_of([(100, 182)]):
+        for module in MODULES:
+            finder.hear(module, state)
+        told += finder.take(state.t_ns, 1.0) if state.t_ns > ms(180) else []
+    (stall,) = told
+    assert (stall.who, stall.stolen_ms) == (MACHINE, 70.0)
+    assert stall.words == "the machine stood still for 86 ms, 70 ms taken by its host"
+
+
+def test_in_slow_motion_a_stall_is_as_long_as_the_fleets_clock_says() -> None:
+    gaps = [Gap(ms(1000), ms(80), ANY_CORE, 0)]
+    finder = StallFinder(2, lambda: [gaps.pop()] if gaps else [])
+    assert finder.take(ms(500), 0.5) == []
+    (stall,) = finder.take(ms(500) + MERGE_NS, 0.5)
+    assert stall == Stall(ms(460), ms(500), MACHINE)
+
+
+@given(
+    st.integers(ms(1e5), ms(1e9)),
+    st.integers(ms(20), ms(9e4)),
+    st.sampled_from([MACHINE, "core 3"]),
+)
+def test_an_event_in_the_record_gives_the_stall_again(end_ns: int, long_ns: int, who: str) -> None:
+    stall = Stall(end_ns - long_ns, end_ns, who, 30.0)
+    (found,) = stalls_of([stall.event(1, 0)])
+    assert found.begin_ns == pytest.approx(stall.begin_ns, abs=ms(0.051))
+    assert found[1:] == stall[1:]
+
+
+@pytest.mark.parametrize("detail", ["", "63 ms", "x ms, stolen 0 ms", "inf ms, stolen 0 ms"])
+def test_a_stall_in_other_words_is_left_out(detail: str) -> None:
+    event = A.event(1, 0)
+    assert stalls_of([sample(RunEvent, kind=int(RunEventKind.STALLED), detail=detail)]) == []
+    assert len(stalls_of([event])) == 1
+
+
+@dataclass
+class Log:
+    """The events of a run."""
+
+    run: list[RunEvent]
+    joints: dict[str, list[JointEvent]] = field(default_factory=dict)
+
+    def messages(self, topic: Topic, module: str = "") -> list[Any]:
+        return self.run if topic is topics.RUN_EVENT else self.joints.get(module, [])
+
+
+def change(t_ms: float, before: Mode, after: Mode) -> JointEvent:
+    cause = Cause.COMMAND_STALE if before is Mode.TRACK else Cause.COMMANDS_FRESH
+    return sample(
+        JointEvent, t_ns=ms(t_ms), mode_before=int(before), mode_after=int(after), cause=int(cause)
+    )
+
+
+def held(from_ms: float, to_ms: float) -> list[JointEvent]:
+    return [change(from_ms, Mode.TRACK, Mode.HOLD), change(to_ms, Mode.HOLD, Mode.TRACK)]
+
+
+def test_a_hold_by_a_stall_is_apart_until_the_robot_has_caught_up() -> None:
+    log: Any = Log([A.event(1, 0)], {MODULES[0]: held(170, 600), MODULES[1]: held(172, 640)})
+    (row,) = disturbances(log, 0, 5 * NS_PER_S)
+    assert (row.begin_ns, row.held_until_ns, row.held) == (A.begin_ns, ms(640), 2)
+    assert row.end_ns == ms(640) + CATCH_UP_NS
+    assert drop_outs(log, [row], 0, 5 * NS_PER_S) == []
+
+
+def test_a_hold_long_after_a_stall_is_none_of_its_doing() -> None:
+    log: Any = Log([A.event(1, 0)], {module: held(900, 1400) for module in MODULES})
+    (row,) = disturbances(log, 0, 5 * NS_PER_S)
+    assert (row.held_until_ns, row.held) == (None, 0)
+    assert row.end_ns < ms(200)
+    (line,) = drop_outs(log, [row], 0, 5 * NS_PER_S)
+    assert line == "0.90 s: all six left TRACK, COMMAND_STALE; no stall was measured then"
+
+
+def test_a_kill_ends_what_a_stall_is_the_reason_of() -> None:
+    kill = sample(RunEvent, t_ns=ms(500), kind=int(RunEventKind.KILLED))
+    log: Any = Log([A.event(1, 0), kill], {MODULES[0]: [change(170, Mode.TRACK, Mode.HOLD)]})
+    (row,) = disturbances(log, 0, 5 * NS_PER_S)
+    assert (row.end_ns, row.held_until_ns, row.held) == (ms(500), None, 1)
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory: pytest.TempPathFactory) -> RunLog:
+    """A planner that stands still for 80 ms while the hand leads down; as by a stall of it all."""
+    out = tmp_path_factory.mktemp("stalled")
+    flags = ("--kill", "planner@1.2:STOP", "--restart", "planner@1.28", "--duration", "4")
+    assert cli.main(["sim", *flags, "--out", str(out)]) == 0
+    return read_run(out / "run.mcap")
+
+
+def test_figures_leave_out_what_a_stall_made_of_a_run_and_a_line_tells_it(stopped: RunLog) -> None:
+    events = stopped.messages(topics.RUN_EVENT)
+    (stop,) = (row for row in events if row.kind == RunEventKind.KILLED)
+    kept = [row for row in events if row.kind == RunEventKind.STARTED]
+    zero_ns = round(stop.t_ns - stop.scenario_s * NS_PER_S)
+    stall = Stall(stop.t_ns, stop.t_ns + ms(80), MACHINE)
+    series = stopped._series[topics.RUN_EVENT.key(stopped.robot)]
+    try:
+        series.decoded = [*kept]
+        without = verdict.summarise(stopped, 4.0)
+        series.decoded = [*kept, stall.event(9, zero_ns)]
+        apart = verdict.summarise(stopped, 4.0)
+    finally:
+        series.decoded = events
+    (force,) = (row for row in LIMITS if row.key == "operator_peak_n")
+    assert verdict_table.mark(force, without) == "over"
+    assert any("all six left TRACK, COMMAND_STALE" in line for line in without["drop_outs"])
+    assert verdict_table.mark(force, apart) == "ok"
+    assert apart["drop_outs"] == []
+    (row,) = apart["stalls"]
+    assert row["modules_held"] == 6
+    assert row["operator_peak_n"] == pytest.approx(without["operator_peak_n"])
+    assert "the machine stood still for 80 ms: all six held until" in row["said"]
+    words = shown(apart | {"stopped": []})
+    assert row["said"] in words
+    assert "leave out what a stall made of the run" in words
+
+
+def test_messages_lost_in_a_stall_name_it_and_stalls_without_effect_share_a_line() -> None:
+    row = {"said": "6.58 s: x", "modules_held": 0, "messages_lost": 2, "lasted_ms": 63.0}
+    quiet = [row | {"messages_lost": 0, "lasted_ms": length} for length in (21.0, 34.0)]
+    summary = judged(sequence_gaps=2, stalls=[row, *quiet], across_stalls=["sequence_gaps"])
+    words = shown(summary)
+    assert re.search(r"messages lost on the way .* the machine stood still", words)
+    assert "6.58 s: x\n2 more stalls without consequence, 34 ms at most\n" in words
+    assert "does not decide" not in words
+
+
+def test_a_demo_without_stalls_says_nothing_of_them(tmp_path: Path) -> None:
+    assert cli.main(["sim", "--duration", "1", "--out", str(tmp_path)]) == 0
+    summary = verdict.summarise(read_run(tmp_path / "run.mcap"), 1.0)
+    assert (summary["stalls"], summary["across_stalls"], summary["drop_outs"]) == ([], [], [])
+    assert verdict_table.stalls(summary) == []

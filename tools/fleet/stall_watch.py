@@ -1,0 +1,131 @@
+"""Idle real-time threads, one a core: what delays them is the machine, and nothing that runs on it.
+
+Run as a program (`python stall_watch.py FILE`) it appends a line for each gap, and ends with the
+process that started it. It imports the standard library alone, so that it is up at once.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Final, NamedTuple, Self
+
+PERIOD_NS: Final = 4_000_000
+GAP_NS: Final = 20_000_000
+"""A delay beyond the period that counts: with some milliseconds of network, an age of 50 ms."""
+PRIORITY: Final = 90
+"""Above every service (`shared.scheduling`)."""
+CORES_MAX: Final = 8
+"""With more cores one thread wanders: so many wake-ups would be a load of their own."""
+ANY_CORE: Final = -1
+_STEAL_EVERY: Final = 50
+_STEAL_FIELD: Final = 8
+_NS_PER_TICK: Final = 1_000_000_000 // os.sysconf("SC_CLK_TCK")
+
+
+class Gap(NamedTuple):
+    """Time in which a core ran nothing. All times are of CLOCK_MONOTONIC."""
+
+    end_ns: int
+    lasted_ns: int
+    core: int
+    """`ANY_CORE`: no thread was bound to one."""
+    stolen_ns: int
+    """So much of it the host of a virtual machine took away, by /proc/stat, in ticks of 10 ms."""
+
+
+class StallWatch:
+    """The program beside a fleet, from `__enter__` to `__exit__`."""
+
+    def __init__(self, path: Path) -> None:
+        """Take the file for the gaps; it is made."""
+        self._path = path
+
+    def __enter__(self) -> Self:
+        """Start."""
+        self._path.touch()
+        self._file = self._path.open("rb")
+        self._process = subprocess.Popen(
+            [sys.executable, "-I", "-S", __file__, str(self._path)], stdin=subprocess.DEVNULL
+        )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End the program."""
+        self._process.kill()
+        self._process.wait()
+        self._file.close()
+
+    def take(self) -> list[Gap]:
+        """Return the gaps since the last call."""
+        lines = self._file.readlines()
+        if lines and not lines[-1].endswith(b"\n"):  # the rest is being written
+            self._file.seek(-len(lines.pop()), os.SEEK_CUR)
+        return [_parsed(line) for line in lines]
+
+
+def gaps_in(path: Path, from_ns: int = 0) -> list[Gap]:
+    """Return what was written, from a time on; a last line that is not whole is left out."""
+    lines = path.read_bytes().splitlines(keepends=True)
+    found = [_parsed(line) for line in lines if line.endswith(b"\n")]
+    return [gap for gap in found if gap.end_ns >= from_ns]
+
+
+def _parsed(line: bytes) -> Gap:
+    return Gap(*map(int, line.split()))
+
+
+def watch(path: Path) -> None:
+    """Write gaps until the process that started this one is no more."""
+    parent = os.getppid()
+    descriptor = os.open(path, os.O_WRONLY | os.O_APPEND)
+    cores = sorted(os.sched_getaffinity(0))
+    # A thread without real time waits its turn: on its core it would take other work for a stall.
+    bound = _takes_real_time() and len(cores) <= CORES_MAX
+    for core in cores[1:] if bound else ():
+        threading.Thread(target=_watch_core, args=(descriptor, core, parent)).start()
+    _watch_core(descriptor, cores[0] if bound else ANY_CORE, parent)
+
+
+def _takes_real_time() -> bool:
+    with suppress(PermissionError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))  # threads inherit it
+        return True
+    return False
+
+
+def _watch_core(descriptor: int, core: int, parent: int) -> None:
+    if core != ANY_CORE:
+        os.sched_setaffinity(0, {core})
+    looks, stolen_ns, last_ns = 0, _stolen_ns(core), time.monotonic_ns()
+    while os.getppid() == parent:
+        time.sleep(PERIOD_NS / 1e9)
+        now_ns = time.monotonic_ns()
+        lasted_ns = now_ns - last_ns - PERIOD_NS
+        looks += 1
+        if lasted_ns > GAP_NS:
+            before_ns, stolen_ns = stolen_ns, _stolen_ns(core)
+            taken_ns = min(lasted_ns, stolen_ns - before_ns)
+            os.write(descriptor, b"%d %d %d %d\n" % (now_ns, lasted_ns, core, taken_ns))
+        elif looks % _STEAL_EVERY == 0:
+            stolen_ns = _stolen_ns(core)
+        last_ns = now_ns
+
+
+def _stolen_ns(core: int) -> int:
+    """Return the time stolen from a core since the machine started; of all cores together."""
+    name = b"cpu " if core == ANY_CORE else b"cpu%d " % core
+    for line in Path("/proc/stat").read_bytes().splitlines():
+        if line.startswith(name):
+            fields = line.split()
+            return int(fields[_STEAL_FIELD]) * _NS_PER_TICK if len(fields) > _STEAL_FIELD else 0
+    return 0
+
+
+if __name__ == "__main__":
+    watch(Path(sys.argv[1]))

@@ -1,0 +1,358 @@
+"""Stalls: times in which the machine, or all that ran of the fleet, stood still.
+
+A module that gets no command in time holds, as it should: a run is judged apart from what a stall
+made of it. Whoever leads a run finds stalls and puts them into its record; all others read them
+there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.bus import topics
+from shared.bus.code_names import name_of
+from shared.bus.messages import (
+    Cause,
+    JointEvent,
+    JointState,
+    Mode,
+    RunEvent,
+    RunEventKind,
+    SimTruth,
+)
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.mcap_log.sequence_stats import KeyCount
+from shared.robot.joints import MODULES
+from tools.fleet.stall_watch import ANY_CORE, GAP_NS, Gap
+from tools.runs.run_log import RunLog
+
+MACHINE: Final = "the machine"
+SERVICES: Final = "all joint services"
+PERIOD_NS: Final = round(NS_PER_S / topics.JOINT_STATE.rate_hz)
+ALIVE_NS: Final = NS_PER_S
+"""A module that was silent for longer before a stall has no part in it."""
+MERGE_NS: Final = 50 * NS_PER_MS
+"""So late two ways of finding one stall tell it."""
+DROP_OUT_NS: Final = 150 * NS_PER_MS
+"""A module that loses TRACK so soon after a stall does so for it: commands grow too old."""
+CATCH_UP_NS: Final = NS_PER_S
+"""So long after the modules track again the robot catches up with the hand."""
+STALL_SHOWN_NS: Final = 2 * NS_PER_S
+"""So long a display tells of a stall."""
+TOGETHER_NS: Final = 100 * NS_PER_MS
+"""Drop-outs of several modules within this time share a line."""
+ARRIVE_NS: Final = 250 * NS_PER_MS
+"""So long after a stall messages pile up, and may be lost."""
+
+
+class Stall(NamedTuple):
+    """Time in which something stood still, monotonic as of messages."""
+
+    begin_ns: int
+    end_ns: int
+    who: str
+    """`MACHINE`, one of its cores, or `SERVICES`."""
+    stolen_ms: float = 0.0
+    """So much of it was taken by the host of a virtual machine."""
+
+    @property
+    def lasted_ms(self) -> float:
+        """How long it was."""
+        return (self.end_ns - self.begin_ns) / NS_PER_MS
+
+    @property
+    def words(self) -> str:
+        """For example `the machine stood still for 63 ms`."""
+        taken = f", {self.stolen_ms:.0f} ms taken by its host" if self.stolen_ms else ""
+        return f"{self.who} stood still for {self.lasted_ms:.0f} ms{taken}"
+
+    def event(self, seq: int, scenario_zero_ns: int) -> RunEvent:
+        """Return the event that `stalls_of` reads."""
+        return RunEvent(
+            t_ns=self.end_ns,
+            seq=seq,
+            kind=int(RunEventKind.STALLED),
+            subject=self.who,
+            detail=f"{self.lasted_ms:.1f} ms, stolen {self.stolen_ms:.0f} ms",
+            scenario_s=(self.begin_ns - scenario_zero_ns) / NS_PER_S,
+        )
+
+
+def stalls_of(events: Iterable[RunEvent]) -> list[Stall]:
+    """Return the stalls among a run's events; those of another form are left out."""
+    found = []
+    for event in events:
+        words = event.detail.split()
+        if event.kind != RunEventKind.STALLED or len(words) < 5:
+            continue
+        try:
+            lasted_ms, stolen_ms = float(words[0]), float(words[3])
+            begin_ns = event.t_ns - round(lasted_ms * NS_PER_MS)
+        except (ValueError, OverflowError):  # written by hand: infinite, or no number
+            continue
+        found.append(Stall(begin_ns, event.t_ns, event.subject, stolen_ms))
+    return found
+
+
+class CommonSilence:
+    """Finds when every joint service that was alive sent nothing, from the states that are seen.
+
+    Not every state need be seen: the sequence number tells how many there were between two.
+    """
+
+    def __init__(self) -> None:
+        self._last: dict[str, tuple[int, int]] = {}
+        self._silent: dict[str, tuple[int, int]] = {}
+
+    def feed(self, module: str, state: JointState) -> Stall | None:
+        """Take a state; return the stall that it is the last to tell of."""
+        t_ns, seq = self._last.get(module, (state.t_ns, state.seq - 1))
+        self._last[module] = state.t_ns, state.seq
+        between = state.seq - seq - 1
+        silent_ns = state.t_ns - t_ns - between * PERIOD_NS
+        if between < 0 or silent_ns <= PERIOD_NS + GAP_NS:
+            return None
+        self._silent[module] = t_ns, t_ns + silent_ns
+        alive = [one for one, (at_ns, _) in self._last.items() if at_ns > t_ns - ALIVE_NS]
+        if not self._silent.keys() >= set(alive):
+            return None
+        begin_ns = max(self._silent[one][0] for one in alive)
+        end_ns = min(self._silent[one][1] for one in alive)
+        if len(alive) < 2 or end_ns - begin_ns <= GAP_NS:
+            return None
+        self._silent.clear()
+        return Stall(begin_ns, end_ns, SERVICES)
+
+
+class StallFinder:
+    """Finds the stalls of a live run, each once, whatever told of it."""
+
+    def __init__(self, cores: int, gaps: Callable[[], Sequence[Gap]]) -> None:
+        """Take what watches.
+
+        Args:
+            cores: how many threads watch a core of their own; fewer gaps are not the machine's.
+            gaps: returns the new ones, CLOCK_MONOTONIC.
+        """
+        self._cores, self._gaps = cores, gaps
+        self._silences = CommonSilence()
+        self._pending: list[Stall] = []
+
+    def hear(self, module: str, state: JointState) -> None:
+        """Take a state of a module."""
+        stall = self._silences.feed(module, state)
+        if stall is not None:
+            self._pending.append(stall)
+
+    def take(self, now_ns: int, pace: float) -> list[Stall]:
+        """Return what has ended some moments ago and was not returned before, in order.
+
+        Args:
+            now_ns: fleet's clock.
+            pace: its rate beside CLOCK_MONOTONIC.
+        """
+        for gap in self._gaps():
+            end_ns, lasted_ns = int(pace * gap.end_ns), int(pace * gap.lasted_ns)
+            who = MACHINE if gap.core == ANY_CORE else f"core {gap.core}"
+            stolen_ms = pace * gap.stolen_ns / NS_PER_MS
+            self._pending.append(Stall(end_ns - lasted_ns, end_ns, who, stolen_ms))
+        if not self._pending or now_ns < MERGE_NS + max(row.end_ns for row in self._pending):
+            return []
+        found, self._pending = merged(self._pending, self._cores), []
+        return found
+
+
+def merged(stalls: Iterable[Stall], cores: int) -> list[Stall]:
+    """Return stalls that overlap as one: the machine's if it, or all its cores, had a part in it.
+
+    Args:
+        stalls: in any order.
+        cores: that are watched, each by itself.
+    """
+    groups: list[list[Stall]] = []
+    end_ns = -1
+    for stall in sorted(stalls):
+        if stall.begin_ns > end_ns:
+            groups.append([])
+            end_ns = stall.end_ns
+        groups[-1].append(stall)
+        end_ns = max(end_ns, stall.end_ns)
+    return [_joined(group, cores) for group in groups]
+
+
+def _joined(group: Sequence[Stall], cores: int) -> Stall:
+    names = {row.who for row in group} - {SERVICES}
+    who = min(names) if len(names) == 1 else MACHINE if names else SERVICES
+    if names and MACHINE not in names and 1 < len(names) < cores:
+        who = " and ".join(sorted(names))
+    return Stall(
+        min(row.begin_ns for row in group),
+        max(row.end_ns for row in group),
+        who,
+        max(row.stolen_ms for row in group),
+    )
+
+
+class Disturbance(NamedTuple):
+    """What a stall made of a run, for as long as it is judged apart."""
+
+    stall: Stall
+    begin_ns: int
+    end_ns: int
+    held_until_ns: int | None
+    """When all modules tracked again; None: none held, or they did not track again."""
+    held: int
+    """Number of modules that went to HOLD."""
+
+
+def disturbances(log: RunLog, begin_ns: int, end_ns: int) -> list[Disturbance]:
+    """Return what each stall of a part of a run made of it.
+
+    Args:
+        log: the run.
+        begin_ns: of the part, monotonic.
+        end_ns: of the part; what a stall made ends there at the latest.
+    """
+    events: list[RunEvent] = log.messages(topics.RUN_EVENT)
+    stalls = [row for row in stalls_of(events) if begin_ns <= row.begin_ns <= end_ns]
+    if not stalls:
+        return []
+    kills = [row.t_ns for row in events if row.kind == RunEventKind.KILLED]
+    transitions = {name: log.messages(topics.JOINT_EVENT, name) for name in MODULES}
+    found = []
+    for stall in stalls:
+        limit_ns = min([t_ns for t_ns in kills if t_ns >= stall.begin_ns] + [end_ns])
+        backs_ns = [
+            back_ns
+            for rows in transitions.values()
+            if (back_ns := _back_ns(rows, stall)) is not None
+        ]
+        until_ns = max(backs_ns, default=stall.end_ns)
+        held_until_ns = int(until_ns) if backs_ns and until_ns < limit_ns else None
+        catch_up_ns = CATCH_UP_NS if backs_ns else PERIOD_NS
+        last_ns = int(min(until_ns + catch_up_ns, limit_ns))
+        found.append(Disturbance(stall, stall.begin_ns, last_ns, held_until_ns, len(backs_ns)))
+    return found
+
+
+def _back_ns(rows: Sequence[JointEvent], stall: Stall) -> float | None:
+    """Return when a module that a stall made hold tracked again; infinite if it never did."""
+    dropped = False
+    for row in rows:
+        if dropped and row.mode_after == Mode.TRACK:
+            return row.t_ns
+        in_time = stall.begin_ns <= row.t_ns <= stall.end_ns + DROP_OUT_NS
+        dropped |= in_time and row.mode_before == Mode.TRACK
+    return math.inf if dropped else None
+
+
+def inside(rows: Iterable[Disturbance], times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return for each time whether it is judged apart."""
+    mask = np.zeros(len(times_ns), dtype=bool)
+    for row in rows:
+        mask |= (times_ns >= row.begin_ns) & (times_ns <= row.end_ns)
+    return mask
+
+
+def as_dicts(
+    log: RunLog, rows: Sequence[Disturbance], truth: Sequence[SimTruth], zero_ns: int
+) -> list[dict[str, Any]]:
+    """Return disturbances as plain values, with what the robot did meanwhile.
+
+    Args:
+        log: the run.
+        rows: in order.
+        truth: of the part that is judged.
+        zero_ns: of the times, which are s.
+    """
+    lost = _lost(log, rows)
+    times_ns = np.array([row.t_ns for row in truth])
+    found = []
+    for row, missing in zip(rows, lost, strict=True):
+        first, last = np.searchsorted(times_ns, (row.begin_ns, row.end_ns + 1))
+        meanwhile = truth[first:last]
+        values: dict[str, Any] = {
+            "at_s": (row.begin_ns - zero_ns) / NS_PER_S,
+            "who": row.stall.who,
+            "lasted_ms": row.stall.lasted_ms,
+            "stolen_ms": row.stall.stolen_ms,
+            "modules_held": row.held,
+            "held_until_s": row.held_until_ns and (row.held_until_ns - zero_ns) / NS_PER_S,
+            "operator_peak_n": max((abs(one.operator_force[2]) for one in meanwhile), default=None),
+            "com_x_max_mm": max((1e3 * abs(one.over[0]) for one in meanwhile), default=None),
+            "messages_lost": missing,
+        }
+        found.append(values | {"said": _said(row.stall.words, values)})
+    return found
+
+
+def _said(words: str, values: dict[str, Any]) -> str:
+    """Return for example `6.58 s: the machine stood still for 63 ms: all six held until 7.12 s`."""
+    parts = [f"{values['at_s']:.2f} s: {words}"]
+    if values["modules_held"]:
+        who = "all six" if values["modules_held"] == len(MODULES) else values["modules_held"]
+        until = values["held_until_s"]
+        parts[0] += f": {who} held" + (f" until {until:.2f} s" if until is not None else "")
+        if values["operator_peak_n"] is not None:
+            parts.append(f"hand at most {values['operator_peak_n']:.1f} N then")
+            parts.append(f"COM x at most {values['com_x_max_mm']:.1f} mm")
+    if values["messages_lost"]:
+        parts.append(f"messages lost: {values['messages_lost']}")
+    return ", ".join(parts)
+
+
+def _lost(log: RunLog, rows: Sequence[Disturbance]) -> list[int]:
+    """Return how many messages were lost on the way to the log in each disturbance."""
+    found = [0] * len(rows)
+    for key in log.keys() if rows else ():
+        count = KeyCount(several=topics.several_may_write(key))
+        before_ns = missing = 0
+        for at_ns, _, seq in log.raw(key):
+            count.feed(seq)
+            if count.missing > missing:
+                for place, row in enumerate(rows):
+                    if before_ns <= row.stall.end_ns + ARRIVE_NS and at_ns >= row.begin_ns:
+                        found[place] += count.missing - missing
+                        break
+            before_ns, missing = at_ns, count.missing
+    return found
+
+
+def drop_outs(log: RunLog, rows: Sequence[Disturbance], zero_ns: int, end_ns: int) -> list[str]:
+    """Return a line for each time that modules left TRACK, and no stall was the reason.
+
+    Args:
+        log: the run.
+        rows: what the stalls made of it.
+        zero_ns: from here on; times are s since then.
+        end_ns: up to here.
+    """
+    found = sorted(
+        (event.t_ns, module, name_of(Cause, event.cause))
+        for module in MODULES
+        for event in log.messages(topics.JOINT_EVENT, module)
+        if event.mode_before == Mode.TRACK and zero_ns <= event.t_ns < end_ns
+    )
+    apart = inside(rows, np.array([t_ns for t_ns, *_ in found], np.int64))
+    groups: list[list[tuple[int, str, str]]] = []
+    for row, is_apart in zip(found, apart, strict=True):
+        if is_apart:
+            continue
+        if not groups or row[0] - groups[-1][0][0] > TOGETHER_NS:
+            groups.append([])
+        groups[-1].append(row)
+    lines = []
+    for group in groups:
+        modules = [module for _, module, _ in group]
+        who = "all six" if len(set(modules)) == len(MODULES) else ", ".join(modules)
+        why = ", ".join(sorted({cause for *_, cause in group}))
+        lines.append(
+            f"{(group[0][0] - zero_ns) / NS_PER_S:.2f} s: {who} left TRACK, {why}; no stall was "
+            "measured then"
+        )
+    return lines
