@@ -29,12 +29,13 @@ _ALERTS: Final = {
     "CERTIFICATE_UNKNOWN": "it does not believe our certificate",
 }
 _VERDICTS: Final = {
-    "certificate is not yet valid": "is not valid yet",
-    "certificate has expired": "has expired",
-    "unable to get local issuer certificate": "is of another authority",
-    "self-signed certificate in certificate chain": "is of another authority",
-    "certificate signature failure": "is of another authority",
+    7: "is of another authority",  # certificate signature failure
+    9: "is not valid yet",
+    10: "has expired",
+    19: "is of another authority",  # self-signed certificate in certificate chain
+    20: "is of another authority",  # unable to get local issuer certificate
 }
+"""By OpenSSL's X509_V_ERR codes: its words change from version to version."""
 
 
 def own_fault(own: Credentials) -> str:
@@ -141,4 +142,4 @@ def _verdict(error: ssl.SSLCertVerificationError) -> str:
     if "mismatch" in found:
         return f"is another host's ({found})"
     now = f"{dt.datetime.now(dt.UTC):%Y-%m-%d %H:%M} UTC"
-    return f"{_VERDICTS.get(found, found)}, by this host's clock ({now})"
+    return f"{_VERDICTS.get(error.verify_code, found)}, by this host's clock ({now})"

@@ -114,6 +114,31 @@ def test_failures_are_listed_last_and_the_other_parts_are_run(root: Path, status
     assert last.count("== failed: ERROR tests/test_x.py") == 3
 
 
+def test_the_last_line_says_what_ran_and_what_was_skipped_and_why(root: Path) -> None:
+    skipped = "echo 'SKIPPED [4] tests/x.py:81: needs a Chromium'"
+    write_tool(root, "pytest", f"{skipped}; {skipped}; echo '=== 9 passed, 8 skipped in 3.1s ==='")
+    code, said = run(root)
+    last = said.splitlines()[-1]
+    assert code == 0
+    assert last.startswith("== passed in 1 min: ruff check, 0 s; ruff format --check, 0 s; mypy, 0")
+    assert "; 9 passed, 8 skipped in 3.1s (pytest -m live and not wide tests/system); " in last
+    assert last.endswith("; skipped: 24: needs a Chromium")
+    write_tool(root, "pytest", "echo '=== 9 passed in 3.1s ==='")
+    write_tool(root, "mypy", "exit 1")
+    last = run(root)[1].splitlines()[-1]
+    assert last.startswith("== FAILED in 1 min: ")
+    assert last.endswith("; skipped: nothing")
+
+
+def test_its_help_names_the_parts_and_runs_none(root: Path) -> None:
+    script = subprocess.run(
+        ["bash", "deploy/test", "--help"], cwd=root, capture_output=True, text=True, check=True
+    )
+    assert "Parts: ruff check, ruff format, mypy; tests without processes" in script.stdout
+    assert "Exits with 0 if every part passed" in script.stdout
+    assert "called" not in script.stdout
+
+
 @pytest.mark.parametrize("background", [False, True])
 @pytest.mark.parametrize("part", ["mypy", "pytest"])
 def test_ctrl_c_ends_all_of_it(root: Path, part: str, *, background: bool) -> None:

@@ -9,9 +9,12 @@ from __future__ import annotations
 
 import os
 import stat
+import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
+import pytest
 import tomli_w
 
 from shared.process import CHECKOUT
@@ -67,6 +70,8 @@ def make_hosts(base: Path, *, real: bool = False, running: bool = False) -> Path
         real: the hosts have this checkout with its environment; else scripts that only call back.
         running: their services are to run, so what files name has to be each host's own.
     """
+    if running and not _may_mount():
+        pytest.skip("no mount namespace here: each host is to have a folder of one name")
     (base / "bin").mkdir(parents=True)
     _script(base / "bin" / "ssh", SSH.format(base=base, shared=SHARED))
     for name, body in TOOLS.items():
@@ -95,6 +100,13 @@ def make_hosts(base: Path, *, real: bool = False, running: bool = False) -> Path
     }
     file.write_text(tomli_w.dumps(table), encoding="utf-8")
     return file
+
+
+@cache
+def _may_mount() -> bool:
+    user = [] if os.geteuid() == 0 else ["--user", "--map-root-user"]
+    said = subprocess.run(["unshare", *user, "--mount", "true"], capture_output=True, check=False)
+    return said.returncode == 0
 
 
 def _checkout(base: Path) -> Path:

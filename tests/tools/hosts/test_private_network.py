@@ -113,6 +113,8 @@ def test_the_services_wait_for_it_and_start_in_it(host: Host, robot: RobotConfig
         assert any(file.path.endswith("/xrl-net.service") for file in files)
         plain = msgspec.structs.replace(host, private=(), nic="")
         assert "netns" not in layout.unit(hosts, plain)
+        if shutil.which("ip") is None:
+            return
         with pytest.raises(FleetError, match="network namespace"):  # there is none here
             Remote(hosts, host).run("true", on_bus=True)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import msgspec
 import pytest
@@ -38,9 +39,13 @@ class FakePlanner:
 
 
 @pytest.fixture(autouse=True)
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(assist, "REPEAT_S", 0.001)
-    monkeypatch.setattr(assist, "HEARD_S", 0.05)
+def clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let time pass while the verb sleeps, and no more: no machine stalls here."""
+    now_s = [1000.0]
+    clock = SimpleNamespace(
+        monotonic=lambda: now_s[0], sleep=lambda s: now_s.__setitem__(0, now_s[0] + s)
+    )
+    monkeypatch.setattr(assist, "time", clock)
 
 
 def status(robot: RobotConfig, requested_by: str, given: float = 0.0) -> PlannerStatus:
