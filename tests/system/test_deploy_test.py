@@ -121,7 +121,7 @@ def test_the_last_line_says_what_ran_and_what_was_skipped_and_why(root: Path) ->
     code, said = run(root)
     last = said.splitlines()[-1]
     assert code == 0
-    assert re.match(r"== passed in 0 min \d+ s: ruff check, \d s; ruff format --check, \d s; ", last)
+    assert re.match(r"== passed in 0 min \d+ s: ruff check, \d s; ruff format --check, \d s;", last)
     assert "; 9 passed, 8 skipped in 3.1s (pytest -m live and not wide tests/system); " in last
     assert last.endswith("; skipped: 24: needs a Chromium")
     write_tool(root, "pytest", "echo '=== 9 passed in 3.1s ==='")

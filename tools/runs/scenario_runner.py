@@ -10,7 +10,7 @@ import math
 import os
 import signal
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Final, NamedTuple
 
 from shared.bus import topics
@@ -32,9 +32,8 @@ from shared.robot.joints import MODULES
 from tools.fleet import procfs
 from tools.fleet.pace import IDLE_LEAST, CoresFullError, IdleMeter, idle_and_total, idle_share
 from tools.fleet.proxy_client import ProxyClient
-from tools.fleet.stall_watch import StallWatch
 from tools.fleet.supervise import SupervisedFleet
-from tools.runs.stalls import STALL_SHOWN_NS, Stall, StallFinder
+from tools.runs.live_stalls import LiveStalls
 
 READY_TIMEOUT_S: Final = 45.0
 """Longer than all that a planner waits after the first five drop-outs: a machine may stall."""
@@ -158,11 +157,7 @@ class ScenarioRunner:
         self._note = ""
         self._pids: dict[str, int] = {}
         self._next_pids_s = 0.0
-        self._watch = StallWatch(fleet.run.path / STALLS_FILE)
-        self._finder = StallFinder(len(os.sched_getaffinity(0)), self._watch.take)
-        self._stalls: list[Stall] = []
-        self._shown_stall: Stall | None = None
-        self._stall_held = 0
+        self._stalls = LiveStalls()
         self._killed = False
 
     def run(self, is_over: Callable[[], bool] = lambda: False) -> EndOfRun:
@@ -177,7 +172,7 @@ class ScenarioRunner:
             RunError: the robot did not come to stand, or the simulated world went silent.
             FleetError: a service that was to be restarted could not be.
         """
-        with self._watch:
+        with self._stalls.watched(self._fleet.run.path / STALLS_FILE):
             return self._run(is_over)
 
     def _run(self, is_over: Callable[[], bool]) -> EndOfRun:
@@ -275,7 +270,7 @@ class ScenarioRunner:
                 )
             time.sleep(POLL_S)
         self._check_cores(idle)  # tracking for a moment is not being carried through a scenario
-        self._tell(_describe_machine(idle_share(before), self._stalls))
+        self._tell(self._stalls.describe_machine(idle_share(before), IDLE_LEAST))
         self._note = ""
         return True
 
@@ -308,25 +303,11 @@ class ScenarioRunner:
         self._say(RunEventKind.STARTED, self._scenario.name, "")
 
     def _look_for_stalls(self) -> None:
-        for stall in self._finder.take(now_ns(), pace()):
-            self._stalls.append(stall)
-            self._shown_stall, self._stall_held = stall, 0
+        for stall in self._stalls.take():
             self._said += 1
             event = stall.event(self._said, self._start_ns or stall.begin_ns + NS_PER_S)
             self.said.append(event)
             self._events.put(event)
-
-    def _stall_words(self) -> str:
-        """Return what to show of the newest stall; empty if it was a while ago."""
-        stall = self._shown_stall
-        if stall is None or now_ns() - stall.end_ns > STALL_SHOWN_NS:
-            return ""
-        held = 0 if self._killed else list(self._modes.values()).count(Mode.HOLD)
-        self._stall_held = max(self._stall_held, held)
-        if not self._stall_held:
-            return stall.words
-        who = "all six" if self._stall_held == len(MODULES) else self._stall_held
-        return f"{stall.words}: {who} {'hold' if held else 'held'}"
 
     def _listen(self) -> None:
         """Receive new messages and show them."""
@@ -334,7 +315,7 @@ class ScenarioRunner:
         for module, latest in self._states.items():
             state = latest.take()
             if state is not None:
-                self._finder.hear(module, state)
+                self._stalls.hear(module, state)
                 self._modes[module] = state.mode
                 self._heard_s[module] = time.monotonic()
             elif time.monotonic() - self._heard_s.get(module, 0.0) > UNHEARD_S:
@@ -346,7 +327,9 @@ class ScenarioRunner:
                 name_of(Mode, self._modes[module])[0] if module in self._modes else "-"
                 for module in MODULES
             )
-            note = "; ".join(word for word in (self._note, self._stall_words()) if word)
+            held_by_it = [] if self._killed else list(self._modes.values())
+            words = (self._note, self._stalls.words(held_by_it))
+            note = "; ".join(word for word in words if word)
             self._show(LiveSnapshot(truth, modes, note))
         elif time.monotonic() - self._truth_at_s > SILENT_S and self._start_ns:
             raise RunError(f"the simulator has said nothing for {SILENT_S:.0f} s; see its log")
@@ -415,14 +398,3 @@ class ScenarioRunner:
         )
         self.said.append(event)
         self._events.put(event)
-
-
-def _describe_machine(idle: float, stalls: Sequence[Stall]) -> str:
-    """Return how the machine carries the fleet, before the scenario starts."""
-    words = f"{len(os.sched_getaffinity(0))} cores, {100 * idle:.0f} % idle beside the fleet"
-    if idle < IDLE_LEAST:
-        words += f": too little, modules may hold; `--pace {pace() / 2:g}` asks for half of it"
-    if not stalls:
-        return words
-    most_ms = max(stall.lasted_ms for stall in stalls)
-    return f"{words}; {len(stalls)} stalls so far, {most_ms:.0f} ms at most"

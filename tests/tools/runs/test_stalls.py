@@ -15,13 +15,14 @@ from hypothesis import strategies as st
 from shared.bus import topics
 from shared.bus.messages import Cause, JointEvent, JointState, Mode, RunEvent, RunEventKind
 from shared.bus.topics import Topic
-from shared.clock import NS_PER_MS, NS_PER_S
+from shared.clock import NS_PER_MS, NS_PER_S, now_ns
 from shared.robot.joints import MODULES
 from tests.shared.mcap_log.runs import sample
 from tests.tools.runs.test_impaired import judged, shown
 from tools import cli
 from tools.fleet.stall_watch import ANY_CORE, Gap
 from tools.runs import verdict, verdict_table
+from tools.runs.live_stalls import LiveStalls
 from tools.runs.run_log import RunLog, read_run
 from tools.runs.stalls import (
     CATCH_UP_NS,
@@ -146,6 +147,31 @@ def test_in_slow_motion_a_stall_is_as_long_as_the_fleets_clock_says() -> None:
     assert finder.take(ms(500), 0.5) == []
     (stall,) = finder.take(ms(500) + MERGE_NS, 0.5)
     assert stall == Stall(ms(460), ms(500), MACHINE)
+
+
+def test_the_live_line_tells_who_held_by_a_stall_and_forgets_it_after_moments() -> None:
+    live = LiveStalls()
+    track, hold = [int(Mode.TRACK)] * 6, [int(Mode.HOLD)] * 6
+    assert live.words(hold) == ""
+    now = now_ns()
+    live.found.append(Stall(now - ms(63), now, MACHINE))
+    words = "the machine stood still for 63 ms"
+    assert live.words([]) == words, "they hold for another reason"
+    assert live.words(track) == words
+    assert live.words([*hold[:2], *track[2:]]) == f"{words}: 2 hold"
+    assert live.words(hold) == f"{words}: all six hold"
+    assert live.words(track) == f"{words}: all six held"
+    live.found.append(Stall(now - 3 * NS_PER_S, now - round(2.5 * NS_PER_S), MACHINE))
+    assert live.words(hold) == ""
+
+
+def test_how_the_machine_carries_the_fleet_is_told_with_its_stalls() -> None:
+    live = LiveStalls()
+    assert live.describe_machine(0.24, 0.08) == f"{live.cores} cores, 24 % idle beside the fleet"
+    live.found += [Stall(0, ms(41), MACHINE), Stall(ms(60), ms(90), MACHINE)]
+    words = live.describe_machine(0.031, 0.08)
+    assert "3 % idle beside the fleet: too little, modules may hold; `--pace 0.5`" in words
+    assert words.endswith("; 2 stalls so far, 41 ms at most")
 
 
 @given(
