@@ -247,7 +247,7 @@ def _back_ns(rows: Sequence[JointEvent], stall: Stall) -> float | None:
         if dropped and row.mode_after == Mode.TRACK:
             return row.t_ns
         in_time = stall.begin_ns <= row.t_ns <= stall.end_ns + DROP_OUT_NS
-        dropped |= in_time and row.mode_before == Mode.TRACK
+        dropped |= in_time and row.mode_before == Mode.TRACK and row.mode_after != Mode.DAMP
     return math.inf if dropped else None
 
 
