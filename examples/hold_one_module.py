@@ -10,7 +10,7 @@ from own_drive import BenchDrive
 
 from services.joint.drive_manager import DriveCommand, DriveManager
 from shared.config.files import load
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 
 
 def main() -> None:

@@ -11,7 +11,7 @@ import math
 from services.simulator.operator import HandForce, Operator
 from shared.config.files import load
 from shared.config.scenarios import Keyframe, Lead, Scenario
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from tools.runs.lockstep import Lockstep
 
 LIMIT = 12.0  # N

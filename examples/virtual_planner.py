@@ -11,7 +11,7 @@ from pathlib import Path
 from shared.bus.messages import Mode
 from shared.config.files import load
 from shared.config.scenarios import Keyframe, Kill, Restart, Scenario
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from tools.runs.lockstep import Lockstep
 
 SQUAT = Scenario(

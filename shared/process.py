@@ -8,17 +8,13 @@ import os
 import signal
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from types import FrameType
 
-from shared import log
+from shared import log, places
 from shared.exceptions import BUG_EXIT_CODE, XrlError, os_error_in_words
+from shared.places import CHECKOUT as CHECKOUT  # noqa: PLC0414 - known by this module, too
+from shared.places import DEFAULT_CONFIG as DEFAULT_CONFIG  # noqa: PLC0414
 from shared.run_directory import default_run_dir, service_directory
-
-CHECKOUT = Path(__file__).resolve().parents[1]
-"""Top of this checkout; where the packages are installed, the folder that holds them."""
-
-DEFAULT_CONFIG = CHECKOUT / "deploy" / "robot.toml"
 
 SOCKET_PATH_MAX = 100
 """Longest path of a UNIX socket that works everywhere; the kernel takes 107 bytes."""
@@ -31,7 +27,9 @@ def service_parser(description: str, example: str) -> argparse.ArgumentParser:
         epilog=f"example:\n  {example}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--config", type=Path, default=DEFAULT_CONFIG, help="robot file (TOML)")
+    parser.add_argument(
+        "--config", type=places.config_argument, default=places.NOT_NAMED, help=places.HELP
+    )
     parser.add_argument(
         "--run-dir",
         type=service_directory,

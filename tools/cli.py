@@ -15,8 +15,8 @@ from collections.abc import Sequence
 from types import FrameType
 from typing import Any
 
+from shared import revision
 from shared.exceptions import BUG_EXIT_CODE, XrlError, os_error_in_words
-from shared.process import CHECKOUT
 from tools.guarded_streams import guarded_streams
 from tools.verb_table import VERBS
 
@@ -93,6 +93,8 @@ def _parser(arguments: Sequence[str], *, whole: bool = False) -> argparse.Argume
     if wanted and wanted not in names:
         near = difflib.get_close_matches(wanted, names, n=3)
         hint = f"did you mean {' or '.join(near)}? " if near else ""
+        if arguments[0].startswith("-"):
+            hint = f"{arguments[0]} comes after the verb; "
         parser.error(f"no verb {wanted[:40]!r}; {hint}`xrl --help` lists them")
     for verb in VERBS:
         if whole or verb.name == wanted:
@@ -105,18 +107,14 @@ def _parser(arguments: Sequence[str], *, whole: bool = False) -> argparse.Argume
 
 
 class _Version(argparse.Action):
-    """`--version`: of the package, and of the checkout if it runs from one."""
+    """`--version`: and the commit that this code is of."""
 
     def __init__(self, option_strings: Sequence[str], dest: str, **options: Any) -> None:
         super().__init__(option_strings, dest, nargs=0, **options)
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        from shared.mcap_log.provenance import UNKNOWN, code  # noqa: PLC0415 - for this alone
-
-        found = code(CHECKOUT)
-        commit, changed = found["git_commit"], found["git_dirty"] == "true"
-        words = "" if commit == UNKNOWN else f" ({commit[:12]}{' with changes' if changed else ''})"
-        print(f"xrl {importlib.metadata.version('xrl')}{words}")
+        words = revision.in_words(revision.code())
+        print(f"xrl {importlib.metadata.version('xrl')} ({words})")
         parser.exit()
 
 

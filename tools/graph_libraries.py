@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -29,8 +30,8 @@ from services.simulator.plant import PlantConfig
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, RunError
-from shared.process import DEFAULT_CONFIG
 from shared.robot.compiled_graph import FLAGS, FOLDER, Array, library_of
+from tools.verb_table import add_config
 
 SAMPLES: Final = 200
 """Drawn arguments on which library and graph must agree."""
@@ -38,6 +39,11 @@ DRAWN_MAX: Final = (0.3, 2.0)
 """Largest drawn arguments, in turn: with the first most results are numbers, the second is as far
 as joints go."""
 _NO_COMPILER: Final = "no C compiler `cc` on PATH: CasADi interprets the law's graphs, all runs"
+
+
+def command() -> str:
+    """Return the command that runs this module, from wherever it is typed."""
+    return shlex.join([sys.executable, "-P", "-m", "tools.graph_libraries"])
 
 
 def graphs_of(robot: RobotConfig) -> list[ca.Function]:
@@ -131,7 +137,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--config", type=Path, default=DEFAULT_CONFIG, help="robot file")
+    add_config(parser)
     arguments = parser.parse_args(argv)
     robot = config_file.load(arguments.config)
     if shutil.which("cc") is None:

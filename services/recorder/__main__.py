@@ -28,7 +28,7 @@ from services.recorder.host_watch import HostWatch
 from services.recorder.loop import CAPACITY, Recorder, free_bytes_at, summary
 from services.recorder.roster import Roster
 from services.recorder.snapshot import SnapshotRing
-from shared import log, scheduling
+from shared import log, revision, scheduling
 from shared.bus import topics
 from shared.bus.arrivals import Arrivals
 from shared.bus.same_host import ports_here
@@ -41,7 +41,7 @@ from shared.exceptions import ConfigError, RunError
 from shared.mcap_log import provenance
 from shared.mcap_log.files import FIRST
 from shared.mcap_log.writer import SCHEMA_VERSION, MessageSource, RunWriter
-from shared.process import CHECKOUT, StopFlag, run_service, service_parser
+from shared.process import StopFlag, run_service, service_parser
 from shared.robot import gain_schedule
 
 DRAIN_PERIOD_S: Final = 0.02
@@ -279,7 +279,7 @@ def _metadata(
         "of": ",".join(arguments.of or ()),
     }
     return {
-        "run": run | provenance.code(CHECKOUT) | provenance.machine(),
+        "run": run | revision.code() | provenance.machine(),
         "packages": provenance.packages(),
         "recorder": {
             "flush_ms": f"{config.flush_ms:g}",

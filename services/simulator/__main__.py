@@ -27,16 +27,11 @@ from shared.bus.traces import SimState
 from shared.config import files as config_file
 from shared.config import scenarios
 from shared.config.robot_config import RobotConfig, expand
-from shared.process import (
-    DEFAULT_CONFIG,
-    StopFlag,
-    freeze_garbage,
-    run_service,
-    service_parser,
-)
+from shared.places import SCENARIOS
+from shared.process import StopFlag, freeze_garbage, run_service, service_parser
 from shared.robot.joints import MODULE_INDEX, N_JOINTS
 
-DEFAULT_SCENARIO = DEFAULT_CONFIG.parent / "scenarios" / "stand.toml"
+DEFAULT_SCENARIO = SCENARIOS / "stand.toml"
 
 
 def main() -> int:

@@ -1,4 +1,4 @@
-"""Where a run comes from: code, packages, machine. Written first into its log.
+"""Where a run comes from: packages and machine; `shared.revision` has the code. Written first.
 
 Two runs can only be expected to agree bit by bit if these do: OpenBLAS picks its
 kernels by CPU and thread count (docs/logs.md).
@@ -9,11 +9,12 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import platform
-import subprocess
 from pathlib import Path
 from typing import Final
 
 import msgspec
+
+from shared.revision import UNKNOWN
 
 THREAD_VARIABLES: Final = (
     "OMP_NUM_THREADS",
@@ -23,28 +24,6 @@ THREAD_VARIABLES: Final = (
     "ZENOH_RUNTIME",
 )
 """Environment variables that change the behaviour of numeric libraries and the bus."""
-
-UNKNOWN: Final = "unknown"
-
-_GIT_TIMEOUT_S: Final = 5.0
-
-
-def code(root: Path) -> dict[str, str]:
-    """Return `git_commit` and `git_dirty` ("true"/"false") of a checkout.
-
-    Both are "unknown" if `root` is not the top of a git checkout with a commit, or if
-    git is not there: an installed wheel inside somebody else's checkout is not that
-    checkout.
-    """
-    unknown = {"git_commit": UNKNOWN, "git_dirty": UNKNOWN}
-    top = _git(root, "rev-parse", "--show-toplevel")
-    if top is None or Path(top).resolve() != root.resolve():
-        return unknown
-    commit = _git(root, "rev-parse", "--verify", "HEAD")
-    changes = _git(root, "status", "--porcelain")
-    if commit is None or changes is None:
-        return unknown
-    return {"git_commit": commit, "git_dirty": "true" if changes else "false"}
 
 
 def machine() -> dict[str, str]:
@@ -76,18 +55,3 @@ def cpu_model(cpuinfo: Path) -> str:
         lines = []
     names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     return next(names, "") or platform.processor() or UNKNOWN
-
-
-def _git(root: Path, *arguments: str) -> str | None:
-    """Return what git says, or None if it fails for any reason."""
-    try:
-        done = subprocess.run(
-            ("git", "-C", str(root), *arguments),
-            capture_output=True,
-            text=True,
-            timeout=_GIT_TIMEOUT_S,
-            check=True,
-        )
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return done.stdout.strip()

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from shared import revision
 from shared.exceptions import BUG_EXIT_CODE, RunError
-from shared.mcap_log import provenance
-from shared.process import CHECKOUT, run_service
+from shared.process import run_service
 from tools import cli
 from tools.studies.sweeps import pool
 from tools.verb_table import VERBS
@@ -173,9 +173,8 @@ def test_the_version_is_that_of_the_package_and_of_the_checkout(
         cli.main(["--version"])
     assert left.value.code == 0
     said = capsys.readouterr().out
-    assert said.startswith(f"xrl {importlib.metadata.version('xrl')}")
-    commit = provenance.code(CHECKOUT)["git_commit"]
-    assert commit == provenance.UNKNOWN or commit[:12] in said
+    assert said.startswith(f"xrl {importlib.metadata.version('xrl')} ")
+    assert f"({revision.in_words(revision.code())})" in said
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from shared.exceptions import RunError
-from shared.process import CHECKOUT
+from shared.places import CHECKOUT
 from shared.robot.joints import MODULES
 from tools.bench.bus_process import PLANNER, WARM_UP_S, BusReport
 

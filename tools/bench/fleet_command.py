@@ -13,7 +13,7 @@ from rich.text import Text
 
 from shared.config import files as config_file
 from shared.exceptions import FAULT_EXIT_CODE
-from shared.process import CHECKOUT
+from shared.places import CHECKOUT
 from shared.robot import gain_schedule
 from tools.bench import fleet
 from tools.bench.flags import add_flags, write_rows

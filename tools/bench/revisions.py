@@ -21,7 +21,7 @@ from typing import Final, Self
 import msgspec
 
 from shared.exceptions import RunError
-from shared.process import CHECKOUT
+from shared.places import CHECKOUT, need_checkout
 from tools.bench.worker import Answer, Request
 
 _BENCH: Final = "tools/bench"
@@ -34,8 +34,9 @@ def unpacked(revision: str) -> Iterator[Path]:
     """Yield a folder with the tree of a git revision and this tree's bench.
 
     Raises:
-        RunError: git is missing, or knows no such revision.
+        RunError: this is no checkout, git is missing, or it knows no such revision.
     """
+    need_checkout("--against")
     try:
         done = subprocess.run(
             ["git", "archive", "--format=tar", revision],

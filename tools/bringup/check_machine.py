@@ -14,11 +14,12 @@ from typing import Final
 
 from shared import scheduling
 from shared.config.robot_config import RobotConfig
+from shared.places import FILES
 from shared.robot.compiled_graph import library_of
 from tools.bringup.check_socketcan import query_ip, socketcan_rows
 from tools.bringup.rows import Finding, FindingKind, judged, ok, warning, wrong
 from tools.fleet.process_table import is_simulated
-from tools.graph_libraries import graphs_of
+from tools.graph_libraries import command, graphs_of
 
 SUBJECT: Final = "machine"
 CPUS_MIN: Final = 2
@@ -30,7 +31,8 @@ ODRIVE_VENDOR: Final = "1209"
 ODRIVE_PRODUCTS: Final = tuple(f"0d3{i}" for i in range(1, 10))
 """As in deploy/udev/91-odrive.rules."""
 UDEV_FIX: Final = (
-    "`sudo cp deploy/udev/91-odrive.rules /etc/udev/rules.d/` and what its head says; plug in again"
+    f"`sudo cp {FILES}/udev/91-odrive.rules /etc/udev/rules.d/` and what its head says; "
+    "plug in again"
 )
 RTPRIO_FIX: Final = (
     "`YOU - rtprio 40` in /etc/security/limits.d/xrl.conf and log in again, or systemd's "
@@ -101,7 +103,7 @@ def _graphs(robot: RobotConfig) -> Finding:
     found, wanted = f"{there} of {len(graphs)} in C", "all in C"
     if there == len(graphs):
         return ok(SUBJECT, "law's graphs", found, wanted)
-    fix = "with a C compiler `cc`: `python -m tools.graph_libraries --config FILE`"
+    fix = f"with a C compiler `cc`: `{command()} --config FILE`"
     return warning(SUBJECT, "law's graphs", found, wanted, fix)
 
 

@@ -14,6 +14,7 @@ from typing import Any, Final
 
 from shared.can.drive_settings import CAN_BAUD_RATE
 from shared.config.robot_config import RobotConfig
+from shared.places import FILES
 from tools.bringup.rows import Finding, FindingKind, judged, warning, wrong
 
 Links = Mapping[str, Mapping[str, Any]]
@@ -106,7 +107,7 @@ def _details(name: str, link: Mapping[str, Any]) -> list[Finding]:
                 "send queue",
                 f"{length} frames",
                 f"{low} to {high}",
-                f"deploy/udev/92-can.rules, or `sudo ip link set {name} txqueuelen 64`",
+                f"{FILES}/udev/92-can.rules, or `sudo ip link set {name} txqueuelen 64`",
                 why,
                 otherwise=FindingKind.WARNING,
             )

@@ -24,10 +24,11 @@ from shared.config.robot_config import RobotConfig, expand
 from shared.config.toml_file import Range, Section, read_toml
 from shared.exceptions import ConfigError, FleetError
 from shared.network.proxy_protocol import SOCKET
-from shared.process import DEFAULT_CONFIG, SOCKET_PATH_MAX
+from shared.places import FILES
+from shared.process import SOCKET_PATH_MAX
 from shared.robot.joints import MODULES
 
-TABLE = DEFAULT_CONFIG.parent / "processes.toml"
+TABLE = FILES / "processes.toml"
 """The process table of this checkout."""
 
 PYTHON, CONFIG, MODULE = "{python}", "{config}", "{module}"

@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import hashlib
 import platform
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -21,7 +20,8 @@ from services.recorder.loop import free_bytes_at
 from shared.bus.credentials import NAMES, keys_folder
 from shared.config import files as config_file
 from shared.exceptions import XrlError
-from shared.process import CHECKOUT
+from shared.places import CHECKOUT, IS_CHECKOUT
+from shared.revision import UNKNOWN, code
 from shared.robot import gain_schedule
 from tools.fleet.run_dir import SUPERVISOR_PID
 from tools.keys.bundle import held_files
@@ -36,7 +36,7 @@ class Probe(msgspec.Struct, frozen=True):
     """What a host says of itself."""
 
     revision: str
-    """Of the checkout, by git; "+": with changes. Empty: not known."""
+    """Commit of the code; "+": with changes. Empty: not known."""
     lock: str
     """Hash of what the environment was made from."""
     python: str
@@ -70,7 +70,11 @@ def probe(config: Path, run_dir: Path) -> Probe:
             warnings.append("its services run since before it knew who is let in: restart them")
     except (XrlError, OSError) as error:
         wrong.append(str(error))
-    if not _environment_is_current():
+    if not IS_CHECKOUT:
+        warnings.append(
+            f"{CHECKOUT}: a wheel, no checkout: which lock its packages are of is not known"
+        )
+    elif not _environment_is_current():
         warnings.append(f"{CHECKOUT}: the environment is not that of this version: deploy/install")
     free_mib = free_bytes_at(run_dir) // MIB
     if free_mib < FREE_MIB:
@@ -120,13 +124,10 @@ def _environment_is_current() -> bool:
 
 
 def _revision() -> str:
-    words = ["git", "-c", f"safe.directory={CHECKOUT}", "-C", str(CHECKOUT), "describe"]
-    words += ["--always", "--dirty=+", "--abbrev=12"]
-    try:
-        done = subprocess.run(words, capture_output=True, text=True, check=False)
-    except OSError:
+    found = code()
+    if found["git_commit"] == UNKNOWN:
         return ""
-    return done.stdout.strip() if done.returncode == 0 else ""
+    return found["git_commit"][:12] + ("+" if found["git_dirty"] == "true" else "")
 
 
 def main() -> None:

@@ -13,6 +13,7 @@ from rich.text import Text
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
+from shared.places import refuse_shipped
 from tools.fleet import procfs
 from tools.fleet.run_dir import RunDir
 from tools.identify.estimates import (
@@ -99,8 +100,9 @@ def refuse_running(path: Path) -> None:
     """Refuse to write the robot file of a fleet that is up: a service that restarts would read it.
 
     Raises:
-        RunError: naming the fleet, and what to do.
+        RunError: naming the fleet, and what to do; or it is the shipped one of an installed wheel.
     """
+    refuse_shipped(path)
     for place in sorted(procfs.fleets()):
         manifest = RunDir(Path(place)).read_manifest()
         if manifest is not None and Path(manifest.config).resolve() == path.resolve():

@@ -24,7 +24,7 @@ from shared.config.files import load
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Scenario
 from shared.config.scenarios import load as load_scenario
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
 from tools.learning.policy import ACTIONS, LARGEST, OBSERVED, acted, observed
 from tools.runs.experiment import scenario_file

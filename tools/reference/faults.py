@@ -8,7 +8,7 @@ from typing import Final
 from shared.config.files import load
 from shared.config.scenarios import FAULT_KINDS
 from shared.config.sections import TripLimit, TripsConfig
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from shared.robot.fault_table import DRIVE_FAULTS, LOSSES
 from shared.robot.trip_table import JOINT_TRIPS, PLANNER_TRIPS, TripRow
 from tools.reference.field_docs import one_line

@@ -11,7 +11,7 @@ import msgspec
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.config.toml_file import Range
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from shared.robot.gain_schedule import inputs_of
 from tools.reference.field_docs import field_docs, one_line, summary
 

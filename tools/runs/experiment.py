@@ -32,7 +32,7 @@ from shared.config.scenarios import (
 )
 from shared.config.sections import LawConfig
 from shared.exceptions import FleetError, RunError
-from shared.process import DEFAULT_CONFIG
+from shared.places import SCENARIOS
 from shared.robot import gain_schedule
 from shared.robot.joints import MODULES
 from tools.guarded_streams import printable
@@ -42,8 +42,6 @@ from tools.terminal import Console, marked
 from tools.verb_table import add_config
 
 E = TypeVar("E", Kill, Restart, Push, Fault, Inject)
-
-SCENARIOS = DEFAULT_CONFIG.parent / "scenarios"
 
 PLANT_FILE = "plant.toml"
 """Name of the plant among a run's results and in its log."""

@@ -11,6 +11,7 @@ from typing import Any, Final, TypeVar
 
 from services.planner.controller_file import ATTACHED, controller_maker, split_spec
 from services.simulator.plant import PlantConfig
+from shared import revision
 from shared.bus import topics
 from shared.bus.codec import encode
 from shared.bus.messages import Message, SimTruth
@@ -21,7 +22,6 @@ from shared.config.scenarios import Scenario
 from shared.mcap_log import provenance
 from shared.mcap_log.writer import SCHEMA_VERSION, RunWriter
 from shared.network.impairment import Impairment
-from shared.process import CHECKOUT
 from shared.robot.robot_model import mjcf
 from tools.runs import experiment
 from tools.runs.centralised.fleet import CONTROLS, SHIPPED
@@ -116,7 +116,7 @@ def record_run(
         recorded,
         offset_ns=0,
         metadata={
-            "run": run_metadata | metadata | provenance.code(CHECKOUT) | provenance.machine(),
+            "run": run_metadata | metadata | revision.code() | provenance.machine(),
             "packages": provenance.packages(),
         },
         attachments={file.name: file.read_bytes() for file in inputs}

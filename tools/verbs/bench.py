@@ -18,7 +18,7 @@ from rich.text import Text
 
 from shared.config import files as config_file
 from shared.exceptions import FAULT_EXIT_CODE
-from shared.process import CHECKOUT
+from shared.places import CHECKOUT
 from shared.robot import gain_schedule
 from tools.bench import bus_command, fleet_command, revisions, table
 from tools.bench.flags import add_flags, write_rows
@@ -106,9 +106,9 @@ def measure(
         console: for the progress.
     """
     with ExitStack() as stack:
+        other = None if against is None else stack.enter_context(revisions.unpacked(against))
         workers = [stack.enter_context(Worker(CHECKOUT, config))]
-        if against is not None:
-            other = stack.enter_context(revisions.unpacked(against))
+        if other is not None:
             workers.append(stack.enter_context(Worker(other, its_config(config, other))))
         for worker in workers:  # the machine is then this measurement's alone
             worker.ask(READY)

@@ -17,6 +17,7 @@ from shared.config.files import load
 from shared.config.robot_config import RobotConfig, expand
 from shared.config.sections import CanConfig
 from shared.exceptions import FAULT_EXIT_CODE, DriveError, FleetError
+from shared.places import FILES
 from tools.bringup import check_robot
 from tools.bringup.can_monitor import (
     BusTraffic,
@@ -113,7 +114,7 @@ def _set_up(robot: RobotConfig, *, apply: bool) -> int:
                 return FAULT_EXIT_CODE
     if not apply:
         print(
-            "# printed only; --apply runs them, as root. deploy/udev/92-can.rules does it at boot"
+            f"# printed only; --apply runs them, as root. {FILES}/udev/92-can.rules does it at boot"
         )
     return 0
 

@@ -12,10 +12,10 @@ from typing import Final
 
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
+from shared import revision
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE, RunError
 from shared.mcap_log import provenance
-from shared.process import CHECKOUT
 from tools.fleet import procfs
 from tools.number_arguments import natural
 from tools.runs import experiment
@@ -204,7 +204,7 @@ def _about(robot: RobotConfig) -> dict[str, str]:
         "driver": robot.joint_service.driver,
         "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
     }
-    return run | provenance.code(CHECKOUT) | provenance.machine()
+    return run | revision.code() | provenance.machine()
 
 
 def _make_out(out: Path | None) -> Path:

@@ -14,7 +14,7 @@ from shared.clock import NS_PER_S
 from shared.exceptions import RunError
 from shared.mcap_log.extended_copy import write_extended
 from shared.mcap_log.files import SUFFIX
-from shared.process import DEFAULT_CONFIG
+from shared.places import FILES
 from tools.analysis.reports import scene
 from tools.analysis.reports.moving_picture import write_gif
 from tools.export.folders import whole_folder
@@ -39,7 +39,7 @@ from tools.topic_keys import keys_named
 from tools.verb_table import RUN_HELP, Subparsers, add_verb
 
 SCENE_SUFFIX: Final = ".scene" + SUFFIX
-LAYOUT: Final = DEFAULT_CONFIG.parent / "foxglove" / "xrl.json"
+LAYOUT: Final = FILES / "foxglove" / "xrl.json"
 """For a robot of this name; `--layout` writes it for the name in the log."""
 LAYOUT_ROBOT: Final = "xrl"
 BAG_RATE_HZ: Final = 100.0
@@ -80,8 +80,8 @@ def add_parser(subparsers: Subparsers) -> None:
         "--layout",
         type=Path,
         metavar="FILE",
-        help="also write Foxglove's layout for this robot's name (deploy/foxglove/xrl.json "
-        "is the one for `xrl`)",
+        help="also write Foxglove's layout for this robot's name (that for "
+        "`xrl` is shipped, deploy/foxglove/xrl.json)",
     )
     parser.add_argument(
         "--gif",

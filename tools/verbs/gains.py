@@ -14,6 +14,7 @@ from services.planner.push_limit import DIRECTIONS, equivalent_slope
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, ConfigError
+from shared.places import refuse_shipped
 from shared.robot import gain_schedule
 from shared.robot.gain_table import GainSchedule
 from tools.terminal import Console
@@ -68,6 +69,7 @@ def run(args: argparse.Namespace) -> int:
         stale = gain_schedule.why_stale(config_file.load(args.config))
         console.print(f"{path}: {stale or 'fits the robot'}", soft_wrap=True)
         return FAULT_EXIT_CODE if stale else 0
+    refuse_shipped(path)
     robot = config_file.load_without_schedule(args.config)
     schedule = compute(robot, console, args.damping_of)
     gain_schedule.write(path, schedule)

@@ -19,7 +19,7 @@ from shared.clock import NS_PER_S, now_ns
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig, expand
 from shared.exceptions import ConfigError, FleetError, RunError
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from tools.analysis.playback import arguments, guard, reading, selection
 from tools.analysis.playback.display import Display, introduce, summary, where
 from tools.analysis.playback.player import Player

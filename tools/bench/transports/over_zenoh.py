@@ -6,7 +6,7 @@ from pathlib import Path
 
 from shared.bus.session import Session, open_session
 from shared.config import files as config_file
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from tools.bench.transports.base import Put, Take
 
 

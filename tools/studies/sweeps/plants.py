@@ -14,9 +14,9 @@ import msgspec
 from services.simulator.plant import PlantConfig, changed
 from shared.config.toml_file import Section, read_toml
 from shared.exceptions import ConfigError
-from shared.process import DEFAULT_CONFIG
+from shared.places import FILES
 
-RANGES_FILE: Final = DEFAULT_CONFIG.parent / "plants" / "ranges.toml"
+RANGES_FILE: Final = FILES / "plants" / "ranges.toml"
 
 
 LEAST_SHARE: Final = 0.5

@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from tools.number_arguments import count, natural
 from tools.studies.sweeps import cluster, pool
 from tools.studies.sweeps.table import CaseTable, Row, Words, code_digest

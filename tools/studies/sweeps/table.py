@@ -21,7 +21,7 @@ from typing import IO, Final, TypeAlias
 
 from shared.atomic_file import atomic_file
 from shared.exceptions import RunError
-from shared.process import CHECKOUT
+from shared.places import CHECKOUT
 
 INPUTS_FILE: Final = "inputs.json"
 Row: TypeAlias = Mapping[str, str]

@@ -19,7 +19,7 @@ from shared.config import scenarios
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Push, Scenario
 from shared.exceptions import RunError
-from shared.process import DEFAULT_CONFIG
+from shared.places import SCENARIOS
 from shared.robot.gain_schedule import believing
 from shared.robot.trip_table import JOINT_TRIPS, untripped
 from tools.runs.lockstep import Lockstep
@@ -121,7 +121,7 @@ def _at(at: float, height: float = UP, pitch: float = 0.0, assist: float = 0.0) 
 
 
 def _shipped(name: str) -> Scenario:
-    return scenarios.load(DEFAULT_CONFIG.parent / "scenarios" / f"{name}.toml")
+    return scenarios.load(SCENARIOS / f"{name}.toml")
 
 
 _SHOVE: Final = Push(at=3.0, duration=0.3, force=(40.0, 0.0, 0.0))

@@ -1,0 +1,48 @@
+"""What the wheel holds beside the packages: the data files, and the commit it is built from."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+
+FILES = (
+    "robot.toml",
+    "robot.gains.json",
+    "processes.toml",
+    "hosts.example.toml",
+    "scenarios",
+    "plants",
+    "foxglove",
+    "udev",
+)
+"""Of `deploy/`; they are installed into `shared/files/`, where `shared/places.py` finds them."""
+
+
+class WheelFiles(BuildHookInterface):  # type: ignore[type-arg]  # hatchling names no configuration
+    """Lays the files into a wheel; an editable one has the checkout's own."""
+
+    def initialize(self, version: str, build_data: dict[str, Any]) -> None:
+        """Say what goes where."""
+        root = Path(self.root)
+        main = {str(root / "deploy" / "xrl_main.py"): "xrl_main.py"}
+        if version == "editable":
+            build_data["force_include_editable"] = main
+            return
+        sys.path.insert(0, self.root)
+        from shared.revision import BUILT_FROM, code  # noqa: PLC0415 - found only now
+
+        self._scratch = tempfile.TemporaryDirectory()
+        commit = Path(self._scratch.name, "commit.json")
+        commit.write_text(json.dumps(code(root)), encoding="utf-8")
+        files = {str(root / "deploy" / name): f"shared/files/{name}" for name in FILES}
+        build_data["force_include"] |= main | files | {str(commit): BUILT_FROM}
+
+    def finalize(self, version: str, _build_data: dict[str, Any], _artifact: str) -> None:
+        """Remove what was made for the build."""
+        if version != "editable":
+            self._scratch.cleanup()
