@@ -7,12 +7,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, NamedTuple, TypeAlias
 
-from shared.process import DEFAULT_CONFIG
+from shared import places
 from shared.run_directory import RUN_DIR_VARIABLE, default_run_dir, own_directory
 
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # noqa: SLF001 - its only name
 """What `add_parser` is given."""
 
+FLEET: Final = "that of the fleet in --run-dir"
+"""Whose robot file a verb takes that works on a fleet, if there is one: for `add_config`."""
 RUN_HELP: Final = "a run's record, finished or not; or its directory: all files of a split run"
 
 
@@ -113,12 +115,22 @@ def add_run_dir(
     )
 
 
-def add_config(parser: argparse.ArgumentParser) -> None:
-    """Add `--config`: the robot file."""
+def add_config(parser: argparse.ArgumentParser, *, before: str = "") -> None:
+    """Add `--config`: the robot file, found in the working directory if it is not given.
+
+    Args:
+        parser: of the verb.
+        before: whose robot file a verb takes before it looks there, such as a running fleet's. Then
+            the argument is None if it is not given, and the verb calls `places.robot_file` itself.
+    """
+    if before:
+        text = places.HELP.replace("(default: ", f"(default: {before}, else ")
+        parser.add_argument("--config", type=Path, metavar="FILE", help=text)
+        return
     parser.add_argument(
         "--config",
-        type=Path,
-        default=DEFAULT_CONFIG,
+        type=places.config_argument,
+        default=places.NOT_NAMED,
         metavar="FILE",
-        help="robot file (default: deploy/robot.toml of this checkout)",
+        help=places.HELP,
     )

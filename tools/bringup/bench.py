@@ -15,10 +15,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
+from shared import places
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig, expand
 from shared.exceptions import FleetError, XrlError
-from shared.process import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
 from tools.bringup import reach
 from tools.fleet import process_table, procfs
@@ -34,17 +34,20 @@ GONE: Final = (
 
 
 def robot_file(args: Namespace) -> Path:
-    """Return the robot file: of the fleet that is up in `--run-dir`, else `--config`.
+    """Return the robot file: of the fleet that is up in `--run-dir`, else as `places.robot_file`.
 
     Raises:
-        FleetError: both are given and differ.
+        ConfigError: there is no fleet, and the file found may not be taken.
+        FleetError: `--config` is not the fleet's.
     """
     run = RunDir(args.run_dir)
     manifest = run.read_manifest()
-    given = Path(os.path.abspath(args.config))  # noqa: PTH100 - as the manifest has it
     if manifest is None or not reach.is_up(run.path):
-        return given
-    if given not in (DEFAULT_CONFIG, Path(manifest.config)):
+        return Path(os.path.abspath(places.robot_file(args.config)))  # noqa: PTH100 - links stay
+    if args.config is None:
+        return Path(manifest.config)
+    given = Path(os.path.abspath(args.config))  # noqa: PTH100 - as the manifest has it
+    if given != Path(manifest.config):
         raise FleetError(
             f"the fleet in {run.path} runs with {manifest.config}, not with {given}; "
             "leave --config out, or name another fleet with --run-dir"

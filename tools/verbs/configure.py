@@ -30,7 +30,7 @@ from tools.bringup.reach import (
 )
 from tools.fleet.process_table import is_simulated
 from tools.terminal import Console, marked
-from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
+from tools.verb_table import FLEET, Subparsers, add_config, add_run_dir, add_verb
 
 BACKUPS: Final = Path("out") / "drive-backups"
 
@@ -69,7 +69,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "--out", type=Path, default=BACKUPS, metavar="DIR",
         help=f"where the backup is written (default {BACKUPS})",
     )  # fmt: skip
-    add_config(parser)
+    add_config(parser, before=FLEET)
     add_run_dir(parser)
     add_plant(parser)
 

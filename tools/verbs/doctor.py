@@ -14,7 +14,7 @@ from tools.bringup.reach import add_plant, check_plants
 from tools.bringup.report import report_of, show
 from tools.bringup.survey import survey
 from tools.terminal import Console
-from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
+from tools.verb_table import FLEET, Subparsers, add_config, add_run_dir, add_verb
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -29,7 +29,7 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl doctor --plant knee_left.axis0.controller.config.vel_limit=2
         """,
     )
-    add_config(parser)
+    add_config(parser, before=FLEET)
     add_run_dir(parser)
     parser.add_argument("--verbose", action="store_true", help="a line for each check that is ok")
     parser.add_argument("--json", action="store_true", help="print JSON: every row")

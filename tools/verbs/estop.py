@@ -8,11 +8,13 @@ import time
 from pathlib import Path
 from typing import Final
 
+from shared import places
 from shared.bus.operator_key import require_operator
 from shared.bus.session import open_session
 from shared.config.files import load
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError, XrlError
+from shared.places import ROBOT_FILE
 from shared.process import StopFlag
 from shared.robot.joints import MODULES
 from tools.fleet.emergency_stop import GIVE_UP_S, BusStop, request_here, stop_all, wait_here
@@ -61,7 +63,8 @@ def add_parser(subparsers: Subparsers) -> None:
         "--config",
         type=Path,
         metavar="FILE",
-        help="robot file (default: that of the fleet in the run directory)",
+        help=f"robot file (default: that of the fleet in the run directory, else {ROBOT_FILE} of "
+        "the working directory)",
     )
 
 
@@ -120,9 +123,11 @@ def _robot(args: argparse.Namespace) -> RobotConfig:
     if args.config is not None:
         return load(args.config)
     manifest = RunDir(args.run_dir).read_manifest()  # whether or not its supervisor lives
-    if manifest is None:
+    if manifest is not None:
+        return load(Path(manifest.config))
+    if places.robot_file_here() is None:  # a stop of the shipped robot would be heard by nobody
         raise FleetError(f"no fleet is up in {args.run_dir}; name its robot file with --config")
-    return load(Path(manifest.config))
+    return load(places.robot_file())
 
 
 def _wait(robot: RobotConfig, run_dir: Path, *, here: bool) -> int:

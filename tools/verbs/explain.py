@@ -19,6 +19,7 @@ from services.planner.inverse_kinematics import describe as in_words_of_reach
 from services.planner.kinematics import Kinematics
 from services.planner.push_limit import PushLimits
 from services.planner.torque_breakdown import TorqueBreakdown, torque_breakdown
+from shared import places
 from shared.bus import topics
 from shared.bus.code_names import name_of
 from shared.bus.messages import (
@@ -104,7 +105,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--assist", type=finite, default=0.0, metavar="N", help="with --q and --p (0 N)"
     )
-    add_config(parser)
+    add_config(parser, before="that in the log")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -113,8 +114,9 @@ def run(args: argparse.Namespace) -> int:
     if sum(given is not None for given in (args.log, args.q, args.p)) != 1:
         raise RunError("give a run's log, --q ANGLES or --p POSE; one of them")
     if args.log is None:
-        robot = config_file.load(args.config)
-        gain_schedule.require(robot, args.config)
+        path = places.robot_file(args.config)
+        robot = config_file.load(path)
+        gain_schedule.require(robot, path)
         if args.q is None:
             q = at_pose(robot, args.p)
         else:

@@ -13,6 +13,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from shared import places
 from shared.bus import topics
 from shared.bus.messages import PlannerStatus
 from shared.bus.operator_key import require_operator
@@ -37,7 +38,7 @@ from tools.runs import experiment
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run
 from tools.terminal import Console
-from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
+from tools.verb_table import FLEET, Subparsers, add_config, add_run_dir, add_verb
 
 LEVEL_SD: Final = 0.003
 """rad: a floor that a spirit level calls level."""
@@ -109,7 +110,7 @@ def add_parser(subparsers: Subparsers) -> None:
         one.add_argument(
             "--out", type=Path, metavar="DIR", help="where the picture goes (out/identify-<time>)"
         )
-        add_config(one)
+        add_config(one, before=FLEET)
         add_run_dir(one)
 
 
@@ -122,12 +123,14 @@ def run(args: argparse.Namespace) -> int:
         raise RunError(f"--level {args.level:g}: more than 0 and at most {LEVEL_MAX:g} is right")
     scenario = scenarios.load(experiment.scenario_file(MOTIONS))
     if args.dry_run:
-        _show_motions(scenario, config_file.load_without_schedule(args.config), console)
+        _show_motions(
+            scenario, config_file.load_without_schedule(places.robot_file(args.config)), console
+        )
         return 0
     added = _added(args.added, max(1, len(args.record)))
     if args.record:
         logs = [read_run(path) for path in args.record]
-        robot, path = _same_robot(logs), args.config
+        robot, path = _same_robot(logs), places.robot_file(args.config)
         if args.apply:
             report.refuse_running(path)
         moments = [_moments_in(log) for log in logs]

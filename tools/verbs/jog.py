@@ -21,7 +21,7 @@ from tools.bringup.jog_drive import NOT_IDLE, Interrupts, JogResult, first_readi
 from tools.bringup.jogging import JogPlan, Sample, gentle, judge, outside, what_to_see
 from tools.number_arguments import count, finite
 from tools.terminal import Console, marked
-from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
+from tools.verb_table import FLEET, Subparsers, add_config, add_run_dir, add_verb
 
 BY: Final = 0.05
 PERIOD_S: Final = 2.0
@@ -73,7 +73,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "(default: %(default)s)",
     )
     parser.add_argument("--yes", action="store_true", help="do not ask")
-    add_config(parser)
+    add_config(parser, before=FLEET)
     add_run_dir(parser)
 
 

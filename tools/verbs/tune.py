@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 
 from services.simulator.plant import IDEAL, PlantConfig, plant_from
+from shared import places
 from shared.bus.operator_key import require_operator
 from shared.bus.session import open_session
 from shared.config import files as config_file
@@ -29,7 +30,7 @@ from tools.tune import module_probe
 from tools.tune.excitation import Excitation, excitation
 from tools.tune.pose_probe import DIRECTIONS, LiveProbe, ProbeCourse, in_lockstep, inertia_along
 from tools.tune.response import ResponseFit, answer_of, propose
-from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
+from tools.verb_table import FLEET, Subparsers, add_config, add_run_dir, add_verb
 
 SIZE_SHARE: Final = 0.8
 """Of `law.probe_max`."""
@@ -71,7 +72,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument("--yes", action="store_true", help="do not ask")
     parser.add_argument("--out", type=Path, metavar="DIR", help="for the picture (out/tune-<time>)")
     experiment.add_plant(parser)
-    add_config(parser)
+    add_config(parser, before=FLEET)
     add_run_dir(parser)
 
 
@@ -124,7 +125,7 @@ def _refuse_mixed(args: argparse.Namespace) -> None:
 def _tune_direction(args: argparse.Namespace, console: Console) -> int:
     row = DIRECTIONS.index(args.what)
     fleet = None if args.sim or args.dry_run else SupervisedFleet.attach(args.run_dir)
-    path = args.config if fleet is None else Path(fleet.manifest.config)
+    path = places.robot_file(args.config) if fleet is None else Path(fleet.manifest.config)
     robot = experiment.load_robot(path)
     plan = excitation(_size(args, robot, row))
     sines = ", ".join(f"{sine.frequency_hz:g}" for sine in plan.sines)

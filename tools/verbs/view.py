@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+from shared import places
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError, RunError
@@ -65,7 +66,7 @@ def add_parser(subparsers: Subparsers) -> None:
         help=f"serve the frames to Foxglove in place of a page (port: {foxglove_server.PORT})",
     )
     add_part(parser)
-    add_config(parser)
+    add_config(parser, before="that of the record or of the fleet")
     add_run_dir(parser)
 
 
@@ -91,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
 @contextlib.contextmanager
 def _source(args: argparse.Namespace) -> Iterator[Source]:
     if args.sim:
-        lockstep = LockstepSource(load_robot(args.config))
+        lockstep = LockstepSource(load_robot(places.robot_file(args.config)))
         try:
             yield lockstep
         finally:

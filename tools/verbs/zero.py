@@ -31,7 +31,7 @@ from tools.bringup.zeroing import DriveLook, is_right, look, outside, refusal, z
 from tools.fleet.supervise import SupervisedFleet
 from tools.number_arguments import finite, finite_numbers
 from tools.terminal import Console, marked
-from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
+from tools.verb_table import FLEET, Subparsers, add_config, add_run_dir, add_verb
 
 DEGREES_FROM: Final = 7.0
 """No joint has an angle of so many rad: more than a turn."""
@@ -80,7 +80,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "m above the ankles'; the angles then follow from the lengths in the robot file",
     )
     parser.add_argument("--yes", action="store_true", help="do not ask")
-    add_config(parser)
+    add_config(parser, before=FLEET)
     add_run_dir(parser)
 
 
