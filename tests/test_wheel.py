@@ -100,13 +100,16 @@ def test_an_installed_wheel_tells_its_version_and_commit(installed: Path, tmp_pa
 
 
 @pytest.mark.system
-def test_an_installed_wheel_runs_where_there_is_no_checkout(
+def test_an_installed_wheel_runs_a_robot_of_its_own_directory(
     installed: Path, tmp_path: Path
 ) -> None:
-    done = xrl(installed, tmp_path, "sim", "--duration", "1", "--out", "run")
+    lab = tmp_path / "lab"
+    assert xrl(installed, tmp_path, "new", "lab").returncode == 0
+    done = xrl(installed, lab, "sim", "--duration", "1", "--out", "run")
     assert done.returncode == 0, done.stderr
+    assert "config: ./robot.toml" in done.stderr
     assert "STOOD for 1.0 s" in done.stdout
-    assert (tmp_path / "run" / "run.mcap").is_file()
+    assert (lab / "run" / "run.mcap").is_file()
 
 
 @pytest.mark.system

@@ -43,6 +43,7 @@ VERBS: Final = (
     Verb("pendant", "hold a dead man's handle: when it ends, every module stops"),
     Verb("assist", "ask the robot to carry some of the person, while it runs"),
     Verb("lead", "lead height, pitch and assist by a gamepad or by keys"),
+    Verb("new", "make a robot's own directory: robot file, gains, scenarios, plants"),
     Verb("gains", "compute the certified gain schedule of a robot"),
     Verb("tare", "set the harness's zero from its unloaded reading"),
     Verb("doctor", "check drives, buses and computer against the robot file"),

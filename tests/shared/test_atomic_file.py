@@ -102,6 +102,7 @@ WRITERS = {
     "tools/mutants.py": "the source itself",
     "tools/output.py": "into an atomic file",
     "tools/reference/__main__.py": "pages in the checkout",
+    "tools/verbs/new.py": "in a folder that is there whole or not at all",
     "tools/view/serving.py": "what a server says",
     "tools/studies/sweeps/table.py": "rows of a study that goes on after a kill",
 }
