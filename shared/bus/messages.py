@@ -224,8 +224,8 @@ class RunEventKind(IntEnum):
     FAULTED = 5
     """A drive's fault began; the subject is the module, the detail the kind."""
     STALLED = 6
-    """The machine, a core of it or all joint services stood still until then; the subject says
-    which, the detail for how long."""
+    """The machine, a core of it, all joint services or the simulator stood still until then; the
+    subject says which, the detail for how long."""
 
 
 class Message(msgspec.Struct, gc=False, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from shared.bus.messages import JointState, Mode
+from shared.bus.messages import JointState, Mode, SimTruth
 from shared.clock import now_ns, pace
 from shared.robot.joints import MODULES
 from tools.fleet.stall_watch import Gap, StallWatch
@@ -37,6 +37,10 @@ class LiveStalls:
     def hear(self, module: str, state: JointState) -> None:
         """Take a state of a module."""
         self._finder.hear(module, state)
+
+    def see(self, truth: SimTruth) -> None:
+        """Take a state of the simulated world."""
+        self._finder.see(truth)
 
     def take(self) -> list[Stall]:
         """Return what was found since the last call."""

@@ -322,6 +322,7 @@ class ScenarioRunner:
                 self._modes.pop(module, None)
         truth = self._truths.take()
         if truth is not None:
+            self._stalls.see(truth)
             self._truth, self._truth_at_s = truth, time.monotonic()
             modes = tuple(
                 name_of(Mode, self._modes[module])[0] if module in self._modes else "-"

@@ -1,4 +1,4 @@
-"""Stalls: times in which the machine, or all that ran of the fleet, stood still.
+"""Stalls: times in which the machine, all joint services or the simulated world stood still.
 
 A module that gets no command in time holds, as it should: a run is judged apart from what a stall
 made of it. Whoever leads a run finds stalls and puts them into its record; all others read them
@@ -14,6 +14,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from services.joint.loop import READ_TIMEOUT_S
 from shared.bus import topics
 from shared.bus.code_names import name_of
 from shared.bus.messages import (
@@ -21,6 +22,7 @@ from shared.bus.messages import (
     JointEvent,
     JointState,
     Mode,
+    PlannerStatus,
     RunEvent,
     RunEventKind,
     SimTruth,
@@ -33,6 +35,10 @@ from tools.runs.run_log import RunLog
 
 MACHINE: Final = "the machine"
 SERVICES: Final = "all joint services"
+SIMULATOR: Final = "the simulator"
+CYCLE_MAX_NS: Final = round(READ_TIMEOUT_S * NS_PER_S)
+"""Longest cycle of a joint service that runs: its drive is silent."""
+TRUTH_NS: Final = round(NS_PER_S / topics.SIM_TRUTH.rate_hz)
 PERIOD_NS: Final = round(NS_PER_S / topics.JOINT_STATE.rate_hz)
 ALIVE_NS: Final = NS_PER_S
 """A module that was silent for longer before a stall has no part in it."""
@@ -56,7 +62,7 @@ class Stall(NamedTuple):
     begin_ns: int
     end_ns: int
     who: str
-    """`MACHINE`, one of its cores, or `SERVICES`."""
+    """`MACHINE`, one of its cores, `SERVICES` or `SIMULATOR`."""
     stolen_ms: float = 0.0
     """So much of it was taken by the host of a virtual machine."""
 
@@ -99,31 +105,53 @@ def stalls_of(events: Iterable[RunEvent]) -> list[Stall]:
     return found
 
 
-class CommonSilence:
-    """Finds when every joint service that was alive sent nothing, from the states that are seen.
+class Silence:
+    """Finds when one sender stood still, from those of its messages that are seen.
 
-    Not every state need be seen: the sequence number tells how many there were between two.
+    Each message has a count that grows while the sender runs; how much it grew between two messages
+    tells for how long the sender ran in between.
+    """
+
+    def __init__(self, step_ns: int) -> None:
+        """Take the longest time in which the count of a sender that runs grows by one."""
+        self._step_ns = step_ns
+        self.last_ns, self._count = -1, -1
+
+    def feed(self, t_ns: int, count: int) -> tuple[int, int] | None:
+        """Return begin and end of the silence before a message, if it is a stall."""
+        if t_ns == self.last_ns:  # a stamp that is repeated
+            return None
+        last_ns, steps = self.last_ns, count - self._count
+        self.last_ns, self._count = t_ns, count
+        silent_ns = t_ns - last_ns - (steps - 1) * self._step_ns
+        if last_ns < 0 or steps < 0 or silent_ns <= self._step_ns + GAP_NS:
+            return None
+        return last_ns, last_ns + silent_ns
+
+
+class CommonSilence:
+    """Finds when every joint service that was alive stood still.
+
+    By its cycles: its states repeat the stamp of the last sample while a drive is silent.
     """
 
     def __init__(self) -> None:
-        self._last: dict[str, tuple[int, int]] = {}
+        self._of: dict[str, Silence] = {}
         self._silent: dict[str, tuple[int, int]] = {}
 
     def feed(self, module: str, state: JointState) -> Stall | None:
         """Take a state; return the stall that it is the last to tell of."""
-        t_ns, seq = self._last.get(module, (state.t_ns, state.seq - 1))
-        self._last[module] = state.t_ns, state.seq
-        between = state.seq - seq - 1
-        silent_ns = state.t_ns - t_ns - between * PERIOD_NS
-        if between < 0 or silent_ns <= PERIOD_NS + GAP_NS:
+        own = self._of.setdefault(module, Silence(CYCLE_MAX_NS))
+        silent = own.feed(state.t_ns, state.cycle)
+        if silent is None:
             return None
-        self._silent[module] = t_ns, t_ns + silent_ns
-        alive = [one for one, (at_ns, _) in self._last.items() if at_ns > t_ns - ALIVE_NS]
-        if not self._silent.keys() >= set(alive):
+        self._silent[module] = silent
+        alive = [one for one, row in self._of.items() if row.last_ns > silent[0] - ALIVE_NS]
+        if len(alive) < 2 or not self._silent.keys() >= set(alive):
             return None
         begin_ns = max(self._silent[one][0] for one in alive)
         end_ns = min(self._silent[one][1] for one in alive)
-        if len(alive) < 2 or end_ns - begin_ns <= GAP_NS:
+        if end_ns - begin_ns <= GAP_NS:
             return None
         self._silent.clear()
         return Stall(begin_ns, end_ns, SERVICES)
@@ -140,14 +168,20 @@ class StallFinder:
             gaps: returns the new ones, CLOCK_MONOTONIC.
         """
         self._cores, self._gaps = cores, gaps
-        self._silences = CommonSilence()
+        self._services, self._world = CommonSilence(), Silence(TRUTH_NS)
         self._pending: list[Stall] = []
 
     def hear(self, module: str, state: JointState) -> None:
         """Take a state of a module."""
-        stall = self._silences.feed(module, state)
+        stall = self._services.feed(module, state)
         if stall is not None:
             self._pending.append(stall)
+
+    def see(self, truth: SimTruth) -> None:
+        """Take a state of the simulated world."""
+        silent = self._world.feed(truth.t_ns, truth.seq)
+        if silent is not None:
+            self._pending.append(Stall(*silent, SIMULATOR))
 
     def take(self, now_ns: int, pace: float) -> list[Stall]:
         """Return what has ended some moments ago and was not returned before, in order.
@@ -170,6 +204,8 @@ class StallFinder:
 def merged(stalls: Iterable[Stall], cores: int) -> list[Stall]:
     """Return stalls that overlap as one: the machine's if it, or all its cores, had a part in it.
 
+    A core's goes before that of services, and theirs before the simulator's.
+
     Args:
         stalls: in any order.
         cores: that are watched, each by itself.
@@ -186,10 +222,12 @@ def merged(stalls: Iterable[Stall], cores: int) -> list[Stall]:
 
 
 def _joined(group: Sequence[Stall], cores: int) -> Stall:
-    names = {row.who for row in group} - {SERVICES}
-    who = min(names) if len(names) == 1 else MACHINE if names else SERVICES
-    if names and MACHINE not in names and 1 < len(names) < cores:
-        who = " and ".join(sorted(names))
+    names = {row.who for row in group}
+    cores_of = sorted(names - {MACHINE, SERVICES, SIMULATOR})
+    if MACHINE in names or len(cores_of) >= max(cores, 2):
+        who = MACHINE
+    else:
+        who = " and ".join(cores_of) or (SERVICES if SERVICES in names else SIMULATOR)
     return Stall(
         min(row.begin_ns for row in group),
         max(row.end_ns for row in group),
@@ -346,13 +384,24 @@ def drop_outs(log: RunLog, rows: Sequence[Disturbance], zero_ns: int, end_ns: in
         if not groups or row[0] - groups[-1][0][0] > TOGETHER_NS:
             groups.append([])
         groups[-1].append(row)
+    statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS) if groups else []
+    sent_ns = np.array([row.t_ns for row in statuses], np.int64)
     lines = []
     for group in groups:
         modules = [module for _, module, _ in group]
         who = "all six" if len(set(modules)) == len(MODULES) else ", ".join(modules)
         why = ", ".join(sorted({cause for *_, cause in group}))
-        lines.append(
-            f"{(group[0][0] - zero_ns) / NS_PER_S:.2f} s: {who} left TRACK, {why}; no stall was "
-            "measured then"
-        )
+        at_ns = group[0][0]
+        silent_ms = _longest_gap_ms(sent_ns, at_ns - DROP_OUT_NS, at_ns)
+        known = "no stall was measured then"
+        if silent_ms:
+            known = f"the planner sent nothing for {silent_ms:.0f} ms"
+        lines.append(f"{(at_ns - zero_ns) / NS_PER_S:.2f} s: {who} left TRACK, {why}; {known}")
     return lines
+
+
+def _longest_gap_ms(sent_ns: NDArray[np.int64], begin_ns: int, end_ns: int) -> float:
+    """Return the longest gap between messages of a time, ms; 0.0 if each came as it should."""
+    near = sent_ns[(sent_ns >= begin_ns) & (sent_ns <= end_ns + DROP_OUT_NS)]
+    longest_ns = int(np.diff(near).max(initial=0))
+    return longest_ns / NS_PER_MS if longest_ns > PERIOD_NS + GAP_NS else 0.0

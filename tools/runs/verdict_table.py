@@ -74,7 +74,7 @@ def mark(row: VerdictLimit, summary: Summary) -> str:
     if row.key == "sequence_gaps" and summary["stopped"]:
         return "of a service that was stopped"
     if row.key in summary["across_stalls"]:
-        return "the machine stood still"
+        return "in a stall"
     if row.key in OF_THE_MACHINE:
         return f"{OVER}, a busy machine" if row.key != "sequence_gaps" else OVER
     return f"{OVER}, links impaired" if summary.get("links_impaired") else OVER
@@ -94,8 +94,9 @@ def stalls(summary: Summary) -> list[str]:
     rest = [row["lasted_ms"] for row in rows if row not in told]
     lines = [row["said"] for row in told]
     if rest:
-        lines.append(f"{len(rest)} {'more ' if told else ''}stalls without consequence, "
-                     f"{max(rest):.0f} ms at most")  # fmt: skip
+        stalls_are = "stall was" if len(rest) == 1 else "stalls were"
+        lines.append(f"{len(rest)} {'more ' if told else ''}{stalls_are} without consequence: "
+                     f"{max(rest):.0f} ms{' at most' if len(rest) > 1 else ''}")  # fmt: skip
     if told:
         lines.append("The figures above leave out what a stall made of the run.")
     lines += summary["drop_outs"]

@@ -11,9 +11,19 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import structs
 
 from shared.bus import topics
-from shared.bus.messages import Cause, JointEvent, JointState, Mode, RunEvent, RunEventKind
+from shared.bus.messages import (
+    Cause,
+    JointEvent,
+    JointState,
+    Mode,
+    PlannerStatus,
+    RunEvent,
+    RunEventKind,
+    SimTruth,
+)
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS, NS_PER_S, now_ns
 from shared.robot.joints import MODULES
@@ -29,6 +39,7 @@ from tools.runs.stalls import (
     MACHINE,
     MERGE_NS,
     SERVICES,
+    SIMULATOR,
     CommonSilence,
     Stall,
     StallFinder,
@@ -52,17 +63,16 @@ def states_of(stops_ms: Sequence[tuple[float, float]], until_ms: int = 400) -> l
     while t < until_ms:
         stop = next(((a, b) for a, b in stops_ms if a <= t < b), None)
         t = stop[1] if stop else t
-        sent.append(sample(JointState, t_ns=ms(t), seq=len(sent) + 1))
+        sent.append(sample(JointState, t_ns=ms(t), seq=len(sent) + 1, cycle=2 * len(sent)))
         t += CYCLE_MS
     return sent
 
 
 def found_in(states: dict[str, list[JointState]], every: int = 1) -> list[Stall]:
     silences = CommonSilence()
-    rows = sorted(
-        (state.t_ns, module, state) for module, sent in states.items() for state in sent[::every]
-    )
-    stalls = (silences.feed(module, state) for _, module, state in rows)
+    rows = [(module, state) for module, sent in states.items() for state in sent[::every]]
+    rows.sort(key=lambda row: row[1].t_ns)
+    stalls = (silences.feed(module, state) for module, state in rows)
     return [stall for stall in stalls if stall is not None]
 
 
@@ -71,7 +81,7 @@ def test_a_time_in_which_no_module_sends_is_a_stall_of_the_services(every: int) 
     states = {module: states_of([(100 + i, 180 + i)]) for i, module in enumerate(MODULES)}
     (stall,) = found_in(states, every)
     assert stall.who == SERVICES
-    assert stall.lasted_ms == pytest.approx(80, abs=3 * CYCLE_MS)
+    assert stall.lasted_ms == pytest.approx(80, abs=3 * CYCLE_MS + 4 * (every - 1) * CYCLE_MS)
     assert stall.begin_ns == pytest.approx(ms(100), abs=ms(2 * every * CYCLE_MS))
 
 
@@ -97,9 +107,29 @@ def test_silences_of_modules_one_after_the_other_are_no_stall() -> None:
 def test_a_service_that_starts_again_and_counts_from_one_is_no_stall() -> None:
     states = {module: states_of([]) for module in MODULES}
     for module in MODULES:
-        later = [sample(JointState, t_ns=ms(900 + 4 * i), seq=i + 1) for i in range(20)]
+        later = [sample(JointState, t_ns=ms(900 + 4 * i), seq=i, cycle=2 * i) for i in range(20)]
         states[module] = states[module][:50] + later
     assert found_in(states) == []
+
+
+def test_silent_drives_are_no_stall_of_their_services() -> None:
+    """The services run on, and repeat the stamp of the last sample."""
+    states = {module: states_of([], 100) for module in MODULES}
+    for sent in states.values():
+        last = sent[-1]
+        for _ in range(20):  # 100 ms
+            sent.append(structs.replace(sent[-1], seq=sent[-1].seq + 1, cycle=sent[-1].cycle + 1))
+        after = sent[-1].cycle + 1
+        sent += [structs.replace(last, t_ns=ms(200 + 4 * i), cycle=after + 2 * i) for i in range(9)]
+    assert found_in(states) == []
+
+
+def test_a_world_that_sends_no_truth_is_a_stall_of_the_simulator() -> None:
+    finder = StallFinder(2, list)
+    for seq, t_ms in enumerate([0, 10, 20, 142, 150, 160, 180, 190]):  # one of them is not seen
+        finder.see(sample(SimTruth, t_ns=ms(t_ms), seq=seq + (t_ms >= 180)))
+    (stall,) = finder.take(ms(300), 1.0)
+    assert stall == Stall(ms(20), ms(142), SIMULATOR)
 
 
 A = Stall(ms(100), ms(160), "core 0")
@@ -113,6 +143,7 @@ A = Stall(ms(100), ms(160), "core 0")
         ([A._replace(who="core 1")], 4, "core 0 and core 1"),
         ([A._replace(who=SERVICES, end_ns=ms(190))], 2, "core 0"),
         ([A._replace(who=MACHINE)], 2, MACHINE),
+        ([A._replace(who=SIMULATOR)], 2, "core 0"),
     ],
 )
 def test_what_overlaps_is_one_stall_of_all_that_stood_still(
@@ -138,7 +169,7 @@ def test_a_live_stall_is_told_once_whatever_finds_it() -> None:
         told += finder.take(state.t_ns, 1.0) if state.t_ns > ms(180) else []
     (stall,) = told
     assert (stall.who, stall.stolen_ms) == (MACHINE, 70.0)
-    assert stall.words == "the machine stood still for 86 ms, 70 ms taken by its host"
+    assert stall.words == "the machine stood still for 84 ms, 70 ms taken by its host"
 
 
 def test_in_slow_motion_a_stall_is_as_long_as_the_fleets_clock_says() -> None:
@@ -199,8 +230,11 @@ class Log:
 
     run: list[RunEvent]
     joints: dict[str, list[JointEvent]] = field(default_factory=dict)
+    planner: list[PlannerStatus] = field(default_factory=list)
 
     def messages(self, topic: Topic, module: str = "") -> list[Any]:
+        if topic is topics.PLANNER_STATUS:
+            return self.planner
         return self.run if topic is topics.RUN_EVENT else self.joints.get(module, [])
 
 
@@ -230,6 +264,14 @@ def test_a_hold_long_after_a_stall_is_none_of_its_doing() -> None:
     assert row.end_ns < ms(200)
     (line,) = drop_outs(log, [row], 0, 5 * NS_PER_S)
     assert line == "0.90 s: all six left TRACK, COMMAND_STALE; no stall was measured then"
+
+
+def test_a_planner_that_was_silent_is_named_and_not_excused() -> None:
+    sent = [sample(PlannerStatus, t_ns=ms(t)) for t in (800, 804, 808, 871, 875)]
+    log: Any = Log([], {MODULES[2]: held(862, 1400)}, sent)
+    (line,) = drop_outs(log, [], 0, 5 * NS_PER_S)
+    assert line.endswith("left TRACK, COMMAND_STALE; the planner sent nothing for 63 ms")
+    assert line.startswith(f"0.86 s: {MODULES[2]} ")
 
 
 def test_a_kill_ends_what_a_stall_is_the_reason_of() -> None:
@@ -281,8 +323,8 @@ def test_messages_lost_in_a_stall_name_it_and_stalls_without_effect_share_a_line
     quiet = [row | {"messages_lost": 0, "lasted_ms": length} for length in (21.0, 34.0)]
     summary = judged(sequence_gaps=2, stalls=[row, *quiet], across_stalls=["sequence_gaps"])
     words = shown(summary)
-    assert re.search(r"messages lost on the way .* the machine stood still", words)
-    assert "6.58 s: x\n2 more stalls without consequence, 34 ms at most\n" in words
+    assert re.search(r"messages lost on the way .* in a stall", words)
+    assert "6.58 s: x\n2 more stalls were without consequence: 34 ms at most\n" in words
     assert "does not decide" not in words
 
 
