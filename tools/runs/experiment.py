@@ -32,7 +32,7 @@ from shared.config.scenarios import (
 )
 from shared.config.sections import LawConfig
 from shared.exceptions import FleetError, RunError
-from shared.places import SCENARIOS
+from shared.places import DEFAULT_CONFIG, SCENARIOS
 from shared.robot import gain_schedule
 from shared.robot.joints import MODULES
 from tools.guarded_streams import printable
@@ -64,8 +64,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         "--scenario",
         default="squat",
         metavar="NAME|FILE",
-        help="what happens: a name from deploy/scenarios, or a file (default: squat, "
-        "the paper's Fig. 7)",
+        help="what happens: a name (of a file in scenarios/ beside the robot file, or one that is "
+        "shipped), or a file (default: squat, the paper's Fig. 7)",
     )
     parser.add_argument("--duration", type=finite, metavar="S", help="scenario time to run, s")
     parser.add_argument(
@@ -216,17 +216,24 @@ def parse_fault(text: str) -> Fault:
     return msgspec.convert({**row, "axis": axis, "duration": duration}, Fault)
 
 
-def scenario_file(name: str) -> Path:
+def scenario_file(name: str, config: Path = DEFAULT_CONFIG) -> Path:
     """Return the file of a scenario given by name or path, absolute.
+
+    Args:
+        name: a path that ends with .toml; or a name: first from the folder `scenarios` beside the
+            robot file, then from those that are shipped.
+        config: the robot file.
 
     Raises:
         FleetError: there is none; the message lists the names.
     """
-    path = Path(name) if name.endswith(".toml") else SCENARIOS / f"{name}.toml"
-    if not path.is_file():
-        known = ", ".join(sorted(file.stem for file in SCENARIOS.glob("*.toml"))) or "none yet"
-        raise FleetError(f"no scenario {name!r}; one of {known}, or the path of a .toml file")
-    return path.absolute()
+    folders = (config.parent / SCENARIOS.name, SCENARIOS)
+    paths = [Path(name)] if name.endswith(".toml") else [at / f"{name}.toml" for at in folders]
+    for path in paths:
+        if path.is_file():
+            return path.absolute()
+    known = ", ".join(sorted({file.stem for at in folders for file in at.glob("*.toml")}))
+    raise FleetError(f"no scenario {name!r}; one of {known}, or the path of a .toml file")
 
 
 def make_scenario(args: argparse.Namespace) -> Scenario:
@@ -238,7 +245,7 @@ def make_scenario(args: argparse.Namespace) -> Scenario:
     Raises:
         ConfigError: file and flags make no valid scenario.
     """
-    path = scenario_file(args.scenario)
+    path = scenario_file(args.scenario, args.config)
     scenario = scenarios.load(path)
     duration = args.duration if args.duration is not None else scenario.duration
     if duration <= 0.0:

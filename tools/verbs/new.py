@@ -110,7 +110,7 @@ def _what_next(directory: Path) -> str:
         "what next:",
         f"  cd {shlex.quote(str(directory))}",
         "  xrl sim                                  # every verb finds robot.toml here",
-        "  xrl sim --scenario scenarios/crawl.toml --plant plants/ideal.toml",
+        "  xrl sim --scenario crawl --plant plants/ideal.toml",
         "  xrl gains                                # after a change of masses, lengths, limits",
     ]
     if shutil.which("cc"):

@@ -234,7 +234,7 @@ def _overrides(args: argparse.Namespace, out: Path) -> dict[str, list[str]]:
     if args.readonly:
         overrides |= {module: ["--readonly"] for module in MODULES}
     if args.scenario is not None:
-        path = str(scenario_file(args.scenario))
+        path = str(scenario_file(args.scenario, args.config))
         overrides["simulator"] = ["--scenario", path, "--autostart", str(SETTLE_S)]
         overrides["recorder"] += ["--scenario", path, "--scenario-text", args.scenario]
     if args.plant:

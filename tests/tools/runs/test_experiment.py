@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from shared.config.scenarios import FAULT_KINDS, Fault
-from shared.exceptions import ConfigError
-from shared.process import DEFAULT_CONFIG
+from shared.exceptions import ConfigError, FleetError
+from shared.places import DEFAULT_CONFIG, SCENARIOS
 from shared.robot.gain_schedule import path_beside
 from tools.runs import experiment
 
@@ -70,3 +70,16 @@ def test_an_imu_is_not_fitted_to_a_robot_without_a_bus_for_it(tmp_path: Path) ->
     assert not experiment.load_robot(older).imu.fitted
     with pytest.raises(ConfigError, match=r"imu\.bus"):
         experiment.load_robot(older, imu=True)
+
+
+def test_a_scenario_is_taken_by_name_from_beside_the_robot_file_first(tmp_path: Path) -> None:
+    config = tmp_path / "robot.toml"
+    assert experiment.scenario_file("squat", config) == SCENARIOS / "squat.toml"
+    own = tmp_path / "scenarios"
+    own.mkdir()
+    shutil.copy(SCENARIOS / "stand.toml", own / "squat.toml")
+    shutil.copy(SCENARIOS / "stand.toml", own / "mine.toml")
+    assert experiment.scenario_file("squat", config) == own / "squat.toml"
+    assert experiment.scenario_file("crawl", config) == SCENARIOS / "crawl.toml"
+    with pytest.raises(FleetError, match="no scenario 'nothing'; one of .*crawl, .*mine, .*squat"):
+        experiment.scenario_file("nothing", config)
