@@ -38,6 +38,9 @@ SAMPLES: Final = 200
 DRAWN_MAX: Final = (0.3, 2.0)
 """Largest drawn arguments, in turn: with the first most results are numbers, the second is as far
 as joints go."""
+_HELPERS_BEGIN: Final = '#pragma GCC push_options\n#pragma GCC optimize ("fp-contract=fast")\n'
+_HELPERS_END: Final = "/* Configuration this file was compiled with */\n"
+"""In the C of a graph: up to here are functions that CasADi's own library has as well."""
 _NO_COMPILER: Final = "no C compiler `cc` on PATH: CasADi interprets the law's graphs, all runs"
 
 
@@ -80,14 +83,24 @@ def build(function: ca.Function, folder: Path = FOLDER) -> Path:
     return path
 
 
+def translation(function: ca.Function) -> str:
+    """Return a graph as C.
+
+    The interpreter computes operation by operation, but calls its library for products of matrices
+    and the like. On Arm that library has fused multiply-adds, so the C has them in the same places.
+    """
+    code = ca.CodeGenerator(f"{function.name()}.c")
+    code.add(function)
+    end = f"#pragma GCC pop_options\n{_HELPERS_END}"
+    return _HELPERS_BEGIN + code.dump().replace(_HELPERS_END, end, 1)
+
+
 def _build(function: ca.Function, compiler: str, path: Path) -> None:
     """Build a library under another name, and move it to its path only if it proves right."""
     folder = path.parent
     with tempfile.TemporaryDirectory(dir=folder) as name:
         here, source = Path(name), f"{function.name()}.c"
-        code = ca.CodeGenerator(source)
-        code.add(function)
-        (here / source).write_text(code.dump(), encoding="utf-8")
+        (here / source).write_text(translation(function), encoding="utf-8")
         library = here / path.name
         done = subprocess.run(
             [compiler, *FLAGS, source, "-o", str(library), "-lm"],

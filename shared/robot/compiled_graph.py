@@ -23,7 +23,8 @@ Array = NDArray[np.float64]
 FOLDER: Final = Path(sys.prefix) / "xrl-graphs"
 """Libraries of this environment, one for each graph."""
 FLAGS: Final = ("-O2", "-ffp-contract=off", "-fPIC", "-shared")
-"""The compiler's. No fused multiply-add: it would round otherwise than CasADi's interpreter."""
+"""The compiler's. No fused multiply-add: it would round otherwise than CasADi's interpreter. The
+functions of its library are an exception (`tools.graph_libraries.translation`)."""
 SWITCH: Final = "XRL_GRAPHS"
 """Environment variable; `interpreted` leaves every library aside."""
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import platform
 import shutil
+import subprocess
 from pathlib import Path
 
 import casadi as ca
@@ -16,12 +18,19 @@ from shared.config import scenarios
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.robot import compiled_graph
-from shared.robot.compiled_graph import SWITCH, CompiledGraph, library_of
+from shared.robot.compiled_graph import FLAGS, SWITCH, CompiledGraph, library_of
 from tools import graph_libraries
 from tools.graph_libraries import build, compare, graphs_of
 from tools.runs.experiment import scenario_file
 
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler here")
+
+FUSED = ("-mfma",) if platform.machine() == "x86_64" else ()
+"""Has a compiler use fused multiply-adds, if it may; on Arm it does of itself."""
+can_fuse = pytest.mark.skipif(
+    bool(FUSED) and " fma " not in Path("/proc/cpuinfo").read_text(encoding="utf-8"),
+    reason="the processor has no fused multiply-add",
+)
 
 
 def graph(factor: float = 2.0) -> ca.Function:
@@ -64,6 +73,26 @@ def test_the_switch_leaves_libraries_aside(folder: Path, monkeypatch: pytest.Mon
     build(graph(), folder)
     monkeypatch.setenv(SWITCH, "interpreted")
     assert not CompiledGraph(graph()).translated
+
+
+@can_fuse
+@needs_compiler
+def test_products_of_matrices_are_fused_where_a_processor_can_and_a_graphs_own_sums_are_not(
+    tmp_path: Path,
+) -> None:
+    """As CasADi's library and its interpreter round on Arm, where every graph is compared."""
+    a, b, c = 1.0 + 2.0**-30, 1.0 - 2.0**-30, -1.0
+    row, scalars = ca.MX.sym("row", 1, 2), ca.SX.sym("scalars", 3)
+    own = ca.Function("own", [scalars], [scalars[0] * scalars[1] + scalars[2]])
+    column, three = ca.MX.sym("column", 2), ca.MX.sym("three", 3)
+    both = ca.Function("both", [row, column, three], [row @ column, own(three)])
+    (tmp_path / "both.c").write_text(graph_libraries.translation(both), encoding="utf-8")
+    words = ["cc", *FLAGS, *FUSED, "both.c", "-o", "both.so"]
+    subprocess.run(words, check=True, cwd=tmp_path)
+    library = ca.external("both", str(tmp_path / "both.so"))
+    product, own_sum = library.call([ca.DM([[c, a]]), ca.DM([1.0, b]), ca.DM([a, b, c])])
+    assert float(product) == -(2.0**-60), "once rounded"
+    assert float(own_sum) == 0.0, "twice rounded"
 
 
 def test_a_library_with_other_numbers_is_refused() -> None:
