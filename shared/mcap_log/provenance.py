@@ -27,11 +27,13 @@ THREAD_VARIABLES: Final = (
 
 
 def machine() -> dict[str, str]:
-    """Return Python, platform, CPU model, CPU count and the thread environment (JSON)."""
+    """Return Python, platform, processor, C library and the thread environment (JSON)."""
     threads = {name: os.environ[name] for name in THREAD_VARIABLES if name in os.environ}
     return {
         "python": platform.python_version(),
         "platform": platform.platform(),
+        "architecture": platform.machine() or UNKNOWN,
+        "libc": " ".join(platform.libc_ver()).strip() or UNKNOWN,
         "cpu_model": cpu_model(Path("/proc/cpuinfo")),
         "cpu_count": str(os.cpu_count() or 0),
         "thread_env": msgspec.json.encode(threads).decode(),
@@ -48,10 +50,17 @@ def packages() -> dict[str, str]:
 
 
 def cpu_model(cpuinfo: Path) -> str:
-    """Return the CPU's name as Linux gives it, or the platform module's."""
+    """Return the CPU's name as Linux gives it, or the platform module's.
+
+    On Arm Linux gives numbers: the makers and parts of the cores, each once.
+    """
     try:
         lines = cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
         lines = []
-    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return next(names, "") or platform.processor() or UNKNOWN
+    rows = [(name.strip(), value.strip()) for name, _, value in (x.partition(":") for x in lines)]
+    names = (value for name, value in rows if name == "model name")
+    makers = (value for name, value in rows if name == "CPU implementer")
+    parts = (value for name, value in rows if name == "CPU part")
+    cores = sorted({f"{maker} part {part}" for maker, part in zip(makers, parts, strict=False)})
+    return next(names, "") or ", ".join(cores) or platform.processor() or UNKNOWN

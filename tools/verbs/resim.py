@@ -13,13 +13,15 @@ from rich.table import Table
 from rich.text import Text
 
 from services.planner.controller_file import controller_maker
+from shared import revision
 from shared.bus.messages import Message
 from shared.exceptions import FAULT_EXIT_CODE, RunError
-from shared.mcap_log.provenance import machine
+from shared.mcap_log import provenance
 from shared.robot.joints import MODULES
 from tools.analysis.reexecution import rewritten
 from tools.analysis.reexecution.compare import size
 from tools.analysis.reexecution.execution import Execution
+from tools.analysis.reexecution.origin import likely_reason
 from tools.analysis.reexecution.outcome import ReexecutionResult
 from tools.analysis.reexecution.params import with_params
 from tools.analysis.reexecution.ranges import RangeTask, execute_range, merged, ranges_of
@@ -128,15 +130,17 @@ def run(args: argparse.Namespace) -> int:
             outcomes = _one_by_one(
                 args, logs, min(part.end_s, index.length_s), names, recomputed, progress
             )
-    _other_machine(index, console)
     if has_own_controller(index) and args.controller is None and "planner" in names:
         console.print(
             "a controller of somebody's own led: the planner is equal only with --controller FILE",
             style="yellow",
         )
     console.print(summary(outcomes))
+    changed = bool(args.param or args.controller)
     for outcome in outcomes:
-        tell(outcome, index, console, changed=bool(args.param or args.controller))
+        tell(outcome, index, console, changed=changed)
+    if not changed and any(outcome.comparison.first for outcome in outcomes):
+        _tell_reason(index, console)
     if not any(outcome.ticks for outcome in outcomes):
         raise RunError(
             f"{args.log}: nothing could be executed: it holds no memory of these services; a "
@@ -267,11 +271,10 @@ def _short(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)[:24]
 
 
-def _other_machine(index: RunIndex, console: Console) -> None:
-    """Say so if the run is of another processor: BLAS then takes other kernels."""
-    recorded, here = index.metadata["run"].get("cpu_model", ""), machine()["cpu_model"]
-    if recorded and recorded != here:
-        console.print(
-            f"recorded on {recorded}, executed on {here}: last bits may differ; see --tolerance",
-            style="yellow",
-        )
+def _tell_reason(index: RunIndex, console: Console) -> None:
+    """Print what the run was made with that is something else here."""
+    here = {
+        "run": revision.code() | provenance.machine(),
+        "packages": provenance.packages(),
+    }
+    console.print(likely_reason(index.metadata, here), style="yellow")

@@ -14,6 +14,14 @@ def test_the_cpu_has_a_name_with_and_without_cpuinfo(tmp_path: Path) -> None:
     assert provenance.cpu_model(tmp_path / "absent")
 
 
+def test_an_arm_cpu_is_named_by_its_cores_each_kind_once(tmp_path: Path) -> None:
+    """Linux gives no model name there: two boards would be the same machine, an unknown one."""
+    little, big = "CPU implementer\t: 0x41\nCPU part\t: 0xd05\n", "0x41\nCPU part\t: 0xd0b\n"
+    cpuinfo = tmp_path / "cpuinfo"
+    cpuinfo.write_text(f"processor\t: 0\n{little}{little}CPU implementer\t: {big}")
+    assert provenance.cpu_model(cpuinfo) == "0x41 part 0xd05, 0x41 part 0xd0b"
+
+
 def test_machine_and_packages_are_text_and_name_what_changes_bits(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -21,4 +29,5 @@ def test_machine_and_packages_are_text_and_name_what_changes_bits(
     machine = provenance.machine()
     assert '"OPENBLAS_NUM_THREADS":"1"' in machine["thread_env"]
     assert all(isinstance(value, str) and value for value in machine.values())
-    assert {"numpy", "msgspec", "mcap"} <= set(provenance.packages())
+    assert {"architecture", "libc", "python", "cpu_model"} <= set(machine)
+    assert {"casadi", "msgspec", "numpy", "pin", "scipy"} <= set(provenance.packages())

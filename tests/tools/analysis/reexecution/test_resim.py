@@ -13,14 +13,18 @@ from services.simulator.plant import PlantConfig, changed
 from shared.bus import topics
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Fault, Kill, Restart
+from shared.exceptions import FAULT_EXIT_CODE
+from shared.mcap_log import provenance
 from shared.network.impairment import Impairment
 from shared.robot.joints import MODULES
 from tests.imu.robots import with_imu
 from tests.lockstep.runs import still
 from tests.shared.mcap_log.runs import state
 from tests.tools.analysis.reexecution.executions import executed
+from tests.tools.exit_codes import exit_code
 from tools import cli
 from tools.analysis.reexecution.outcome import ReexecutionResult
+from tools.analysis.reexecution.params import with_params
 from tools.analysis.reexecution.ranges import execute_range, merged, ranges_of
 from tools.runs.recorded_lockstep import simulate
 from tools.runs.run_log import WHOLE, RunLog, RunPart, parts_of, read_run
@@ -189,6 +193,24 @@ def test_a_trace_that_the_log_lacks_does_not_let_the_service_go_on_from_a_guess(
     outcome = executed(log, "ankle_left")
     assert outcome.starts == 2
     assert outcome.comparison.first is None
+
+
+def test_a_difference_is_told_with_its_likely_reason_and_none_without(
+    recorded: Path,
+    robot: RobotConfig,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    versions = provenance.packages()
+    reason = f"numpy {versions['numpy']}, here 0.1"
+    words = ["resim", str(recorded), "--service", "planner", "--until-first-difference"]
+    monkeypatch.setattr(provenance, "packages", lambda: versions | {"numpy": "0.1"})
+    assert exit_code(words) == 0
+    assert reason not in capsys.readouterr().out
+    other = with_params(with_imu(robot), ["gains.k_p_x=2000"], "")
+    monkeypatch.setattr(resim, "robot_of", lambda _log: other)
+    assert exit_code(words) == FAULT_EXIT_CODE
+    assert reason in capsys.readouterr().out
 
 
 def test_a_changed_gain_changes_what_comes_out_from_the_first_tick_with_an_error_on(
