@@ -21,6 +21,7 @@ import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
+from zlib import crc32
 
 from services.joint.rearm_guard import mapped
 from shared.bus.messages import Mode, Pair
@@ -33,9 +34,11 @@ STALE_NS: Final = 20 * NS_PER_MS
 """An older angle says nothing of where the joint is now."""
 GONE_NS: Final = round(LOST_S * NS_PER_S)
 """Age of a row beyond which its service is dead or its drive is lost, ns."""
+_SUM: Final = struct.Struct("<Q")
+_BODY: Final = struct.Struct("<QddQQ")
 _ROW: Final = struct.Struct("<QQddQQ")
-"""A number that is odd while it is written, then a `NeighbourRow`."""
-_NUMBER: Final = struct.Struct("<Q")
+"""The checksum of a `NeighbourRow`, then the row. A number that is odd while a row is written would
+do only where other processors see stores in their order; Arm does not promise that."""
 READS: Final = 5
 """Reads of a row until it is whole; its writer may have died over it."""
 _LEG: Final = N_MODULES // 2
@@ -83,7 +86,7 @@ def view_of(module: str, rows: Sequence[NeighbourRow | None], now_ns: int) -> Ne
 
     Args:
         module: name of the viewing module.
-        rows: the six rows; None while one is being written.
+        rows: the six rows; None while one is being written, or if it never was.
         now_ns: the host's monotonic clock.
     """
     kind, own = kind_of(module), MODULE_INDEX[module]
@@ -135,15 +138,11 @@ class Neighbours:
         self._memory = mapped(path_of(run_dir), _SIZE)
         self._module = module
         self._at = MODULES.index(module) * _ROW.size
-        self._written: int = _ROW.unpack_from(self._memory, self._at)[0] & ~1
 
     def write(self, row: NeighbourRow) -> None:
         """Write down where this module is."""
-        self._written += 2
-        memory, at = self._memory, self._at
-        # not `pack_into`, which first writes zeros: a reader took a module for one that never was
-        memory[at : at + _ROW.size] = _ROW.pack(self._written - 1, *row)
-        _NUMBER.pack_into(memory, at, self._written)  # even again: whole
+        body = _BODY.pack(*row)
+        self._memory[self._at : self._at + _ROW.size] = _SUM.pack(crc32(body)) + body
 
     @staticmethod
     def mode_of(run_dir: Path, module: str) -> Mode | None:
@@ -156,12 +155,12 @@ class Neighbours:
             try:
                 with path_of(run_dir).open("rb", buffering=0) as file:
                     file.seek(MODULES.index(module) * _ROW.size)
-                    number, *row = _ROW.unpack(file.read(_ROW.size))
+                    data = file.read(_ROW.size)
+                row, whole = _unpacked(data)
             except (OSError, struct.error):
                 return None
-            mode = NeighbourRow(*row).mode
-            found = Mode(mode) if number and mode in tuple(Mode) else None
-            if number and not number & 1:
+            found = Mode(row.mode) if any(data) and row.mode in tuple(Mode) else None
+            if whole:
                 break
         return found
 
@@ -170,7 +169,11 @@ class Neighbours:
         return view_of(self._module, [self._read(at) for at in range(0, _SIZE, _ROW.size)], now_ns)
 
     def _read(self, at: int) -> NeighbourRow | None:
-        number, *row = _ROW.unpack_from(self._memory, at)
-        if number & 1 or _ROW.unpack_from(self._memory, at)[0] != number:
-            return None  # written meanwhile; the next cycle is 2 ms away
-        return NeighbourRow(*row)
+        row, whole = _unpacked(self._memory[at : at + _ROW.size])
+        return row if whole else None  # written meanwhile; the next cycle is 2 ms away
+
+
+def _unpacked(data: bytes) -> tuple[NeighbourRow, bool]:
+    """Return a row, and True if it is whole."""
+    checksum, *row = _ROW.unpack(data)
+    return NeighbourRow(*row), checksum == crc32(data[_SUM.size :])
