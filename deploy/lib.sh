@@ -17,7 +17,8 @@ die() { say "$*"; exit 2; }  # 1 is a robot that fell
 tried="3.14 3.13 3.12 3.11"  # Pythons that the lock files were tried with, the preferred one first
 
 full=$root/requirements.lock
-runtime=$root/requirements.runtime.lock  # what a robot runs: no test tools
+runtime=$root/requirements.runtime.lock  # what a robot in service needs
+robot_extras="ros2 usb"  # what only some robots need; requirements.NAME.lock adds it to the runtime's
 
 # The environment is right while this stays the same; scripts in it hold its absolute path.
 fingerprint() {  # LOCK
@@ -68,6 +69,7 @@ how_to_install() {
 }
 
 # Wheels bring all but one library of the system. Without it the first import would be a traceback.
+# (Drives over USB want libusb-1.0 as well; who uses them is told so, shared/system_packages.py.)
 check_libraries() {  # PYTHON
   "$1" -c 'import ctypes; ctypes.CDLL("libgomp.so.1")' 2>/dev/null ||
     die "the library libgomp.so.1 is missing, which Pinocchio needs; install it:" \
@@ -115,6 +117,14 @@ make_environment() {  # LOCK
     die "pip could not install the locked packages, see above; the next try starts afresh"
   fingerprint "$lock" >"$stamp"
   rm -f "$half_made"
+}
+
+add_extras() {  # NAME...
+  local extra
+  for extra; do
+    "$venv/bin/python" -m pip install --quiet --compile --require-hashes --only-binary :all: --no-deps \
+      --requirement "$root/requirements.$extra.lock" || die "pip could not add $extra, see above"
+  done
 }
 
 # The graphs' C is right while this stays the same; a library also carries its graph's hash.

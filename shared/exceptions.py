@@ -64,6 +64,10 @@ class RunError(XrlError):
     """A run could not be carried out or its record could not be read."""
 
 
+class MissingPackageError(RunError):
+    """An optional package is not installed (`shared.extras`)."""
+
+
 _REMEDIES: Final = {
     errno.ENOSPC: "a disk is full: that of the output, /tmp or /dev/shm",
     errno.EDQUOT: "this user's share of a disk is used up",

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import ast
 import fnmatch
+import subprocess
+import sys
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+
+from shared.extras import EXTRAS
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("services", "shared", "tools")
@@ -64,6 +68,13 @@ VENDORS = {
     "aiohttp": ["tools/view/server.py"],
     "cryptography": ["tools/keys/certificates.py"],
     "cvxpy": ["services/planner/split_program.py"],
+    "matplotlib": [
+        "tools/output.py",
+        "tools/runs/figure.py",
+        "tools/runs/damping_picture.py",
+        "tools/studies/*/*picture.py",
+    ],
+    "PIL": ["tools/analysis/reports/canvas.py", "tools/analysis/reports/moving_picture.py"],
     "casadi": [
         "services/planner/certificate.py",
         "services/planner/symbolic.py",
@@ -87,6 +98,20 @@ VENDORS = {
 }
 """Who may import a vendor's package: one owner each; MCAP is written and read in two places,
 and python-can is the wire itself to those that speak on it."""
+
+NEEDS_EXTRA = {
+    "services/joint/drivers/odrive_usb.py": "usb",
+    "tools/bringup/usb_board.py": "usb",
+    "tools/view/server.py": "view",
+    "tools/view/foxglove_server.py": "foxglove",
+    "tools/export/ros2_bag.py": "ros2",
+    "tools/analysis/reports/canvas.py": "plot",
+    "tools/analysis/reports/moving_*.py": "plot",
+    "tools/learning/environment.py": "learn",
+    "tools/bench/transports/over_*.py": "bench",
+}
+"""Modules that cannot be imported without an extra. Whoever imports one, by a function, has called
+`require` there. All others can be imported with the packages of `dependencies` alone."""
 
 LAWS = [
     "services/joint/pd_law.py",
@@ -275,6 +300,60 @@ def test_a_vendor_package_has_its_owner_and_no_other(vendor: str) -> None:
     }
     assert strangers == set()
     assert users, f"nothing imports {vendor}: the row can go"
+
+
+ALONE = """
+import importlib, sys
+for name in {hidden}:
+    sys.modules[name] = None
+for name in {modules}:
+    try:
+        importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        print(name, error.name)
+"""
+
+
+def test_a_module_can_be_imported_without_the_packages_of_extras_but_those_listed() -> None:
+    """Services, `--help` and completion are made of these."""
+    hidden = sorted({name for names in EXTRAS.values() for name in names})
+    modules = [file.removesuffix(".py").replace("/", ".") for file in SOURCES]
+    code = ALONE.format(hidden=hidden, modules=modules)
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, cwd=ROOT, check=True, capture_output=True, text=True, timeout=100)
+    failed = dict(line.split() for line in done.stdout.splitlines())
+    assert all(package.split(".")[0] in hidden for package in failed.values()), failed
+    files = {name.replace(".", "/") + ".py" for name in failed}
+    listed = {file for file in SOURCES if any(fnmatch.fnmatch(file, row) for row in NEEDS_EXTRA)}
+    beside = {"tools/bench/transports/over_zenoh.py", "tools/bench/transports/over_datagrams.py"}
+    assert files == listed - beside
+
+
+def extra_of(imported: Import) -> str:
+    """Return the extra that the imported module of ours cannot do without; "" if there is none."""
+    for module in (imported.module, imported.full):
+        file = module.replace(".", "/") + ".py"
+        if file in SOURCES:
+            for row, extra in NEEDS_EXTRA.items():
+                if fnmatch.fnmatch(file, row):
+                    return extra
+    return ""
+
+
+def test_what_needs_an_extra_is_imported_where_it_is_required() -> None:
+    wrong = []
+    for file, source in SOURCES.items():
+        if any(fnmatch.fnmatch(file, row) for row in NEEDS_EXTRA):
+            continue
+        wanted = {extra for imported in IMPORTS[file] if (extra := extra_of(imported))}
+        for node in ast.walk(ast.parse(source)):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                text = ast.unparse(node)
+                extras = {extra_of(imported) for imported in imports_in(text)} - {""}
+                wanted -= extras
+                wrong += [(file, node.name, e) for e in extras if f"require('{e}'" not in text]
+        wrong += [(file, "at its top", extra) for extra in wanted]
+    assert wrong == []
 
 
 @pytest.mark.parametrize("file", LAWS)

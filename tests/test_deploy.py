@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from shared.extras import ON_ROBOTS
+
 ROOT = Path(__file__).resolve().parents[1]
 TOOLS = ("bash", "cat", "dirname", "sha256sum", "find", "mkdir")
 
@@ -100,3 +102,26 @@ def test_without_a_python_uv_makes_the_environment(system: Path) -> None:
     done = run(system, "make_venv")
     assert done.returncode == 2
     assert "no Python of 3.14 3.13 3.12 3.11 with its venv module" in done.stderr
+
+
+def test_a_robots_extras_are_those_that_the_runtime_knows(system: Path) -> None:
+    assert set(run(system, 'printf %s "$robot_extras"').stdout.split()) == ON_ROBOTS
+
+
+def test_an_extra_is_added_by_its_own_lock_with_hashes(system: Path) -> None:
+    program(system, "python", 'echo "$*"')
+    (system / "bin").mkdir()
+    (system / "bin" / "python").symlink_to(system / "python")
+    done = run(system, f'venv={system}; add_extras ros2 usb; echo "added $?"')
+    first, second, end = done.stdout.splitlines()
+    assert first.endswith(f"--requirement {ROOT}/requirements.ros2.lock")
+    assert second.endswith(f"--requirement {ROOT}/requirements.usb.lock")
+    assert "--require-hashes --only-binary :all: --no-deps" in first
+    assert end == "added 0"
+
+
+def test_no_other_extra_goes_with_a_robots_environment() -> None:
+    words = [ROOT / "deploy" / "install", "--runtime", "usb", "sim"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=30)
+    assert done.returncode == 2
+    assert done.stderr == "deploy: sim: one of ros2 usb goes with --runtime\n"

@@ -30,6 +30,7 @@ from services.simulator.plant import PlantConfig
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, RunError
+from shared.extras import is_installed
 from shared.robot.compiled_graph import FLAGS, FOLDER, Array, library_of
 from tools.verb_table import add_config
 
@@ -50,11 +51,13 @@ def command() -> str:
 
 
 def graphs_of(robot: RobotConfig) -> list[ca.Function]:
-    """Return every graph that a planner and a simulated world of a robot call in their cycles."""
-    body = body_of(robot, PlantConfig())
-    drivetrain = step_graph(body.drivetrain, body.motor_from_joint, body.model.opt.timestep)
-    law = symbolic.build(robot, leg_geometry(robot))
-    return [*law, certificate.stiffness_graph(), drivetrain, axis_control.law_graph()]
+    """Return the graphs of the law, and of the simulator where the extra `sim` is installed."""
+    graphs = [*symbolic.build(robot, leg_geometry(robot)), certificate.stiffness_graph()]
+    if is_installed("sim"):
+        body = body_of(robot, PlantConfig())
+        drivetrain = step_graph(body.drivetrain, body.motor_from_joint, body.model.opt.timestep)
+        graphs += [drivetrain, axis_control.law_graph()]
+    return graphs
 
 
 def build(function: ca.Function, folder: Path = FOLDER) -> Path:

@@ -12,6 +12,7 @@ from rich.progress import Progress
 
 from shared.atomic_file import atomic_file, replace_file
 from shared.exceptions import RunError
+from shared.extras import require
 from tools.terminal import Console
 
 if TYPE_CHECKING:
@@ -58,6 +59,23 @@ def write_atomically(out: Path, content: bytes, *, private: bool = False) -> Non
         replace_file(out, content, private=private)
     except OSError as error:
         raise RunError(f"{out}: cannot be written: {error.strerror}; give another -o") from None
+
+
+def new_figure(width: float, height: float, dpi: int = 110) -> Figure:
+    """Return an empty picture of Matplotlib, laid out by itself.
+
+    Args:
+        width: inches.
+        height: inches.
+        dpi: dots per inch.
+
+    Raises:
+        MissingPackageError: there is no Matplotlib.
+    """
+    require("plot")
+    from matplotlib.figure import Figure  # noqa: PLC0415 - takes a second, and needs the extra
+
+    return Figure(figsize=(width, height), dpi=dpi, layout="constrained")
 
 
 def save_figure(figure: Figure, path: Path) -> None:

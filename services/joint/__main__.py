@@ -20,6 +20,7 @@ from shared.bus.traces import JointTrace
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig, expand
 from shared.config.sections import CanConfig
+from shared.extras import require
 from shared.process import (
     StopFlag,
     freeze_garbage,
@@ -80,7 +81,7 @@ def open_drive(robot: RobotConfig, module: str, run_dir: Path, *, read_only: boo
 def _open(robot: RobotConfig, module: str, run_dir: Path) -> Drive:
     wiring = robot.module_named(module)
     if robot.joint_service.driver == "odrive_usb":
-        # imported here: the package takes a second, and needs the system's libusb-1.0
+        require("usb")
         from services.joint.drivers.odrive_usb import OdriveUsb  # noqa: PLC0415
 
         return OdriveUsb(wiring.serial_number, robot.drive)

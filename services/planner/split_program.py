@@ -16,9 +16,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-import cvxpy as cp
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
@@ -33,9 +32,15 @@ from services.planner.push_limit import PushLimits, limits_at
 from services.planner.split import CouplingGains, ScheduledGains
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
+from shared.extras import late
 from shared.robot.gain_schedule import VERSION, digest_of, inputs_of
 from shared.robot.gain_table import GainSchedule, LegGains
 from shared.robot.joints import N_LEG
+
+if TYPE_CHECKING:
+    import cvxpy as cp
+else:
+    cp = late("cvxpy")
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]

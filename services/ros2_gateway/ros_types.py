@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rosbags.typesys import Stores, get_typestore
+from shared.extras import late
+
+if TYPE_CHECKING:
+    from rosbags import typesys
+else:
+    typesys = late("rosbags.typesys")
 
 
 class RosTypes:
@@ -16,7 +21,7 @@ class RosTypes:
         Args:
             distribution: of `shared.config.checks.ROS2_DISTRIBUTIONS`.
         """
-        self._store = get_typestore(Stores[f"ROS2_{distribution.upper()}"])
+        self._store = typesys.get_typestore(typesys.Stores[f"ROS2_{distribution.upper()}"])
 
     def hash(self, type_name: str) -> str:
         """Return the hash of a type's description, such as `RIHS01_a13e...`."""

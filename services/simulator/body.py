@@ -8,9 +8,8 @@ floor and feet are changed on it here.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,8 +24,14 @@ from services.simulator.plant import (
 from shared.bus.messages import Vector3
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.config.sections import OperatorConfig
+from shared.extras import late
 from shared.robot.joints import JOINTS, MODULES, SIDES
 from shared.robot.robot_model import ankle_positions, mjcf, stand_pose
+
+if TYPE_CHECKING:
+    import mujoco
+else:
+    mujoco = late("mujoco")
 
 Array = NDArray[np.float64]
 

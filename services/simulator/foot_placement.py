@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from services.simulator.body import Body
+from shared.extras import late
 from shared.robot.joints import JOINTS, N_LEG, SIDES
+
+if TYPE_CHECKING:
+    import mujoco
+else:
+    mujoco = late("mujoco")
 
 Array = NDArray[np.float64]
 

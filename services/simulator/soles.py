@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-import mujoco
 import numpy as np
 
 from services.simulator.posture import as_vector
 from shared.bus.messages import Pair, Vector3
+from shared.extras import late
+
+if TYPE_CHECKING:
+    import mujoco
+else:
+    mujoco = late("mujoco")
 
 LEAST_N: Final = 1e-3
 """A sole that bears less has no centre of pressure."""

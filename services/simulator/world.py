@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,6 +23,12 @@ from services.simulator.posture import as_vector, measure_posture
 from services.simulator.soles import sole_loads
 from shared.bus.messages import HandLead, SimTruth, Vector3, Vector4
 from shared.config.scenarios import Lead, Scenario, lead, push_at
+from shared.extras import late
+
+if TYPE_CHECKING:
+    import mujoco
+else:
+    mujoco = late("mujoco")
 
 Array = NDArray[np.float64]
 

@@ -10,6 +10,7 @@ from rich.progress import track
 from rich.table import Table
 
 from shared.exceptions import RunError
+from shared.extras import missing_package
 from tools.bench import bus
 from tools.bench.flags import add_flags, write_rows
 from tools.bench.transports.base import TRANSPORTS, installed
@@ -27,7 +28,7 @@ def add_parser(others: Subparsers) -> None:
         help="the fleet's pattern of messages over Zenoh and over other transports",
         description="Run six modules at 500 Hz and a planner at 250 Hz, as processes that only "
         "send and\nreceive, over each transport that is installed. Those beyond Zenoh and "
-        "datagrams come with\n`pip install -e '.[bench]'`.",
+        "datagrams come with\nthe extra `bench`.",
         epilog="examples:\n  xrl bench bus\n"
         "  xrl bench bus --transport zenoh --transport datagrams --seconds 30",
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -53,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     names = args.transport or list(present)
     for name in names:
         if name not in present:
-            raise RunError(f"{name} is not installed; `pip install -e '.[bench]'` does it")
+            raise missing_package("bench", [name])
     console = Console()
     rounds = [
         [bus.measure(name, args.seconds) for name in names]

@@ -13,6 +13,7 @@ from rich.text import Text
 
 from shared.config import files as config_file
 from shared.exceptions import FAULT_EXIT_CODE
+from shared.extras import require
 from shared.places import CHECKOUT
 from shared.robot import gain_schedule
 from tools.bench import fleet
@@ -74,6 +75,7 @@ def add_parser(others: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Lead each tree in turn and print the medians; with --strict a missed target is a fault."""
+    require("sim")
     robot = config_file.load(args.config)
     gain_schedule.require(robot, args.config)
     check_pace(args.pace, simulated=True)

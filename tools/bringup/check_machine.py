@@ -16,6 +16,7 @@ from shared import scheduling
 from shared.config.robot_config import RobotConfig
 from shared.places import FILES
 from shared.robot.compiled_graph import library_of
+from shared.system_packages import libusb_fix
 from tools.bringup.check_socketcan import query_ip, socketcan_rows
 from tools.bringup.rows import Finding, FindingKind, judged, ok, warning, wrong
 from tools.fleet.process_table import is_simulated
@@ -196,8 +197,9 @@ def _libusb() -> Finding:
     try:
         ctypes.CDLL("libusb-1.0.so.0")
     except OSError:
-        fix = "`sudo apt install libusb-1.0-0`"
-        return wrong("USB", "libusb-1.0", "not found", "installed", fix, "no ODrive over USB")
+        return wrong(
+            "USB", "libusb-1.0", "not found", "installed", libusb_fix(), "no ODrive over USB"
+        )
     return ok("USB", "libusb-1.0", "installed", "installed")
 
 

@@ -21,6 +21,7 @@ from services.simulator.axis_settings import Settings, plant
 from shared.config.robot_config import RobotConfig, expand
 from shared.config.sections import CanConfig
 from shared.exceptions import FleetError
+from shared.extras import require
 from tools.bringup.boards import FoundBoards
 from tools.bringup.can_monitor import listen
 from tools.fleet import procfs
@@ -229,7 +230,7 @@ def boards_on_usb(
     with contextlib.ExitStack() as stack:
         if is_simulated(robot):
             stack.enter_context(emulated_usb(run_dir))
-        # not before the stand-in is there; and it takes a moment
+        require("usb")  # not before the stand-in is there
         from tools.bringup.usb_board import UsbBus  # noqa: PLC0415
 
         bus = UsbBus()

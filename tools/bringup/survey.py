@@ -9,7 +9,7 @@ from typing import Final
 from shared.can import drive_settings
 from shared.config.robot_config import RobotConfig, expand
 from shared.config.sections import CanConfig
-from shared.exceptions import DriveError, FleetError
+from shared.exceptions import DriveError, FleetError, MissingPackageError
 from shared.robot.joints import MODULES
 from tools.bringup import (
     check_alike,
@@ -121,7 +121,7 @@ def _usb(
                 rows += _module(robot, module, found, read, services_up=services_up)
                 rows += _position(robot, module, found, traffic)
             rows += check_alike.alike_rows(read)
-    except (DriveError, FleetError) as error:
+    except (DriveError, FleetError, MissingPackageError) as error:
         found_out, _, fix = str(error).removeprefix("USB: ").partition("; ")
         rows.append(_unreached(robot, "all drives", found_out, fix or "see there"))
     return rows

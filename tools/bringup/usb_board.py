@@ -18,16 +18,14 @@ from odrive.device_manager import (
     DeviceManagerDelegate,
     FilterSpec,
     Subscription,
-    get_device_manager,
 )
 from odrive.libodrive import DeviceType
 from odrive.runtime_device import RuntimeDevice
 
+from services.joint.drivers.odrive_usb import device_manager
 from shared.can.drive_settings import AXES
 from shared.exceptions import DriveError
 from tools.bringup.boards import Board, FoundBoards, Value, describe_firmware, number
-
-LIBUSB_FIX: Final = "apt install libusb-1.0-0"
 
 FIND_S: Final = 3.0
 """Longest wait for boards to show up: discovery itself takes a few tenths."""
@@ -53,12 +51,7 @@ class UsbBus:
     """
 
     def __init__(self) -> None:
-        try:
-            self._manager = get_device_manager(force_background_thread=True)
-        except OSError as error:
-            raise DriveError(
-                f"USB: {error}; the odrive package needs the system's libusb-1.0: {LIBUSB_FIX}"
-            ) from error
+        self._manager = device_manager()
         self._present: dict[str, Any] = {}
         """Boards that are plugged in now, by serial number; written by the package's loop."""
         self._boards: list[UsbBoard] = []

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from shared.exceptions import RunError
+from shared.extras import late
 from tools.export.tables import Columns, Kinds
 
-try:
+if TYPE_CHECKING:
     import pyarrow as pa
     from pyarrow import parquet as pq
-except ImportError:
-    pa = pq = None
+else:
+    pa = late("pyarrow")
+    pq = late("pyarrow.parquet")
 
 
 class ParquetFile:
@@ -21,12 +22,7 @@ class ParquetFile:
     suffix: Final = ".parquet"
 
     def __init__(self, path: Path, kinds: Kinds) -> None:
-        """Begin it; the suffix is added to the path.
-
-        Raises:
-            RunError: pyarrow is not installed.
-        """
-        require()
+        """Begin it; the suffix is added to the path."""
         types = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string()}
         self._schema = pa.schema([(name, types[kind]) for name, kind in kinds.items()])
         path = path.with_name(path.name + self.suffix)
@@ -39,13 +35,3 @@ class ParquetFile:
     def close(self) -> None:
         """Finish it."""
         self._writer.close()
-
-
-def require() -> None:
-    """Make sure that Parquet can be written.
-
-    Raises:
-        RunError: pyarrow is not installed.
-    """
-    if pa is None:
-        raise RunError("--parquet needs pyarrow: pip install 'xrl[parquet]', or take --csv")

@@ -23,6 +23,7 @@ from shared.config.files import load
 from shared.config.robot_config import RobotConfig, expand
 from shared.config.toml_file import Range, Section, read_toml
 from shared.exceptions import ConfigError, FleetError
+from shared.extras import EXTRAS, require
 from shared.network.proxy_protocol import SOCKET
 from shared.places import FILES
 from shared.process import SOCKET_PATH_MAX
@@ -75,6 +76,8 @@ class Process(Section, frozen=True):
     """`simulation`: not started where the drives are real; `injected`: only where the network is
     to be impaired; `imu`: only on a robot that has one; `ros2`: only where ROS 2 is to see it;
     `named`: only where it is asked for by name."""
+    extra: str = ""
+    """Extra of pyproject.toml whose packages it needs."""
     topic: str = ""
     """Topic that it publishes steadily, as in `shared.bus.topics`; empty if there is none."""
 
@@ -128,6 +131,7 @@ def make_plan(
     Raises:
         ConfigError: the robot file or the table cannot be used.
         FleetError: a service is unknown, or the run directory's path is too long.
+        MissingPackageError: a service needs a package that is not installed.
     """
     path = Path(os.path.abspath(config_path))  # noqa: PTH100 - symlinks stay as they were given
     config = load(path)
@@ -143,6 +147,7 @@ def make_plan(
         for row in rows
     )
     check_run_dir(run_dir, config)
+    _require_packages(rows, config)
     through = {pair.dials for pair in PAIRS} if injected else set()
     commands = {
         row.name: [
@@ -155,6 +160,15 @@ def make_plan(
     listeners = listeners_of(rows, config, run_dir)
     usb = emulated and config.joint_service.driver == "odrive_usb"
     return FleetPlan(path, rows, commands, listeners, table.environment, emulated_usb=usb)
+
+
+def _require_packages(rows: Iterable[Process], config: RobotConfig) -> None:
+    """Make sure that each service has its packages."""
+    for row in rows:
+        if row.extra:
+            require(row.extra)
+        if row.kind == "joint" and config.joint_service.driver == "odrive_usb":
+            require("usb")
 
 
 def load_table(path: Path = TABLE) -> ProcessTable:
@@ -172,6 +186,9 @@ def load_table(path: Path = TABLE) -> ProcessTable:
         if row.topic and row.topic not in topics:
             right = f"one of {', '.join(topics)}"
             raise ConfigError(str(path), f"process[{index}].topic", f"{row.topic!r}", right)
+        if row.extra and row.extra not in EXTRAS:
+            right = f"one of {', '.join(EXTRAS)}"
+            raise ConfigError(str(path), f"process[{index}].extra", f"{row.extra!r}", right)
         _check_placeholders(path, index, row)
         rows += _for_each_module(row) if row.name == MODULE else [row]
     names = [row.name for row in rows]

@@ -18,12 +18,14 @@ from shared.clock import now_ns
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, DriveError
+from shared.extras import require
 from shared.robot.joints import AXES, MODULES
 from tools.bringup import bench, jog_drive, limits
 from tools.bringup.jogging import MotionPlan, Sample, outside
 from tools.bringup.stops import within_stops
 from tools.identify import joint_drive, report
 from tools.identify.estimates import JointResult, of_joints
+from tools.identify.picture import draw_joints
 from tools.identify.sines import SinePlan, fit_sines
 from tools.output import make_folder
 from tools.terminal import Console, marked
@@ -55,6 +57,8 @@ class Stopped(NamedTuple):
 def run(args: argparse.Namespace, console: Console) -> int:
     """Measure the joints that are asked for; 0 if no motion was stopped."""
     modules, axes = _asked(args)
+    if not args.dry_run:
+        require("plot")
     path = bench.robot_file(args)
     robot = config_file.load_without_schedule(path)
     if args.apply:
@@ -259,8 +263,6 @@ def _tell(
 ) -> None:
     estimates = of_joints(results, robot)
     folder = make_folder(args.out, "identify")
-    from tools.identify.picture import draw_joints  # noqa: PLC0415 - takes a second
-
     picture = folder / "joints.png"
     draw_joints(estimates, results, picture)
     report.tell(estimates, robot, path if args.apply else None, console)

@@ -7,16 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
 
 from tools.identify.body_fit import BodyFit
 from tools.identify.estimates import JointResult, ParameterEstimate, Verdict
 from tools.identify.quasi_static import SLOT_S
-from tools.output import save_figure
-
-mpl.use("Agg")
+from tools.output import new_figure, save_figure
 
 FARTHEST = 6.0
 """Half widths; an interval farther away is an arrow."""
@@ -34,7 +30,7 @@ def draw_body(estimates: Sequence[ParameterEstimate], fit: BodyFit, path: Path) 
         fit: whose residuals are drawn.
         path: of the picture.
     """
-    figure = Figure(figsize=(13, 8), dpi=110, layout="constrained")
+    figure = new_figure(13, 8)
     parts: Any = figure.subfigures(1, 2, width_ratios=(1.1, 1.0))
     left, right = parts
     _draw_intervals(estimates, left.subplots(1, 1))
@@ -81,7 +77,7 @@ def draw_joints(
     estimates: Sequence[ParameterEstimate], results: Sequence[JointResult], path: Path
 ) -> None:
     """Draw intervals, and each joint's torque over its angle beside the fit, into a PNG file."""
-    figure = Figure(figsize=(13, 2.0 + 2.4 * len(results)), dpi=110, layout="constrained")
+    figure = new_figure(13, 2.0 + 2.4 * len(results))
     parts: Any = figure.subfigures(1, 2, width_ratios=(1.0, 1.0))
     left, right = parts
     _draw_intervals(estimates, left.subplots(1, 1))

@@ -6,6 +6,7 @@ import select
 from typing import Any, Final
 
 from shared.exceptions import FleetError
+from shared.extras import late, require
 from tools.pads.controls import (
     BTN_JOYSTICK,
     BTN_SOUTH,
@@ -25,11 +26,8 @@ from tools.pads.layouts import known_mapping
 from tools.pads.pilot import DEAD_ZONE, Deflection
 from tools.pads.sdl_mapping import given_lines, mapping_from
 
-evdev: Any
-try:
-    import evdev
-except ImportError:
-    evdev = None
+evdev: Any = late("evdev")
+
 
 STICK_REST_MAX: Final = DEAD_ZONE
 """Farthest from its middle that a stick let go of lies, of half its way.
@@ -217,8 +215,7 @@ def open_pads(path: str | None) -> list[PadDevice]:
     Raises:
         FleetError: there is none, or evdev is not installed.
     """
-    if evdev is None:
-        raise FleetError("a gamepad needs evdev: pip install 'xrl[pad]'; or lead by keys: --keys")
+    require("pad", "lead by keys: --keys")
     found: list[PadDevice] = []
     for candidate in [path] if path is not None else evdev.list_devices():
         try:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
 
 from services.planner.dynamic_certificate import (
     HALF_NAMES,
@@ -19,9 +17,13 @@ from services.planner.dynamic_certificate import (
 )
 from services.planner.sampled_loop import NO_HAND, NOMINAL
 from shared.config.robot_config import RobotConfig
-from tools.output import save_figure
+from shared.extras import late
+from tools.output import new_figure, save_figure
 
-mpl.use("Agg")
+if TYPE_CHECKING:
+    import matplotlib as mpl
+else:
+    mpl = late("matplotlib")
 
 STIFFNESSES: Final = tuple(float(k) for k in np.geomspace(2e3, 2e5, 25))
 DELAYS_MS: Final = (2.0, 20.0)
@@ -39,7 +41,7 @@ def draw(robot: RobotConfig, nodes: list[StiffnessNode], design: Design, path: P
         path: of the picture.
     """
     certificate = DynamicCertificate(robot, nodes)
-    figure = Figure(figsize=(13, 6), dpi=110, layout="constrained")
+    figure = new_figure(13, 6)
     colours = mpl.colormaps["viridis"]
     period = 1.0 / robot.planner.rate_hz
     for half, axis in enumerate(figure.subplots(1, 2, sharey=True)):

@@ -5,26 +5,27 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.patches import Patch
 
 from shared.bus import topics
 from shared.bus.messages import JointState, Mode, PlannerMode, RunEvent, RunEventKind
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import files as config_file
 from shared.exceptions import ConfigError
+from shared.extras import late
 from shared.robot.joints import MODULES
 from shared.text_file import decoded
-from tools.output import save_figure
+from tools.output import new_figure, save_figure
 from tools.runs.impairment_intervals import Impaired, impairments
 from tools.runs.run_log import RunLog
 from tools.runs.verdict import Summary, course, fell
 
-mpl.use("Agg")
+if TYPE_CHECKING:
+    from matplotlib import patches
+else:
+    patches = late("matplotlib.patches")
 
 MODE_COLOURS: Final[dict[int, str]] = {
     Mode.DISARMED: "#d9d9d9",
@@ -64,7 +65,7 @@ def draw(log: RunLog, name: str, summary: Summary, path: Path) -> None:
     heights = [2.0, 1.4, 1.7, 1.5, 1.6, 1.6]
     if network:
         heights.insert(4, 0.2 + 0.22 * min(len(network), LANES_MAX))
-    figure = Figure(figsize=(11.5, 1.15 * sum(heights)), dpi=110, layout="constrained")
+    figure = new_figure(11.5, 1.15 * sum(heights))
     axes = figure.subplots(
         len(heights), 1, sharex=True, gridspec_kw={"height_ratios": heights}, squeeze=False
     )[:, 0]
@@ -168,10 +169,12 @@ def _modes(axis: Any, log: RunLog, start_ns: int, end_s: float) -> None:
     axis.invert_yaxis()
     axis.set_xlim(0.0, end_s)
     axis.tick_params(labelsize=8)
-    handles = [Patch(color=colour, label=Mode(mode).name) for mode, colour in MODE_COLOURS.items()]
+    handles = [
+        patches.Patch(color=colour, label=Mode(mode).name) for mode, colour in MODE_COLOURS.items()
+    ]
     handles[2].set_label("TRACK; planner leads")
     if WAITS_COLOUR in leads:
-        handles.append(Patch(color=WAITS_COLOUR, label="planner waits\nafter drop-outs"))
+        handles.append(patches.Patch(color=WAITS_COLOUR, label="planner waits\nafter drop-outs"))
     _legend(axis, handles)
 
 

@@ -6,18 +6,14 @@ import math
 from pathlib import Path
 from typing import Final
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
 from rich import box
 from rich.table import Table
 
-from tools.output import save_figure
+from tools.output import new_figure, save_figure
 from tools.tune.excitation import HOLD_S, REST_S
 from tools.tune.pose_probe import ProbeCourse
 from tools.tune.response import ResponseFit
-
-mpl.use("Agg")
 
 _COLOURS: Final = {"measured": "#1f5fa8", "predicted": "#9aa0a6", "proposed": "#2c7a4b"}
 
@@ -56,7 +52,7 @@ def draw(
     title: str, courses: dict[str, ProbeCourse], answers: dict[str, ResponseFit], path: Path
 ) -> None:
     """Draw step and frequency responses into a PNG file."""
-    figure = Figure(figsize=(12, 6), dpi=110, layout="constrained")
+    figure = new_figure(12, 6)
     figure.suptitle(title)
     axes = figure.subplot_mosaic([["step", "size"], ["step", "phase"]])
     step, size, phase = axes["step"], axes["size"], axes["phase"]

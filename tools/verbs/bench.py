@@ -18,6 +18,7 @@ from rich.text import Text
 
 from shared.config import files as config_file
 from shared.exceptions import FAULT_EXIT_CODE
+from shared.extras import require
 from shared.places import CHECKOUT
 from shared.robot import gain_schedule
 from tools.bench import bus_command, fleet_command, revisions, table
@@ -78,6 +79,7 @@ def run(args: argparse.Namespace) -> int:
 
 def run_parts(args: argparse.Namespace) -> int:
     """Measure the parts and print; with --strict a missed target is a fault."""
+    require("sim")
     gain_schedule.require(config_file.load(args.config), args.config)
     console = Console()
     rows, missing = measure(args.config.resolve(), args.against, args.rounds or ROUNDS, console)

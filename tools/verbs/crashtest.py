@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from shared import revision
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE, RunError
+from shared.extras import require
 from shared.mcap_log import provenance
 from tools.fleet import procfs
 from tools.number_arguments import natural
@@ -74,6 +75,7 @@ def run(args: argparse.Namespace) -> int:
     if args.list:
         report.list_cases(cases, console)
         return 0
+    require("sim")
     robot = experiment.load_robot(args.config)
     out = _make_out(args.out)
     for other in procfs.fleets():

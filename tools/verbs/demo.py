@@ -17,6 +17,7 @@ from shared.bus.messages import PlannerStatus
 from shared.bus.session import Session
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Scenario
+from shared.extras import require
 from tools.fleet.others import warn_of_others
 from tools.fleet.pace import add_pace
 from tools.fleet.supervise import SupervisedFleet
@@ -74,6 +75,9 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the experiment; 0 only if the robot stood to the end."""
+    require("sim")
+    if args.view:
+        require("view", "leave --view")
     console = Console()
     args.scenario = args.scenario or ("stand" if args.view else "squat")
     if args.view and args.duration is None:

@@ -12,15 +12,13 @@ from rich.progress import Progress
 
 from shared.clock import NS_PER_S
 from shared.exceptions import RunError
+from shared.extras import require
 from shared.mcap_log.extended_copy import write_extended
 from shared.mcap_log.files import SUFFIX
 from shared.places import FILES
 from tools.analysis.reports import scene
-from tools.analysis.reports.moving_picture import write_gif
 from tools.export.folders import whole_folder
 from tools.export.parquet import ParquetFile
-from tools.export.parquet import require as require_parquet
-from tools.export.ros2_bag import write_bag
 from tools.export.tables import (
     FOR_REEXECUTION,
     GRID_NAME,
@@ -138,8 +136,14 @@ def run(args: argparse.Namespace) -> int:
         raise RunError("--topic chooses what is in tables: add --csv DIR or --parquet DIR")
     if args.rate is not None and all(out is None for out in asked[2:]):
         raise RunError("--rate is that of tables or of a bag: add --csv, --parquet or --ros2bag")
-    if args.parquet is not None:
-        require_parquet()
+    for extra, wanted, otherwise in (
+        ("foxglove", args.scene, ""),
+        ("plot", args.gif, ""),
+        ("parquet", args.parquet, "take --csv"),
+        ("ros2", args.ros2bag, ""),
+    ):
+        if wanted:
+            require(extra, otherwise)
     if args.curves and args.gif is None:
         raise RunError("--curves go beside a picture: name it with --gif FILE")
     path: Path = args.file
@@ -198,6 +202,9 @@ def _write_tables(
 
 def _write_bag(index: RunIndex, part: RunPart, args: argparse.Namespace, console: Console) -> None:
     """Write a bag of ROS 2, with progress."""
+    require("ros2")
+    from tools.export.ros2_bag import write_bag  # noqa: PLC0415 - needs the extra
+
     with (
         whole_folder(args.ros2bag, index.path, force=args.force) as folder,
         progress_along("writing", index.length_s) as done,
@@ -210,6 +217,9 @@ def _write_bag(index: RunIndex, part: RunPart, args: argparse.Namespace, console
 
 def _draw(log: RunLog, out: Path, console: Console, *, with_curves: bool) -> None:
     """Draw the run's moving picture, with progress."""
+    require("plot")
+    from tools.analysis.reports.moving_picture import write_gif  # noqa: PLC0415 - needs the extra
+
     with Progress(console=console, transient=True) as shown:
         bar = shown.add_task("drawing", total=1.0)
         count = write_gif(

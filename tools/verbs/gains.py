@@ -10,13 +10,18 @@ import msgspec
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from services.planner import split_program
+from services.planner.dynamic_certificate import DynamicCertificate
 from services.planner.push_limit import DIRECTIONS, equivalent_slope
+from services.planner.stability_margins import stability_margins_of
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, ConfigError
+from shared.extras import require
 from shared.places import refuse_shipped
 from shared.robot import gain_schedule
 from shared.robot.gain_table import GainSchedule
+from tools.runs import damping_picture
 from tools.terminal import Console
 from tools.verb_table import Subparsers, add_config, add_verb
 
@@ -70,6 +75,9 @@ def run(args: argparse.Namespace) -> int:
         console.print(f"{path}: {stale or 'fits the robot'}", soft_wrap=True)
         return FAULT_EXIT_CODE if stale else 0
     refuse_shipped(path)
+    require("design")
+    if args.picture is not None:
+        require("plot")
     robot = config_file.load_without_schedule(args.config)
     schedule = compute(robot, console, args.damping_of)
     gain_schedule.write(path, schedule)
@@ -92,8 +100,6 @@ def compute(robot: RobotConfig, console: Console, damping_of: Path | None = None
     Raises:
         RunError: no local gains meet the certificate somewhere.
     """
-    from services.planner import split_program  # noqa: PLC0415 - cvxpy takes a second to load
-
     design = None
     if damping_of is not None:
         other = gain_schedule.read(damping_of)
@@ -116,8 +122,6 @@ def compute(robot: RobotConfig, console: Console, damping_of: Path | None = None
 
 
 def _show(robot: RobotConfig, schedule: GainSchedule, console: Console) -> None:
-    from services.planner import split_program  # noqa: PLC0415 - cvxpy takes a second to load
-
     table = Table(title="Local stiffness D of each leg, torso upright, N m/rad")
     table.add_column("COM m", justify="right")
     for kind in ("ankle", "knee", "hip"):
@@ -140,8 +144,6 @@ def _show(robot: RobotConfig, schedule: GainSchedule, console: Console) -> None:
 
 def _show_pushes(robot: RobotConfig, schedule: GainSchedule, console: Console) -> None:
     """Print how hard a constant push each tier holds, upright."""
-    from services.planner import split_program  # noqa: PLC0415 - cvxpy takes a second to load
-
     table = Table(title="Hardest constant push, N: led / planner dead / drives alone / body")
     table.add_column("COM m", justify="right")
     for name in DIRECTIONS:
@@ -170,10 +172,6 @@ def _show_pushes(robot: RobotConfig, schedule: GainSchedule, console: Console) -
 
 def _show_damping(robot: RobotConfig, schedule: GainSchedule, console: Console) -> None:
     """Print the design chosen with the dynamic certificate, and its margins."""
-    from services.planner import split_program  # noqa: PLC0415 - cvxpy takes a second to load
-    from services.planner.dynamic_certificate import DynamicCertificate  # noqa: PLC0415
-    from services.planner.stability_margins import stability_margins_of  # noqa: PLC0415
-
     D_B = ", ".join(f"{value:.1f}" for value in schedule.D_B)
     console.print(
         f"local damping of a leg, ankle to hip, phi and theta: {D_B} N m s/rad; tau_coupled: two "
@@ -197,9 +195,6 @@ def _show_damping(robot: RobotConfig, schedule: GainSchedule, console: Console) 
 
 def draw_damping(robot: RobotConfig, schedule: GainSchedule, path: Path) -> None:
     """Draw the eigenvalue paths of a schedule into a PNG file."""
-    from services.planner import split_program  # noqa: PLC0415 - cvxpy takes a second to load
-    from tools.runs import damping_picture  # noqa: PLC0415 - and so does matplotlib
-
     nodes = [node for node in split_program.dynamic_nodes(robot, schedule) if node.pitch == 0.0]
     damping_picture.draw(robot, nodes, split_program.design_of(schedule), path)
 

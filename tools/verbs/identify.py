@@ -23,6 +23,7 @@ from shared.config import scenarios
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Lead, Scenario
 from shared.exceptions import DECLINED_EXIT_CODE, RunError
+from shared.extras import require
 from shared.robot.joints import AXES, MODULES
 from tools.bringup.bench import confirm
 from tools.bringup.jog_drive import Interrupts
@@ -31,6 +32,7 @@ from tools.identify import joint_bench, report
 from tools.identify.body_fit import Record, fit
 from tools.identify.estimates import of_body, zero_corrections
 from tools.identify.motion import Motion
+from tools.identify.picture import draw_body
 from tools.identify.quasi_static import Moments, TimedRows, moments_of
 from tools.number_arguments import finite
 from tools.output import make_folder
@@ -127,6 +129,7 @@ def run(args: argparse.Namespace) -> int:
             scenario, config_file.load_without_schedule(places.robot_file(args.config)), console
         )
         return 0
+    require("plot")
     added = _added(args.added, max(1, len(args.record)))
     if args.record:
         logs = [read_run(path) for path in args.record]
@@ -149,8 +152,6 @@ def run(args: argparse.Namespace) -> int:
     payload_sd = WEIGHED_SD if args.weighed else None
     result = fit(robot, records, level_sd=args.level, payload_sd=payload_sd)
     estimates = of_body(result, robot)
-    from tools.identify.picture import draw_body  # noqa: PLC0415 - takes a second
-
     picture = make_folder(args.out, "identify") / "identify.png"
     draw_body(estimates, result, picture)
     report.tell(estimates, robot, path if args.apply else None, console)

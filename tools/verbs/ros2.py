@@ -11,6 +11,7 @@ from services.ros2_gateway.rmw import domain
 from shared.config import checks
 from shared.config.files import load
 from shared.exceptions import FAULT_EXIT_CODE
+from shared.extras import require
 from tools.fleet.ros2_check import check
 from tools.number_arguments import finite
 from tools.terminal import Console, marked
@@ -53,6 +54,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Look, and print what was found; 0 if nothing is missing."""
+    require("ros2")
     robot = load(args.config)
     if args.router is not None:
         ros2 = msgspec.structs.replace(robot.ros2, router=args.router)

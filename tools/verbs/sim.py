@@ -13,6 +13,7 @@ from services.simulator.plant import plant_from
 from shared.bus import topics
 from shared.bus.messages import SimTruth
 from shared.exceptions import RunError
+from shared.extras import require
 from shared.network.impairment import Impairment
 from tools.number_arguments import finite
 from tools.runs import experiment, recorded_lockstep, verdict, verdict_table
@@ -81,6 +82,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the experiment; 0 only if the robot stood to the end."""
+    require("sim")
     if args.delay < 0.0 or args.jitter < 0.0 or not 0.0 <= args.loss <= 1.0:
         raise RunError("--delay and --jitter must be at least 0 ms, --loss from 0 to 1")
     console = Console()

@@ -7,6 +7,7 @@ import importlib
 from types import ModuleType
 from typing import Final
 
+from shared.extras import require
 from tools.verb_table import Subparsers, add_verb
 
 STUDIES: Final = {
@@ -40,6 +41,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the study."""
+    require("sim")
     return int(args.study(args))
 
 

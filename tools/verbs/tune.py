@@ -17,6 +17,7 @@ from shared.bus.session import open_session
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, RunError
+from shared.extras import require
 from shared.robot import gain_schedule
 from shared.robot.joints import AXES, MODULES
 from tools.bringup import bench, jog_drive
@@ -29,6 +30,7 @@ from tools.terminal import Console, marked
 from tools.tune import module_probe
 from tools.tune.excitation import Excitation, excitation
 from tools.tune.pose_probe import DIRECTIONS, LiveProbe, ProbeCourse, in_lockstep, inertia_along
+from tools.tune.report import answer_table, draw
 from tools.tune.response import ResponseFit, answer_of, propose
 from tools.verb_table import FLEET, Subparsers, add_config, add_run_dir, add_verb
 
@@ -83,6 +85,8 @@ def run(args: argparse.Namespace) -> int:
         raise RunError(f"{args.what[:40]}: one of {', '.join((*DIRECTIONS, *MODULES))} is right")
     _check_wanted(args)
     _refuse_mixed(args)
+    if not args.dry_run:
+        require("sim" if args.sim else "plot")
     if args.what in MODULES:
         return _tune_module(args, console)
     return _tune_direction(args, console)
@@ -355,8 +359,6 @@ def _tell(
     *,
     closed: bool,
 ) -> None:
-    from tools.tune.report import answer_table, draw  # noqa: PLC0415 - takes a second
-
     out = make_folder(args.out, "tune")
     console.print(answer_table(answers, closed=closed))
     title = args.what if args.what in DIRECTIONS else f"{args.what} {args.axis or 'theta'}"

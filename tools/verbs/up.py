@@ -17,6 +17,7 @@ from shared.bus.topics import HOST_RECORDER
 from shared.config import files as config_file
 from shared.config.robot_config import SERVICES, RobotConfig
 from shared.exceptions import BusError, FleetError, RunError
+from shared.extras import require
 from shared.robot import gain_schedule
 from shared.robot.joints import MODULES
 from tools.fleet.fleet_status import OPEN
@@ -140,6 +141,8 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Start the fleet and say where it is."""
+    if args.view:
+        require("view", "leave --view")
     robot = config_file.load(args.config)
     gain_schedule.require(robot, args.config)
     if robot.bus.security.mode == "mtls":

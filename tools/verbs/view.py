@@ -12,6 +12,7 @@ from shared import places
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError, RunError
+from shared.extras import require
 from shared.process import StopFlag
 from tools.fleet.supervise import SupervisedFleet
 from tools.output import progress_along, write_atomically
@@ -21,13 +22,11 @@ from tools.runs.run_index import RunIndex
 from tools.runs.run_parts import add_part, read_asked
 from tools.terminal import Console, marked
 from tools.verb_table import RUN_HELP, Subparsers, add_config, add_run_dir, add_verb
-from tools.view import foxglove_server
-from tools.view.foxglove_server import FoxgloveServer
 from tools.view.live import LiveSource
 from tools.view.lockstep import LockstepSource
 from tools.view.record import RecordSource
-from tools.view.server import HOST, PORT
 from tools.view.serving import add_port, serve
+from tools.view.settings import FOXGLOVE_PORT, HOST, PORT
 from tools.view.single_file import single_file
 from tools.view.source import Source
 
@@ -63,7 +62,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--foxglove",
         action="store_true",
-        help=f"serve the frames to Foxglove in place of a page (port: {foxglove_server.PORT})",
+        help=f"serve the frames to Foxglove in place of a page (port: {FOXGLOVE_PORT})",
     )
     add_part(parser)
     add_config(parser, before="that of the record or of the fleet")
@@ -72,6 +71,10 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
+    if args.sim:
+        require("sim")
+    if args.html is None and not args.foxglove:
+        require("view", "write it as one page: --html FILE" if args.record is not None else "")
     if args.sim and args.record is not None:
         raise RunError("a record and --sim do not go together; leave one out")
     if args.act and (args.sim or args.record is not None):
@@ -114,9 +117,12 @@ def _source(args: argparse.Namespace) -> Iterator[Source]:
 
 def _serve_foxglove(args: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
+    require("foxglove")
+    from tools.view.foxglove_server import FoxgloveServer  # noqa: PLC0415 - needs the extra
+
     stop = StopFlag()
     with _source(args) as source:
-        port = foxglove_server.PORT if args.port == PORT else args.port
+        port = FOXGLOVE_PORT if args.port == PORT else args.port
         server = FoxgloveServer(source, port)
         print(f"ws://{HOST}:{server.port}  (in Foxglove: open a connection; Ctrl-C ends it)")
         sys.stdout.flush()

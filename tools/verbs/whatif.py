@@ -16,6 +16,7 @@ from shared.config import scenarios
 from shared.config.scenarios import Scenario
 from shared.config.toml_file import parse_toml
 from shared.exceptions import FELL_EXIT_CODE, RunError
+from shared.extras import require
 from shared.robot.joints import MODULES
 from tools.number_arguments import count, finite
 from tools.runs.experiment import PLANT_FILE
@@ -76,6 +77,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Go on from every moment; 0 if the robot would have stood each time."""
+    require("sim")
     if not (args.every >= 0.1 - 1e-9 and args.for_s > 0.0):
         raise RunError("--every from 0.1 s on (so often is the state recorded), --for over 0 s")
     console = Console()

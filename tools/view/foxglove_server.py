@@ -16,11 +16,9 @@ from tools.analysis.reports import foxglove as encoding
 from tools.analysis.reports import scene
 from tools.analysis.reports.scene import RobotPose
 from tools.view.frame import Frame
-from tools.view.server import FRAMES_S, HOST
+from tools.view.settings import FOXGLOVE_PORT, FRAMES_S, HOST
 from tools.view.source import Source
 
-PORT: Final = 8765
-"""That Foxglove offers."""
 LINKS_EVERY: Final = 30
 """Frames between two messages of the robot's bodies, which do not change."""
 
@@ -28,7 +26,7 @@ LINKS_EVERY: Final = 30
 class FoxgloveServer:
     """Serves one source; subscribed to it only while somebody looks."""
 
-    def __init__(self, source: Source, port: int = PORT) -> None:
+    def __init__(self, source: Source, port: int = FOXGLOVE_PORT) -> None:
         """Listen on this computer.
 
         Raises:
@@ -49,9 +47,9 @@ class FoxgloveServer:
         self._frame = foxglove.Channel(
             f"xrl/{robot}/frame", schema=_schema_of_frames(), context=self._context
         )
-        self._poses = self._channel("frames", encoding.TRANSFORMS)
-        self._links = self._channel("links", encoding.SCENE)
-        self._state = self._channel("state", encoding.SCENE)
+        self._poses = self._channel("frames", encoding.transforms_schema())
+        self._links = self._channel("links", encoding.scene_schema())
+        self._state = self._channel("state", encoding.scene_schema())
 
     def _channel(self, name: str, schema: foxglove.Schema) -> foxglove.Channel:
         return foxglove.Channel(

@@ -11,7 +11,6 @@ import contextlib
 import secrets
 from collections.abc import AsyncIterator, Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Final
 
 import msgspec
@@ -19,11 +18,9 @@ from aiohttp import WSMsgType, web
 
 from shared.exceptions import FleetError, XrlError
 from tools.view.cursor import TimelineCursor
+from tools.view.settings import FRAMES_S, HOST, PAGE, PORT, UPLOT
 from tools.view.source import Order, Source
 
-HOST: Final = "127.0.0.1"
-PORT: Final = 8417
-FRAMES_S: Final = 30.0
 MESSAGE_MAX: Final = 4096
 """Largest message of a page, bytes."""
 CLIENTS_MAX: Final = 8
@@ -33,8 +30,6 @@ CLOSE_S: Final = 1.0
 """Longest wait for a page to take what is left and to close."""
 STOPS_MAX: Final = 4
 """Emergency stops under way at a time; each repeats itself for up to three seconds."""
-PAGE: Final = Path(__file__).parent / "page"
-UPLOT: Final = Path(__file__).parents[1] / "analysis" / "reports" / "vendor" / "uplot"
 _TYPES: Final = {
     ".html": "text/html", ".js": "text/javascript", ".css": "text/css",
 }  # fmt: skip

@@ -14,10 +14,11 @@ from pathlib import Path
 
 from shared.config.endpoints import PORT_MAX
 from shared.exceptions import FleetError
+from shared.extras import require
 from shared.run_directory import private_files
 from tools.number_arguments import whole
 from tools.terminal import Console
-from tools.view.server import HOST, PORT, ViewServer
+from tools.view.settings import HOST, PORT
 from tools.view.source import Source
 
 _END_S = 5.0
@@ -39,11 +40,15 @@ def serve(source: Source, port: int) -> None:
 
     Raises:
         FleetError: the port is in use.
+        MissingPackageError: there is no aiohttp.
     """
     asyncio.run(_serve(source, port))
 
 
 async def _serve(source: Source, port: int) -> None:
+    require("view")
+    from tools.view.server import ViewServer  # noqa: PLC0415 - needs the extra
+
     server = ViewServer(source, port)
     ended = asyncio.Event()
     loop = asyncio.get_running_loop()

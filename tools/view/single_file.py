@@ -13,7 +13,7 @@ import msgspec
 
 from shared.exceptions import RunError
 from tools.view.record import RecordSource
-from tools.view.server import FRAMES_S, PAGE, UPLOT
+from tools.view.settings import FRAMES_S, PAGE, UPLOT
 
 _MODULES: Final = (
     "vendor/three/three.module.min.js", "recorded.js", "plots.js", "scene.js", "main.js",

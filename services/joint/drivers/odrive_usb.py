@@ -35,6 +35,7 @@ from shared.clamp import clamp
 from shared.clock import NS_PER_MS, machine_s, now_ns
 from shared.config.sections import DriveConfig
 from shared.exceptions import DriveError
+from shared.system_packages import libusb_fix
 
 EXCHANGE_HZ: Final = 200
 """Largest rate, Hz: a v3 board answers no faster over USB (docs/drives.md)."""
@@ -61,6 +62,18 @@ class _Request:
 
     def __init__(self, *, arm: bool) -> None:
         self.arm = arm
+
+
+def device_manager() -> DeviceManager:
+    """Return the package's manager, on a loop in a thread of its own; loads libusb-1.0.
+
+    Raises:
+        DriveError: there is no libusb-1.0 on this system.
+    """
+    try:
+        return get_device_manager(force_background_thread=True)
+    except OSError as error:
+        raise DriveError(f"USB: {error}; the odrive package needs it: {libusb_fix()}") from error
 
 
 class OdriveUsb:
@@ -112,12 +125,7 @@ class OdriveUsb:
         # Made by the package's loop, and resolved there once the control thread has written:
         self._awaited: asyncio.Future[None] | None = None
         self._feed_until_ns = 0  # later than 0: arm was asked for, and no idle since
-        try:
-            self._manager = get_device_manager(force_background_thread=True)
-        except OSError as error:
-            raise DriveError(
-                f"odrive: {error}; it needs the system's libusb-1.0: apt install libusb-1.0-0"
-            ) from error
+        self._manager = device_manager()
         self._task: Future[None] = asyncio.run_coroutine_threadsafe(
             self._run(self._manager), self._manager.loop
         )

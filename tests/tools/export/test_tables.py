@@ -15,7 +15,6 @@ from shared.bus.topics import TOPICS, Topic
 from shared.clock import NS_PER_S
 from tests.tools.exit_codes import exit_code
 from tools import cli
-from tools.export import parquet
 from tools.export.tables import FOR_REEXECUTION, HELD_S, columns_of
 from tools.runs.run_index import RunIndex
 from tools.runs.run_log import read_run
@@ -105,18 +104,6 @@ def test_the_columns_of_a_type_are_all_of_its_fields_each_element_one(topic: Top
         fields, key=lambda name: name not in ("t_ns", "seq")
     )
     assert all(column.kind in (int, float, bool, str) for column in columns.values())
-
-
-def test_without_pyarrow_parquet_says_what_to_install(
-    run_file: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(parquet, "pa", None)
-    assert cli.main(["export", str(run_file), "--parquet", str(tmp_path / "t")]) == 2
-    assert "pip install" in capsys.readouterr().err
-    assert not (tmp_path / "t").exists()
 
 
 @pytest.mark.parametrize(

@@ -8,20 +8,23 @@ quaternions (x, y, z, w), colours are (r, g, b, a) from 0 to 1.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Final, Literal, NamedTuple, TypeAlias
-
-from foxglove import messages as well_known
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 from shared.bus.messages import Vector3
 from shared.clock import NS_PER_S
+from shared.extras import late
 from shared.robot.frames import ORIGIN, UPRIGHT, FramePose, Quaternion
+
+if TYPE_CHECKING:
+    import foxglove
+    from foxglove import messages as well_known
+else:
+    well_known = late("foxglove.messages")
 
 Colour: TypeAlias = tuple[float, float, float, float]
 
 ENCODING: Final = "protobuf"
 """Encoding of the messages."""
-TRANSFORMS: Final = well_known.FrameTransforms.get_schema()
-SCENE: Final = well_known.SceneUpdate.get_schema()
 
 
 class Solid(NamedTuple):
@@ -55,6 +58,16 @@ class Entity(NamedTuple):
     name: str
     solids: tuple[Solid, ...] = ()
     arrows: tuple[Arrow, ...] = ()
+
+
+def transforms_schema() -> foxglove.Schema:
+    """Return the schema of `foxglove.FrameTransforms`."""
+    return well_known.FrameTransforms.get_schema()
+
+
+def scene_schema() -> foxglove.Schema:
+    """Return the schema of `foxglove.SceneUpdate`."""
+    return well_known.SceneUpdate.get_schema()
 
 
 def transforms(ns: int, rows: Iterable[FramePose]) -> bytes:

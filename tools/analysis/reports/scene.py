@@ -81,9 +81,9 @@ class RobotPose(NamedTuple):
 def channels(robot: str) -> list[NewChannel]:
     """Return the channels of a scene: `FRAMES`, `LINKS`, `STATE` and, for Rerun, `MODEL`."""
     rows = (
-        ("frames", foxglove.TRANSFORMS, f"{RATE_HZ:g}", "pose of each module"),
-        ("links", foxglove.SCENE, f"{1.0 / LINKS_PERIOD_S:g}", "bodies of the robot"),
-        ("state", foxglove.SCENE, f"{RATE_HZ:g}", "modes by colour, COM, forces"),
+        ("frames", foxglove.transforms_schema(), f"{RATE_HZ:g}", "pose of each module"),
+        ("links", foxglove.scene_schema(), f"{1.0 / LINKS_PERIOD_S:g}", "bodies of the robot"),
+        ("state", foxglove.scene_schema(), f"{RATE_HZ:g}", "modes by colour, COM, forces"),
     )
     found = [
         NewChannel(

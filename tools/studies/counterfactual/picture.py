@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from shared.bus import topics
 from shared.clock import NS_PER_S
-from tools.output import save_figure
+from tools.output import new_figure, save_figure
 from tools.runs.run_log import RunLog
 from tools.studies.counterfactual.run import Counterfactual
 
@@ -22,7 +21,7 @@ def draw(
 ) -> None:
     """Draw the fates over the recorded height into a PNG file."""
     truth = [row for row in log.messages(topics.SIM_TRUTH) if row.scenario_s >= 0.0]
-    figure = Figure(figsize=(11, 7.0), dpi=110, layout="constrained")
+    figure = new_figure(11, 7.0)
     height, ended, com, margin = figure.subplots(
         4, 1, sharex=True, gridspec_kw={"height_ratios": [1.6, 0.4, 1.6, 1.2]}
     )

@@ -16,10 +16,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
-import matplotlib as mpl
 import msgspec
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from services.joint import differential
@@ -38,9 +36,7 @@ from shared.config.scenarios import Keyframe, Push, Scenario
 from shared.exceptions import RunError
 from shared.robot.joints import MODULES, N_JOINTS, N_LEG
 from shared.robot.robot_model import stand_pose
-from tools.output import save_figure
-
-mpl.use("Agg")
+from tools.output import new_figure, save_figure
 
 Array = NDArray[np.float64]
 
@@ -347,7 +343,7 @@ def threshold(said: Sequence[tuple[float, bool]]) -> float:
 
 def draw_picture(rows: Sequence[Mapping[str, str]], title: str, path: Path) -> None:
     """Draw margin against how far the COM went, into a PNG file; rows as in the table."""
-    figure = Figure(figsize=(9, 5.5), dpi=110, layout="constrained")
+    figure = new_figure(9, 5.5)
     axis = figure.subplots()
     for stood, colour in ((True, "#4c9f70"), (False, "#c0392b")):
         some = [row for row in rows if row["stood"] == str(stood)]

@@ -16,6 +16,7 @@ from threading import Lock
 from typing import Any, Final, TypeVar
 
 from shared.exceptions import RunError
+from shared.extras import require
 from tools.studies.sweeps.table import code_digest
 
 T = TypeVar("T")
@@ -105,13 +106,8 @@ def _digest_here(code: tuple[str, ...]) -> str:
 
 
 def _dask() -> Any:
-    try:
-        return importlib.import_module("distributed")
-    except ModuleNotFoundError:
-        raise RunError(
-            "--cluster needs Dask, which is not installed; install this project with its extra "
-            "`cluster`: pip install '.[cluster]'"
-        ) from None
+    require("cluster", "leave --cluster")
+    return importlib.import_module("distributed")
 
 
 def _checked_address(address: str) -> str:

@@ -7,15 +7,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final, TypeAlias
 
-import matplotlib as mpl
 import msgspec
-from matplotlib.figure import Figure
 
 from services.planner.dynamic_certificate import HALF_NAMES
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE
 from tools.number_arguments import count, natural
-from tools.output import save_figure
+from tools.output import new_figure, save_figure
 from tools.runs import experiment
 from tools.studies.sweeps import study
 from tools.studies.sweeps.dynamics_trial import (
@@ -28,8 +26,6 @@ from tools.studies.sweeps.dynamics_trial import (
 from tools.studies.sweeps.table import Row, code_of
 from tools.terminal import Console
 from tools.verb_table import add_config
-
-mpl.use("Agg")
 
 N: Final = 100
 TABLE: Final = "dynamics.csv"
@@ -124,7 +120,7 @@ def exit_code(rows: Iterable[Mapping[str, object]]) -> int:
 
 def draw_picture(rows: Sequence[Row], title: str, path: Path) -> None:
     """Draw predictions against results into a PNG file; rows as in the table."""
-    figure = Figure(figsize=(9, 5.5), dpi=110, layout="constrained")
+    figure = new_figure(9, 5.5)
     axis = figure.subplots()
     for grew, colour in (("False", "#4c9f70"), ("True", "#c0392b")):
         some = [row for row in rows if row["grew"] == grew and row["ended"] != "unready"]

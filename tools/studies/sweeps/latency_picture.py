@@ -6,13 +6,10 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-import matplotlib as mpl
-from matplotlib.colors import LinearSegmentedColormap
-from matplotlib.figure import Figure
-
-from tools.output import save_figure
+from shared.extras import late
+from tools.output import new_figure, save_figure
 from tools.studies.sweeps.latency_report import (
     Falls,
     chosen,
@@ -27,12 +24,13 @@ from tools.studies.sweeps.latency_trial import DURATION_S, PUSHES
 from tools.studies.sweeps.push_range import SHARE
 from tools.studies.sweeps.table import Row
 
-mpl.use("Agg")
+if TYPE_CHECKING:
+    from matplotlib import colors
+else:
+    colors = late("matplotlib.colors")
 
 FALLS: Final = "latency-falls.png"
 EFFORT: Final = "latency-effort.png"
-SHARES: Final = LinearSegmentedColormap.from_list("falls", ["#e3f1e7", "#f2b7a0", "#b3261e"])
-"""From none fell to all fell."""
 HOLDS: Final = 0.1
 """With a larger share of the time in HOLD, a robot does not follow the hand."""
 DPI: Final = 120
@@ -60,6 +58,11 @@ LOOKS: Final = {
 }
 
 
+def _shares() -> colors.Colormap:
+    """Return colours from none fell to all fell."""
+    return colors.LinearSegmentedColormap.from_list("falls", ["#e3f1e7", "#f2b7a0", "#b3261e"])
+
+
 def draw(rows: Sequence[Row], force_max: float, what: str, folder: Path) -> tuple[Path, ...]:
     """Draw both pictures into PNG files.
 
@@ -82,7 +85,7 @@ def _draw_falls(rows: Sequence[Row], what: str, path: Path) -> None:
     names = controls_in(rows)
     map_in = 0.5 + 0.26 * min(len(values_in(rows, "loss")), 12)
     height = 1.0 + (map_in + 0.2) * len(names) + SHARES_IN
-    figure = Figure(figsize=(7.5, height), dpi=DPI, layout="constrained")
+    figure = new_figure(7.5, height, dpi=DPI)
     grid = figure.add_gridspec(len(names) + 1, 1, height_ratios=[map_in] * len(names) + [SHARES_IN])
     for index, name in enumerate(names):
         axis = figure.add_subplot(grid[index])
@@ -106,7 +109,7 @@ def _draw_map(axis: Any, rows: Sequence[Row], name: str) -> None:
         for loss in losses
     ]
     shares = [[cell.fallen / cell.of if cell.of else math.nan for cell in line] for line in cells]
-    axis.imshow(shares, cmap=SHARES, vmin=0.0, vmax=1.0, origin="lower", aspect="auto")
+    axis.imshow(shares, cmap=_shares(), vmin=0.0, vmax=1.0, origin="lower", aspect="auto")
     for y, line in enumerate(cells):
         for x, cell in enumerate(line):
             if cell.of:
@@ -187,7 +190,7 @@ def _in_all(rows: Sequence[Row], name: str) -> str:
 
 
 def _draw_effort(rows: Sequence[Row], force_max: float, what: str, path: Path) -> None:
-    figure = Figure(figsize=(7.5, 6.0), dpi=DPI, layout="constrained")
+    figure = new_figure(7.5, 6.0, dpi=DPI)
     effort, hold = figure.subplots(2, 1, sharex=True, height_ratios=(2.2, 1.0))
     delays = values_in(rows, "delay_ms")
     for name in controls_in(rows):

@@ -5,31 +5,32 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
-
-import matplotlib as mpl
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import BoundaryNorm
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Rectangle
+from typing import TYPE_CHECKING, Any, Final
 
 from shared.config.robot_config import RobotConfig
-from tools.output import save_figure
+from shared.extras import late
+from tools.output import new_figure, save_figure
 from tools.studies.sweeps.cases import PUSHES_MAX, payloads
 from tools.studies.sweeps.figures import Ending
 from tools.studies.sweeps.table import Row
 
-mpl.use("Agg")
+if TYPE_CHECKING:
+    import matplotlib as mpl
+    from matplotlib import cm, colors, lines, patches
+
+else:
+    mpl = late("matplotlib")
+    cm = late("matplotlib.cm")
+    colors = late("matplotlib.colors")
+    lines = late("matplotlib.lines")
+    patches = late("matplotlib.patches")
 
 FALL_COLOUR: Final = "#c0392b"
-COLOURS: Final = mpl.colormaps["viridis"]
-"""Colours of the payload."""
 
 
 def draw(rows: Sequence[Row], robot: RobotConfig, title: str, path: Path) -> None:
     """Draw the study into a PNG file."""
-    figure = Figure(figsize=(13, 11), dpi=110, layout="constrained")
+    figure = new_figure(13, 11)
     norm = _norm(payloads(robot))
     polar = figure.add_subplot(2, 2, 1, projection="polar")
     _draw_pushes(polar, rows, norm)
@@ -37,22 +38,31 @@ def draw(rows: Sequence[Row], robot: RobotConfig, title: str, path: Path) -> Non
     _draw_excursions(figure.add_subplot(2, 2, 3), rows, norm, robot)
     _draw_operator(figure.add_subplot(2, 2, 4), rows, norm)
     bar = figure.colorbar(
-        ScalarMappable(norm, COLOURS), ax=figure.axes, shrink=0.5, ticks=payloads(robot)
+        cm.ScalarMappable(norm, _colours()), ax=figure.axes, shrink=0.5, ticks=payloads(robot)
     )
     bar.set_label("payload in kg")
     figure.suptitle(title, fontsize=13, x=0.01, ha="left")
     save_figure(figure, path)
 
 
-def _norm(levels: Sequence[float]) -> BoundaryNorm:
+def _colours() -> colors.Colormap:
+    """Return the colours of the payload."""
+    return mpl.colormaps["viridis"]
+
+
+def _norm(levels: Sequence[float]) -> colors.BoundaryNorm:
     """Return a step of colour for each payload."""
     if len(set(levels)) < len(levels):
-        return BoundaryNorm([-0.5, 0.5], COLOURS.N)
+        return colors.BoundaryNorm([-0.5, 0.5], _colours().N)
     half = (levels[1] - levels[0]) / 2
-    return BoundaryNorm([level - half for level in levels] + [levels[-1] + half], COLOURS.N)
+    return colors.BoundaryNorm(
+        [level - half for level in levels] + [levels[-1] + half], _colours().N
+    )
 
 
-def _scatter(axis: Any, points: Sequence[tuple[float, float, Row]], norm: BoundaryNorm) -> None:
+def _scatter(
+    axis: Any, points: Sequence[tuple[float, float, Row]], norm: colors.BoundaryNorm
+) -> None:
     """Draw stands as dots coloured by payload (hollow: the hand was off), falls as crosses."""
     for hand_on in (True, False):
         stood = [
@@ -60,7 +70,7 @@ def _scatter(axis: Any, points: Sequence[tuple[float, float, Row]], norm: Bounda
             for p in points
             if p[2]["ending"] == Ending.STOOD and (not p[2]["let_go_s"]) == hand_on
         ]
-        colours = COLOURS(norm([float(row["payload_kg"]) for _, _, row in stood]))
+        colours = _colours()(norm([float(row["payload_kg"]) for _, _, row in stood]))
         axis.scatter(
             [x for x, _, _ in stood],
             [y for _, y, _ in stood],
@@ -81,7 +91,7 @@ def _scatter(axis: Any, points: Sequence[tuple[float, float, Row]], norm: Bounda
         )  # fmt: skip
 
 
-def _draw_pushes(axis: Any, rows: Sequence[Row], norm: BoundaryNorm) -> None:
+def _draw_pushes(axis: Any, rows: Sequence[Row], norm: colors.BoundaryNorm) -> None:
     """COM excursion over the direction of the strongest push."""
     known = [row for row in rows if row["com_max_mm"]]
     stood = [float(row["com_max_mm"]) for row in known if row["ending"] == Ending.STOOD]
@@ -99,11 +109,11 @@ def _draw_pushes(axis: Any, rows: Sequence[Row], norm: BoundaryNorm) -> None:
         "COM, largest distance after the kill in mm,\nby direction of the strongest push"
     )
     handles = [
-        Line2D([], [], ls="", marker="o", color="#555555", label="stood, hand on"),
-        Line2D(
+        lines.Line2D([], [], ls="", marker="o", color="#555555", label="stood, hand on"),
+        lines.Line2D(
             [], [], ls="", marker="o", color="#555555", fillstyle="none", label="stood, hand off"
         ),
-        Line2D(
+        lines.Line2D(
             [],
             [],
             ls="",
@@ -126,7 +136,7 @@ def _strongest_push(row: Row) -> float:
     return math.atan2(y, x)
 
 
-def _draw_postures(axis: Any, rows: Sequence[Row], norm: BoundaryNorm) -> None:
+def _draw_postures(axis: Any, rows: Sequence[Row], norm: colors.BoundaryNorm) -> None:
     points = [
         (float(row["kill_height_m"]), float(row["kill_pitch_rad"]), row)
         for row in rows
@@ -140,7 +150,7 @@ def _draw_postures(axis: Any, rows: Sequence[Row], norm: BoundaryNorm) -> None:
 
 
 def _draw_excursions(
-    axis: Any, rows: Sequence[Row], norm: BoundaryNorm, robot: RobotConfig
+    axis: Any, rows: Sequence[Row], norm: colors.BoundaryNorm, robot: RobotConfig
 ) -> None:
     """Where the COM went furthest, over the soles."""
     points = []
@@ -154,7 +164,9 @@ def _draw_excursions(
     length, width, base = (1e3 * v for v in (geometry.l_foot, geometry.w_foot, geometry.w_base))
     outer = (base + width) / 2
     axis.add_patch(
-        Rectangle((-outer, -length / 2), 2 * outer, length, fill=False, ls="--", color="#777777")
+        patches.Rectangle(
+            (-outer, -length / 2), 2 * outer, length, fill=False, ls="--", color="#777777"
+        )
     )
     axis.annotate(
         "edge of the support", (0.02, length / 2), xycoords=("axes fraction", "data"),
@@ -170,7 +182,7 @@ def _draw_excursions(
     axis.grid(visible=True, lw=0.3)
 
 
-def _draw_operator(axis: Any, rows: Sequence[Row], norm: BoundaryNorm) -> None:
+def _draw_operator(axis: Any, rows: Sequence[Row], norm: colors.BoundaryNorm) -> None:
     points = [
         (float(row["delay_ms"]), float(row["operator_peak_before_n"]), row)
         for row in rows

@@ -10,7 +10,9 @@ from typing import TypeAlias
 
 import msgspec
 
+from services.planner import split_program
 from shared.config.robot_config import RobotConfig
+from shared.extras import require
 from shared.robot import gain_schedule
 from shared.robot.gain_table import GainSchedule
 from tools.studies.sweeps import pool
@@ -27,9 +29,12 @@ def prepare(
 
     Raises:
         RunError: a robot has no local gains that meet the certificate; says which.
+        MissingPackageError: a schedule is to be computed, and there is no CVXPY.
     """
     ready = list(robots)
     tasks = [(index, robot) for index, robot in enumerate(robots) if needs_schedule(robot)]
+    if tasks:
+        require("design")
     progress(0, len(tasks))
     solved = pool.results(_solve, tasks, workers, _name)
     for done, ((index, robot), schedule) in enumerate(solved, start=1):
@@ -44,8 +49,6 @@ def needs_schedule(robot: RobotConfig) -> bool:
 
 
 def _solve(task: Task) -> GainSchedule:
-    from services.planner import split_program  # noqa: PLC0415 - cvxpy takes a second to load
-
     robot = task[1]
     shipped = robot.gain_schedule
     # damping and coupling hardly depend on the payload, and their search takes minutes

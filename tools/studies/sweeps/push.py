@@ -9,10 +9,8 @@ from itertools import product
 from pathlib import Path
 from typing import Final, TypeAlias
 
-import matplotlib as mpl
 import msgspec
 import numpy as np
-from matplotlib.figure import Figure
 from rich.table import Table as Printed
 
 from services.simulator import plant as plants
@@ -20,15 +18,13 @@ from services.simulator.plant import PlantConfig, plant_from
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from tools.number_arguments import degrees, finite
-from tools.output import save_figure
+from tools.output import new_figure, save_figure
 from tools.runs import experiment
 from tools.studies.sweeps import study
 from tools.studies.sweeps.push_trial import MODES, POSES, PushResult, PushTrial, run_trial
 from tools.studies.sweeps.table import Row, code_of
 from tools.terminal import Console
 from tools.verb_table import add_config
-
-mpl.use("Agg")
 
 ANGLES_DEG: Final = (0, 45, 90, 135, 180)
 """Left and right are alike."""
@@ -121,7 +117,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     poses = list(dict.fromkeys(row["pose"] for row in rows))
     durations = list(dict.fromkeys(row["duration_s"] for row in rows))
     size = (0.5 + 4.6 * len(poses), 0.8 + 4.6 * len(durations))
-    figure = Figure(figsize=size, dpi=100, layout="constrained")
+    figure = new_figure(*size, dpi=100)
     for number, (duration, pose) in enumerate(product(durations, poses)):
         axis = figure.add_subplot(len(durations), len(poses), number + 1, projection="polar")
         axis.set_theta_zero_location("N")  # type: ignore[attr-defined]  # of polar axes

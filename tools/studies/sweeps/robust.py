@@ -8,17 +8,15 @@ from functools import partial
 from pathlib import Path
 from typing import Final, TypeAlias
 
-import matplotlib as mpl
 import msgspec
 import numpy as np
-from matplotlib.figure import Figure
 from rich.table import Table as Printed
 from scipy.stats import spearmanr
 
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from tools.number_arguments import count, finite, natural
-from tools.output import save_figure
+from tools.output import new_figure, save_figure
 from tools.runs import experiment
 from tools.studies.sweeps import plants, push_range, study
 from tools.studies.sweeps.figures import ENDINGS, Ending, exit_code
@@ -37,8 +35,6 @@ from tools.studies.sweeps.table import Row, code_of
 from tools.studies.sweeps.wilson import wilson
 from tools.terminal import Console, marked
 from tools.verb_table import add_config
-
-mpl.use("Agg")
 
 N: Final = 100
 SLOPE_MAX_DEG: Final = 15.0
@@ -170,7 +166,7 @@ def _excursion(row: Row) -> float:
 
 def _draw(rows: Sequence[Row], args: argparse.Namespace, path: Path) -> None:
     """Draw what takes the margin, and the excursions by stiffness, into a PNG file."""
-    figure = Figure(figsize=(13, 6.5), dpi=110, layout="constrained")
+    figure = new_figure(13, 6.5)
     left, right = figure.subplots(1, 2)
     ranked = ranking(rows)[:14][::-1]
     left.barh([key for key, _ in ranked], [value for _, value in ranked], color="#1f5f8b")

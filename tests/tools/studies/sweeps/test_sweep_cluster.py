@@ -6,6 +6,7 @@ import logging
 import sys
 from collections.abc import Sequence
 from concurrent.futures import CancelledError
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -45,6 +46,7 @@ class Inline(ModuleType):
 
     def __init__(self) -> None:
         super().__init__("distributed")
+        self.__spec__ = ModuleSpec("distributed", None, origin="here")
         self.closed = self.cancelled = False
         self.address = ""
         self.loop = object()

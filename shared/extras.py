@@ -1,0 +1,118 @@
+"""The optional packages: which extra of pyproject.toml brings each, and how an absent one is told.
+
+`pip install xrl` brings what a robot in service needs. A verb of an owner's desk calls `require`
+before it begins; a module that uses such a package takes it by `late`, so that it can be imported
+without the package.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import platform
+import sys
+from pathlib import Path
+from typing import Any, Final
+
+from shared.exceptions import MissingPackageError
+from shared.process import CHECKOUT
+
+_PLOT: Final = ("matplotlib", "PIL")
+
+EXTRAS: Final = {
+    "sim": ("mujoco", *_PLOT),
+    "plot": _PLOT,
+    "design": ("cvxpy",),
+    "view": ("aiohttp",),
+    "foxglove": ("foxglove",),
+    "ros2": ("rosbags",),
+    "usb": ("odrive",),
+    "parquet": ("pyarrow",),
+    "pad": ("evdev",),
+    "learn": ("gymnasium",),
+    "cluster": ("distributed",),
+    "bench": ("cyclonedds", "iceoryx2", "lcm", "zmq"),
+}
+"""The packages of each extra, as they are imported."""
+
+UNLOCKED: Final = frozenset({"bench"} if platform.machine() == "x86_64" else {"bench", "pad"})
+"""Extras that `requirements.lock` does not hold: evdev has no wheel for other machines."""
+
+ON_ROBOTS: Final = frozenset({"ros2", "usb"})
+"""Extras of some robots: `requirements.EXTRA.lock` adds each to a robot's environment."""
+
+
+def require(extra: str, otherwise: str = "") -> None:
+    """Make sure that the packages of an extra are installed; imports none of them.
+
+    Args:
+        extra: its name in `EXTRAS`.
+        otherwise: what serves without them.
+
+    Raises:
+        MissingPackageError: one is not.
+    """
+    missing = [name for name in EXTRAS[extra] if not _is_there(name)]
+    if missing:
+        raise missing_package(extra, missing, otherwise)
+
+
+def is_installed(extra: str) -> bool:
+    """Return True if all packages of an extra are installed."""
+    return all(map(_is_there, EXTRAS[extra]))
+
+
+def _is_there(package: str) -> bool:
+    """Return True for a package; deploy is on the path too, and its folder `foxglove` is none."""
+    found = importlib.util.find_spec(package)
+    if found is None or found.origin is not None:
+        return found is not None
+    folders = found.submodule_search_locations or ()
+    return any(Path(folder).resolve().parent != CHECKOUT / "deploy" for folder in folders)
+
+
+def missing_package(extra: str, missing: list[str], otherwise: str = "") -> MissingPackageError:
+    """Return the error that names packages, their extra and the command that brings it."""
+    if extra not in UNLOCKED and (CHECKOUT / "requirements.lock").is_file():
+        command = f"{CHECKOUT}/deploy/install{f' --runtime {extra}' * (extra in ON_ROBOTS)}"
+    elif _is_there("pip"):
+        command = f"{sys.executable} -m pip install 'xrl[{extra}]'"
+    else:  # in an environment of uvx or pipx
+        command = f"install 'xrl[{extra}]' in place of 'xrl'"
+    *others, last = missing
+    are, them = ("are", "them") if others else ("is", "it")
+    names = f"{', '.join(others)} and {last}" if others else last
+    return MissingPackageError(
+        f"{names} {are} not installed; the extra `{extra}` brings {them}: "
+        f"{command}{'; or ' if otherwise else ''}{otherwise}"
+    )
+
+
+def late(module: str) -> Any:
+    """Return a stand-in for a module of an optional package, imported when it is first used.
+
+    That use raises `MissingPackageError` where the package is not installed.
+
+    Args:
+        module: such as `matplotlib.patches`.
+    """
+    return _LateModule(module)
+
+
+class _LateModule:
+    """Passes on what is asked of it; each name is looked up once."""
+
+    def __init__(self, module: str) -> None:
+        self._module = module
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            found = getattr(importlib.import_module(self._module), name)
+        except ModuleNotFoundError as error:
+            package = self._module.partition(".")[0]
+            if not f"{self._module}.".startswith(f"{error.name}."):
+                raise  # another package, which it needs
+            extra = next(extra for extra, names in EXTRAS.items() if package in names)
+            raise missing_package(extra, [package]) from None
+        setattr(self, name, found)
+        return found

@@ -1,0 +1,142 @@
+"""Optional packages: which extra brings each, and how it is told that one is absent."""
+
+import importlib.metadata
+import re
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from shared import extras
+from shared.exceptions import MissingPackageError
+from shared.extras import EXTRAS, ON_ROBOTS, UNLOCKED, is_installed, late, require
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+OPTIONAL: dict[str, list[str]] = PROJECT["optional-dependencies"]
+NO_USE = {"build", "dev", "docs", "desk"}
+"""Extras of no verb: the last one is several others in one word."""
+
+
+def distribution(requirement: str) -> str:
+    return re.split(r"[^\w.-]", requirement)[0].lower()
+
+
+def packages_of(extra: str) -> set[str]:
+    """Return the distributions of an extra, and of those that it names."""
+    found = set()
+    for requirement in OPTIONAL[extra]:
+        inner = re.fullmatch(r"xrl\[(.*)\]", requirement)
+        if inner is None:
+            found.add(distribution(requirement))
+        else:
+            found |= set().union(*(packages_of(name) for name in inner[1].split(",")))
+    return found
+
+
+def locked(name: str) -> set[str]:
+    text = (ROOT / name).read_text(encoding="utf-8")
+    return {line.partition("==")[0] for line in text.splitlines() if re.match(r"[a-z].*==", line)}
+
+
+def test_the_table_has_the_extras_of_the_project() -> None:
+    assert set(EXTRAS) == set(OPTIONAL) - NO_USE
+
+
+@pytest.mark.parametrize("extra", EXTRAS)
+def test_an_extra_brings_the_packages_that_the_table_says(extra: str) -> None:
+    known = importlib.metadata.packages_distributions()
+    for name in EXTRAS[extra]:
+        brings = {one.lower() for one in known.get(name, [])}
+        assert brings & packages_of(extra) or (not brings and extra in UNLOCKED), name
+
+
+def test_a_robots_lock_holds_its_packages_and_those_of_no_extra() -> None:
+    held = locked("requirements.runtime.lock")
+    assert {distribution(requirement) for requirement in PROJECT["dependencies"]} <= held
+    assert held & set().union(*(packages_of(extra) for extra in EXTRAS)) == set()
+
+
+@pytest.mark.parametrize("extra", sorted(ON_ROBOTS))
+def test_a_lock_of_some_robots_holds_what_it_adds_to_a_robots_lock(extra: str) -> None:
+    held = locked(f"requirements.{extra}.lock")
+    assert packages_of(extra) <= held
+    assert held & locked("requirements.runtime.lock") == set()
+    assert held <= locked("requirements.lock")
+
+
+def test_the_whole_lock_holds_every_extra_that_is_said_to_be_in_it() -> None:
+    held = locked("requirements.lock")
+    for extra in set(EXTRAS) - {*UNLOCKED, "pad"}:
+        assert packages_of(extra) <= held, extra
+    assert "evdev-binary" in held
+
+
+def test_what_is_absent_is_told_with_its_extra_and_what_brings_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    require("sim")
+    assert is_installed("sim")
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    assert not is_installed("sim")
+    with pytest.raises(MissingPackageError) as found:
+        require("sim")
+    install = ROOT / "deploy" / "install"
+    assert str(found.value) == f"mujoco is not installed; the extra `sim` brings it: {install}"
+    monkeypatch.setitem(sys.modules, "odrive", None)
+    with pytest.raises(MissingPackageError, match=r"deploy/install --runtime usb$"):
+        require("usb")
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    with pytest.raises(
+        MissingPackageError, match=r"^mujoco and PIL are not .* brings them: .*; or"
+    ):
+        require("sim", "look at a record")
+
+
+def test_outside_of_a_checkout_pip_brings_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(extras, "CHECKOUT", tmp_path)
+    monkeypatch.setitem(sys.modules, "aiohttp", None)
+    pip = f"{re.escape(sys.executable)} -m pip install 'xrl\\[view\\]'"
+    with pytest.raises(MissingPackageError, match=pip):
+        require("view")
+    monkeypatch.setitem(sys.modules, "pip", None)
+    with pytest.raises(MissingPackageError, match=r"install 'xrl\[view\]' in place of 'xrl'"):
+        require("view")
+
+
+def test_a_late_module_is_imported_when_it_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "mujoco", raising=False)
+    mujoco = late("mujoco")
+    assert "mujoco" not in sys.modules
+    assert mujoco.mj_step is sys.modules["mujoco"].mj_step
+
+
+def test_a_late_module_that_is_absent_says_so_when_it_is_used(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "cvxpy", None)
+    cvxpy = late("cvxpy")
+    with pytest.raises(MissingPackageError, match=r"^cvxpy is not installed; the extra `design`"):
+        _ = cvxpy.Variable
+
+
+def test_a_folder_of_deploy_is_no_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(EXTRAS, "made_up", ("plants",))
+    monkeypatch.syspath_prepend(ROOT / "deploy")
+    with pytest.raises(MissingPackageError, match=r"^plants is not installed"):
+        require("made_up")
+    with pytest.raises(MissingPackageError, match=r"^plants is not installed"):
+        _ = late("plants.inner").name
+
+
+def test_a_package_that_lacks_another_one_is_not_said_to_be_absent(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "rosbags.py").write_text("import there_is_no_such_package\n", encoding="utf-8")
+    monkeypatch.delitem(sys.modules, "rosbags", raising=False)
+    with pytest.raises(ModuleNotFoundError, match="there_is_no_such_package"):
+        _ = late("rosbags").typesys

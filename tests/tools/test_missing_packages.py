@@ -1,0 +1,71 @@
+"""Without an optional package a verb says in one line what is absent, before it begins anything."""
+
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+
+from shared.extras import EXTRAS
+from tools import cli
+
+
+@pytest.mark.parametrize(
+    ("words", "extra"),
+    [
+        ("demo", "sim"),
+        ("demo --view", "sim"),
+        ("sim", "sim"),
+        ("sweep kill --n 1", "sim"),
+        ("crashtest --quick", "sim"),
+        ("whatif OUT --kill planner", "sim"),
+        ("bench", "sim"),
+        ("bench fleet", "sim"),
+        ("tune x --sim", "sim"),
+        ("tune x", "plot"),
+        ("identify body OUT", "plot"),
+        ("identify joint --all", "plot"),
+        ("gains", "design"),
+        ("view", "view"),
+        ("view OUT", "view"),
+        ("view --sim", "sim"),
+        ("view --foxglove", "foxglove"),
+        ("up --view", "view"),
+        ("export OUT --gif a.gif", "plot"),
+        ("export OUT --scene", "foxglove"),
+        ("export OUT --ros2bag bag", "ros2"),
+        ("export OUT --parquet t", "parquet"),
+        ("ros2 check", "ros2"),
+    ],
+)
+def test_a_verb_names_the_extra_that_it_lacks(
+    words: str,
+    extra: str,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for name in {name for names in EXTRAS.values() for name in names}:
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(shlex.split(words.replace("OUT", str(tmp_path / "run.mcap")))) == 2
+    output, errors = capsys.readouterr()
+    assert errors.count("\n") == 1
+    assert f"the extra `{extra}` brings " in errors
+    assert output == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("flags", "extra"), [([], "sim"), (["--no-sim", "--ros2"], "ros2")])
+def test_up_starts_no_service_without_its_packages(
+    flags: list[str],
+    extra: str,
+    monkeypatch: pytest.MonkeyPatch,
+    run_dir: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setitem(sys.modules, EXTRAS[extra][0], None)
+    run = ["--run-dir", str(run_dir / "run"), "--out", str(run_dir / "out")]
+    assert cli.main(["up", *flags, *run]) == 2
+    assert f"the extra `{extra}` brings it" in capsys.readouterr().err
+    assert not (run_dir / "run").exists()
