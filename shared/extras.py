@@ -39,7 +39,7 @@ UNLOCKED: Final = frozenset({"bench"} if platform.machine() == "x86_64" else {"b
 """Extras that `requirements.lock` does not hold: evdev has no wheel for other machines."""
 
 ON_ROBOTS: Final = frozenset({"ros2", "usb"})
-"""Extras of some robots: `requirements.EXTRA.lock` adds each to a robot's environment."""
+"""Extras of some robots: `./deploy/install --runtime NAME` adds one, from a lock of its own."""
 
 
 def require(extra: str, otherwise: str = "") -> None:

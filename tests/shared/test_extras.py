@@ -35,9 +35,13 @@ def packages_of(extra: str) -> set[str]:
     return found
 
 
-def locked(name: str) -> set[str]:
+def locked_lines(name: str) -> list[str]:
     text = (ROOT / name).read_text(encoding="utf-8")
-    return {line.partition("==")[0] for line in text.splitlines() if re.match(r"[a-z].*==", line)}
+    return [line for line in text.splitlines() if re.match(r"[a-z].*==", line)]
+
+
+def locked(name: str) -> set[str]:
+    return {line.partition("==")[0] for line in locked_lines(name)}
 
 
 def test_the_table_has_the_extras_of_the_project() -> None:
@@ -56,6 +60,16 @@ def test_a_robots_lock_holds_its_packages_and_those_of_no_extra() -> None:
     held = locked("requirements.runtime.lock")
     assert {distribution(requirement) for requirement in PROJECT["dependencies"]} <= held
     assert held & set().union(*(packages_of(extra) for extra in EXTRAS)) == set()
+
+
+def test_the_page_counts_a_robots_packages() -> None:
+    page = (ROOT / "docs" / "security.md").read_text(encoding="utf-8")
+    assert f"{len(locked('requirements.runtime.lock'))} packages, 0.9 GB" in page
+    for extra in ON_ROBOTS:
+        lines = locked_lines(f"requirements.{extra}.lock")
+        count = sum("; sys_platform == 'win32'" not in line for line in lines)
+        row = next(line for line in page.splitlines() if line.startswith(f"| `{extra}` |"))
+        assert f"| {count} |" in row
 
 
 @pytest.mark.parametrize("extra", sorted(ON_ROBOTS))
