@@ -5,6 +5,7 @@
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd -P)
 venv=$root/.venv
 stamp=$venv/xrl.stamp       # what the environment was made from; absent while it is being made
+kind=$venv/xrl.kind         # full or runtime, as it was asked for last
 half_made=$venv/xrl.making  # stands from the first to the last step of making it
 graphs=$venv/xrl-graphs/stamp  # what the law's graphs were translated into C from, where cc is
 
@@ -144,16 +145,27 @@ translate_graphs() {
     printf '%s\n' "$from" >"$graphs") || say "the law's graphs stay interpreted: slower, else the same"
 }
 
+# After a `git pull` a robot's environment is a robot's again, whichever script makes it.
+kind_for() {  # full, runtime, or any: as it was
+  local was
+  was=$(cat "$kind" 2>/dev/null) || was=full
+  [ "$1" = any ] && printf '%s\n' "$was" || printf '%s\n' "$1"
+}
+
 # Make `.venv` from the lock file, or do nothing, quickly, if it is right already.
 # Two at once: the second waits. Stopped in the middle: the next one starts afresh.
 environment() {  # [full | runtime]: either is right without
-  local wanted=${1:-any} lock=$full
-  [ "$wanted" != runtime ] || lock=$runtime
+  local wanted=${1:-any} lock=$full made_as
+  made_as=$(kind_for "$wanted")
+  [ "$made_as" != runtime ] || lock=$runtime
   is_current "$wanted" && graphs_are_current && return
   command -v flock >/dev/null || die "flock is missing (package util-linux)"
   exec 9<"$root"
   flock --nonblock 9 || { say "waiting for another script that is making .venv"; flock 9; }
-  is_current "$wanted" || make_environment "$lock"
+  if ! is_current "$wanted"; then
+    make_environment "$lock"
+    printf '%s\n' "$made_as" >"$kind"
+  fi
   graphs_are_current || translate_graphs
   exec 9<&-
 }

@@ -125,3 +125,21 @@ def test_no_other_extra_goes_with_a_robots_environment() -> None:
     done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=30)
     assert done.returncode == 2
     assert done.stderr == "deploy: sim: one of ros2 usb goes with --runtime\n"
+
+
+@pytest.mark.parametrize(
+    ("was", "asked", "made"),
+    [
+        ("runtime", "any", "runtime"),
+        ("full", "any", "full"),
+        (None, "any", "full"),
+        ("runtime", "full", "full"),
+        ("full", "runtime", "runtime"),
+    ],
+)
+def test_an_environment_is_made_again_as_it_was(
+    was: str | None, asked: str, made: str, system: Path
+) -> None:
+    if was is not None:
+        (system / "xrl.kind").write_text(f"{was}\n", encoding="utf-8")
+    assert run(system, f"kind={system}/xrl.kind; kind_for {asked}").stdout == f"{made}\n"
