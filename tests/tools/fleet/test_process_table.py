@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import re
 import socket
+import sys
 import tempfile
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -13,7 +15,7 @@ import pytest
 from shared.bus.links import PAIRS
 from shared.config.files import load
 from shared.config.robot_config import SERVICES
-from shared.exceptions import ConfigError, FleetError
+from shared.exceptions import ConfigError, FleetError, MissingPackageError
 from shared.process import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
 from tools.fleet import process_table
@@ -124,6 +126,27 @@ def test_the_imus_service_is_started_on_a_robot_that_has_one_and_by_the_injector
     assert set(load(fitted).services) <= set(told.commands)
 
 
+def test_drives_on_usb_are_not_looked_for_without_their_package(
+    run_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "odrive", None)
+    assert "knee_left" in plan(run_dir).commands
+    on_usb = run_dir / "robot.toml"
+    text = DEFAULT_CONFIG.read_text(encoding="utf-8")
+    on_usb.write_text(text.replace('driver = "odrive_can"', 'driver = "odrive_usb"'), "utf-8")
+    make = partial(
+        process_table.make_plan,
+        on_usb,
+        run_dir,
+        overrides={},
+        simulation=False,
+        table_path=process_table.TABLE,
+    )
+    assert list(make(services=["planner"]).commands) == ["planner"]
+    with pytest.raises(MissingPackageError, match="the extra `usb` brings it"):
+        make(services=None)
+
+
 @pytest.mark.parametrize("changes", [{"services": ["plannr"]}, {"overrides": {"plannr": []}}])
 def test_an_unknown_service_is_refused_with_the_known_ones(
     run_dir: Path, changes: dict[str, object]
@@ -139,6 +162,7 @@ def test_an_unknown_service_is_refused_with_the_known_ones(
         ('colour = "red"', "process[0].colour"),
         ('topic = "joint/state"', "process[0].topic"),
         ('only = "sundays"', "process[0].only"),
+        ('extra = "sundays"', "process[0].extra"),
     ],
 )
 def test_a_bad_row_is_refused_with_its_key(tmp_path: Path, line: str, key: str) -> None:
