@@ -6,8 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from shared.config.files import load_without_schedule
 from shared.extras import EXTRAS
+from shared.process import DEFAULT_CONFIG
 from tools import cli
+from tools.bringup import survey
 
 
 @pytest.mark.parametrize(
@@ -69,3 +72,16 @@ def test_up_starts_no_service_without_its_packages(
     assert cli.main(["up", *flags, *run]) == 2
     assert f"the extra `{extra}` brings it" in capsys.readouterr().err
     assert not (run_dir / "run").exists()
+
+
+def test_doctor_tells_in_a_row_that_no_settings_are_read_without_the_package_for_usb(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    file = tmp_path / "lab.toml"
+    text = DEFAULT_CONFIG.read_text(encoding="utf-8")
+    file.write_text(text.replace('interface = "xrl_unix"', 'interface = "socketcan"'), "utf-8")
+    robot = load_without_schedule(file)
+    monkeypatch.setitem(sys.modules, "odrive", None)
+    (row,) = survey._usb(robot, tmp_path, {}, services_up=False)
+    assert row.found == "odrive is not installed"
+    assert row.fix.startswith("the extra `usb` brings it: ")
