@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from shared.exceptions import MissingPackageError
-from shared.process import CHECKOUT
+from shared.places import CHECKOUT
 
 _PLOT: Final = ("matplotlib", "PIL")
 

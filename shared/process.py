@@ -12,8 +12,6 @@ from types import FrameType
 
 from shared import log, places
 from shared.exceptions import BUG_EXIT_CODE, XrlError, os_error_in_words
-from shared.places import CHECKOUT as CHECKOUT  # noqa: PLC0414 - known by this module, too
-from shared.places import DEFAULT_CONFIG as DEFAULT_CONFIG  # noqa: PLC0414
 from shared.run_directory import default_run_dir, service_directory
 
 SOCKET_PATH_MAX = 100

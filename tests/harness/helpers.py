@@ -20,7 +20,7 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import HarnessConfig
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from shared.robot.stewart import geometry_matrix
 
 ROBOT = config_file.load(DEFAULT_CONFIG)

@@ -18,7 +18,7 @@ from services.planner.split import LocalGains
 from shared.bus.messages import SplitSource
 from shared.config.files import load
 from shared.config.robot_config import RobotConfig
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from shared.robot.capture_point import capture_point
 from shared.robot.robot_model import stand_pose
 

@@ -21,7 +21,7 @@ from shared.bus.messages import JointState
 from shared.bus.session import Publisher, open_session
 from shared.config.files import load
 from shared.exceptions import RunError
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from tests.shared.mcap_log import runs
 from tools import cli
 from tools.runs.run_log import RunLog, read_run

@@ -18,7 +18,7 @@ from shared.bus.messages import Estop, JointCommand, JointEvent, Wrench
 from shared.bus.session import Latest, Publisher, Session, open_session
 from shared.config import files as config_file
 from shared.exceptions import BusError
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -32,7 +32,7 @@ from shared.config import files as config_file
 from shared.bus import topics
 from shared.bus.session import open_session
 from shared.bus.messages import Estop, JointCommand, JointEvent
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 robot, run_dir = config_file.load(DEFAULT_CONFIG), Path(sys.argv[1])
 """
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from shared.bus import socket_linger
 from shared.bus.session import open_session
 from shared.config import files as config_file
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from tests.certified import opened
 
 ON_FOR_10_S = struct.pack("ii", 1, 10)

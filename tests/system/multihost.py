@@ -32,7 +32,7 @@ from shared.clock import now_ns
 from shared.config import scenarios
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Push, Scenario
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
 from tests.certified import certified
 from tests.system.namespaces import Network

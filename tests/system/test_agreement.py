@@ -31,7 +31,7 @@ from shared.config import files as config_file
 from shared.config.scenarios import Inject
 from shared.network.impairment import Impairer, Impairment
 from shared.network.proxy_protocol import SOCKET
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
 from tests.shared.mcap_log.runs import sample
 from tests.system.stalls import has_stalled, stalled_before_it_began

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(60)]
 

@@ -19,7 +19,7 @@ from shared.bus import topics
 from shared.bus.messages import JointState, Mode, SimTruth
 from shared.bus.session import Latest, open_session
 from shared.config.robot_config import RobotConfig
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
 from tests.system.verbs import xrl
 from tools.fleet import procfs

@@ -21,7 +21,7 @@ from shared.bus.messages import JointState, Mode, PlannerMode, PlannerStatus, Si
 from shared.bus.session import open_session
 from shared.config.files import load
 from shared.config.robot_config import RobotConfig
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
 from shared.run_directory import RUN_DIR_VARIABLE
 from tests.system.waiting import wait_for

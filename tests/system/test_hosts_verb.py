@@ -20,7 +20,7 @@ from shared.bus.messages import JointState, Mode
 from shared.bus.session import Session, open_session
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
 from tests.certified import install_all
 from tests.system.test_hosts import with_drives_in

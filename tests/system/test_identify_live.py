@@ -12,7 +12,7 @@ from shared.bus.session import open_session
 from shared.clock import keep_pace
 from shared.config import files as config_file
 from shared.config.scenarios import Keyframe, Scenario
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from tools.identify.motion import Motion
 from tools.identify.quasi_static import moments_of
 from tools.tune.excitation import Excitation, SinePart

@@ -24,7 +24,7 @@ from shared.clock import NS_PER_MS, now_ns
 from shared.config import files as config_file
 from shared.config.scenarios import Inject
 from shared.network.proxy_protocol import SOCKET
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from tests.shared.mcap_log.runs import sample
 from tools import cli
 from tools.fleet.proxy_client import ProxyClient

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from shared.bus.messages import Mode
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from shared.robot.joints import JOINTS, MODULES
 from tests.system.ros2_network import OtherNode, free_port, router, session
 from tests.system.waiting import wait_for

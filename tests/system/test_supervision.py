@@ -19,7 +19,7 @@ import pytest
 from supervisor.states import ProcessStates
 
 from shared.exceptions import FleetError
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from tests.system.waiting import wait_for
 from tools import cli
 from tools.fleet import procfs, supervise

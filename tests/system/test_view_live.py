@@ -17,7 +17,7 @@ import pytest
 
 from shared.bus import topics
 from shared.bus.messages import Mode, RunEventKind
-from shared.process import CHECKOUT
+from shared.places import CHECKOUT
 from tools.runs.hand_path import hand_path
 from tools.runs.run_log import read_run
 

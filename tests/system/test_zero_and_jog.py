@@ -22,7 +22,7 @@ from shared.bus.session import open_session
 from shared.can import cansimple
 from shared.can.cansimple import Command
 from shared.config.robot_config import RobotConfig, expand
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
 from tests.system.verbs import xrl
 from tools.bringup import bench, zeroing

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from shared.process import CHECKOUT
+from shared.places import CHECKOUT
 
 XRL = "import sys; from xrl_main import main; sys.exit(main())"
 STARTS = """

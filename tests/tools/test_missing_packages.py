@@ -8,7 +8,7 @@ import pytest
 
 from shared.config.files import load_without_schedule
 from shared.extras import EXTRAS
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from tools import cli
 from tools.bringup import survey
 

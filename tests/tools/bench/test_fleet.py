@@ -15,7 +15,7 @@ from shared.bus.messages import JointCommand
 from shared.bus.traces import CycleTrace, JointTrace
 from shared.clock import NS_PER_MS
 from shared.exceptions import RunError
-from shared.process import CHECKOUT, DEFAULT_CONFIG
+from shared.places import CHECKOUT, DEFAULT_CONFIG
 from tests.shared.mcap_log.runs import ROBOT, sample, write
 from tests.tools.exit_codes import exit_code
 from tools.bench import fleet, fleet_command

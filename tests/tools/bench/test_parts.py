@@ -11,7 +11,7 @@ import pytest
 from shared.config import scenarios
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.process import CHECKOUT, DEFAULT_CONFIG
+from shared.places import CHECKOUT, DEFAULT_CONFIG
 from shared.robot.joints import MODULES
 from tools.bench import parts, revisions, timing
 from tools.bench.parts import PARTS, Part, Recorded

@@ -11,7 +11,7 @@ import pytest
 
 from shared import scheduling
 from shared.config.robot_config import RobotConfig
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from tools.bringup import check_machine
 from tools.bringup.rows import Finding, FindingKind
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from shared.exceptions import FleetError
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from tools.fleet.process_table import TABLE, make_plan
 from tools.fleet.proxy_client import ProxyClient
 from tools.fleet.run_dir import RunDir

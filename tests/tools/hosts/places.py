@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 import tomli_w
 
-from shared.process import CHECKOUT
+from shared.places import CHECKOUT
 from shared.robot.joints import MODULES
 
 BODY = ["planner", "harness", "recorder"]

@@ -18,7 +18,7 @@ import tomli_w
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from tests.tools.hosts.places import LEGS, SHARED, make_hosts
 from tools import cli
 from tools.hosts import hosts_file, layout

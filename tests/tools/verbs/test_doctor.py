@@ -18,7 +18,7 @@ import pytest
 from shared.can import cansimple
 from shared.can.cansimple import Command
 from shared.can.cansimple_06 import Command06
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from tools import cli
 from tools.fleet import procfs
 

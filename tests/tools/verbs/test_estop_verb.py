@@ -13,7 +13,7 @@ from shared.bus.messages import Mode
 from shared.bus.topics import VIEWER
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
 from tests.certified import certified, install_all
 from tests.tools.exit_codes import exit_code

@@ -7,7 +7,7 @@ from argparse import Namespace
 
 import pytest
 
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from shared.robot.fault_table import DRIVE_FAULTS, LOSSES
 from shared.robot.trip_table import JOINT_TRIPS, PLANNER_TRIPS
 from tools.verbs import faults

@@ -12,7 +12,7 @@ import pytest
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from tests.certified import certified, opened
 from tests.shared.mcap_log import runs
 from tests.shared.mcap_log.runs import item, write

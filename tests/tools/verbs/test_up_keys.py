@@ -11,7 +11,7 @@ import pytest
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import BusError
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from tests.certified import certified
 from tools import cli
 from tools.keys import authority as authority_module

@@ -10,7 +10,7 @@ import pytest
 
 from services.simulator.led_hand import HEIGHTS, PUSH_MAX
 from shared.bus.messages import Mode
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
 from tools.runs.experiment import load_robot
 from tools.view.frame import Frame

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from tests.tools.view.browser import BROWSER, Page, browser
 from tests.tools.view.test_record_source import LOG
 from tools import cli

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from shared.process import CHECKOUT
+from shared.places import CHECKOUT
 from tests.tools.exit_codes import exit_code
 from tests.tools.view.test_record_source import LOG
 from tools import cli

@@ -19,7 +19,7 @@ from shared.bus import codec, topics
 from shared.bus.messages import Estop, JointCommand, JointState, Message, SimTruth, Wrench
 from shared.bus.session import Session, open_session
 from shared.config import files as config_file
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from tests.shared.mcap_log import runs
 from tests.shared.mcap_log.runs import Queue, sample
 from tools.analysis.playback.arguments import LISTEN

@@ -10,7 +10,7 @@ import pytest
 
 from shared.bus.messages import Cause, Trip
 from shared.config.robot_config import RobotConfig
-from shared.process import DEFAULT_CONFIG
+from shared.places import DEFAULT_CONFIG
 from shared.robot.trip_table import JOINT_TRIPS, PLANNER_TRIPS
 from tools import cli
 from tools.studies.sweeps.trips import exit_code, wrong_with
