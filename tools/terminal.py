@@ -73,9 +73,14 @@ class Console(rich.console.Console):
         self, renderable: RenderableType, options: ConsoleOptions | None = None
     ) -> Iterable[Segment]:
         """Yield the segments of anything printable, whole and without foreign control."""
+        segments = super().render(renderable, options)
         if isinstance(renderable, Table):
             self._let_fit(renderable, options or self.options)
-        for segment in super().render(renderable, options):
+            if not self.is_terminal:  # one long cell would pad every row with blanks
+                lines = Segment.split_lines(super().render(renderable, options))
+                texts = ["".join(part.text for part in line).rstrip() for line in lines]
+                segments = [Segment(f"{text}\n") for text in texts]
+        for segment in segments:
             if segment.control or is_clean(segment.text):
                 yield segment
             else:

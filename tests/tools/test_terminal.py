@@ -52,6 +52,14 @@ def test_a_pipe_gets_a_table_whole_without_frame_and_colour() -> None:
     assert "\x1b" not in text
 
 
+def test_in_a_pipe_no_row_ends_in_blanks_though_one_cell_is_long() -> None:
+    made = Table("what", "found")
+    made.add_row("a", "x" * 3000)
+    made.add_row("b", "fine")
+    lines = printed(made, terminal=False).splitlines()
+    assert lines == ["what  found", f"a     {'x' * 3000}", "b     fine"]
+
+
 @pytest.mark.parametrize("width", [40, 80, 100])
 def test_a_terminal_folds_a_table_and_cuts_nothing(width: int) -> None:
     text = OURS.sub("", printed(table(), terminal=True, width=width))
