@@ -19,6 +19,7 @@ from shared.robot.joints import JOINTS, MODULES
 from tools.analysis.reports.page_model import TimelineEvent
 from tools.analysis.reports.run_data import RunData
 from tools.analysis.reports.signals import Array
+from tools.runs import stalls
 from tools.runs.verdict import leading
 from tools.runs.verdict_limits import LIMITS
 
@@ -119,8 +120,10 @@ def _world(run: RunData) -> Iterator[Violation]:
     if run.course is None:
         return
     t = run.course.t + run.at(run.course.zero_ns)
-    leads = leading(run.log, np.round(t * NS_PER_S).astype(np.int64) + run.zero_ns)
-    inside = run.inside(t)
+    times_ns = np.round(t * NS_PER_S).astype(np.int64) + run.zero_ns
+    leads = leading(run.log, times_ns)
+    stalled = stalls.inside(stalls.disturbances(run.log, times_ns[0], times_ns[-1]), times_ns)
+    inside = run.inside(t) & ~stalled
     for name, field, index, scale, leading_key, other_key in WORLD:
         rows = np.array([getattr(row, field) for row in run.course.rows], dtype=np.float64)
         values = np.abs(rows if rows.ndim == 1 else rows[:, index]) * scale

@@ -90,7 +90,7 @@ class Judge:
         lines = _verdict_lines(summary)
         cautions = verdict_table.stalls(summary)
         cautions += [] if summary["in_real_time"] else [lines[-2]]
-        caution = "; ".join(cautions)
+        caution = " ".join(f"{line.rstrip('.')}." for line in cautions)
         return RunVerdict(lines[-1], bool(summary["stood"]), _rows(summary), caution)
 
 
