@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -42,6 +43,7 @@ as joints go."""
 _HELPERS_BEGIN: Final = '#pragma GCC push_options\n#pragma GCC optimize ("fp-contract=fast")\n'
 _HELPERS_END: Final = "/* Configuration this file was compiled with */\n"
 """In the C of a graph: up to here are functions that CasADi's own library has as well."""
+_HELPER: Final = re.compile(r"^(?=(?:void|int|casadi_int|casadi_real) casadi_\w+\()", re.MULTILINE)
 _NO_COMPILER: Final = "no C compiler `cc` on PATH: CasADi interprets the law's graphs, all runs"
 
 
@@ -94,8 +96,9 @@ def translation(function: ca.Function) -> str:
     """
     code = ca.CodeGenerator(f"{function.name()}.c")
     code.add(function)
-    end = f"#pragma GCC pop_options\n{_HELPERS_END}"
-    return _HELPERS_BEGIN + code.dump().replace(_HELPERS_END, end, 1)
+    helpers, end, own = code.dump().partition(_HELPERS_END)
+    helpers = _HELPER.sub("static ", helpers)  # of others GCC 14 does not take the option
+    return f"{_HELPERS_BEGIN}{helpers}#pragma GCC pop_options\n{end}{own}"
 
 
 def _build(function: ca.Function, compiler: str, path: Path) -> None:

@@ -9,6 +9,7 @@ import pytest
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
+from shared.places import DEFAULT_CONFIG
 from tests.usb import robot_file
 from tools.fleet import process_table
 
@@ -56,4 +57,4 @@ def test_only_an_emulated_robot_on_usb_has_the_stand_in(tmp_path: Path) -> None:
     path = robot_file.write(tmp_path)
     assert plan(path, simulation=True).emulated_usb
     assert not plan(path, simulation=False).emulated_usb
-    assert not plan(process_table.DEFAULT_CONFIG, simulation=True).emulated_usb
+    assert not plan(DEFAULT_CONFIG, simulation=True).emulated_usb

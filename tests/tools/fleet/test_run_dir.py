@@ -193,9 +193,11 @@ def test_a_service_of_another_fleet_gets_no_signal(claimed: RunDir) -> None:
 
 def test_a_process_of_the_fleet_is_known_by_its_mark(claimed: RunDir) -> None:
     marked = {**os.environ, FLEET_VARIABLE: str(claimed.path)}
-    with subprocess.Popen(
-        [sys.executable, "-c", "input()"], stdin=subprocess.PIPE, env=marked
-    ) as member:
+    words = [sys.executable, "-c", "print(flush=True); input()"]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(words, stdin=pipe, stdout=pipe, env=marked) as member:
+        assert member.stdout is not None
+        member.stdout.readline()  # until then the kernel may still be laying out its environment
         assert procfs.fleet_pids(claimed.path) == {member.pid}
         assert procfs.fleet_pids(claimed.path.with_name("other")) == set()
         member.communicate(b"\n")
