@@ -10,8 +10,12 @@ import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
 
+from shared.config import files
+from shared.places import DEFAULT_CONFIG
+from shared.robot.gain_schedule import inputs_of
 from tools.reference.__main__ import FOLDER, PAGES
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -61,6 +65,17 @@ def test_a_generated_page_is_up_to_date(name: str) -> None:
         pytest.skip("its help is as argparse of the oldest Python, 3.11, wraps it")
     path = FOLDER / name
     assert path.read_text(encoding="utf-8") == PAGES[name](), "run `python -m tools.reference`"
+
+
+def test_a_table_said_to_need_xrl_gains_is_wholly_an_input_of_the_gain_schedule() -> None:
+    config = files.load(DEFAULT_CONFIG)
+    inputs = set(inputs_of(config))
+    text = DEFAULT_CONFIG.read_text(encoding="utf-8")
+    said = re.findall(r"^\[(\w+)\].*what changes here needs `xrl gains`", text, re.MULTILINE)
+    assert said
+    for section in said:
+        fields = msgspec.structs.fields(getattr(config, section))
+        assert {f"{section}.{field.name}" for field in fields} <= inputs
 
 
 def test_every_reference_to_a_page_leads_to_a_page_and_an_anchor() -> None:

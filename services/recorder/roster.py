@@ -17,7 +17,7 @@ NEWS_NS: Final = 100 * NS_PER_MS
 
 
 class Roster:
-    """The recorder dials every service and is dialled by every tool: it knows them all."""
+    """Every tool dials the recorder, so the recorder knows all that are linked."""
 
     def __init__(self, session: Session) -> None:
         """Begin to watch."""

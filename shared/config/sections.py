@@ -372,8 +372,8 @@ class Ros2Config(Section, frozen=True):
 
 
 LOST_S: Final = 0.1
-"""Silence after which a drive without a watchdog is lost; `services.joint.neighbours` takes a
-module for gone after the same."""
+"""Silence after which a drive without a watchdog is lost, s. In DAMP a knee whose fellow has been
+silent for that time holds, whatever the watchdog (`services.joint.neighbours`)."""
 
 
 class DriveConfig(Section, frozen=True):

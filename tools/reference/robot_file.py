@@ -28,6 +28,7 @@ default must be there. *Shipped* is the value in `deploy/robot.toml`.
 
 After a change of one of these run `xrl gains`, because the gain schedule beside the file depends on
 them: {inputs}.
+`law.lead_easing` does so only beyond the value for which the schedule was made.
 """
 _LONGEST: Final = 60
 """Characters of a shipped value that fit a cell."""

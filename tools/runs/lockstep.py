@@ -56,7 +56,7 @@ from tools.runs.virtual_planner import VirtualPlanner
 SETTLE_NS = NS_PER_S
 """The scenario starts this long after all six modules track, ns."""
 READY_NS = 20 * NS_PER_S
-"""Time in which all six modules must track, ns; the run ends if they do not."""
+"""Virtual time by which the scenario must have started, ns. It starts at 1 s: 19 s of a run."""
 
 Record = Callable[[Topic, str, Message], None]
 """Takes what live would be on the bus: topic, module or "", message."""
@@ -224,8 +224,8 @@ class Lockstep:
     def run(self) -> Iterator[SimTruth]:
         """Run to the scenario's end; yield the truth at its rate.
 
-        Before the scenario starts its time is negative. Ends early if by then the robot has fallen
-        or does not track within `READY_NS`.
+        Before the scenario starts its time is negative. Ends early if by then the robot has fallen,
+        or if the scenario has not started when virtual time is past `READY_NS`.
         """
         while self.world.scenario_s < self.scenario.duration:
             while self._todo and self.world.scenario_s >= self._todo[0].at:
