@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import io
+import pkgutil
 import re
 import subprocess
 import sys
@@ -33,6 +35,8 @@ _ABROAD = {
     *("_us", "_hz", "_degc"),  # endings of names
 }
 """Names in backticks that are other programs'."""
+_EQUATION = re.compile(r"docs/law\.md\s+((?:(?:,|\s+and)?\s*\(\d+\))+)")
+"""One or several numbers of its equations: `docs/law.md (6) and (12)`."""
 _OLD = re.compile(r"design,?\s+(?:#\s+)?sections?\s+\d", re.IGNORECASE)
 
 
@@ -95,6 +99,41 @@ def test_no_design_section_is_left() -> None:
         if _OLD.search(path.read_text(encoding="utf-8"))
     ]
     assert found == []
+
+
+def _functions_in_code() -> dict[str, set[int]]:
+    """Return the equations of docs/law.md that docstrings name, by function."""
+    found: dict[str, set[int]] = {}
+
+    def visit(node: ast.AST, name: str) -> None:
+        for child in ast.iter_child_nodes(node):
+            inside = name
+            if isinstance(child, ast.FunctionDef | ast.ClassDef):
+                inside = f"{name}.{child.name}"
+                for numbers in _EQUATION.findall(ast.get_docstring(child) or ""):
+                    found.setdefault(inside, set()).update(map(int, re.findall(r"\d+", numbers)))
+            visit(child, inside)
+
+    for path in _tracked(".py"):
+        module = path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".")
+        visit(ast.parse(path.read_text(encoding="utf-8")), module)
+    return found
+
+
+def test_each_equation_of_the_law_names_its_function_and_that_function_names_it() -> None:
+    law = (DOCS / "law.md").read_text(encoding="utf-8")
+    text, table = law.split("## Equations in the code")
+    shown = [
+        int(a or b) for a, b in re.findall(r"\\tag\{(\d+)\}|^\| \((\d+)\) \|", text, re.MULTILINE)
+    ]
+    listed = re.findall(r"^\| \((\d+)\) \| `([\w.]+)` \|$", table, re.MULTILINE)
+    assert shown == list(range(1, len(shown) + 1)), "numbered in the page's order"
+    assert [int(number) for number, _ in listed] == shown
+    named: dict[str, set[int]] = {}
+    for number, function in listed:
+        assert callable(pkgutil.resolve_name(function)), function
+        named.setdefault(function, set()).add(int(number))
+    assert _functions_in_code() == named
 
 
 def test_every_file_that_a_page_names_exists() -> None:

@@ -12,7 +12,7 @@ from shared.bus.messages import Pair
 
 
 def joint_from_motor(motor_turns: Pair, gear_ratio: float) -> Pair:
-    """Return (phi, theta) in rad (or rad/s) from motor turns (or turn/s)."""
+    """Return (phi, theta) in rad (or rad/s) from motor turns (or turn/s): docs/law.md (3)."""
     half = math.pi / gear_ratio  # 2 pi / 2 N
     m1, m2 = motor_turns
     return ((m1 - m2) * half, (m1 + m2) * half)

@@ -34,7 +34,7 @@ class Setpoint(msgspec.Struct, gc=False, frozen=True):
 def torque(setpoint: Setpoint | JointCommand, q: Pair, v: Pair) -> Pair:
     """Return tau = k_p (q_ref - q) + k_d (v_ref - v) + tau_ff + tau_coupled, N m.
 
-    Of a command: as it was when the planner sent it.
+    It is docs/law.md (13). Of a command: as it was when the planner sent it.
     """
     s = setpoint
     return (
@@ -50,7 +50,7 @@ def torque(setpoint: Setpoint | JointCommand, q: Pair, v: Pair) -> Pair:
 
 
 def extrapolate(command: JointCommand, age_s: float) -> Setpoint:
-    """Return the command's law at this age: references moved on by their rates.
+    """Return the command's law at this age, references moved on by their rates: docs/law.md (21).
 
     Args:
         command: references and rates at age zero.

@@ -58,7 +58,7 @@ class SetpointLaw:
         return self._stiffened_ns > 0
 
     def age_s(self, command: JointCommand, now_ns: int) -> float:
-        """Return a command's age, s, as far as it is extrapolated."""
+        """Return a command's age, s, as far as it is extrapolated: docs/law.md (22)."""
         return min(self._aging_max_s, (now_ns - command.echo_t_ns) / NS_PER_S)
 
     def is_settled(self, now_ns: int) -> bool:

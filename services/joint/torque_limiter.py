@@ -63,7 +63,10 @@ def limit_torque(tau: Pair, q: Pair, tau_last: Pair, limits: TorqueLimits) -> Pa
 
 
 def limit_differential(tau: Pair, tau_module_max: float) -> Pair:
-    """Clip each motor's torque: |tau_phi + tau_theta| and |tau_theta - tau_phi| <= max."""
+    """Clip each motor's torque: |tau_phi + tau_theta| and |tau_theta - tau_phi| <= max.
+
+    Together they are docs/law.md (4).
+    """
     total = clamp(tau[1] + tau[0], -tau_module_max, tau_module_max)
     difference = clamp(tau[1] - tau[0], -tau_module_max, tau_module_max)
     return ((total - difference) * 0.5, (total + difference) * 0.5)

@@ -65,7 +65,7 @@ def motor_mean(D: Array) -> Array:
 
 
 def stiffness_graph() -> ca.Function:
-    """Return the graph (T, H, D, scale) -> K_fail scaled (6, 12), K_fail (6, 6).
+    """Return the graph (T, H, D, scale) -> K_fail scaled (6, 12), K_fail (6, 6): docs/law.md (19).
 
     Columns 0 to 5 of the first are tier 2, where D holds, and 6 to 11 tier 3, where its mean by
     module holds. The second is that of tier 2 in N/m, N/rad and N m/rad.

@@ -50,7 +50,7 @@ class UncoupledGains:
         self._damping = _scaled(damping * B_p[closed])
 
     def at(self, K_fail: Array, B_local: Array) -> tuple[Array, Array]:
-        """Return K_c and B_c (6, 6), symmetric and not negative.
+        """Return K_c and B_c (6, 6), symmetric and not negative: docs/law.md (16).
 
         Zero at angles at which the closed chain has no finite rates: nothing can be added there.
 
@@ -91,7 +91,7 @@ class CouplingFilter:
         self._second: Array = np.zeros(N_JOINTS)
 
     def advance(self, tau: Array, dt: float) -> Array:
-        """Return the filtered torque (12,), N m.
+        """Return the filtered torque (12,), N m: docs/law.md (18).
 
         Args:
             tau: unfiltered (12,), N m.

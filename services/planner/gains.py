@@ -41,7 +41,7 @@ class GainLaw:
         self._identity = np.eye(N_JOINTS)
 
     def gains(self, kinematics: Kinematics, hessian_F: Array) -> JointGains:
-        """Return the gains.
+        """Return the gains: docs/law.md (10) and (11).
 
         Args:
             kinematics: updated at the configuration.

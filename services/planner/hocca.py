@@ -152,7 +152,7 @@ class Hocca:
         wrench: Wrench | None = None,
         up_torso: Vector3 | None = None,
     ) -> LawOutput:
-        """Run the law once.
+        """Run the law once: docs/law.md (6) and (12).
 
         Args:
             q: measured joint angles (12,), rad.

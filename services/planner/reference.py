@@ -82,7 +82,7 @@ class Reference:
         self.D_left[:] = D_left
 
     def solve(self, p_ref: Array) -> IkResult:
-        """Solve q = IK(p_ref) from `start`, and evaluate all arrays there.
+        """Solve q = IK(p_ref) from `start`, and evaluate all arrays there: docs/law.md (7).
 
         Args:
             p_ref: (6,), m and rad.

@@ -127,7 +127,7 @@ def _reference(pose: ca.Function, hessian: ca.Function) -> ca.Function:
     """Return the graph of what a tick needs at the reference pose.
 
     One Gauss-Newton step, damped as `InverseKinematics.solve_rates`, and with the same
-    decomposition T = [J; C]^-1 [I; 0]; see docs/law.md for the torques.
+    decomposition T = [J; C]^-1 [I; 0], which gives v_ref: docs/law.md (8).
     """
     q, stance, D_left = ca.MX.sym("q", N_JOINTS), ca.MX.sym("s", 6), ca.MX.sym("D_L", 6, 6)
     p_ref, pdot_ref, F_O = ca.MX.sym("p", 6), ca.MX.sym("pdot", 6), ca.MX.sym("F_O", 6)
@@ -190,7 +190,7 @@ def _stance(geometry: tuple[LegGeometry, LegGeometry], q: ca.SX) -> ca.SX:
 
 
 def _chain(geometry: LegGeometry, foot: _Foot, q: ca.SX) -> _Leg:
-    """Return knee, torso and Jacobians of one leg: a product of exponentials, foot first."""
+    """Return knee, torso and Jacobians of one leg: docs/law.md (1) as a product of exponentials."""
     rotation = foot.rotation
     shift = foot.r - rotation @ ca.DM(geometry.r_foot)
     axes, points = [], []
@@ -230,7 +230,7 @@ class _Pose(NamedTuple):
 
 
 def _pose(config: RobotConfig, legs: list[_Leg], D_left: ca.SX) -> _Pose:
-    """Mix the legs' estimates of the torso by D, and build p, J and the closure."""
+    """Mix the legs' estimates of the torso by D; build p, J, closure: docs/law.md (5), (15)."""
     right, left = legs
     closure = ca.vertcat(
         left.r_torso - right.r_torso, _rotation_vector(left.rotation @ right.rotation.T)
@@ -269,7 +269,7 @@ def _pose(config: RobotConfig, legs: list[_Leg], D_left: ca.SX) -> _Pose:
 def _hessian(
     config: RobotConfig, legs: list[_Leg], D_left: ca.SX, pose: _Pose, F: ca.SX, F_harness: ca.SX
 ) -> ca.SX:
-    """Return d(J^T F + J_harness^T F_harness)/dq, symmetric, block diagonal by leg.
+    """Return d(J^T F + J_harness^T F_harness)/dq, symmetric, block diagonal: docs/law.md (20).
 
     Each leg's share of the wrench is constant. A change of the sharing with q only moves forces
     between the legs, which no motion of the closed chain feels. For joint j below joint k,
@@ -320,7 +320,7 @@ def _by_rotation(config: RobotConfig, rotation: ca.SX, F: ca.SX, F_harness: ca.S
 
 
 def _left_load_share(config: RobotConfig, feet: list[_Foot], legs: list[_Leg]) -> ca.SX:
-    """Return D_L (6, 6), the left leg's share of a torso wrench (docs/law.md#load-sharing).
+    """Return D_L (6, 6), the left leg's share of a torso wrench: docs/law.md (14).
 
     Leg i gives the torso the wrench X_i w_i, with w_i at its foot. Foot moments are costly: beyond
     a lever of a few centimetres the sole tips. W weights them. The least-effort distribution of a
@@ -351,7 +351,7 @@ def _rodrigues(axis: ca.DM, angle: ca.SX) -> ca.SX:
 
 
 def _angles(rotation: ca.SX) -> ca.SX:
-    """Return (roll, pitch, yaw) of R = Rz(yaw) Rx(roll) Ry(pitch), rad."""
+    """Return (roll, pitch, yaw) of R = Rz(yaw) Rx(roll) Ry(pitch), rad: docs/law.md (2)."""
     return ca.vertcat(
         ca.asin(rotation[2, 1]),
         ca.atan2(-rotation[2, 0], rotation[2, 2]),
