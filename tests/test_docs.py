@@ -15,10 +15,17 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from services.recorder import disk_guard, host_watch, snapshot
+from services.simulator import posture
+from shared.bus.session import peers_of
+from shared.clock import NS_PER_S
 from shared.config import files
+from shared.config.robot_config import SERVICES
 from shared.places import DEFAULT_CONFIG
 from shared.robot.gain_schedule import inputs_of
+from shared.robot.joints import MODULES
 from tools.reference.__main__ import FOLDER, PAGES
+from tools.runs import standing
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -80,6 +87,36 @@ def test_a_table_said_to_need_xrl_gains_is_wholly_an_input_of_the_gain_schedule(
     for section in said:
         fields = msgspec.structs.fields(getattr(config, section))
         assert {f"{section}.{field.name}" for field in fields} <= inputs
+
+
+def test_the_page_of_networks_says_who_dials_whom() -> None:
+    page = (DOCS / "networks.md").read_text(encoding="utf-8")
+    for name in (service for service in SERVICES if service not in MODULES):
+        (dialled,) = re.findall(rf"^\| `{name}`[^|]* \| ([^|]+) \|$", page, re.MULTILINE)
+        six, *others = dialled.split(", ")
+        assert six == "the six joint services"
+        assert {*MODULES, *(other.strip("`") for other in others)} == set(peers_of(name))
+
+
+@pytest.mark.parametrize(
+    ("page", "text"),
+    [
+        ("logs.md", f"| below {disk_guard.WARN:g} | warns in its log; again only once"),
+        ("logs.md", f"again only once {disk_guard.CALM:g} were free"),
+        ("logs.md", f"| {disk_guard.RESUME:g} and more, after that |"),
+        ("logs.md", f"the same factors of {host_watch.RUN_DIR_MIN_MIB} MiB"),
+        ("logs.md", f"silent for {snapshot.SILENT_NS // NS_PER_S} s"),
+        ("logs.md", " or ".join(f"`{row.name}`" for row in snapshot.STEADY[1:])),
+        ("simulator.md", f"| below {posture.FALLEN_HEIGHT:.2f} m;"),
+        ("simulator.md", f"yaw, either way | over {posture.FALLEN_ANGLE:g} rad"),
+        ("simulator.md", f"against the floor | over {posture.FALLEN_TILT:g} rad"),
+        ("simulator.md", f"than {standing.SOLE_TILT_MAX:g} rad, roll and yaw"),
+        ("simulator.md", f"roll and yaw within {standing.TURNED_MAX:g} rad"),
+        ("simulator.md", f"pitch from {standing.PITCH[0]:g} to {standing.PITCH[1]:g} rad"),
+    ],
+)
+def test_a_page_has_the_codes_figure(page: str, text: str) -> None:
+    assert text in (DOCS / page).read_text(encoding="utf-8")
 
 
 def test_every_reference_to_a_page_leads_to_a_page_and_an_anchor() -> None:
