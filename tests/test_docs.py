@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import fnmatch
 import io
 import pkgutil
 import re
@@ -18,6 +19,7 @@ import pytest
 from services.recorder import disk_guard, host_watch, snapshot
 from services.simulator import posture
 from shared.bus.session import peers_of
+from shared.bus.topics import TOPICS
 from shared.clock import NS_PER_S
 from shared.config import files
 from shared.config.robot_config import SERVICES
@@ -96,6 +98,29 @@ def test_the_page_of_networks_says_who_dials_whom() -> None:
         six, *others = dialled.split(", ")
         assert six == "the six joint services"
         assert {*MODULES, *(other.strip("`") for other in others)} == set(peers_of(name))
+
+
+def test_the_table_of_processes_has_every_topic_that_a_service_writes() -> None:
+    page = (DOCS / "architecture.md").read_text(encoding="utf-8")
+    for service in (
+        "planner",
+        "six joint services",
+        "harness",
+        "imu",
+        "recorder",
+        "simulator",
+        "network_proxy",
+    ):
+        (cell,) = re.findall(rf"^\| {service}[^|]*\| `[^|]*\| ([^|]*) \|", page, re.MULTILINE)
+        told, folder = [], ""
+        for name in re.findall(r"`([^`]+)`", cell.partition(";")[0]):
+            told.append(name if "/" in name else folder + name)
+            folder = told[-1].rpartition("/")[0] + "/"
+        writer = "*" if service == "six joint services" else service
+        written = {topic.name for topic in TOPICS if writer in topic.writers}
+        told_of = {name: set(fnmatch.filter(written, name)) for name in told}
+        assert all(told_of.values()), service
+        assert set().union(*told_of.values()) == written, service
 
 
 @pytest.mark.parametrize(
