@@ -14,7 +14,7 @@ BEYOND_RAD: Final = 0.5
 SPEED_MAX: Final = 100.0
 """rad/s, five times the speed at which a drive limits its motor."""
 TURN_MAX: Final = 100.0
-"""rad/s, three times the range of the IMUs in `docs/drives.md`; faster than any torso turns."""
+"""rad/s, three times the range of the IMU in `docs/bring-up.md`; faster than any torso turns."""
 UNIT_ERROR: Final = 0.1
 """How far a direction's length may be from 1."""
 N_CELLS: Final = 6

@@ -1,8 +1,9 @@
 """The bus: publishers, subscribers and the links between processes (docs/networks.md).
 
-The only file that knows Zenoh. Every process is a peer with a fixed endpoint. There is no router,
-no scouting and no gossip, and a peer forwards nothing: each pair of processes that share a key has
-a link of its own (`peers_of`).
+The only file that knows Zenoh, beside the gateway's session with ROS 2. Every service is a peer
+with a fixed endpoint. There is no router, no scouting and no gossip, and a peer forwards nothing:
+each pair of services has a link of its own, but for two joint services, and a tool has one with
+each service (`peers_of`).
 
 On the control path (`Publisher.put`, `Latest.take`) nothing blocks, logs or raises. A message that
 cannot be sent or decoded is counted, and its absence shows as age. RUST_LOG=info shows Zenoh's own
