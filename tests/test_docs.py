@@ -34,6 +34,8 @@ DOCS = ROOT / "docs"
 _PAGE = re.compile(r"docs/([\w/-]+\.md)(?:#([\w-]+))?")
 _PATH = re.compile(r"`((?:services|shared|tools|tests|deploy|docs|examples)/[\w./-]+?)/?`")
 _NAME = re.compile(r"(?<!`)`([A-Za-z_][\w.]*\w)(?:\(\))?`(?!`)")
+_DOTTED = re.compile(r"(?<!`)`(\w+)\.(?!(?:mcap|png|py|toml|md)`)([A-Za-z_]\w*)(?:\(\))?`(?!`)")
+"""`module.name`, `Class.name` or `table.key`, but no file."""
 _ABROAD = {
     *("odrv", "odrv0", "control_mode_updated", "flat_endpoints", "is_ready"),  # ODrive
     "erase_configuration",
@@ -243,6 +245,23 @@ def test_every_name_in_backticks_exists() -> None:
         if not known.issuperset(name.split("."))
     ]
     assert stale == [], "renamed or removed"
+
+
+def test_a_dotted_name_on_a_page_is_in_the_module_or_class_that_it_names() -> None:
+    words: dict[str, set[str]] = {}
+    for path in _tracked(".py"):
+        text = path.read_text(encoding="utf-8")
+        found = set(re.findall(r"\w+", text))
+        for name in (path.stem, *re.findall(r"^class (\w+)", text, re.MULTILINE)):
+            words.setdefault(name, set()).update(found)
+    config = files.load(DEFAULT_CONFIG)
+    stale = [
+        f"{page.relative_to(ROOT)}: {owner}.{name}"
+        for page in [*DOCS.rglob("*.md"), ROOT / "README.md"]
+        for owner, name in _DOTTED.findall(page.read_text(encoding="utf-8"))
+        if name not in words.get(owner, {name}) and not hasattr(getattr(config, owner, None), name)
+    ]
+    assert stale == [], "renamed, removed or moved"
 
 
 def test_the_pages_build_without_a_warning(tmp_path: Path) -> None:
