@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -91,7 +92,7 @@ def start(*arguments: str, **options: object) -> subprocess.Popen[str]:
 
 def interfaces() -> list[str]:
     """Return the network interfaces of this process's own namespace."""
-    return sorted(path.name for path in Path("/sys/class/net").iterdir())
+    return sorted(name for _, name in socket.if_nameindex())
 
 
 def wait_until_empty(namespaces: list[str]) -> set[int]:
