@@ -67,11 +67,11 @@ VENDORS = {
     "pinocchio": ["services/planner/model.py"],
     "aiohttp": ["tools/view/server.py"],
     "cryptography": ["tools/keys/certificates.py"],
-    "cvxpy": ["services/planner/split_program.py"],
+    "cvxpy": ["tools/lab/design/split_program.py"],
     "matplotlib": [
         "tools/output.py",
         "tools/runs/figure.py",
-        "tools/runs/damping_picture.py",
+        "tools/lab/design/damping_picture.py",
         "tools/studies/*/*picture.py",
     ],
     "PIL": ["tools/analysis/reports/canvas.py", "tools/analysis/reports/moving_picture.py"],
@@ -141,13 +141,13 @@ LAWS = [
     "tools/identify/quasi_static.py",
     "tools/identify/sines.py",
     "services/planner/assist.py",
-    "services/planner/torque_breakdown.py",
+    "tools/lab/design/torque_breakdown.py",
     "services/planner/coupling.py",
-    "services/planner/design_program.py",
-    "services/planner/dynamic_certificate.py",
-    "services/planner/poses.py",
-    "services/planner/sampled_loop.py",
-    "services/planner/stability_margins.py",
+    "tools/lab/design/design_program.py",
+    "tools/lab/design/dynamic_certificate.py",
+    "tools/lab/design/poses.py",
+    "tools/lab/design/sampled_loop.py",
+    "tools/lab/design/stability_margins.py",
     "services/planner/certificate.py",
     "services/planner/controller.py",
     "services/planner/controller_guard.py",
@@ -263,6 +263,32 @@ def test_a_tool_imports_no_test(file: str) -> None:
     assert [i.full for i in IMPORTS[file] if i.top == "tests"] == []
 
 
+LOADED = """
+import importlib, sys
+for name in {modules}:
+    importlib.import_module(name)
+print(*(found.__file__ for name, found in sys.modules.items() if name.startswith("services.")))
+"""
+
+
+def test_a_service_holds_what_its_process_imports_and_nothing_else() -> None:
+    """At its start, or later by a function: what only tools import is a tool's."""
+    files = {file for file in SOURCES if service_of(file)}
+    modules = {f"services.{service_of(file)}.__main__" for file in files}
+    modules |= {
+        imported.module
+        for file in files
+        for node in ast.walk(ast.parse(SOURCES[file]))
+        if isinstance(node, ast.FunctionDef)
+        for imported in imports_in(ast.unparse(node))
+        if imported.top == "services"
+    }
+    words = [sys.executable, "-c", LOADED.format(modules=sorted(modules))]
+    done = subprocess.run(words, cwd=ROOT, check=True, capture_output=True, text=True, timeout=100)
+    loaded = {Path(name).relative_to(ROOT).as_posix() for name in done.stdout.split()}
+    assert files - loaded == set()
+
+
 def test_no_module_imports_a_verb() -> None:
     importers = {
         file
@@ -272,16 +298,21 @@ def test_no_module_imports_a_verb() -> None:
     assert importers == set(), "what two verbs share belongs beside them, not in one of them"
 
 
-TOOL_ROOMS = ("fleet", "runs", "analysis", "studies")
-"""Each may import those before it."""
-ROOMS_BESIDE = {"bringup": ("fleet",), "bench": ("fleet", "runs")}
-"""Rooms beside them, and what these may import."""
+ROOMS_BELOW = {
+    "fleet": (),
+    "runs": ("fleet",),
+    "analysis": ("fleet", "runs"),
+    "lab": (),
+    "studies": ("fleet", "runs", "analysis", "lab"),
+    "bringup": ("fleet",),
+    "bench": ("fleet", "runs"),
+}
+"""Rooms of the tools, and the rooms that each may import."""
 
 
-@pytest.mark.parametrize("room", [*TOOL_ROOMS, *ROOMS_BESIDE])
+@pytest.mark.parametrize("room", ROOMS_BELOW)
 def test_a_room_of_the_tools_imports_only_those_below_it(room: str) -> None:
-    below = ROOMS_BESIDE.get(room) or TOOL_ROOMS[: TOOL_ROOMS.index(room)]
-    above = {*TOOL_ROOMS, *ROOMS_BESIDE, "verbs"} - {room, *below}
+    above = {*ROOMS_BELOW, "verbs"} - {room, *ROOMS_BELOW[room]}
     wrong = {
         (file, imported.full)
         for file, found in IMPORTS.items()
@@ -290,6 +321,18 @@ def test_a_room_of_the_tools_imports_only_those_below_it(room: str) -> None:
         if any(f"{imported.full}.".startswith(f"tools.{other}.") for other in above)
     }
     assert wrong == set()
+
+
+def test_the_design_of_the_gains_knows_the_planners_law_and_no_other_service() -> None:
+    allowed = ("services.planner.", "shared.", "tools.lab.design.", "tools.output.")
+    foreign = {
+        (file, imported.full)
+        for file, found in IMPORTS.items()
+        if file.startswith("tools/lab/design/")
+        for imported in found
+        if imported.top in PACKAGES and not f"{imported.full}.".startswith(allowed)
+    }
+    assert foreign == set()
 
 
 @pytest.mark.parametrize("vendor", VENDORS)
@@ -420,7 +463,13 @@ def test_no_controller_can_see_the_plant() -> None:
         file
         for file, source in SOURCES.items()
         if file.startswith(
-            ("services/planner/", "services/joint/", "services/harness/", "services/imu/")
+            (
+                "services/planner/",
+                "services/joint/",
+                "services/harness/",
+                "services/imu/",
+                "tools/lab/design/",
+            )
         )
         and ("simulation" in source and ".simulation" in source)
     ]

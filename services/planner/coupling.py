@@ -11,7 +11,7 @@ with T^T D_B T. In the closed rows of p, the rest of the body's K_p and B_p (pap
 
 through two poles at `coupling_bandwidth_hz`. The feedback is some milliseconds old and acts on the
 bare rotors of a flexible drivetrain. Without the filter, the robot shook below 40 000 N m/rad and
-fell. `services.planner.dynamic_certificate` computes which bandwidth and damping are safe.
+fell. `tools.lab.design.dynamic_certificate` computes which bandwidth and damping are safe.
 """
 
 from __future__ import annotations

@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from services.planner.hocca import Hocca
 from services.planner.levelling import SLOPE_MAX, Levelling, slope_of, up_of
-from services.planner.torque_breakdown import torque_breakdown
 from shared.bus.messages import Pair, Vector3
 from shared.config.robot_config import GRAVITY, RobotConfig
 from tests.imu.robots import with_imu
 from tests.planner import oracle
 from tests.planner.conftest import Closed
+from tools.lab.design.torque_breakdown import torque_breakdown
 
 LEVEL = np.zeros(3)
 DT = 0.004

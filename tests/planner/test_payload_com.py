@@ -8,13 +8,13 @@ import pytest
 
 from services.planner.inverse_kinematics import InverseKinematics
 from services.planner.kinematics import Kinematics
-from services.planner.push_limit import LoadedStand
 from shared.config.robot_config import RobotConfig
 from shared.robot.gain_schedule import inputs_of
 from shared.robot.robot_model import stand_pose
 from tests.planner import oracle
 from tests.planner.oracle import Array
 from tests.planner.stands import Stand
+from tools.lab.design.push_limit import LoadedStand
 
 PLACE = (0.08, -0.05, 0.15)
 SIDES = (oracle.RIGHT, oracle.LEFT)

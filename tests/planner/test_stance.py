@@ -10,14 +10,14 @@ import pytest
 from services.planner.hocca import Hocca
 from services.planner.kinematics import Kinematics, Measured
 from services.planner.planner import Planner
-from services.planner.poses import Poses
-from services.planner.push_limit import LoadedStand
 from services.planner.stance import FOLLOW_S, Stance
 from shared.bus.messages import PlannerMode
 from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
 from tests.planner.conftest import Closed
 from tests.planner.oracle import LEFT, RIGHT, Array
+from tools.lab.design.poses import Poses
+from tools.lab.design.push_limit import LoadedStand
 
 STANCES = (
     (0.1, 0.0, 0.0, 0.0, 0.0, 0.0),

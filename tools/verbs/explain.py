@@ -17,8 +17,6 @@ from services.planner.certificate import Weakest
 from services.planner.inverse_kinematics import InverseKinematics
 from services.planner.inverse_kinematics import describe as in_words_of_reach
 from services.planner.kinematics import Kinematics
-from services.planner.push_limit import PushLimits
-from services.planner.torque_breakdown import TorqueBreakdown, torque_breakdown
 from shared import places
 from shared.bus import topics
 from shared.bus.code_names import name_of
@@ -38,6 +36,8 @@ from shared.robot import gain_schedule
 from shared.robot.joints import JOINTS, MODULES, N_JOINTS
 from shared.robot.robot_model import stand_pose
 from shared.text_file import read_text
+from tools.lab.design.push_limit import PushLimits
+from tools.lab.design.torque_breakdown import TorqueBreakdown, torque_breakdown
 from tools.number_arguments import finite, finite_numbers
 from tools.runs import snapshot_text
 from tools.runs.recorded_robot import refuse_own_controller, robot_of

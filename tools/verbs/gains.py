@@ -10,10 +10,6 @@ import msgspec
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from services.planner import split_program
-from services.planner.dynamic_certificate import DynamicCertificate
-from services.planner.push_limit import DIRECTIONS, equivalent_slope
-from services.planner.stability_margins import stability_margins_of
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, ConfigError
@@ -21,7 +17,10 @@ from shared.extras import require
 from shared.places import refuse_shipped
 from shared.robot import gain_schedule
 from shared.robot.gain_table import GainSchedule
-from tools.runs import damping_picture
+from tools.lab.design import damping_picture, split_program
+from tools.lab.design.dynamic_certificate import DynamicCertificate
+from tools.lab.design.push_limit import DIRECTIONS, equivalent_slope
+from tools.lab.design.stability_margins import stability_margins_of
 from tools.terminal import Console
 from tools.verb_table import Subparsers, add_config, add_verb
 

@@ -7,8 +7,8 @@ import math
 
 from rich.table import Table
 
-from services.planner.body_stiffness import BodyStiffness, for_robot
 from shared.config import files as config_file
+from tools.lab.design.body_stiffness import BodyStiffness, for_robot
 from tools.terminal import Console
 from tools.verb_table import Subparsers, add_config, add_verb
 

@@ -13,13 +13,13 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from services.planner.kinematics import Kinematics
-from services.planner.torque_breakdown import torque_breakdown
 from shared.bus import topics
 from shared.bus.messages import PlannerStatus
 from shared.config.robot_config import RobotConfig
 from shared.robot.joints import JOINTS, MODULES, N_JOINTS
 from shared.robot.robot_model import stand_pose
 from tools import cli
+from tools.lab.design.torque_breakdown import torque_breakdown
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run
 from tools.runs.run_parts import zero_ns

@@ -9,9 +9,9 @@ from typing import Final, TypeAlias
 
 import msgspec
 
-from services.planner.dynamic_certificate import HALF_NAMES
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE
+from tools.lab.design.dynamic_certificate import HALF_NAMES
 from tools.number_arguments import count, natural
 from tools.output import new_figure, save_figure
 from tools.runs import experiment

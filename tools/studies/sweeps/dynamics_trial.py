@@ -20,10 +20,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.dynamic_certificate import Condition, DynamicCertificate, nodes_of
 from services.planner.planner import Planner
-from services.planner.sampled_loop import NOMINAL, HandModel
-from services.planner.split_program import design_of
 from services.simulator.plant import IDEAL, PlantConfig, changed
 from shared.bus.messages import Mode
 from shared.config.robot_config import RobotConfig
@@ -32,6 +29,9 @@ from shared.network.impairment import Impairment
 from shared.robot.gain_schedule import believing
 from shared.robot.gain_table import GainSchedule
 from shared.robot.joints import N_LEG
+from tools.lab.design.dynamic_certificate import Condition, DynamicCertificate, nodes_of
+from tools.lab.design.sampled_loop import NOMINAL, HandModel
+from tools.lab.design.split_program import design_of
 from tools.runs.lockstep import Lockstep
 
 HEIGHTS: Final = (0.95, 1.188)

@@ -23,7 +23,7 @@ from tools.verb_table import add_config
 N: Final = 500
 TABLE: Final = "cases.csv"
 PICTURE: Final = "cases.png"
-CODE: Final = code_of("tools.studies.sweeps.outcome")
+CODE: Final = code_of("tools.studies.sweeps.outcome", "tools.studies.sweeps.prepare")
 """What decides how a case comes out."""
 COLUMNS_OUT: Final = KillResult.__struct_fields__
 LABELS: Final = {"ending": ENDINGS}

@@ -10,11 +10,11 @@ from typing import TypeAlias
 
 import msgspec
 
-from services.planner import split_program
 from shared.config.robot_config import RobotConfig
 from shared.extras import require
 from shared.robot import gain_schedule
 from shared.robot.gain_table import GainSchedule
+from tools.lab.design import split_program
 from tools.studies.sweeps import pool
 
 Progress = Callable[[int, int], None]

@@ -7,11 +7,11 @@ import math
 import random
 from typing import Final
 
-from services.planner.poses import Poses
-from services.planner.push_limit import LoadedStand
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Push
 from shared.exceptions import RunError
+from tools.lab.design.poses import Poses
+from tools.lab.design.push_limit import LoadedStand
 from tools.number_arguments import finite
 
 DIGITS: Final = 3

@@ -12,14 +12,14 @@ from typing import Final
 
 import msgspec
 
-from services.planner.poses import Poses
-from services.planner.push_limit import LoadedStand, PushLimits, limits_along
 from services.planner.split import ScheduledGains
 from services.simulator.plant import PlantConfig
 from shared.bus.messages import SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Kill, Push, Scenario
 from shared.exceptions import RunError
+from tools.lab.design.poses import Poses
+from tools.lab.design.push_limit import LoadedStand, PushLimits, limits_along
 from tools.runs.lockstep import FleetMoment, Lockstep
 from tools.runs.network import BASE
 from tools.studies.sweeps.figures import Ending, ending_of
@@ -60,7 +60,7 @@ class PushResult(msgspec.Struct, frozen=True, kw_only=True):
     fell_n: float | None
     """The lightest that it fell at, within `STEP_N` of it; None: it stood them all."""
     held_limit_n: float
-    """What this mode's gains hold if the push lasts (`services.planner.push_limit`)."""
+    """What this mode's gains hold if the push lasts (`tools.lab.design.push_limit`)."""
     held_part: str
     """What gives way then."""
     body_limit_n: float

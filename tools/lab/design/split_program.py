@@ -22,13 +22,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner import design_program
 from services.planner.certificate import Certificate, Margins
-from services.planner.command_bounds import BoundsOverPoses
-from services.planner.dynamic_certificate import Design, nodes_of
-from services.planner.dynamic_certificate import StiffnessNode as DynamicNode
-from services.planner.poses import PoseNode, Poses
-from services.planner.push_limit import PushLimits, limits_at
 from services.planner.split import CouplingGains, ScheduledGains
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
@@ -36,6 +30,12 @@ from shared.extras import late
 from shared.robot.gain_schedule import VERSION, digest_of, inputs_of
 from shared.robot.gain_table import GainSchedule, LegGains
 from shared.robot.joints import N_LEG
+from tools.lab.design import design_program
+from tools.lab.design.command_bounds import BoundsOverPoses
+from tools.lab.design.dynamic_certificate import Design, nodes_of
+from tools.lab.design.dynamic_certificate import StiffnessNode as DynamicNode
+from tools.lab.design.poses import PoseNode, Poses
+from tools.lab.design.push_limit import PushLimits, limits_at
 
 if TYPE_CHECKING:
     import cvxpy as cp

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.kinematics import Kinematics
-from services.planner.poses import PoseNode
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.robot.gain_table import Bounds, ModuleBounds
 from shared.robot.joints import MODULES, N_LEG, kind_of
+from tools.lab.design.poses import PoseNode
 
 Array = NDArray[np.float64]
 

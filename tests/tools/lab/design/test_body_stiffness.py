@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from services.planner.body_stiffness import body_stiffness, for_robot
 from shared.config.robot_config import RobotConfig
+from tools.lab.design.body_stiffness import body_stiffness, for_robot
 
 ROUNDING = 1e-3
 """The paper rounds theta_edge to 0.0490 and g to 9.8 on the way."""

@@ -1,7 +1,7 @@
 """Chooses damping and coupling with the dynamic certificate. Offline; run by `xrl gains`.
 
     minimise    effort of the hand in a squat [N] + SWAY_WEIGHT (slowest decay + DECAY_WANTED)+
-    subject to  every condition of `services.planner.dynamic_certificate` decays
+    subject to  every condition of `tools.lab.design.dynamic_certificate` decays
 
 The variables are the six local dampings of a leg, and bandwidth and damping of tau_coupled, all on
 a ladder of ratios. The method is coordinate descent from a stable start. Each step evaluates the
@@ -18,10 +18,10 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from services.planner.dynamic_certificate import Design, DynamicCertificate, StiffnessNode
 from services.planner.split import CouplingGains
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
+from tools.lab.design.dynamic_certificate import Design, DynamicCertificate, StiffnessNode
 
 Progress = Callable[[str], None]
 

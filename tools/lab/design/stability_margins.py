@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
-from services.planner.dynamic_certificate import (
+from tools.lab.design.dynamic_certificate import (
     DELAY_MIN_S,
     Condition,
     Design,
     DynamicCertificate,
 )
-from services.planner.sampled_loop import Gains
+from tools.lab.design.sampled_loop import Gains
 
 LADDER: Final = (1.0, 1.41, 2.0, 2.82, 4.0, 5.64, 8.0)
 """Factors tried on gains, in ascending order."""

@@ -16,13 +16,13 @@ from services.planner.gains import GainLaw
 from services.planner.kinematics import Kinematics, Measured
 from services.planner.law_terms import LawAtReference
 from services.planner.levelling import up_of
-from services.planner.push_limit import PushLimits, limits_at
 from services.planner.reference import Reference
 from services.planner.split import GainSplit, LocalGains
 from shared.bus.messages import AS_CONFIGURED, Pair, Vector6
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.exceptions import RunError
 from shared.robot.joints import N_LEG, SIDES
+from tools.lab.design.push_limit import PushLimits, limits_at
 
 Array = NDArray[np.float64]
 

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from services.planner.dynamic_certificate import (
+from shared.config.robot_config import RobotConfig
+from shared.extras import late
+from tools.lab.design.dynamic_certificate import (
     HALF_NAMES,
     Condition,
     Design,
     DynamicCertificate,
     StiffnessNode,
 )
-from services.planner.sampled_loop import NO_HAND, NOMINAL
-from shared.config.robot_config import RobotConfig
-from shared.extras import late
+from tools.lab.design.sampled_loop import NO_HAND, NOMINAL
 from tools.output import new_figure, save_figure
 
 if TYPE_CHECKING:

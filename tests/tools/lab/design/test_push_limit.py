@@ -11,14 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from services.planner.poses import Poses
-from services.planner.push_limit import DIRECTIONS, LoadedStand, equivalent_slope
 from services.simulator.body import body_of
 from services.simulator.plant import NAMED, changed
 from services.simulator.world import World
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.config.scenarios import Keyframe, Push, Scenario
 from shared.robot.joints import N_JOINTS, N_LEG
+from tools.lab.design.poses import Poses
+from tools.lab.design.push_limit import DIRECTIONS, LoadedStand, equivalent_slope
 
 Array = NDArray[np.float64]
 

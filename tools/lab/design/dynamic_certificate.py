@@ -1,7 +1,7 @@
 """Dynamic certificate: the sampled-data loop is stable on flexible joints. Offline and pure.
 
 The static certificate (`services.planner.certificate`) requires stiffness. This one requires that
-no motion of `services.planner.sampled_loop` grows. It covers every pose of the schedule, and every
+no motion of `tools.lab.design.sampled_loop` grows. It covers every pose of the schedule, and every
 drivetrain (`robustness.stiffness`), hand and delay of the robot file:
 
 - with every feedback torque, and with tau_coupled alone, scaled by `gain_margin`;
@@ -20,8 +20,11 @@ from numpy.typing import NDArray
 from services.planner.certificate import motor_mean
 from services.planner.coupling import UncoupledGains
 from services.planner.model import BodyInertia
-from services.planner.poses import Poses
-from services.planner.sampled_loop import (
+from services.planner.split import CouplingGains
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import MODULES
+from tools.lab.design.poses import Poses
+from tools.lab.design.sampled_loop import (
     NO_HAND,
     NOMINAL,
     DrivetrainModel,
@@ -34,9 +37,6 @@ from services.planner.sampled_loop import (
     Stand,
     halves,
 )
-from services.planner.split import CouplingGains
-from shared.config.robot_config import RobotConfig
-from shared.robot.joints import MODULES
 
 Array = NDArray[np.float64]
 

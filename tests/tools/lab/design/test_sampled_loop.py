@@ -9,14 +9,21 @@ import mujoco
 import numpy as np
 import pytest
 
-from services.planner.dynamic_certificate import (
+from services.planner.model import BodyInertia
+from services.planner.split import ScheduledGains
+from services.simulator.body import body_of
+from services.simulator.plant import IDEAL, PlantConfig, changed
+from services.simulator.world import World
+from shared.config.robot_config import RobotConfig
+from tests.lockstep.runs import still
+from tests.tools.lab.design import loop_oracle
+from tools.lab.design.dynamic_certificate import (
     Condition,
     DynamicCertificate,
     StiffnessNode,
     nodes_of,
 )
-from services.planner.model import BodyInertia
-from services.planner.sampled_loop import (
+from tools.lab.design.sampled_loop import (
     NO_HAND,
     DrivetrainModel,
     Feedback,
@@ -27,15 +34,8 @@ from services.planner.sampled_loop import (
     Stand,
     whole,
 )
-from services.planner.split import ScheduledGains
-from services.planner.split_program import design_of
-from services.planner.stability_margins import stability_margins_of
-from services.simulator.body import body_of
-from services.simulator.plant import IDEAL, PlantConfig, changed
-from services.simulator.world import World
-from shared.config.robot_config import RobotConfig
-from tests.lockstep.runs import still
-from tests.planner import loop_oracle
+from tools.lab.design.split_program import design_of
+from tools.lab.design.stability_margins import stability_margins_of
 from tools.runs.lockstep import Lockstep
 
 
@@ -160,7 +160,7 @@ def test_the_plant_has_the_simulated_world_s_modes(robot: RobotConfig) -> None:
 
 
 def stand_at(robot: RobotConfig, q: np.ndarray) -> Stand:
-    from services.planner.poses import Poses  # noqa: PLC0415 - only its constants are wanted
+    from tools.lab.design.poses import Poses  # noqa: PLC0415 - only its constants are wanted
 
     poses = Poses(robot)
     kinematics = poses.kinematics

@@ -6,9 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from services.planner import design_program, split_program
 from services.planner.certificate import Margins
-from services.planner.dynamic_certificate import DynamicCertificate
 from services.planner.inverse_kinematics import InverseKinematics
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
@@ -18,6 +16,8 @@ from shared.robot.robot_model import stand_pose
 from tests.planner.conftest import at_pose, com_height
 from tests.planner.oracle import Array
 from tests.planner.stands import Stand
+from tools.lab.design import design_program, split_program
+from tools.lab.design.dynamic_certificate import DynamicCertificate
 
 SOLVED = 1e-3
 """The solver's tolerance, in margins and in shares of the cost."""

@@ -1,0 +1,1 @@
+"""The laboratory, for researchers: design of the gains. No robot in service needs it."""

@@ -1,0 +1,1 @@
+"""Design of the gains by `xrl gains`: their schedule, its certificates, what pushes they bear."""
