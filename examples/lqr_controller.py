@@ -17,8 +17,8 @@ import numpy as np
 from scipy.linalg import solve_continuous_are
 
 from services.planner.controller import Action, Array, Observation
-from services.planner.kinematics import Kinematics
-from services.planner.model import BodyInertia
+from services.planner.law.kinematics import Kinematics
+from services.planner.law.model import BodyInertia
 from shared.config.robot_config import RobotConfig
 from shared.robot.robot_model import stand_pose
 

@@ -64,7 +64,7 @@ VENDORS = {
         "services/simulator/foot_placement.py",
         "services/simulator/soles.py",
     ],
-    "pinocchio": ["services/planner/model.py"],
+    "pinocchio": ["services/planner/law/model.py"],
     "aiohttp": ["tools/view/server.py"],
     "cryptography": ["tools/keys/certificates.py"],
     "cvxpy": ["tools/lab/design/split_program.py"],
@@ -76,8 +76,8 @@ VENDORS = {
     ],
     "PIL": ["tools/analysis/reports/canvas.py", "tools/analysis/reports/moving_picture.py"],
     "casadi": [
-        "services/planner/certificate.py",
-        "services/planner/symbolic.py",
+        "services/planner/law/certificate.py",
+        "services/planner/law/symbolic.py",
         "services/simulator/axis_control.py",
         "services/simulator/drivetrain.py",
         "shared/robot/compiled_graph.py",
@@ -132,7 +132,6 @@ LAWS = [
     "shared/robot/dropouts.py",
     "shared/robot/fault_table.py",
     "tools/bringup/jogging.py",
-    "services/planner/probe.py",
     "tools/tune/excitation.py",
     "tools/tune/response.py",
     "tools/identify/body_fit.py",
@@ -140,30 +139,10 @@ LAWS = [
     "tools/identify/estimates.py",
     "tools/identify/quasi_static.py",
     "tools/identify/sines.py",
-    "services/planner/assist.py",
-    "tools/lab/design/torque_breakdown.py",
-    "services/planner/coupling.py",
-    "tools/lab/design/design_program.py",
-    "tools/lab/design/dynamic_certificate.py",
-    "tools/lab/design/poses.py",
-    "tools/lab/design/sampled_loop.py",
-    "tools/lab/design/stability_margins.py",
-    "services/planner/certificate.py",
     "services/planner/controller.py",
-    "services/planner/controller_guard.py",
     "tools/learning/policy.py",
-    "services/planner/engagement_fsm.py",
-    "services/planner/gains.py",
-    "services/planner/hocca.py",
-    "services/planner/inverse_kinematics.py",
-    "services/planner/kinematics.py",
-    "services/planner/law_terms.py",
-    "services/planner/reference.py",
-    "services/planner/small_matrices.py",
     "services/planner/state_phases.py",
     "services/planner/planner.py",
-    "services/planner/split.py",
-    "services/planner/symbolic.py",
     "services/harness/filter.py",
     "services/ros2_gateway/conversions.py",
     "services/ros2_gateway/gateway.py",
@@ -174,7 +153,6 @@ LAWS = [
     "shared/robot/remedies.py",
     "shared/robot/robot_urdf.py",
     "services/imu/attitude.py",
-    "services/planner/levelling.py",
     "services/joint/tracer.py",
     "services/planner/snapshots.py",
     "services/planner/checkpoint.py",
@@ -201,6 +179,13 @@ LAWS = [
     "services/simulator/drivetrain.py",
     "services/simulator/plant.py",
     "services/simulator/world.py",
+    *(
+        file
+        for file in SOURCES
+        if file.startswith(
+            ("services/planner/law/", "services/planner/watch/", "tools/lab/design/")
+        )
+    ),
 ]
 """Pure: state, now, inputs -> outputs."""
 
@@ -287,6 +272,18 @@ def test_a_service_holds_what_its_process_imports_and_nothing_else() -> None:
     done = subprocess.run(words, cwd=ROOT, check=True, capture_output=True, text=True, timeout=100)
     loaded = {Path(name).relative_to(ROOT).as_posix() for name in done.stdout.split()}
     assert files - loaded == set()
+
+
+def test_the_law_does_not_know_what_watches_it() -> None:
+    above = ("services.planner.watch.", "services.planner.planner.", "services.planner.loop.")
+    wrong = {
+        (file, imported.full)
+        for file, found in IMPORTS.items()
+        if file.startswith("services/planner/law/")
+        for imported in found
+        if f"{imported.full}.".startswith(above)
+    }
+    assert wrong == set()
 
 
 def test_no_module_imports_a_verb() -> None:

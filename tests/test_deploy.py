@@ -143,3 +143,12 @@ def test_an_environment_is_made_again_as_it_was(
     if was is not None:
         (system / "xrl.kind").write_text(f"{was}\n", encoding="utf-8")
     assert run(system, f"kind={system}/xrl.kind; kind_for {asked}").stdout == f"{made}\n"
+
+
+def test_the_graphs_are_translated_after_a_change_of_files_that_are_there(system: Path) -> None:
+    """A file that had moved would be passed over, and its graph be the old one."""
+    told = run(system, 'cat() { printf "%s\\n" "$@" >&3; }; graphs_fingerprint 3>&1 >/dev/null')
+    stamp, *files = map(Path, told.stdout.split())
+    assert stamp.name == "xrl.stamp"
+    assert {file.name: file.is_file() for file in files} == {file.name: True for file in files}
+    assert "symbolic.py" in {file.name for file in files}

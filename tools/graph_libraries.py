@@ -22,8 +22,8 @@ from typing import Final
 import casadi as ca
 import numpy as np
 
-from services.planner import certificate, symbolic
-from services.planner.model import leg_geometry
+from services.planner.law import certificate, symbolic
+from services.planner.law.model import leg_geometry
 from services.simulator import axis_control
 from services.simulator.body import body_of
 from services.simulator.drivetrain import step_graph

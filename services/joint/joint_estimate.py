@@ -24,8 +24,8 @@ JUMP_SPEED: Final = 10.0
 """turn/s that a motor may have gained since the last sample, which may be 100 ms old: a leg
 in free fall gains 8."""
 SPEED_MAX: Final = 300.0
-"""turn/s: 100 rad/s at a joint behind 18:1, as `services.planner.plausible` has it. A speed of 1e30
-would also excuse any jump after it."""
+"""turn/s: 100 rad/s at a joint behind 18:1, as `services.planner.watch.plausible` has it. A speed
+of 1e30 would also excuse any jump after it."""
 REJECTED_MAX: Final = 3
 """Number of rejected samples in a row after which the position is lost."""
 

@@ -2,8 +2,9 @@
 
 It runs inside the planner: in lockstep, live and from the log. Everything around it stays as it is:
 stance, load, assist, engagement and trips of the planner; certificate of the local gains
-(`services.planner.controller_guard`); age rule, envelope and torque limits of the joint services.
-Joints are in the order of `shared.robot.joints`, the pose is p = [COM x y z; torso roll pitch yaw].
+(`services.planner.watch.controller_guard`); age rule, envelope and torque limits of the joint
+services. Joints are in the order of `shared.robot.joints`, the pose is p = [COM x y z; torso roll
+pitch yaw].
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.hocca import LawOutput
 from services.planner.intents import OperatorRequest
+from services.planner.law.hocca import LawOutput
 from shared.bus.messages import Wrench
 
 Array = NDArray[np.float64]

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from typing import Final, NamedTuple
 
-from services.planner.probe import NO_ROW
+from services.planner.law.probe import NO_ROW
 from shared.bus.messages import STRAIGHT, OperatorIntent, Vector4
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import AssistConfig

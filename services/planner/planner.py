@@ -13,19 +13,19 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.assist import Overload, force_up
 from services.planner.controller import Controller, Observation
-from services.planner.controller_guard import ControllerGuard
-from services.planner.engagement_fsm import Engagement
-from services.planner.hocca import Hocca, LawOutput
 from services.planner.intents import OperatorRequest
-from services.planner.limp_leg_watch import LimpLegWatch
-from services.planner.plausible import Plausible
-from services.planner.rival_watch import RivalWatch
+from services.planner.law.assist import Overload, force_up
+from services.planner.law.hocca import Hocca, LawOutput
 from services.planner.snapshots import TickState
 from services.planner.state_phases import StatePhases
-from services.planner.trips import PlannerTrips, values_of
-from services.planner.unattended import Unattended
+from services.planner.watch.controller_guard import ControllerGuard
+from services.planner.watch.engagement_fsm import Engagement
+from services.planner.watch.limp_leg_watch import LimpLegWatch
+from services.planner.watch.plausible import Plausible
+from services.planner.watch.rival_watch import RivalWatch
+from services.planner.watch.trips import PlannerTrips, values_of
+from services.planner.watch.unattended import Unattended
 from shared.bus.messages import (
     Attitude,
     JointCommand,

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import msgspec
 
-from services.planner.engagement_fsm import Engagement
 from services.planner.intents import OperatorRequest
-from services.planner.limp_leg_watch import LimpLegWatch
-from services.planner.probe import ProbeState
-from services.planner.rival_watch import RivalWatch
+from services.planner.law.probe import ProbeState
+from services.planner.watch.engagement_fsm import Engagement
+from services.planner.watch.limp_leg_watch import LimpLegWatch
+from services.planner.watch.rival_watch import RivalWatch
 from shared.bus.messages import (
     AS_CONFIGURED,
     STRAIGHT,

@@ -446,7 +446,7 @@ class PlannerStatus(Message, frozen=True):
     """Trip for which it does not lead."""
     load: Vector3 = (0.0, 0.0, 0.0)
     """Load beyond the robot file: kg, and moments a and b about pitch, N m
-    (`services.planner.load`)."""
+    (`services.planner.law.load`)."""
     requested_by: str = ""
     """Source of the intent in use; empty: none, or it is stale."""
     probe_row: Int64 = -1

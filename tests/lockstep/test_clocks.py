@@ -14,7 +14,7 @@ from typing import NamedTuple
 import msgspec
 import pytest
 
-from services.planner.engagement_fsm import WAITS_NS
+from services.planner.watch.engagement_fsm import WAITS_NS
 from shared.bus.messages import Cause, JointCommand, Message, Mode, PlannerStatus, SimTruth
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS, NS_PER_S

@@ -12,7 +12,7 @@ import pytest
 
 from services.planner.controller import Action, Observation
 from services.planner.controller_file import controller_maker
-from services.planner.hocca import LawOutput
+from services.planner.law.hocca import LawOutput
 from services.simulator.plant import PlantConfig, changed
 from shared.bus import topics
 from shared.bus.messages import Message, Mode, PlannerMode, PlannerStatus

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.planner.engagement_fsm import FORGET_NS, GRACE_NS, WAITS_NS, Engagement
+from services.planner.watch.engagement_fsm import FORGET_NS, GRACE_NS, WAITS_NS, Engagement
 from shared.bus.messages import Cause, Mode, PlannerMode, SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig

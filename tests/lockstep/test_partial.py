@@ -16,7 +16,7 @@ import random
 
 import pytest
 
-from services.planner.engagement_fsm import GRACE_NS, WAITS_NS
+from services.planner.watch.engagement_fsm import GRACE_NS, WAITS_NS
 from shared.bus.links import ATTITUDES, DIRECTIONS, WRENCHES, directions_of
 from shared.bus.messages import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S

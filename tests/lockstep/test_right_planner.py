@@ -11,7 +11,7 @@ import pytest
 
 from services.joint.envelope import Envelope
 from services.joint.failsafe import Failsafe
-from services.planner.trips import PlannerTrips
+from services.planner.watch.trips import PlannerTrips
 from services.simulator.plant import PlantConfig, changed
 from shared.bus.messages import Cause, Outside, PlannerMode
 from shared.config.robot_config import RobotConfig

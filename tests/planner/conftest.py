@@ -9,8 +9,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from services.planner.inverse_kinematics import InverseKinematics
-from services.planner.kinematics import Kinematics
+from services.planner.law.inverse_kinematics import InverseKinematics
+from services.planner.law.kinematics import Kinematics
 from shared.config import files as config_file
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.robot.robot_model import stand_pose

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from services.planner.certificate import Certificate
-from services.planner.gains import GainLaw, JointGains
-from services.planner.kinematics import Kinematics
-from services.planner.split import GainSplit, LocalGains
+from services.planner.law.certificate import Certificate
+from services.planner.law.gains import GainLaw, JointGains
+from services.planner.law.kinematics import Kinematics
+from services.planner.law.split import GainSplit, LocalGains
 from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
 from tests.planner.oracle import Array

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from services.planner.assist import (
+from services.planner.law.assist import (
     ERROR_MIN,
     LEAD_FADE_S,
     LEAD_MAX,

@@ -8,7 +8,7 @@ from collections import deque
 import msgspec
 import pytest
 
-from services.planner.assist import Coupling, alpha_max, integral_s_min
+from services.planner.law.assist import Coupling, alpha_max, integral_s_min
 
 INTEGRAL_S = 3.0
 STEP_S = 2e-4

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.joint.differential import motor_from_joint
-from services.planner.certificate import DIRECTIONS, UNITS, Certificate, motor_mean
-from services.planner.gains import GainLaw
-from services.planner.inverse_kinematics import InverseKinematics
+from services.planner.law.certificate import DIRECTIONS, UNITS, Certificate, motor_mean
+from services.planner.law.gains import GainLaw
+from services.planner.law.inverse_kinematics import InverseKinematics
 from shared.config.robot_config import RobotConfig
 from shared.robot.robot_model import stand_pose
 from tests.planner.conftest import Closed, at_pose, p_at

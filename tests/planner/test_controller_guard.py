@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from services.planner.controller import Action, Observation
-from services.planner.controller_guard import SUPPORT, ControllerGuard
-from services.planner.hocca import Hocca
 from services.planner.intents import OperatorRequest
-from services.planner.split import LocalGains
+from services.planner.law.hocca import Hocca
+from services.planner.law.split import LocalGains
+from services.planner.watch.controller_guard import SUPPORT, ControllerGuard
 from shared.bus.messages import SplitSource
 from shared.config.files import load
 from shared.config.robot_config import RobotConfig

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.planner.coupling import CouplingFilter, UncoupledGains, pole_gain
+from services.planner.law.coupling import CouplingFilter, UncoupledGains, pole_gain
 
 K_P = np.array([2810.0, 2810.0, 0.0, 800.0, 0.0, 400.0])
 B_P = np.array([300.0, 300.0, 0.0, 60.0, 0.0, 40.0])

@@ -5,7 +5,7 @@ from typing import TypeVar
 import pytest
 
 from services.joint.drivers.base import DriveStatus
-from services.planner.engagement_fsm import FORGET_NS, GRACE_NS, WAITS_NS, Engagement
+from services.planner.watch.engagement_fsm import FORGET_NS, GRACE_NS, WAITS_NS, Engagement
 from shared.bus.messages import JointCommand, Mode, PlannerMode
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig

@@ -6,8 +6,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from services.planner.gains import GainLaw, JointGains
-from services.planner.kinematics import Kinematics
+from services.planner.law.gains import GainLaw, JointGains
+from services.planner.law.kinematics import Kinematics
 from shared.config.robot_config import RobotConfig
 from tests.planner.conftest import Closed
 from tests.planner.oracle import Array

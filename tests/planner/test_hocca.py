@@ -6,10 +6,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from services.planner.hocca import Hocca, LawOutput
-from services.planner.inverse_kinematics import InverseKinematics
-from services.planner.kinematics import Kinematics
-from services.planner.split import LocalGains
+from services.planner.law.hocca import Hocca, LawOutput
+from services.planner.law.inverse_kinematics import InverseKinematics
+from services.planner.law.kinematics import Kinematics
+from services.planner.law.split import LocalGains
 from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
 from tests.planner.conftest import Closed, at_pose

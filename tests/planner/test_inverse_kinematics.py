@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from services.planner.inverse_kinematics import TOLERANCE, IkEnding, InverseKinematics, describe
-from services.planner.kinematics import Kinematics
+from services.planner.law.inverse_kinematics import TOLERANCE, IkEnding, InverseKinematics, describe
+from services.planner.law.kinematics import Kinematics
 from shared.config.robot_config import RobotConfig
 from shared.robot.robot_model import stand_pose
 from tests.planner import oracle

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.planner.kinematics import Kinematics
+from services.planner.law.kinematics import Kinematics
 from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
 from tests.planner.conftest import SQUAT, Closed

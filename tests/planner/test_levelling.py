@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from services.planner.hocca import Hocca
-from services.planner.levelling import SLOPE_MAX, Levelling, slope_of, up_of
+from services.planner.law.hocca import Hocca
+from services.planner.law.levelling import SLOPE_MAX, Levelling, slope_of, up_of
 from shared.bus.messages import Pair, Vector3
 from shared.config.robot_config import GRAVITY, RobotConfig
 from tests.imu.robots import with_imu

@@ -7,9 +7,9 @@ import itertools
 import msgspec
 import pytest
 
-from services.planner.limp_leg_watch import DISARMED_NS, LimpLegWatch
 from services.planner.planner import Planner
 from services.planner.snapshots import TickState
+from services.planner.watch.limp_leg_watch import DISARMED_NS, LimpLegWatch
 from shared.bus.messages import DriveStatus, JointState, Mode
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig

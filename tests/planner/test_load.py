@@ -9,9 +9,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from services.planner.hocca import Hocca
-from services.planner.kinematics import Kinematics
-from services.planner.load import FRICTION_BAND, RESUME_FRACTION, WEIGHING_S, Load
+from services.planner.law.hocca import Hocca
+from services.planner.law.kinematics import Kinematics
+from services.planner.law.load import FRICTION_BAND, RESUME_FRACTION, WEIGHING_S, Load
 from services.planner.snapshots import LoadState
 from shared.bus.messages import Pair, Tare, Wrench
 from shared.config.robot_config import GRAVITY, RobotConfig

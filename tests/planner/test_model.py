@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from services.planner.model import leg_geometry, load_pinocchio, q_tree
+from services.planner.law.model import leg_geometry, load_pinocchio, q_tree
 from shared.config.robot_config import RobotConfig
 from shared.robot.joints import JOINTS, SIDES
 from shared.robot.robot_model import mjcf

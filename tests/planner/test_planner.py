@@ -6,10 +6,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from services.planner.certificate import Margins
-from services.planner.engagement_fsm import WAITS_NS
 from services.planner.intents import OperatorRequest
+from services.planner.law.certificate import Margins
 from services.planner.planner import EARLY_FRACTION, LATE_FRACTION, TICK_GAP_MAX_S, Planner
+from services.planner.watch.engagement_fsm import WAITS_NS
 from shared.bus.messages import (
     DriveStatus,
     JointCommand,

@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from services.planner.planner import Planner
-from services.planner.plausible import BEYOND_RAD, SPEED_MAX, Plausible
+from services.planner.watch.plausible import BEYOND_RAD, SPEED_MAX, Plausible
 from shared.bus.messages import Attitude, Mode, PlannerMode, Tare, Vector3, Wrench
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from services.planner.intents import Intents
-from services.planner.probe import NO_ROW, PROBE_S, ReferenceProbe
+from services.planner.law.probe import NO_ROW, PROBE_S, ReferenceProbe
 from services.simulator.plant import PlantConfig
 from shared.bus import topics
 from shared.bus.messages import JointState, Message, OperatorIntent, PlannerStatus

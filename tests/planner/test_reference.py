@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.planner.hocca import Hocca
-from services.planner.inverse_kinematics import TOLERANCE, InverseKinematics
-from services.planner.kinematics import Kinematics
-from services.planner.reference import Reference
+from services.planner.law.hocca import Hocca
+from services.planner.law.inverse_kinematics import TOLERANCE, InverseKinematics
+from services.planner.law.kinematics import Kinematics
+from services.planner.law.reference import Reference
 from shared.config.robot_config import RobotConfig
 from tests.planner.conftest import Closed
 from tests.planner.oracle import Array

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from services.joint.failsafe import Failsafe, timing_of
 from services.planner.planner import Planner
-from services.planner.rival_watch import AGAIN_NS, RivalWatch
+from services.planner.watch.rival_watch import AGAIN_NS, RivalWatch
 from shared.bus.messages import JointState, PlannerMode, Refusal
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig

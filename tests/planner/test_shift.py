@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from services.planner.intents import OperatorRequest
+from services.planner.law.shift import ROWS, SHIFT_S, ShiftReference
 from services.planner.planner import Planner
-from services.planner.shift import ROWS, SHIFT_S, ShiftReference
 from services.planner.snapshots import ShiftState
 from shared.bus.messages import STRAIGHT, Vector4
 from shared.config.robot_config import RobotConfig

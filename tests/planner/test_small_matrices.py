@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.planner.small_matrices import LuDecomposition, eigenvalue_min, positive_part
+from services.planner.law.small_matrices import LuDecomposition, eigenvalue_min, positive_part
 
 
 @given(seed=st.integers(0, 10_000), n=st.sampled_from([2, 6, 12]), columns=st.integers(0, 6))

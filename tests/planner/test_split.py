@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.planner.certificate import Certificate
-from services.planner.gains import JointGains
-from services.planner.inverse_kinematics import InverseKinematics
-from services.planner.kinematics import Kinematics
-from services.planner.split import GainSplit, ScheduledGains
+from services.planner.law.certificate import Certificate
+from services.planner.law.gains import JointGains
+from services.planner.law.inverse_kinematics import InverseKinematics
+from services.planner.law.kinematics import Kinematics
+from services.planner.law.split import GainSplit, ScheduledGains
 from shared.bus.messages import SplitSource
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.exceptions import ConfigError

@@ -7,10 +7,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from services.planner.hocca import Hocca
-from services.planner.kinematics import Kinematics, Measured
+from services.planner.law.hocca import Hocca
+from services.planner.law.kinematics import Kinematics, Measured
+from services.planner.law.stance import FOLLOW_S, Stance
 from services.planner.planner import Planner
-from services.planner.stance import FOLLOW_S, Stance
 from shared.bus.messages import PlannerMode
 from shared.config.robot_config import RobotConfig
 from tests.planner import oracle

@@ -8,9 +8,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from services.planner import inverse_kinematics, reference
-from services.planner.hocca import Hocca, LawOutput
-from services.planner.inverse_kinematics import InverseKinematics
+from services.planner.law import inverse_kinematics, reference
+from services.planner.law.hocca import Hocca, LawOutput
+from services.planner.law.inverse_kinematics import InverseKinematics
 from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
 from tests.planner.conftest import Closed, at_pose, p_at

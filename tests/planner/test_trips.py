@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from services.planner.hocca import LawOutput
-from services.planner.kinematics import Kinematics, Measured
-from services.planner.trips import CALM_NS, PlannerTrips, values_of
+from services.planner.law.hocca import LawOutput
+from services.planner.law.kinematics import Kinematics, Measured
+from services.planner.watch.trips import CALM_NS, PlannerTrips, values_of
 from shared.bus.messages import Trip
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig

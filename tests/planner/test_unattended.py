@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from services.planner.unattended import ARM, HAND_LOST_NS, HAND_MIN, Unattended
+from services.planner.watch.unattended import ARM, HAND_LOST_NS, HAND_MIN, Unattended
 from shared.bus.messages import Pair
 
 T0 = 5_000_000_000

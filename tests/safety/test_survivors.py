@@ -14,8 +14,8 @@ from services.joint.failsafe import (
     Timing,
     timing_of,
 )
-from services.planner.engagement_fsm import GRACE_NS, Engagement
 from services.planner.planner import Planner
+from services.planner.watch.engagement_fsm import GRACE_NS, Engagement
 from shared.bus.messages import Cause, Mode, PlannerMode, Refusal, Wrench
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig

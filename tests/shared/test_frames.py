@@ -6,8 +6,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from services.planner.kinematics import Kinematics, Measured
-from services.planner.model import load_pinocchio, q_tree
+from services.planner.law.kinematics import Kinematics, Measured
+from services.planner.law.model import load_pinocchio, q_tree
 from shared.config.robot_config import RobotConfig
 from shared.robot import frames
 from shared.robot.joints import JOINTS, MODULES

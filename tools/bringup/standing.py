@@ -6,8 +6,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from services.planner.inverse_kinematics import InverseKinematics, describe
-from services.planner.kinematics import Kinematics
+from services.planner.law.inverse_kinematics import InverseKinematics, describe
+from services.planner.law.kinematics import Kinematics
 from shared.bus.messages import Pair
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError

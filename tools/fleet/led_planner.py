@@ -6,7 +6,7 @@ import os
 import time
 from typing import Final
 
-from services.planner.probe import NO_ROW
+from services.planner.law.probe import NO_ROW
 from shared.bus import topics
 from shared.bus.code_names import name_of
 from shared.bus.messages import STRAIGHT, OperatorIntent, PlannerMode, PlannerStatus, Vector4

@@ -9,8 +9,8 @@ rest. Three equations of force and three of moment: they know masses, torques an
 both legs carry one torso: the left foot, seen from the right one, stays where it is. Six more
 equations: they know the angles. Both feet's soles are taken as flat on one floor.
 
-This is a derivation of its own, from the legs' screw axes (`services.planner.model`), and shares
-nothing with the law's graphs.
+This is a derivation of its own, from the legs' screw axes (`services.planner.law.model`), and
+shares nothing with the law's graphs.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.model import LegGeometry, leg_geometry
+from services.planner.law.model import LegGeometry, leg_geometry
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.robot.joints import N_LEG
 

@@ -11,7 +11,7 @@ import numpy as np
 from services.joint.differential import joint_from_motor
 from services.joint.drivers.base import Drive, DriveReading
 from services.joint.torque_limiter import limits_of
-from services.planner.model import HangingLegs
+from services.planner.law.model import HangingLegs
 from shared.bus.messages import Pair
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig

@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.shift import ROWS
+from services.planner.law.shift import ROWS
 from shared.bus import topics
 from shared.bus.messages import (
     JointEvent,

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.intents import OperatorRequest
-from services.planner.kinematics import Kinematics
-from services.planner.model import BodyInertia
-from services.planner.probe import NO_ROW
+from services.planner.law.kinematics import Kinematics
+from services.planner.law.model import BodyInertia
+from services.planner.law.probe import NO_ROW
 from services.simulator.plant import PlantConfig
 from shared.bus import topics
 from shared.bus.messages import Message, PlannerMode, PlannerStatus

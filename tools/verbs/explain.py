@@ -13,10 +13,10 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from services.planner.certificate import Weakest
-from services.planner.inverse_kinematics import InverseKinematics
-from services.planner.inverse_kinematics import describe as in_words_of_reach
-from services.planner.kinematics import Kinematics
+from services.planner.law.certificate import Weakest
+from services.planner.law.inverse_kinematics import InverseKinematics
+from services.planner.law.inverse_kinematics import describe as in_words_of_reach
+from services.planner.law.kinematics import Kinematics
 from shared import places
 from shared.bus import topics
 from shared.bus.code_names import name_of

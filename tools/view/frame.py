@@ -8,7 +8,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from services.planner.kinematics import Kinematics
+from services.planner.law.kinematics import Kinematics
 from services.simulator.soles import SoleLoad
 from shared.bus import topics
 from shared.bus.code_names import name_of

@@ -14,8 +14,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.kinematics import DETERMINANT_MIN
-from services.planner.model import LegGeometry, leg_geometry
+from services.planner.law.kinematics import DETERMINANT_MIN
+from services.planner.law.model import LegGeometry, leg_geometry
 from services.simulator.soles import SoleLoad
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.robot.joints import N_LEG

@@ -6,8 +6,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from services.planner.inverse_kinematics import InverseKinematics
-from services.planner.kinematics import Kinematics
+from services.planner.law.inverse_kinematics import InverseKinematics
+from services.planner.law.kinematics import Kinematics
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.exceptions import RunError
 from shared.robot.joints import JOINTS

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.planner.kinematics import Kinematics
+from services.planner.law.kinematics import Kinematics
 from shared.config.robot_config import GRAVITY, RobotConfig
 from tests.planner.conftest import Closed, closed, ik, limits  # noqa: F401 - fixtures
 from tests.planner.oracle import Array

@@ -9,8 +9,8 @@ import pytest
 from gymnasium.error import InvalidAction, ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
-from services.planner.certificate import Certificate
-from services.planner.kinematics import Kinematics
+from services.planner.law.certificate import Certificate
+from services.planner.law.kinematics import Kinematics
 from shared.bus import topics
 from shared.bus.messages import JointCommand, JointState, Message
 from shared.bus.topics import Topic

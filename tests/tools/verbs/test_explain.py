@@ -12,7 +12,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from services.planner.kinematics import Kinematics
+from services.planner.law.kinematics import Kinematics
 from shared.bus import topics
 from shared.bus.messages import PlannerStatus
 from shared.config.robot_config import RobotConfig

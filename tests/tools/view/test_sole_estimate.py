@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.planner.kinematics import Kinematics
-from services.planner.model import leg_geometry
+from services.planner.law.kinematics import Kinematics
+from services.planner.law.model import leg_geometry
 from shared.bus.messages import SimTruth
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.robot.robot_model import stand_pose

@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from services.planner.kinematics import Kinematics
+from services.planner.law.kinematics import Kinematics
 from shared.bus import topics
 from shared.bus.messages import JointState, Mode, PlannerStatus, SimTruth, Vector3, Wrench
 from shared.clock import NS_PER_S

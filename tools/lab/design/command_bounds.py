@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.kinematics import Kinematics
+from services.planner.law.kinematics import Kinematics
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.robot.gain_table import Bounds, ModuleBounds
 from shared.robot.joints import MODULES, N_LEG, kind_of

@@ -18,7 +18,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from services.planner.split import CouplingGains
+from services.planner.law.split import CouplingGains
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from tools.lab.design.dynamic_certificate import Design, DynamicCertificate, StiffnessNode

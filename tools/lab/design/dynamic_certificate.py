@@ -1,8 +1,8 @@
 """Dynamic certificate: the sampled-data loop is stable on flexible joints. Offline and pure.
 
-The static certificate (`services.planner.certificate`) requires stiffness. This one requires that
-no motion of `tools.lab.design.sampled_loop` grows. It covers every pose of the schedule, and every
-drivetrain (`robustness.stiffness`), hand and delay of the robot file:
+The static certificate (`services.planner.law.certificate`) requires stiffness. This one requires
+that no motion of `tools.lab.design.sampled_loop` grows. It covers every pose of the schedule, and
+every drivetrain (`robustness.stiffness`), hand and delay of the robot file:
 
 - with every feedback torque, and with tau_coupled alone, scaled by `gain_margin`;
 - with the delay scaled by `delay_margin`;
@@ -17,10 +17,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.certificate import motor_mean
-from services.planner.coupling import UncoupledGains
-from services.planner.model import BodyInertia
-from services.planner.split import CouplingGains
+from services.planner.law.certificate import motor_mean
+from services.planner.law.coupling import UncoupledGains
+from services.planner.law.model import BodyInertia
+from services.planner.law.split import CouplingGains
 from shared.config.robot_config import RobotConfig
 from shared.robot.joints import MODULES
 from tools.lab.design.poses import Poses

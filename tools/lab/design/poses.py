@@ -8,9 +8,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.gains import GainLaw
-from services.planner.inverse_kinematics import InverseKinematics
-from services.planner.kinematics import Kinematics
+from services.planner.law.gains import GainLaw
+from services.planner.law.inverse_kinematics import InverseKinematics
+from services.planner.law.kinematics import Kinematics
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.robot.joints import N_JOINTS, N_LEG
 from shared.robot.robot_model import stand_pose

@@ -1,10 +1,10 @@
 """Computes the largest constant push before a sole tips, a motor saturates or a foot slides. Pure.
 
-The stiffness certificate (`services.planner.certificate`) is linear and has no limits. This module
-adds them, for a constant horizontal push F u at the torso's origin:
+The stiffness certificate (`services.planner.law.certificate`) is linear and has no limits. This
+module adds them, for a constant horizontal push F u at the torso's origin:
 
 1. Limit of the gains. Local gains D hold with references at rest; while the planner is engaged,
-   K_c acts beside them (`services.planner.coupling`). The body moves by dp and the torques change:
+   K_c acts beside them (`services.planner.law.coupling`). The body moves by dp, the torques change:
 
        (K_fail + K_c) dp = F pi,   pi = (dr_torso/dp)^T u,   dtau = -D T dp - J^T K_c dp
 
@@ -25,9 +25,9 @@ import numpy as np
 import scipy.optimize
 from numpy.typing import NDArray
 
-from services.planner.certificate import motor_mean
-from services.planner.coupling import UncoupledGains
-from services.planner.kinematics import Kinematics
+from services.planner.law.certificate import motor_mean
+from services.planner.law.coupling import UncoupledGains
+from services.planner.law.kinematics import Kinematics
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.robot.joints import MODULES, N_JOINTS, N_LEG, SIDES
 from shared.robot.robot_model import ankle_positions

@@ -30,7 +30,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from services.planner.coupling import pole_gain
+from services.planner.law.coupling import pole_gain
 from shared.robot.joints import N_JOINTS, N_LEG
 
 Array = NDArray[np.float64]

@@ -8,8 +8,8 @@ semidefinite program; the other leg is alike:
                 K_loc(motor mean of D) + K_geo >= onboard_fraction diag(K_required)
                 0 <= D <= k_q_fraction_max diag(K_q)
 
-K_loc = T^T D T, and K_geo is as in `services.planner.certificate`. The constraints hold without and
-with the full assist. K_geo is linear in the assist, so every assist in between is covered.
+K_loc = T^T D T, and K_geo is as in `services.planner.law.certificate`. The constraints hold without
+and with the full assist. K_geo is linear in the assist, so every assist in between is covered.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.certificate import Certificate, Margins
-from services.planner.split import CouplingGains, ScheduledGains
+from services.planner.law.certificate import Certificate, Margins
+from services.planner.law.split import CouplingGains, ScheduledGains
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.extras import late

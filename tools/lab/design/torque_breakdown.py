@@ -11,13 +11,13 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.certificate import Weakest, motor_mean
-from services.planner.gains import GainLaw
-from services.planner.kinematics import Kinematics, Measured
-from services.planner.law_terms import LawAtReference
-from services.planner.levelling import up_of
-from services.planner.reference import Reference
-from services.planner.split import GainSplit, LocalGains
+from services.planner.law.certificate import Weakest, motor_mean
+from services.planner.law.gains import GainLaw
+from services.planner.law.kinematics import Kinematics, Measured
+from services.planner.law.law_terms import LawAtReference
+from services.planner.law.levelling import up_of
+from services.planner.law.reference import Reference
+from services.planner.law.split import GainSplit, LocalGains
 from shared.bus.messages import AS_CONFIGURED, Pair, Vector6
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.exceptions import RunError

@@ -21,8 +21,8 @@ from services.joint.drive_manager import ArmingInhibit, DriveAction, DriveComman
 from services.joint.drivers.base import DriveReading, DriveStatus
 from services.joint.neighbours import UNKNOWN, NeighbourView
 from services.joint.torque_limiter import limit_differential
-from services.planner.engagement_fsm import Engagement
 from services.planner.planner import Planner
+from services.planner.watch.engagement_fsm import Engagement
 from shared.bus.messages import JointCommand, JointState, Mode, PlannerMode, PlannerStatus
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig

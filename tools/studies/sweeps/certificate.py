@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 
-from services.planner.certificate import DIRECTIONS
+from services.planner.law.certificate import DIRECTIONS
 from services.simulator.plant import IDEAL, PlantConfig
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig

@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 from services.joint import differential
 from services.joint.pd_law import ZERO, Setpoint, torque
 from services.joint.torque_limiter import limit_torque, limits_of
-from services.planner.certificate import Certificate, Weakest
-from services.planner.gains import GainLaw
-from services.planner.inverse_kinematics import InverseKinematics
-from services.planner.kinematics import Kinematics
+from services.planner.law.certificate import Certificate, Weakest
+from services.planner.law.gains import GainLaw
+from services.planner.law.inverse_kinematics import InverseKinematics
+from services.planner.law.kinematics import Kinematics
 from services.simulator.body import body_of
 from services.simulator.plant import IDEAL, PlantConfig, changed
 from services.simulator.world import World
@@ -112,7 +112,7 @@ class CertificateCase(NamedTuple):
     nudge: tuple[float, float]
     """N along x and y, for `NUDGE_S`."""
     weakest: Weakest
-    """With tier 2's margin (`services.planner.certificate`)."""
+    """With tier 2's margin (`services.planner.law.certificate`)."""
 
 
 class CertificateResult(NamedTuple):

@@ -12,7 +12,7 @@ from typing import Final
 
 import msgspec
 
-from services.planner.split import ScheduledGains
+from services.planner.law.split import ScheduledGains
 from services.simulator.plant import PlantConfig
 from shared.bus.messages import SimTruth
 from shared.config.robot_config import RobotConfig

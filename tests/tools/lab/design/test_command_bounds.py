@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from services.joint.envelope import Envelope
-from services.planner.hocca import Hocca
+from services.planner.law.hocca import Hocca
 from shared.bus.messages import JointCommand, Outside
 from shared.config.robot_config import RobotConfig
 from shared.robot.joints import MODULES

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from services.planner.model import BodyInertia
-from services.planner.split import ScheduledGains
+from services.planner.law.model import BodyInertia
+from services.planner.law.split import ScheduledGains
 from services.simulator.body import body_of
 from services.simulator.plant import IDEAL, PlantConfig, changed
 from services.simulator.world import World

@@ -6,8 +6,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from services.planner.certificate import Margins
-from services.planner.inverse_kinematics import InverseKinematics
+from services.planner.law.certificate import Margins
+from services.planner.law.inverse_kinematics import InverseKinematics
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.robot import gain_schedule

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from services.planner.kinematics import Kinematics
+from services.planner.law.kinematics import Kinematics
 from services.simulator.body import body_of
 from services.simulator.plant import IDEAL
 from services.simulator.world import World

@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 import casadi as ca
 import numpy as np
 
-from services.planner.model import LegGeometry
+from services.planner.law.model import LegGeometry
 from shared.config.robot_config import RobotConfig
 from shared.robot.joints import N_JOINTS, N_LEG
 
@@ -23,7 +23,7 @@ singular."""
 
 
 class Graphs(NamedTuple):
-    """Functions of the law; `services.planner.kinematics` documents their results."""
+    """Functions of the law; `services.planner.law.kinematics` documents their results."""
 
     sharing: ca.Function
     """(q, stance) -> D_L (6, 6), the left leg's load share; the right leg's is I - D_L."""
@@ -38,7 +38,7 @@ class Graphs(NamedTuple):
     gives its upward force from its torques, and its Jacobian's determinant (2,), m^3."""
     reference: ca.Function
     """(q, stance, D_L, p_ref, pdot_ref, F_O, F_assist, F_assist rate, lower and upper joint limits)
-    -> what a tick needs at the reference pose (`services.planner.reference`)."""
+    -> what a tick needs at the reference pose (`services.planner.law.reference`)."""
 
 
 class _Foot(NamedTuple):

@@ -17,9 +17,9 @@ import msgspec
 import numpy as np
 
 from services.planner.controller import Action, Controller, Observation
-from services.planner.hocca import Hocca, LawOutput
+from services.planner.law.hocca import Hocca, LawOutput
+from services.planner.law.split import LocalGains
 from services.planner.snapshots import GuardState
-from services.planner.split import LocalGains
 from shared.bus.messages import SplitSource
 from shared.clamp import clamp
 from shared.config.sections import GeometryConfig

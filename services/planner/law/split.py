@@ -15,8 +15,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.certificate import Certificate, Margins
-from services.planner.gains import JointGains
+from services.planner.law.certificate import Certificate, Margins
+from services.planner.law.gains import JointGains
 from shared.bus.messages import SplitSource
 from shared.clamp import clamp
 from shared.config.robot_config import RobotConfig
@@ -43,7 +43,7 @@ class LocalGains(NamedTuple):
 
 
 class CouplingGains(NamedTuple):
-    """Damping and bandwidth of the planner's coupled torque (`services.planner.coupling`)."""
+    """Damping and bandwidth of the planner's coupled torque (`services.planner.law.coupling`)."""
 
     bandwidth_hz: float
     damping: float

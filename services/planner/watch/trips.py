@@ -12,15 +12,15 @@ robot file):
     harness    the force on the person differs from the request by too much
     sagging    the person presses the robot down harder than a lead does: power of the load beyond
                assist and lead, while it sinks
-    unattended the robot drifts with nobody's hand on it (`services.planner.unattended`)
+    unattended the robot drifts with nobody's hand on it (`services.planner.watch.unattended`)
 
 The trips are checked while the planner is engaged. `unloaded` counts only once both legs have
 carried the torso, because on the hoist neither does. `sagging` counts only after the person has
 once not pressed, because a hand held up in HOLD first catches up. A trip ends when every value has
 been within its limit for `CALM_NS` and the value that tripped was known all the while: a harness
 that falls silent does not end a trip on its force. It counts as a drop-out
-(`services.planner.engagement_fsm`): after repeated trips the planner re-engages after ever longer
-waits.
+(`services.planner.watch.engagement_fsm`): after repeated trips the planner re-engages after ever
+longer waits.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.hocca import LawOutput
+from services.planner.law.hocca import LawOutput
 from services.planner.snapshots import TripsState
 from shared.bus.messages import Trip
 from shared.clock import NS_PER_MS, NS_PER_S

@@ -1,7 +1,8 @@
 """Computes the coupled torque, which the planner adds to the local gains, low-passed. Pure.
 
-Alone, the local gains stand with K_fail = T^T D T + K_geo (`services.planner.certificate`) and damp
-with T^T D_B T. In the closed rows of p, the rest of the body's K_p and B_p (paper, section IV) is
+Alone, the local gains stand with K_fail = T^T D T + K_geo (`services.planner.law.certificate`) and
+damp with T^T D_B T. In the closed rows of p, the rest of the body's K_p and B_p (paper, section IV)
+is
 
     K_c = (K_p - K_fail)+        B_c = (c B_p - T^T D_B T)+        c: `coupling_damping`
 
@@ -21,7 +22,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.small_matrices import positive_part
+from services.planner.law.small_matrices import positive_part
 from shared.robot.joints import N_JOINTS
 
 Array = NDArray[np.float64]

@@ -1,10 +1,10 @@
 """Solves the reference of a tick, and evaluates what the law needs there, in one graph. Pure.
 
-The graph (`services.planner.symbolic`) makes one Gauss-Newton step of the inverse kinematics from
-where the last reference was going. While the planner leads, that step is shorter than `STEP_SURE`,
-so its error is below the solver's tolerance and nothing is evaluated twice. While it holds, two
-steps lead from the measured pose to the middle. What takes more than `STEPS_MAX` steps, or leaves
-the joint limits, goes to `InverseKinematics`, and the graph is evaluated where that ends.
+The graph (`services.planner.law.symbolic`) makes one Gauss-Newton step of the inverse kinematics
+from where the last reference was going. While the planner leads, that step is shorter than
+`STEP_SURE`, so its error is below the solver's tolerance and nothing is evaluated twice. While it
+holds, two steps lead from the measured pose to the middle. What takes more than `STEPS_MAX` steps,
+or leaves the joint limits, goes to `InverseKinematics`, and the graph is evaluated where that ends.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.inverse_kinematics import (
+from services.planner.law.inverse_kinematics import (
     STEP_MAX,
     STEP_SURE,
     IkResult,
     InverseKinematics,
 )
-from services.planner.kinematics import Kinematics, graphs_of
+from services.planner.law.kinematics import Kinematics, graphs_of
 from shared.config.robot_config import RobotConfig
 from shared.robot.compiled_graph import CompiledGraph
 

@@ -24,19 +24,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.assist import AssistLaw, LeadEasing, force_up, is_still, wrench_in_world
-from services.planner.coupling import CouplingFilter
-from services.planner.gains import GainLaw
-from services.planner.kinematics import Measured
-from services.planner.law_terms import LawAtReference
-from services.planner.levelling import Levelling
-from services.planner.load import Load
-from services.planner.probe import NO_ROW, ReferenceProbe
-from services.planner.reference import Reference
-from services.planner.shift import ShiftReference
+from services.planner.law.assist import AssistLaw, LeadEasing, force_up, is_still, wrench_in_world
+from services.planner.law.coupling import CouplingFilter
+from services.planner.law.gains import GainLaw
+from services.planner.law.kinematics import Measured
+from services.planner.law.law_terms import LawAtReference
+from services.planner.law.levelling import Levelling
+from services.planner.law.load import Load
+from services.planner.law.probe import NO_ROW, ReferenceProbe
+from services.planner.law.reference import Reference
+from services.planner.law.shift import ShiftReference
+from services.planner.law.split import GainSplit, LocalGains
+from services.planner.law.stance import FOLLOW_S, Stance
 from services.planner.snapshots import LawState
-from services.planner.split import GainSplit, LocalGains
-from services.planner.stance import FOLLOW_S, Stance
 from shared.bus.messages import STRAIGHT, Pair, Vector3, Vector4, Wrench
 from shared.config.robot_config import GRAVITY, RobotConfig
 
@@ -162,7 +162,7 @@ class Hocca:
             dt: time since the last tick, s.
             shift_requested: requested x, y (m), roll and yaw (rad) of the shift; limited here.
             probe: row of p whose reference is offset, and by how much, m or rad
-                (`services.planner.probe`).
+                (`services.planner.law.probe`).
             align: start from the measured pose, so that engaging makes no step. p_C starts at the
                 measured pose and returns to zero (COM over the ankles, no roll, no yaw; height and
                 pitch stay) during `law.recentre_s` of ticks without `align`. A planner that was

@@ -22,7 +22,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.small_matrices import eigenvalue_min
+from services.planner.law.small_matrices import eigenvalue_min
 from shared.config.robot_config import RobotConfig
 from shared.robot.compiled_graph import CompiledGraph
 from shared.robot.joints import N_JOINTS

@@ -4,7 +4,7 @@ Six task rows (p = p_ref) and six closure rows (both legs agree on the torso) fo
 in the 12 joint angles. There are two solvers:
 
 - `solve`, from a solution near by: Gauss-Newton, one or two steps. A tick needs it only where the
-  single step of `services.planner.reference` is too long, or at a joint limit.
+  single step of `services.planner.law.reference` is too long, or at a joint limit.
 - `solve_from_anywhere`, at the start and in tools: Levenberg-Marquardt inside the joint limits,
   from several starts. If p_ref is out of reach, it ends at the nearest pose at which the legs still
   agree, and reports what limits it.
@@ -20,9 +20,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.kinematics import Kinematics
-from services.planner.small_matrices import LuDecomposition
-from services.planner.symbolic import DAMPING
+from services.planner.law.kinematics import Kinematics
+from services.planner.law.small_matrices import LuDecomposition
+from services.planner.law.symbolic import DAMPING
 from shared.robot.joints import JOINTS, N_JOINTS, N_LEG
 
 Array = NDArray[np.float64]

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.kinematics import Kinematics
+from services.planner.law.kinematics import Kinematics
 from shared.config.robot_config import RobotConfig
 from shared.robot.joints import N_JOINTS
 

@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.coupling import UncoupledGains
-from services.planner.gains import GainLaw, JointGains
-from services.planner.reference import Reference
-from services.planner.split import GainSplit, LocalGains
+from services.planner.law.coupling import UncoupledGains
+from services.planner.law.gains import GainLaw, JointGains
+from services.planner.law.reference import Reference
+from services.planner.law.split import GainSplit, LocalGains
 
 Array = NDArray[np.float64]
 

@@ -2,8 +2,8 @@
 
 p = [COM x y z; torso roll pitch yaw]. The load-sharing matrices D mix the two legs' estimates of
 the torso: J_torso = [D_R^T J_R, D_L^T J_L]. J^T F then requests from each foot a wrench that its
-sole can give. The knees' masses enter through their own leg. `services.planner.symbolic` holds the
-equations.
+sole can give. The knees' masses enter through their own leg. `services.planner.law.symbolic` holds
+the equations.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner import symbolic
-from services.planner.model import leg_geometry
+from services.planner.law import symbolic
+from services.planner.law.model import leg_geometry
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import GeometryConfig, LawConfig, MassConfig
 from shared.robot.compiled_graph import CompiledGraph

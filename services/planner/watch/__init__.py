@@ -1,0 +1,1 @@
+"""What makes the planner hold, ask for stiffer modules or leave the lead to another. Pure."""
