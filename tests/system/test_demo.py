@@ -127,14 +127,15 @@ def test_an_interrupted_demo_leaves_nothing_behind(tmp_path: Path) -> None:
 def test_a_stall_of_all_services_is_told_in_line_record_and_verdict(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "tools.cli", "demo", "--out", str(tmp_path)]
     command += ["--duration", "5", "--kill", "planner@4.5"]
-    before, said = procfs.fleets(), []
+    before, said, stopped = procfs.fleets(), [], False
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         for line in process.stdout:
-            if re.match(r" +1\.\d+ s ", line):
-                (run_dir,) = procfs.fleets() - before
-                stop_all(run_dir, 0.15)
             said.append(line)
+            if not stopped and re.match(r" +[1-9]\.\d+ s ", line):
+                (run_dir,) = procfs.fleets() - before
+                stop_all(run_dir, 0.12)
+                stopped = True
     text = "".join(said)
     if stalled_before_it_began(process.returncode, text, tmp_path):
         pytest.skip("this machine stalled so often that the scenario could not begin")

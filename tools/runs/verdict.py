@@ -33,7 +33,15 @@ from tools.runs.impairment_intervals import Impaired, impairments, touches
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog
 from tools.runs.soundness import soundness, why_not_sound
-from tools.runs.stalls import Disturbance, as_dicts, disturbances, drop_outs, inside, stalls_of
+from tools.runs.stalls import (
+    Disturbance,
+    Stall,
+    as_dicts,
+    disturbances,
+    drop_outs,
+    inside,
+    stalls_of,
+)
 from tools.runs.standing import why_not_standing
 
 Array = NDArray[np.float64]
@@ -115,8 +123,9 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
         "pace": _pace(log),
         "real_time_factor": last.real_time_factor,
         "world_time_lost_s": last.late_s,
-        "in_real_time": last.real_time_factor >= REAL_TIME_FACTOR_MIN
-        and last.late_s - _stood_still_s(events) <= LATE_MAX_S,
+        "in_real_time": _in_real_time(
+            last, [row for row in stalls_of(events) if row.end_ns > zero_ns]
+        ),
     }
     times_ns = np.array([row.t_ns for row in truth])
     disturbed = disturbances(log, truth[0].t_ns, last.t_ns)
@@ -163,8 +172,13 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
     return summary
 
 
-def _stood_still_s(events: Sequence[RunEvent]) -> float:
-    return sum(stall.lasted_ms for stall in stalls_of(events)) / 1e3
+def _in_real_time(last: SimTruth, stalls: Sequence[Stall]) -> bool:
+    """Return True if the world kept up with the clock, but for the stalls."""
+    stood_still_s = sum(row.lasted_ms for row in stalls) / 1e3
+    wall_s = last.scenario_s / max(last.real_time_factor, 1e-9)
+    ran_s = max(wall_s - stood_still_s, 1e-9)
+    factor = last.scenario_s / ran_s if stalls else last.real_time_factor
+    return factor >= REAL_TIME_FACTOR_MIN and last.late_s - stood_still_s <= LATE_MAX_S
 
 
 def _across(

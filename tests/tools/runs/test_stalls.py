@@ -318,6 +318,24 @@ def test_figures_leave_out_what_a_stall_made_of_a_run_and_a_line_tells_it(stoppe
     assert "leave out what a stall made of the run" in words
 
 
+@pytest.mark.parametrize(
+    ("factor", "late_s", "stalls_ms", "kept_up"),
+    [
+        (1.0, 0.0, [], True),
+        (0.98, 0.2, [], False),
+        (0.98, 0.2, [200], True),  # 10 s of the world in 10.2 s of the clock
+        (0.98, 0.2, [60], False),
+        (0.999, 0.01, [25], True),
+    ],
+)
+def test_a_world_that_stood_still_kept_up_while_it_ran(
+    factor: float, late_s: float, stalls_ms: list[int], kept_up: bool
+) -> None:
+    last = sample(SimTruth, scenario_s=10.0, real_time_factor=factor, late_s=late_s)
+    stalls = [Stall(0, ms(lasted), MACHINE) for lasted in stalls_ms]
+    assert verdict._in_real_time(last, stalls) is kept_up
+
+
 def test_messages_lost_in_a_stall_name_it_and_stalls_without_effect_share_a_line() -> None:
     row = {"said": "6.58 s: x", "modules_held": 0, "messages_lost": 2, "lasted_ms": 63.0}
     quiet = [row | {"messages_lost": 0, "lasted_ms": length} for length in (21.0, 34.0)]
