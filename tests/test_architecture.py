@@ -55,7 +55,7 @@ VENDORS = {
     "getpass": ["shared/user.py"],
     "zenoh": ["shared/bus/session.py", "services/ros2_gateway/ros_session.py"],
     "rosbags": ["services/ros2_gateway/ros_types.py", "tools/export/ros2_bag.py"],
-    "gymnasium": ["tools/learning/environment.py"],
+    "gymnasium": ["tools/lab/learning/environment.py"],
     "shtab": ["tools/verbs/completion.py"],
     "pyarrow": ["tools/export/parquet.py"],
     "mujoco": [
@@ -72,7 +72,7 @@ VENDORS = {
         "tools/output.py",
         "tools/runs/figure.py",
         "tools/lab/design/damping_picture.py",
-        "tools/studies/*/*picture.py",
+        "tools/lab/studies/*/*picture.py",
     ],
     "PIL": ["tools/analysis/reports/canvas.py", "tools/analysis/reports/moving_picture.py"],
     "casadi": [
@@ -107,8 +107,8 @@ NEEDS_EXTRA = {
     "tools/export/ros2_bag.py": "ros2",
     "tools/analysis/reports/canvas.py": "plot",
     "tools/analysis/reports/moving_*.py": "plot",
-    "tools/learning/environment.py": "learn",
-    "tools/bench/transports/over_*.py": "bench",
+    "tools/lab/learning/environment.py": "learn",
+    "tools/lab/bench/transports/over_*.py": "bench",
 }
 """Modules that cannot be imported without an extra. Whoever imports one, by a function, has called
 `require` there. All others can be imported with the packages of `dependencies` alone."""
@@ -140,7 +140,7 @@ LAWS = [
     "tools/identify/quasi_static.py",
     "tools/identify/sines.py",
     "services/planner/controller.py",
-    "tools/learning/policy.py",
+    "tools/lab/learning/policy.py",
     "services/planner/state_phases.py",
     "services/planner/planner.py",
     "services/harness/filter.py",
@@ -299,10 +299,8 @@ ROOMS_BELOW = {
     "fleet": (),
     "runs": ("fleet",),
     "analysis": ("fleet", "runs"),
-    "lab": (),
-    "studies": ("fleet", "runs", "analysis", "lab"),
     "bringup": ("fleet",),
-    "bench": ("fleet", "runs"),
+    "lab": ("fleet", "runs", "analysis"),
 }
 """Rooms of the tools, and the rooms that each may import."""
 
@@ -365,7 +363,7 @@ def test_a_module_can_be_imported_without_the_packages_of_extras_but_those_liste
     assert all(package.split(".")[0] in hidden for package in failed.values()), failed
     files = {name.replace(".", "/") + ".py" for name in failed}
     listed = {file for file in SOURCES if any(fnmatch.fnmatch(file, row) for row in NEEDS_EXTRA)}
-    beside = {"tools/bench/transports/over_zenoh.py", "tools/bench/transports/over_datagrams.py"}
+    beside = {f"tools/lab/bench/transports/over_{name}.py" for name in ("zenoh", "datagrams")}
     assert files == listed - beside
 
 

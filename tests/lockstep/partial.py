@@ -21,8 +21,8 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Keyframe, Kill, Push, Restart, Scenario
 from shared.exceptions import RunError
 from shared.robot.joints import MODULE_INDEX, MODULES
+from tools.lab.studies.sweeps.figures import Ending, com_max_mm, ending_of, operator_peak_n, step_nm
 from tools.runs.lockstep import FleetMoment, Lockstep, Record, forget
-from tools.studies.sweeps.figures import Ending, com_max_mm, ending_of, operator_peak_n, step_nm
 
 FailureKind = Literal["links", "commands", "states", "frozen"]
 KINDS: Final[Mapping[FailureKind, str]] = {

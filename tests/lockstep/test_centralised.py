@@ -270,7 +270,7 @@ def test_nothing_but_two_tools_knows_it_and_no_file_names_it() -> None:
     assert users == {
         "tools/runs/recorded_lockstep.py",
         "tools/verbs/sim.py",
-        "tools/studies/sweeps/latency_trial.py",
+        "tools/lab/studies/sweeps/latency_trial.py",
         "tools/runs/centralised/fleet.py",
     }
     for file in (*(ROOT / "deploy").glob("*.toml"), *(ROOT / "deploy" / "scenarios").glob("*")):

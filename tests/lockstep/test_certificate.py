@@ -8,8 +8,8 @@ import pytest
 from shared.bus.messages import SimTruth
 from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
-from tools.studies.sweeps import certificate_study as study
-from tools.studies.sweeps.certificate_study import (
+from tools.lab.studies.sweeps import certificate_study as study
+from tools.lab.studies.sweeps.certificate_study import (
     CertificateCase,
     CertificateCases,
     CertificateResult,

@@ -20,9 +20,9 @@ from shared.bus.topics import Topic
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Kill, Push
 from tests.lockstep.runs import still
+from tools.lab.studies.sweeps import plants
 from tools.runs.lockstep import Lockstep
 from tools.runs.standing_start import begin_standing
-from tools.studies.sweeps import plants
 
 LQR = Path(__file__).parents[2] / "examples" / "lqr_controller.py"
 

@@ -9,7 +9,7 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Kill, Push, Restart
 from shared.robot.joints import MODULES
 from tests.lockstep.runs import push, run, variant
-from tools.studies.sweeps.figures import Ending, ending_of
+from tools.lab.studies.sweeps.figures import Ending, ending_of
 
 
 def killed(at: float, *services: str) -> tuple[Kill, ...]:

@@ -14,9 +14,9 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Fault, Keyframe, Kill, Restart
 from shared.robot.joints import MODULES
 from tests.lockstep.runs import at_rest, still
+from tools.lab.studies.sweeps import plants
 from tools.runs.lockstep import Lockstep
 from tools.runs.standing_start import begin_standing
-from tools.studies.sweeps import plants
 
 
 @pytest.mark.sampled(3)

@@ -19,11 +19,11 @@ from shared.config.scenarios import Inject, Keyframe, Push, Scenario
 from shared.network.impairment import Impairment
 from shared.robot.trip_table import JOINT_TRIPS
 from tests.lockstep.runs import kill, push, restart, variant
+from tools.lab.studies.sweeps import plants
+from tools.lab.studies.sweeps.push_range import PushRange
 from tools.runs.lockstep import Lockstep
 from tools.runs.network import BASE
 from tools.runs.standing_start import begin_standing
-from tools.studies.sweeps import plants
-from tools.studies.sweeps.push_range import PushRange
 
 DOWN = (Keyframe(at=0.0, height=1.188), Keyframe(at=1.5, height=0.95))
 

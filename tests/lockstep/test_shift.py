@@ -9,7 +9,7 @@ from shared.bus.messages import Vector4
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe
 from tests.lockstep.runs import kill, push, restart, run, variant
-from tools.studies.sweeps import plants
+from tools.lab.studies.sweeps import plants
 
 
 @pytest.mark.parametrize("signs", [(1, 1, 1, 1), (-1, 1, -1, 1)])

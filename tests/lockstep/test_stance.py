@@ -11,8 +11,8 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe
 from shared.network.impairment import Impairment
 from tests.lockstep.runs import kill, push, restart, run, variant
+from tools.lab.studies.sweeps import plants
 from tools.runs.lockstep import Lockstep
-from tools.studies.sweeps import plants
 
 Foot = tuple[float, float, float]
 

@@ -21,9 +21,9 @@ from shared.config.scenarios import Keyframe, Push, Scenario
 from shared.network.impairment import Impairment
 from shared.robot.trip_table import JOINT_TRIPS, untripped
 from tests.lockstep.runs import still, variant
+from tools.lab.studies.sweeps.trips_trial import PLANTS, unfiltered
 from tools.runs.lockstep import Lockstep, Record, forget
 from tools.runs.standing_start import begin_standing
-from tools.studies.sweeps.trips_trial import PLANTS, unfiltered
 
 RESTS_TWICE = changed(PlantConfig(), {"person.load_scale": 2.0})
 SHAKEN = [name for name in PLANTS if name != "rigid"]

@@ -104,7 +104,7 @@ WRITERS = {
     "tools/reference/__main__.py": "pages in the checkout",
     "tools/verbs/new.py": "in a folder that is there whole or not at all",
     "tools/view/serving.py": "what a server says",
-    "tools/studies/sweeps/table.py": "rows of a study that goes on after a kill",
+    "tools/lab/studies/sweeps/table.py": "rows of a study that goes on after a kill",
 }
 """Modules of tools that write to files by themselves, and why they may."""
 

@@ -15,8 +15,8 @@ from services.simulator.world import World
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
 from tests.lockstep.runs import variant
+from tools.lab.studies.sweeps import plants
 from tools.runs.lockstep import Lockstep
-from tools.studies.sweeps import plants
 
 WRONG = {
     "body.payload_scale": 0.85,

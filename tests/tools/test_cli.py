@@ -15,7 +15,7 @@ from shared import revision
 from shared.exceptions import BUG_EXIT_CODE, RunError
 from shared.process import run_service
 from tools import cli
-from tools.studies.sweeps import pool
+from tools.lab.studies.sweeps import pool
 from tools.verb_table import VERBS
 from tools.verbs import faults
 

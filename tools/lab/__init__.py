@@ -1,1 +1,1 @@
-"""The laboratory, for researchers: design of the gains. No robot in service needs it."""
+"""The laboratory, for researchers: gain design, studies, benches, learning. No robot needs it."""

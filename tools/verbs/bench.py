@@ -21,13 +21,13 @@ from shared.exceptions import FAULT_EXIT_CODE
 from shared.extras import require
 from shared.places import CHECKOUT
 from shared.robot import gain_schedule
-from tools.bench import bus_command, fleet_command, revisions, table
-from tools.bench.flags import add_flags, write_rows
-from tools.bench.parts import LOCKSTEP, LOCKSTEP_RECORDED, PARTS
-from tools.bench.revisions import Worker, its_config
-from tools.bench.table import Row
-from tools.bench.timing import ASLEEP_S, SWEPT_BYTES, YARDSTICK_CALLS
-from tools.bench.worker import READY, Request
+from tools.lab.bench import bus_command, fleet_command, revisions, table
+from tools.lab.bench.flags import add_flags, write_rows
+from tools.lab.bench.parts import LOCKSTEP, LOCKSTEP_RECORDED, PARTS
+from tools.lab.bench.revisions import Worker, its_config
+from tools.lab.bench.table import Row
+from tools.lab.bench.timing import ASLEEP_S, SWEPT_BYTES, YARDSTICK_CALLS
+from tools.lab.bench.worker import READY, Request
 from tools.terminal import Console, marked
 from tools.verb_table import Subparsers, add_config, add_verb
 

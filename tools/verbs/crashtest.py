@@ -18,13 +18,13 @@ from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE, RunError
 from shared.extras import require
 from shared.mcap_log import provenance
 from tools.fleet import procfs
+from tools.lab.studies.crash import report
+from tools.lab.studies.crash.cases import CASES, CrashCase, CrashVerdict
+from tools.lab.studies.crash.report import JUNIT, RESULTS, Result
+from tools.lab.studies.crash.runner import run_case
 from tools.number_arguments import natural
 from tools.runs import experiment
 from tools.runs.scenario_runner import LiveSnapshot
-from tools.studies.crash import report
-from tools.studies.crash.cases import CASES, CrashCase, CrashVerdict
-from tools.studies.crash.report import JUNIT, RESULTS, Result
-from tools.studies.crash.runner import run_case
 from tools.terminal import Console, marked
 from tools.verb_table import Subparsers, add_config, add_verb
 

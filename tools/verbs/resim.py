@@ -25,13 +25,13 @@ from tools.analysis.reexecution.origin import likely_reason
 from tools.analysis.reexecution.outcome import ReexecutionResult
 from tools.analysis.reexecution.params import with_params
 from tools.analysis.reexecution.ranges import RangeTask, execute_range, merged, ranges_of
+from tools.lab.studies.sweeps.pool import cores, results
 from tools.number_arguments import count, finite
 from tools.runs import experiment
 from tools.runs.recorded_robot import has_own_controller, robot_of
 from tools.runs.run_index import RunIndex
 from tools.runs.run_log import RunLog, parts_of, read_part
 from tools.runs.run_parts import add_part, part_of
-from tools.studies.sweeps.pool import cores, results
 from tools.terminal import Console, marked
 from tools.verb_table import RUN_HELP, Subparsers, add_verb
 

@@ -19,12 +19,13 @@ STUDIES: Final = {
     "trips": "check that each trip comes where it should, and nowhere else",
     "robust": "draw every error of the plant at once: who falls, and why",
 }
-"""The module `tools.studies.sweeps.NAME` has EXAMPLES, `add_flags(parser)`, `run(args) -> int`."""
+"""The module `_SWEEPS.NAME` has EXAMPLES, `add_flags(parser)`, `run(args) -> int`."""
+_SWEEPS: Final = "tools.lab.studies.sweeps"
 
 
 def add_parser(subparsers: Subparsers) -> None:
     """Add the verb and its studies."""
-    modules = {name: importlib.import_module(f"tools.studies.sweeps.{name}") for name in STUDIES}
+    modules = {name: importlib.import_module(f"{_SWEEPS}.{name}") for name in STUDIES}
     parser = add_verb(subparsers, "sweep", "\n".join(_lines(module) for module in modules.values()))
     studies = parser.add_subparsers(metavar="STUDY", required=True)
     for name, words in STUDIES.items():

@@ -18,6 +18,10 @@ from shared.config.toml_file import parse_toml
 from shared.exceptions import FELL_EXIT_CODE, RunError
 from shared.extras import require
 from shared.robot.joints import MODULES
+from tools.lab.studies.counterfactual import picture
+from tools.lab.studies.counterfactual.moments import moments_of
+from tools.lab.studies.counterfactual.run import Counterfactual, Task, counterfactual_of
+from tools.lab.studies.sweeps.pool import cores, results
 from tools.number_arguments import count, finite
 from tools.runs.experiment import PLANT_FILE
 from tools.runs.hand_path import hand_path
@@ -25,10 +29,6 @@ from tools.runs.recorded_robot import refuse_own_controller, robot_of, text_of
 from tools.runs.run_index import RunIndex
 from tools.runs.run_log import RunLog
 from tools.runs.run_parts import add_part, read_asked
-from tools.studies.counterfactual import picture
-from tools.studies.counterfactual.moments import moments_of
-from tools.studies.counterfactual.run import Counterfactual, Task, counterfactual_of
-from tools.studies.sweeps.pool import cores, results
 from tools.terminal import Console, marked
 from tools.verb_table import RUN_HELP, Subparsers, add_verb
 

@@ -19,8 +19,8 @@ from shared.robot.joints import MODULES
 from tests.conftest import ROBOT_FILE
 from tools.identify.body_fit import COM, HARNESS, MASS, SCALE, ZEROS, Record, fit
 from tools.identify.quasi_static import Moments, TimedRows, moments_of
+from tools.lab.studies.sweeps import plants
 from tools.runs.lockstep import Lockstep
-from tools.studies.sweeps import plants
 
 PLANTS = 10
 

@@ -14,12 +14,12 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Fault, Scenario
 from shared.exceptions import RunError
 from tests.lockstep.runs import kill, push, run, still
+from tools.lab.studies.counterfactual.moments import Moment, moments_of
+from tools.lab.studies.counterfactual.run import Task, counterfactual_of, scenario_from
 from tools.runs.network import BASE
 from tools.runs.recorded_lockstep import simulate
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run
-from tools.studies.counterfactual.moments import Moment, moments_of
-from tools.studies.counterfactual.run import Task, counterfactual_of, scenario_from
 from tools.verbs import whatif
 
 HARD = push(2.6, 150.0, 0.0, 0.0)

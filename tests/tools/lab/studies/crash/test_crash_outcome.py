@@ -1,0 +1,233 @@
+"""How a run of the crash matrix is judged, on runs made up for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import msgspec
+import pytest
+
+from shared.bus.messages import Cause, JointEvent, Mode, RunEvent, RunEventKind, SimTruth
+from shared.config import scenarios
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import MODULES
+from tools.lab.studies.crash.cases import (
+    BACK_S,
+    CASES,
+    CRASH_S,
+    DURATION_S,
+    HAND,
+    CrashCase,
+    CrashVerdict,
+    scenario_of,
+)
+from tools.lab.studies.crash.outcome import Heard, as_expected, measure
+
+BY_NAME = {case.name: case for case in CASES}
+PLANNER = BY_NAME["kill-planner"]
+KNEE = BY_NAME["kill-knee_left"]
+S = 1_000_000_000
+
+
+def truth(t: float, **changes: object) -> SimTruth:
+    row = SimTruth(
+        t_ns=round((t + 7.0) * S),
+        seq=round(t * 100),
+        scenario_s=t,
+        com=(0.0, 0.0, 0.8),
+        torso=(0.0, 0.0, scenarios.lead(scenario_of(BY_NAME["kill-planner"]), t).height),
+        angles=(0.0, 0.0, 0.0),
+        operator_force=(0.0, 0.0, 0.0),
+        operator_moment=(0.0, 0.0, 0.0),
+        load_n=0.0,
+        harness_force_z=0.0,
+        push=(0.0, 0.0, 0.0),
+        foot_right_tilt=0.0,
+        foot_left_tilt=0.0,
+        feet_slip=0.0,
+        hoist=0.0,
+        fallen=False,
+        real_time_factor=1.0,
+        late_s=0.0,
+    )
+    return msgspec.structs.replace(row, **changes)
+
+
+def change(
+    t: float, module: str, before: Mode, after: Mode, step: float = 0.0
+) -> tuple[str, JointEvent]:
+    event = JointEvent(
+        t_ns=round((t + 7.0) * S),
+        seq=1,
+        mode_before=int(before),
+        mode_after=int(after),
+        cause=4,
+        age_ns=0,
+        tau_before=(1.0, 2.0),
+        tau_after=(1.0, 2.0 - step),
+    )
+    return module, event
+
+
+def said(t: float, kind: RunEventKind, subject: str = "planner") -> RunEvent:
+    return RunEvent(
+        t_ns=round((t + 7.0) * S), seq=1, kind=int(kind), subject=subject, detail="", scenario_s=t
+    )
+
+
+def holds(at: float = CRASH_S + 0.05, *, but: Sequence[str] = ()) -> list[tuple[str, JointEvent]]:
+    return [change(at, name, Mode.TRACK, Mode.HOLD) for name in MODULES if name not in but]
+
+
+def heard(
+    case: CrashCase,
+    events: Sequence[tuple[str, JointEvent]] = (),
+    *,
+    world: Callable[[float], SimTruth] = truth,
+    end: float = DURATION_S,
+    modes: str = "TTTTTT",
+) -> Heard:
+    rows = [world(index / 100) for index in range(round(end * 100) + 1)]
+    marks = [said(0.0, RunEventKind.STARTED)]
+    scenario = scenario_of(case)
+    marks += [said(row.at, RunEventKind.KILLED, row.service) for row in scenario.kill]
+    marks += [said(row.at, RunEventKind.RESTARTED, row.service) for row in scenario.restart]
+    return Heard(rows, list(events), marks, tuple(modes))
+
+
+def test_a_robot_that_goes_on_has_stood(robot: RobotConfig) -> None:
+    outcome = measure(PLANNER, heard(PLANNER, holds()), robot)
+    assert outcome.verdict is CrashVerdict.STOOD
+    assert outcome.remarks == ()
+    assert outcome.in_real_time
+    assert outcome.sank_mm == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_fall_is_timed_from_the_crash(robot: RobotConfig) -> None:
+    run = heard(PLANNER, holds(), world=lambda t: truth(t, fallen=t >= 4.0), end=5.0)
+    outcome = measure(PLANNER, run, robot)
+    assert outcome.verdict is CrashVerdict.FELL
+    assert outcome.fell_after_s == pytest.approx(4.0 - CRASH_S)
+    assert not as_expected(PLANNER, outcome)
+
+
+@pytest.mark.parametrize(
+    ("depth", "verdict"), [(0.04, CrashVerdict.STOOD), (0.06, CrashVerdict.SANK)]
+)
+def test_a_robot_below_where_the_hand_ever_led_has_sunk(
+    robot: RobotConfig, depth: float, verdict: CrashVerdict
+) -> None:
+    lowest = min(frame.height for frame in HAND)
+
+    def world(t: float) -> SimTruth:
+        height = lowest - depth if t > 6.0 else truth(t).torso[2]
+        return truth(t, torso=(0.0, 0.0, height))
+
+    outcome = measure(PLANNER, heard(PLANNER, holds(), world=world), robot)
+    assert outcome.verdict is verdict
+    assert outcome.sank_mm == pytest.approx(1e3 * depth, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"foot_left_tilt": 0.1}, {"com": (0.2, 0.0, 0.8)}, {"com": (0.0, -0.5, 0.8)}]
+)
+def test_a_robot_that_is_tipping_at_the_end_has_fallen(
+    robot: RobotConfig, changes: dict[str, object]
+) -> None:
+    run = heard(PLANNER, holds(), world=lambda t: truth(t, **(changes if t > 7.9 else {})))
+    assert measure(PLANNER, run, robot).verdict is CrashVerdict.FELL
+
+
+def test_a_run_that_broke_off_is_not_judged(robot: RobotConfig) -> None:
+    outcome = measure(PLANNER, heard(PLANNER, holds(), end=6.0), robot)
+    assert outcome.verdict is CrashVerdict.UNJUDGED
+    assert "6.0 s" in outcome.remarks[0]
+    never = Heard([truth(-1.0)], [], [], ("D",) * 6)
+    assert measure(PLANNER, never, robot).verdict is CrashVerdict.UNJUDGED
+
+
+@pytest.mark.parametrize("changes", [{"real_time_factor": 0.9}, {"late_s": 0.2}])
+def test_a_run_on_a_machine_that_was_too_slow_is_marked(
+    robot: RobotConfig, changes: dict[str, object]
+) -> None:
+    run = heard(PLANNER, holds(), world=lambda t: truth(t, **changes))
+    assert not measure(PLANNER, run, robot).in_real_time
+
+
+def test_safe_is_when_the_slowest_module_that_was_not_hit_holds(robot: RobotConfig) -> None:
+    late = change(2.47, "hip_right", Mode.TRACK, Mode.HOLD)
+    events = [*holds(but=("hip_right", "knee_left")), late]
+    outcome = measure(KNEE, heard(KNEE, events), robot)
+    assert outcome.safe_ms == pytest.approx(70.0)
+    assert outcome.remarks == ()
+
+
+def test_a_module_that_holds_already_is_safe_at_once(robot: RobotConfig) -> None:
+    outcome = measure(PLANNER, heard(PLANNER, holds(at=1.0)), robot)
+    assert outcome.safe_ms == 0.0
+
+
+def test_a_module_that_goes_on_tracking_is_remarked(robot: RobotConfig) -> None:
+    outcome = measure(KNEE, heard(KNEE, holds(but=("hip_left",))), robot)
+    assert outcome.safe_ms is None
+    assert outcome.remarks == ("not all of the other modules held",)
+
+
+def test_what_balance_does_not_need_must_disturb_no_module(robot: RobotConfig) -> None:
+    case = BY_NAME["kill-harness"]
+    assert measure(case, heard(case), robot).remarks == ()
+    event = change(2.5, "hip_left", Mode.TRACK, Mode.HOLD)
+    assert measure(case, heard(case, [event]), robot).remarks == ("left TRACK: hip_left",)
+
+
+def test_another_module_in_fault_is_remarked(robot: RobotConfig) -> None:
+    events = [*holds(), change(2.6, "hip_left", Mode.HOLD, Mode.FAULT)]
+    assert measure(KNEE, heard(KNEE, events), robot).remarks == ("hip_left went to FAULT",)
+
+
+@pytest.mark.parametrize("cause", [Cause.SHAKING, Cause.TORQUE_LIMIT, Cause.TOO_FAST])
+def test_a_module_that_trips_is_remarked(robot: RobotConfig, cause: Cause) -> None:
+    name, event = change(CRASH_S + 0.04, "hip_left", Mode.TRACK, Mode.HOLD)
+    tripped = (name, msgspec.structs.replace(event, cause=int(cause)))
+    events = [*holds(but=("hip_left",)), tripped]
+    remarks = measure(KNEE, heard(KNEE, events), robot).remarks
+    assert remarks == (f"hip_left tripped: {cause.name}",)
+
+
+def test_a_service_that_ends_by_itself_is_remarked(robot: RobotConfig) -> None:
+    run = heard(PLANNER, holds())._replace(died=["harness"])
+    assert measure(PLANNER, run, robot).remarks == ("harness ended by itself",)
+
+
+def test_the_torque_step_is_of_the_modules_that_were_not_hit(robot: RobotConfig) -> None:
+    events = [
+        change(2.45, name, Mode.TRACK, Mode.HOLD, step=9.0 if name in KNEE.hit else 0.5)
+        for name in MODULES
+    ]
+    events.append(change(5.5, "knee_left", Mode.DISARMED, Mode.HOLD, step=3.0))
+    outcome = measure(KNEE, heard(KNEE, events), robot)
+    assert outcome.torque_step_nm == pytest.approx(0.5)
+    assert outcome.torque_step_back_nm == pytest.approx(3.0)
+
+
+def test_it_leads_again_when_the_last_module_tracks(robot: RobotConfig) -> None:
+    times = (5.8, 6.1, 5.9, 5.8, 5.8, 5.8)
+    back = [
+        change(at, name, Mode.HOLD, Mode.TRACK) for at, name in zip(times, MODULES, strict=True)
+    ]
+    outcome = measure(PLANNER, heard(PLANNER, [*holds(), *back]), robot)
+    assert outcome.leads_again_s == pytest.approx(6.1 - BACK_S)
+    not_all = measure(PLANNER, heard(PLANNER, holds(), modes="TTTTTH"), robot)
+    assert not_all.leads_again_s is None
+    assert not_all.remarks == ("does not lead again: TTTTTH",)
+
+
+def test_a_chase_is_timed_by_its_own_kill(robot: RobotConfig) -> None:
+    case = BY_NAME["reengaging-blend"]
+    run = heard(case, [*holds(at=0.9), *holds(at=2.35)])
+    missed = measure(case, run, robot)
+    assert missed.verdict is CrashVerdict.UNJUDGED
+    run.said.append(said(2.3, RunEventKind.KILLED))  # type: ignore[attr-defined]
+    tracked = [change(2.1, name, Mode.HOLD, Mode.TRACK) for name in MODULES]
+    run = run._replace(events=[*holds(at=0.9), *tracked, *holds(at=2.35)])
+    assert measure(case, run, robot).safe_ms == pytest.approx(50.0)

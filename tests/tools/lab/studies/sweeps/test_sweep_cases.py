@@ -1,0 +1,251 @@
+"""The random cases of `xrl sweep kill`, and what is measured in one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from itertools import pairwise
+
+import msgspec
+import numpy as np
+import pytest
+
+from services.planner.law.kinematics import Kinematics
+from services.simulator.body import body_of
+from services.simulator.plant import IDEAL
+from services.simulator.world import World
+from shared.bus.messages import SimTruth
+from shared.clock import NS_PER_S
+from shared.config import scenarios
+from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.config.scenarios import Keyframe, Push, Scenario, lead
+from shared.robot.robot_model import stand_pose
+from tools.lab.studies.sweeps import cases
+from tools.lab.studies.sweeps.cases import KillCase, KillCases
+from tools.lab.studies.sweeps.figures import Ending, exit_code
+from tools.lab.studies.sweeps.outcome import FootLoads, run_case
+from tools.lab.studies.sweeps.push_range import PushRange
+from tools.runs import lockstep
+from tools.runs.lockstep import Lockstep
+from tools.runs.standing import is_tipping
+
+
+@pytest.fixture(scope="module")
+def drawn(robot: RobotConfig) -> list[KillCase]:
+    some = KillCases(robot)
+    return [some.draw(1, number) for number in range(500)]
+
+
+@pytest.fixture(scope="module")
+def diagonal(robot: RobotConfig) -> RobotConfig:
+    """The paper's split: it needs no gain schedule, whatever the payload."""
+    law = msgspec.structs.replace(robot.law, split="diagonal")
+    return msgspec.structs.replace(robot, law=law)
+
+
+def frames(scenario: Scenario, case: KillCase) -> Iterator[tuple[cases.LeadPose, Keyframe]]:
+    return zip(case.poses, scenario.keyframe[1:], strict=True)
+
+
+@pytest.mark.parametrize(
+    ("endings", "code"),
+    [
+        ([Ending.STOOD], 0),
+        ([Ending.STOOD, Ending.UNREADY], 3),
+        ([Ending.UNREADY, Ending.TIPPING], 1),
+        ([Ending.UNREADY, Ending.FELL, Ending.STOOD], 1),
+    ],
+)
+def test_a_case_that_never_began_is_a_fault_and_no_fall(endings: list[Ending], code: int) -> None:
+    assert exit_code(map(str, endings)) == code
+
+
+def test_a_case_is_the_same_without_the_others(robot: RobotConfig, drawn: list[KillCase]) -> None:
+    assert KillCases(robot).draw(1, 137) == drawn[137]
+
+
+def test_no_two_cases_are_alike(robot: RobotConfig, drawn: list[KillCase]) -> None:
+    assert len({case.kill_s for case in drawn}) > 450
+    some = KillCases(robot)
+    other = [some.draw(2, number) for number in range(20)]
+    assert all(a.pushes != b.pushes for a, b in zip(other, drawn, strict=False))
+
+
+def test_no_draw_is_beyond_the_study(robot: RobotConfig, drawn: list[KillCase]) -> None:
+    borne = {kg: PushRange(cases.with_payload(robot, kg)) for kg in cases.payloads(robot)}
+    for case in drawn:
+        assert case.payload_kg in (0.0, 5.1, 10.2, 15.3, 20.4)
+        assert 0.0 <= case.delay_ms <= 20.0
+        assert case.let_go_s is None or 0.0 <= case.let_go_s <= case.kill_s
+        assert 1 <= len(case.pushes) <= 3
+        for push in case.pushes:
+            limit = borne[case.payload_kg].limit_n(math.atan2(push.force[1], push.force[0]))
+            assert 0.074 * limit <= math.hypot(*push.force) <= 0.751 * limit
+            assert push.force[2] == 0.0
+            assert push.duration == 0.3
+        assert all(b.at >= a.at + a.duration for a, b in pairwise(case.pushes))
+        assert case.end_s >= case.kill_s + 2.999
+        assert case.end_s >= case.pushes[-1].at + 1.99
+        assert case.let_go_s is not None or case.end_s >= case.way_end_s + 1.99
+        assert all(0.0 <= pose.assist_n <= robot.assist.force_max for pose in case.poses)
+
+
+def test_every_kind_of_case_is_drawn(drawn: list[KillCase]) -> None:
+    share = {
+        "moving": sum(case.moving for case in drawn),
+        "hand off": sum(case.let_go_s is not None for case in drawn),
+        "hand off at the kill": sum(case.let_go_s == case.kill_s for case in drawn),
+        "pushed before the kill": sum(case.pushes[0].at < case.kill_s for case in drawn),
+        "three pushes": sum(len(case.pushes) == 3 for case in drawn),
+        "two poses": sum(len(case.poses) == 2 for case in drawn),
+        "upright": sum(case.poses[-1].pitch_rad == 0.0 for case in drawn),
+        "crawling": sum(
+            case.poses[-1].height_m < 0.9 and case.poses[-1].pitch_rad > 0.6 for case in drawn
+        ),
+        "assist": sum(case.poses[-1].assist_n > 50.0 for case in drawn),
+        "no assist": sum(case.poses[-1].assist_n == 0.0 for case in drawn),
+    }
+    assert min(share.values()) >= 25, share
+    quadrants = {
+        (push.force[0] > 0.0, push.force[1] > 0.0) for case in drawn for push in case.pushes
+    }
+    assert len(quadrants) == 4
+
+
+def test_the_planner_dies_on_the_way_or_after_it(robot: RobotConfig, drawn: list[KillCase]) -> None:
+    for case in drawn:
+        there = cases.scenario_of(robot, case).keyframe[-1].at
+        assert there == case.way_end_s
+        assert (case.kill_s < there) if case.moving else (case.kill_s >= there + 0.3)
+
+
+def test_a_case_is_a_scenario(robot: RobotConfig, drawn: list[KillCase]) -> None:
+    for case in drawn:
+        scenario = cases.scenario_of(robot, case)
+        scenarios.check("case", scenario)
+        assert [row.at for row in scenario.kill] == [case.kill_s]
+        assert scenario.push == case.pushes
+        for pose, frame in frames(scenario, case):
+            led = lead(scenario, frame.at)
+            assert (led.height, led.pitch, led.assist) == msgspec.structs.astuple(pose)
+
+
+def test_no_operator_leads_faster_than_the_pace(robot: RobotConfig, drawn: list[KillCase]) -> None:
+    for case in drawn:
+        for a, b in pairwise(cases.scenario_of(robot, case).keyframe):
+            for way, speed in zip(
+                (b.height - a.height, b.pitch - a.pitch, b.assist - a.assist),
+                cases.SPEED,
+                strict=True,
+            ):
+                assert abs(way) <= 1.001 * case.pace * speed * (b.at - a.at)
+
+
+@pytest.mark.parametrize(("height", "pitch"), [(0.79, 1.2), (0.85, 0.0), (1.2, 0.6)])
+def test_pitch_is_taken_by_the_hips_alone(robot: RobotConfig, height: float, pitch: float) -> None:
+    """What `reachable` rests on: the COM stays over the ankles when the torso pitches."""
+    assert cases.reachable(robot, height, pitch)
+    q = np.array(stand_pose(robot, height))
+    q[[5, 11]] += pitch
+    kinematics = Kinematics(robot)
+    kinematics.update(q)
+    assert kinematics.p[0] == pytest.approx(0.0, abs=2e-3)
+    assert kinematics.p[4] == pytest.approx(pitch, abs=1e-9)
+
+
+@pytest.mark.parametrize(("height", "pitch"), [(0.75, 0.0), (1.30, 0.0), (0.79, 1.8), (1.2, -2.0)])
+def test_what_the_joint_limits_forbid_is_not_drawn(
+    robot: RobotConfig, height: float, pitch: float
+) -> None:
+    assert not cases.reachable(robot, height, pitch)
+
+
+def test_the_feet_carry_the_robot(diagonal: RobotConfig) -> None:
+    scenario = Scenario(
+        name="stand", about="", duration=0.5, keyframe=(Keyframe(at=0.0, height=1.188),)
+    )
+    fleet = Lockstep(diagonal, scenario, plant=IDEAL)
+    feet = FootLoads(fleet.world)
+    last = list(fleet.run())[-1]
+    weight = diagonal.total_mass * GRAVITY - last.operator_force[2]
+    assert sum(feet.read()) == pytest.approx(weight, rel=0.01)
+    assert feet.read()[0] == pytest.approx(feet.read()[1], rel=0.02)
+
+
+def test_the_hand_is_off_from_the_time_in_the_case(
+    diagonal: RobotConfig, drawn: list[KillCase]
+) -> None:
+    case = msgspec.structs.replace(drawn[0], kill_s=0.9, let_go_s=0.8, delay_ms=1.0, pushes=())
+    rows: list[SimTruth] = []
+    run_case(case, cases.with_payload(diagonal, case.payload_kg), watch=rows.append)
+    on = [row.operator_force[2] for row in rows if 0.6 < row.scenario_s < 0.79]
+    off = [row.operator_force[2] for row in rows if row.scenario_s > 0.82]
+    assert max(abs(force) for force in on) > 1.0
+    assert 0.0 not in on
+    assert set(off) == {0.0}
+
+
+def test_a_robot_that_falls_before_it_can_begin_has_fallen(
+    diagonal: RobotConfig, drawn: list[KillCase]
+) -> None:
+    law = msgspec.structs.replace(diagonal.law, jacobian="average")
+    average = msgspec.structs.replace(diagonal, law=law)
+    outcome = run_case(drawn[0], average)
+    assert outcome.ending == Ending.FELL
+    assert not outcome.stood
+
+
+@pytest.mark.parametrize(
+    ("com", "tilt", "tipping"),
+    [
+        ((0.05, 0.02), 0.02, False),
+        ((0.128, 0.0), 0.0, True),
+        ((-0.128, 0.0), 0.0, True),
+        ((0.0, 0.41), 0.0, True),
+        ((0.0, 0.40), 0.0, False),
+        ((0.0, 0.0), 0.06, True),
+    ],
+)
+def test_a_robot_on_its_way_down_at_the_end_does_not_stand(
+    robot: RobotConfig, drawn: list[KillCase], com: tuple[float, float], tilt: float, tipping: bool
+) -> None:
+    """The soles end 0.127 m before and behind the ankles, and 0.41 m to the sides."""
+    row = World(body_of(robot, IDEAL), cases.scenario_of(robot, drawn[0])).truth(0, 1.0, 0.0)
+    row = msgspec.structs.replace(row, com=(*com, 0.8), foot_right_tilt=tilt, foot_left_tilt=0.0)
+    assert is_tipping(row, robot) is tipping
+
+
+def test_a_case_that_ends_in_mid_fall_is_a_fall(
+    diagonal: RobotConfig, drawn: list[KillCase]
+) -> None:
+    """A push that nothing withstands, half a second before the end."""
+    push = Push(at=3.7, duration=0.25, force=(300.0, 0.0, 0.0))
+    case = msgspec.structs.replace(
+        drawn[0], kill_s=1.0, let_go_s=None, way_end_s=1.0, delay_ms=1.0, pushes=()
+    )
+    for pushes, ending in (((), Ending.STOOD), ((push,), Ending.TIPPING)):
+        short = _Until4s(
+            **{name: getattr(case, name) for name in case.__struct_fields__} | {"pushes": pushes}
+        )
+        outcome = run_case(short, cases.with_payload(diagonal, case.payload_kg))
+        assert outcome.ending == ending
+        assert outcome.fell_at_s is None
+
+
+class _Until4s(KillCase, frozen=True, kw_only=True):
+    """A case that does not wait for what comes of its pushes."""
+
+    @property
+    def end_s(self) -> float:
+        return 4.0
+
+
+def test_a_robot_that_never_tracks_is_no_stand(
+    diagonal: RobotConfig, drawn: list[KillCase], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At 30 ms each way every command is older than 50 ms: it holds, and nothing can begin."""
+    monkeypatch.setattr(lockstep, "READY_NS", 6 * NS_PER_S)
+    case = msgspec.structs.replace(drawn[0], delay_ms=30.0)
+    outcome = run_case(case, cases.with_payload(diagonal, case.payload_kg))
+    assert outcome.ending == Ending.UNREADY
+    assert not outcome.stood

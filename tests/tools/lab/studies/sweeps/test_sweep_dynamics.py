@@ -1,0 +1,119 @@
+"""The dynamic certificate on trial: what is drawn, what is asked, and what counts as growth."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from shared.config.robot_config import RobotConfig
+from tools import cli
+from tools.lab.studies.sweeps import dynamics, dynamics_trial
+from tools.lab.studies.sweeps.dynamics_trial import (
+    UNREADY,
+    DynamicsResult,
+    delay_s,
+    draw,
+    drawn,
+    run_trial,
+)
+
+
+def outcome(**changes: object) -> DynamicsResult:
+    given: dict[str, object] = {"rate": -1.0, "ended": "tracked", "early_rad_s": 0.04}
+    return msgspec.structs.replace(UNREADY, **(given | changes))
+
+
+def test_a_case_is_the_same_without_the_others_and_within_its_ranges() -> None:
+    assert draw(1, 7) == draw(1, 7)
+    assert draw(1, 7) != draw(2, 7)
+    for number in range(200):
+        trial = draw(3, number)
+        for value, (low, high) in (
+            (trial.height, dynamics_trial.HEIGHTS),
+            (trial.stiffness, dynamics_trial.STIFFNESS),
+            (trial.bandwidth_hz, dynamics_trial.BANDWIDTH_HZ),
+            (trial.coupling, dynamics_trial.COUPLING),
+            *((factor, dynamics_trial.DAMPING) for factor in trial.damping),
+        ):
+            assert low * 0.999 <= value <= high * 1.001
+
+
+@pytest.mark.parametrize(("way_ms", "wanted_ms"), [(0, 2), (1, 2), (2, 4), (7, 14), (12, 24)])
+def test_the_delay_asked_about_is_from_a_sample_to_its_first_use(
+    robot: RobotConfig, way_ms: int, wanted_ms: int
+) -> None:
+    trial = msgspec.structs.replace(draw(1, 0), delay_ms=way_ms)
+    assert delay_s(robot, trial) == pytest.approx(wanted_ms / 1e3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "grew"),
+    [
+        ({"late_rad_s": 0.01}, False),
+        ({"late_rad_s": 0.05}, False),
+        ({"late_rad_s": 0.06}, True),
+        ({"early_rad_s": 0.001, "late_rad_s": 0.015}, False),
+        ({"early_rad_s": 0.3, "late_rad_s": 0.3}, True),
+        ({"ended": "fell"}, True),
+        ({"ended": "left"}, True),
+        ({"ended": "unready"}, False),
+    ],
+)
+def test_motion_that_rises_stays_large_or_ends_the_lead_has_grown(
+    changes: dict[str, object], grew: bool
+) -> None:
+    assert outcome(**changes).grew is grew
+
+
+@pytest.mark.parametrize(
+    ("said", "ended", "code"),
+    [("True", "tracked", 3), ("True", "left", 3), ("True", "fell", 1), ("False", "fell", 0)],
+)
+def test_motion_that_grew_against_the_certificate_is_a_fault_and_a_fall_if_it_fell(
+    said: str, ended: str, code: int
+) -> None:
+    as_said = {"said_stable": "True", "grew": "False", "ended": "tracked"}
+    row = {"said_stable": said, "grew": "True", "ended": ended}
+    assert dynamics.exit_code([as_said, row]) == code
+
+
+def test_drawn_gains_change_the_schedule_and_nothing_else(robot: RobotConfig) -> None:
+    trial = draw(1, 0)
+    other = drawn(robot, trial)
+    assert other.gain_schedule is not None
+    assert other.gain_schedule.coupling_bandwidth_hz == trial.bandwidth_hz
+    assert msgspec.structs.replace(other, gain_schedule=robot.gain_schedule) == robot
+
+
+def test_the_shipped_gains_are_predicted_to_fade_and_fade_and_far_too_fast_a_coupling_grows(
+    robot: RobotConfig,
+) -> None:
+    assert robot.gain_schedule is not None
+    shipped = msgspec.structs.replace(
+        draw(1, 0),
+        stiffness=8000.0,
+        delay_ms=1,
+        damping=(1.0,) * 6,
+        bandwidth_hz=robot.gain_schedule.coupling_bandwidth_hz,
+        coupling=robot.gain_schedule.coupling_damping,
+    )
+    stood = run_trial(shipped, robot)
+    assert (stood.said_stable, stood.grew) == (True, False)
+    shook = run_trial(
+        msgspec.structs.replace(shipped, bandwidth_hz=20.0, coupling=6.0, delay_ms=8), robot
+    )
+    assert (shook.said_stable, shook.grew) == (False, True)
+
+
+def test_a_study_is_tabled_drawn_and_counted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "dynamics"
+    assert cli.main(["sweep", "dynamics", "--n", "2", "--workers", "2", "--out", str(out)]) == 0
+    with (out / dynamics.TABLE).open(encoding="utf-8") as file:
+        assert [row["number"] for row in csv.DictReader(file)] == ["0", "1"]
+    assert (out / dynamics.PICTURE).stat().st_size > 10_000
+    assert "said to fade" in capsys.readouterr().out

@@ -1,0 +1,128 @@
+"""The robustness study: trials that repeat, a ranking that finds the cause, a robot that stands."""
+
+from __future__ import annotations
+
+import argparse
+import io
+import math
+import random
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from shared.config.robot_config import RobotConfig
+from tests.tools.exit_codes import exit_code
+from tools import cli
+from tools.lab.studies.sweeps import plants, robust
+from tools.lab.studies.sweeps.figures import Ending
+from tools.lab.studies.sweeps.push_range import PushRange
+from tools.lab.studies.sweeps.robust_trial import (
+    KINDS,
+    draw,
+    plant_of,
+    row_of,
+    run_trial,
+    scenario_of,
+)
+from tools.terminal import Console
+
+
+@pytest.fixture(scope="module")
+def pushes(robot: RobotConfig) -> PushRange:
+    return PushRange(robot)
+
+
+def rows_by(pushes: PushRange, cause: str, n: int = 60) -> list[dict[str, object]]:
+    """Return made-up rows in which one error alone moves the COM."""
+    dice = random.Random(cause)
+    rows = []
+    for number in range(n):
+        row = row_of(draw(pushes, 1, number))
+        far = 100.0 * abs(float(row[cause])) + dice.uniform(0.0, 1e-3)
+        rows.append(row | {"ending": Ending.STOOD, "com_led_max_mm": far})
+    return rows
+
+
+def test_a_trial_follows_from_seed_and_number_alone(pushes: PushRange) -> None:
+    assert draw(pushes, 3, 17) == draw(pushes, 3, 17)
+    assert draw(pushes, 3, 17) != draw(pushes, 4, 17)
+    assert {draw(pushes, 1, number).kind for number in range(3)} == set(KINDS)
+
+
+def test_every_trial_is_a_scenario_that_ends_after_its_kill(
+    robot: RobotConfig, pushes: PushRange
+) -> None:
+    for number in range(30):
+        trial = draw(pushes, 1, number)
+        scenario = scenario_of(robot, trial)
+        assert scenario.duration > trial.kill_s + 2.0
+        assert all(push.at + push.duration < scenario.duration for push in scenario.push)
+
+
+@pytest.mark.parametrize("cause", ["body.com_offset", "drive.lag_s", "floor.slope"])
+def test_the_ranking_finds_the_error_that_moves_the_com(pushes: PushRange, cause: str) -> None:
+    ranked = robust.ranking(rows_by(pushes, cause))
+    assert ranked[0][0] == cause
+    assert ranked[0][1] > 0.9
+    assert abs(ranked[1][1]) < 0.6
+
+
+@pytest.mark.parametrize("few", [True, False])
+def test_of_a_few_trials_no_error_is_ranked(pushes: PushRange, few: bool) -> None:
+    figures = dict.fromkeys((key for key, _, _ in robust.FIGURES), "")
+    rows = [figures | row for row in rows_by(pushes, "drive.lag_s")[: robust.RANKED_LEAST - few]]
+    printed = io.StringIO()
+    robust._show(rows, "xrl sweep robust", Console(width=200, file=printed))
+    assert ("too few to tell" in printed.getvalue()) is few
+    assert ("drive.lag_s" in printed.getvalue()) is not few
+
+
+def test_a_picture_is_drawn_and_falls_are_in_it(pushes: PushRange, tmp_path: Path) -> None:
+    rows = rows_by(pushes, "drive.lag_s")
+    rows[3] |= {"ending": Ending.FELL, "com_led_max_mm": None}
+    robust._draw(rows, argparse.Namespace(beyond=1.0, seed=1, push=0.75), tmp_path / "a.png")
+    assert (tmp_path / "a.png").stat().st_size > 20_000
+
+
+def test_an_impossible_width_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_code(["sweep", "robust", "--n", "0"]) == 2
+    assert "--n: '0'" in capsys.readouterr().err
+
+
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize("number", [0, 1])
+def test_with_every_error_drawn_it_is_led_pushed_killed_and_stands(
+    robot: RobotConfig, pushes: PushRange, number: int
+) -> None:
+    """A squat and a crawl, of the 500 that `xrl sweep robust --n 500` runs."""
+    outcome = run_trial(draw(pushes, 1, number), robot)
+    assert outcome.stood
+    assert outcome.operator_peak_n is not None
+    assert outcome.operator_peak_n < 80.0
+
+
+def test_errors_are_reported_as_one_number_each() -> None:
+    errors = plants.errors_of(plants.draw("one"))
+    assert set(errors) == {row.key for row in plants.shipped().error}
+
+
+def test_an_impossible_slope_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["sweep", "robust", "--slope", "40"]) == 2
+    assert "--slope 40" in capsys.readouterr().err
+
+
+def test_a_slope_that_is_asked_for_has_its_size_and_any_direction_and_all_else_as_drawn(
+    pushes: PushRange,
+) -> None:
+    angles = []
+    for number in range(40):
+        plain = plant_of(draw(pushes, 1, number))
+        sloping = plant_of(draw(pushes, 1, number, 1.0, 5.0))
+        x, y = sloping.floor.slope
+        assert math.hypot(x, y) == pytest.approx(math.radians(5.0), abs=1e-5)
+        angles.append(math.atan2(y, x))
+        floor = msgspec.structs.replace(sloping.floor, slope=plain.floor.slope)
+        assert msgspec.structs.replace(sloping, floor=floor) == plain
+    assert min(angles) < -2.0
+    assert max(angles) > 2.0

@@ -1,0 +1,281 @@
+"""The parts of the fleet that `xrl bench` times, each fed with what a recorded squat gave it."""
+
+from __future__ import annotations
+
+import itertools
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import msgspec
+
+from services.joint.drive_manager import DriveAction, DriveManager
+from services.joint.drivers.odrive_can import OdriveCan
+from services.planner.planner import Planner
+from services.simulator.unix_can_hub import UnixCanHub
+from shared.bus import topics
+from shared.bus.codec import Decoder, encode
+from shared.bus.messages import JointCommand, JointState, Message, Tare, Wrench
+from shared.bus.topics import Topic
+from shared.can import cansimple
+from shared.can.cansimple import Command
+from shared.clock import NS_PER_S
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Scenario
+from shared.config.sections import CanConfig
+from shared.mcap_log.writer import RunWriter
+from shared.robot.joints import MODULES
+from tools.lab.bench.timing import Repeated
+from tools.runs.lockstep import Lockstep, forget
+from tools.runs.recorded_lockstep import DRAIN_EVERY, Outbox
+from tools.runs.standing_start import begin_standing
+
+SECONDS: Final = 3.0
+"""Recorded of the squat: on the way down and up."""
+PIECE_S: Final = 0.5
+"""Virtual time of a lockstep run that makes one figure, s."""
+BATCH: Final = 64
+"""Messages that the recorder takes in one cycle of 12 ms."""
+MODULE: Final = "knee_right"
+
+
+class JointInputs(NamedTuple):
+    """Arguments and outcome of one cycle of a joint service."""
+
+    arguments: tuple[Any, ...]
+    action: DriveAction
+
+
+class Recorded(NamedTuple):
+    """A squat in virtual time, as each part met it."""
+
+    robot: RobotConfig
+    ticks: list[tuple[int, list[JointState]]]
+    """Time of each planner tick, ns, and the six states that it used."""
+    cycles: list[JointInputs]
+    """Cycles of `MODULE`'s service."""
+    messages: list[tuple[Topic, str, Message]]
+    """All that the recorder would get."""
+    fleet: Lockstep
+    """As the recording left it."""
+
+
+def record(robot: RobotConfig, scenario: Scenario) -> Recorded:
+    """Run the fleet in virtual time and keep what its parts were given."""
+    latest: dict[str, JointState] = {}
+    ticks: list[tuple[int, list[JointState]]] = []
+    messages: list[tuple[Topic, str, Message]] = []
+
+    def take(topic: Topic, module: str, message: Message) -> None:
+        messages.append((topic, module, message))
+        if isinstance(message, JointState):
+            latest[module] = message
+        elif topic is topics.PLANNER_STATUS and len(latest) == len(MODULES):
+            ticks.append((message.t_ns, [latest[name] for name in MODULES]))
+
+    fleet = Lockstep(robot, scenario, record=take)
+    joint = fleet.joints[MODULES.index(MODULE)]
+    kept = _KeptManager(robot, MODULE)
+    joint.manager = kept
+    started = begin_standing(fleet)
+    for truth in fleet.run():
+        if not started and truth.scenario_s >= 0.0:
+            started = True
+            ticks.clear()
+            kept.cycles.clear()
+            messages.clear()
+        if truth.scenario_s >= SECONDS:
+            break
+    return Recorded(robot, ticks, kept.cycles, messages, fleet)
+
+
+class _KeptManager(DriveManager):
+    """A joint service that keeps what it was given."""
+
+    def __init__(self, config: RobotConfig, name: str) -> None:
+        super().__init__(config, name)
+        self.cycles: list[JointInputs] = []
+
+    def step(self, *arguments: Any) -> DriveAction:
+        action = super().step(*arguments)
+        self.cycles.append(JointInputs(arguments, action))
+        return action
+
+
+def planner_tick(recorded: Recorded, _stack: ExitStack) -> Repeated:
+    """Six states in, six commands and a status out; the hand leads."""
+    return _tick(recorded, recorded.robot)
+
+
+def planner_tick_diagonal(recorded: Recorded, _stack: ExitStack) -> Repeated:
+    """Run the same with the paper's split: K_q and B_q of all the body."""
+    law = msgspec.structs.replace(recorded.robot.law, split="diagonal")
+    return _tick(recorded, msgspec.structs.replace(recorded.robot, law=law))
+
+
+def _tick(recorded: Recorded, robot: RobotConfig) -> Repeated:
+    planner, inputs = Planner(robot, session=1), itertools.cycle(recorded.ticks)
+    zero = (0.0, 0.0, 0.0)
+    wrench = Wrench(
+        t_ns=0, seq=0, force=(0.0, 0.0, -20.0), moment=zero, valid=True, saturated=False,
+        tare=int(Tare.DONE), age_ns=0,
+    )  # fmt: skip
+
+    def once() -> None:
+        now_ns, states = next(inputs)
+        planner.receive_wrench(wrench, now_ns)
+        for module, state in enumerate(states):
+            planner.receive_state(module, state, now_ns)
+        planner.tick(now_ns)
+        planner.status(now_ns, 0.0)
+
+    return Repeated(once)
+
+
+def joint_cycle(recorded: Recorded, _stack: ExitStack) -> Repeated:
+    """A command's JSON and a sample in, a target and every other cycle a state's JSON out."""
+    manager, decoder = DriveManager(recorded.robot, MODULE), Decoder(JointCommand)
+    inputs = itertools.cycle([(_encoded(one), one.arguments) for one in recorded.cycles])
+    count = itertools.count()
+
+    def once() -> None:
+        payload, (now_ns, reading, _, estop, *near) = next(inputs)
+        command = decoder.decode(payload) if payload else None
+        manager.step(now_ns, reading, command, estop, *near)
+        if next(count) % 2 == 0:
+            encode(manager.controller.state(now_ns))
+
+    return Repeated(once)
+
+
+def _encoded(inputs: JointInputs) -> bytes:
+    command = inputs.arguments[2]
+    return b"" if command is None else encode(command)
+
+
+def drive_exchange(recorded: Recorded, stack: ExitStack) -> Repeated:
+    """Both axes' encoder frames in, the frames of a target out, over the simulator's CAN bus."""
+    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="xrl-bench-")))
+    hub = stack.enter_context(UnixCanHub(folder / "can"))
+    nodes = recorded.robot.module_named(MODULE).node_ids
+    bus = CanConfig(interface="xrl_unix", channel=str(folder / "can"))
+    drive = OdriveCan(bus, nodes, recorded.robot.drive)
+    stack.callback(drive.close)
+    hub.poll()
+    targets = [one.action.target for one in recorded.cycles if one.action.target is not None]
+    inputs = itertools.cycle(targets)
+    ids = [cansimple.arbitration_id(node, Command.GET_ENCODER_ESTIMATES) for node in nodes]
+
+    def before() -> None:
+        hub.poll()
+        hub.broadcast([(can_id, cansimple.pack_two_floats(64.0, 0.1)) for can_id in ids])
+
+    def once() -> None:
+        drive.read(0.005)
+        drive.write(next(inputs))
+
+    return Repeated(once, before)
+
+
+def simulator_step(recorded: Recorded, _stack: ExitStack) -> Repeated:
+    """One step of the world with its twelve emulated axes, without frames and bus."""
+    world, bank = recorded.fleet.world, recorded.fleet.bank
+
+    def once() -> None:
+        world.step(bank.step(world.time, *world.motor_turns()))
+
+    return Repeated(once)
+
+
+def recorder_batch(recorded: Recorded, stack: ExitStack) -> Repeated:
+    """`BATCH` messages from the bus to the file."""
+    writer = _writer(recorded.robot, stack)
+    outbox, messages = Outbox(recorded.robot.name), itertools.cycle(recorded.messages)
+
+    def before() -> None:
+        for topic, module, message in itertools.islice(messages, BATCH):
+            outbox.put(topic, module, message)
+
+    return Repeated(lambda: writer.take_from(outbox, BATCH), before)
+
+
+Prepare = Callable[[Recorded, ExitStack], Repeated]
+
+
+class Part(NamedTuple):
+    """One row of the table."""
+
+    name: str
+    prepare: Prepare
+    warm_us: float | None = None
+    """Target of the CPU time, warm, in the median; None: none."""
+    cold_us: float | None = None
+    """The same, cold."""
+
+
+PARTS: Final = (
+    Part("planner tick", planner_tick, warm_us=110.0, cold_us=300.0),
+    Part("tick, the paper's split", planner_tick_diagonal),
+    Part("joint cycle", joint_cycle),
+    Part("joint's drive over CAN", drive_exchange),
+    Part("simulator step", simulator_step),
+    Part(f"recorder, {BATCH} messages", recorder_batch),
+)
+
+LOCKSTEP: Final = "lockstep"
+LOCKSTEP_RECORDED: Final = "lockstep with a record"
+
+
+class LockstepRun:
+    """A squat in virtual time, measured piece by piece, from the start of the scenario on."""
+
+    def __init__(
+        self, robot: RobotConfig, scenario: Scenario, stack: ExitStack, *, recorded: bool
+    ) -> None:
+        """Stand the robot up: that is not measured."""
+        self._robot, self._scenario, self._recorded = robot, scenario, recorded
+        self._writer = _writer(robot, stack) if recorded else None
+        self._begin()
+
+    def speed(self) -> float:
+        """Run a piece; return how many times faster than real time one core does it."""
+        if self._fleet.world.scenario_s > SECONDS:
+            self._begin()
+        end_s = self._fleet.world.scenario_s + PIECE_S
+        begin, started_ns = time.process_time(), self._fleet.now_ns
+        for truth in self._run:
+            if self._writer is not None and len(self._outbox) >= DRAIN_EVERY:
+                self._writer.take_from(self._outbox, len(self._outbox))
+            if truth.scenario_s >= end_s:
+                break
+        return (self._fleet.now_ns - started_ns) / NS_PER_S / (time.process_time() - begin)
+
+    def _begin(self) -> None:
+        self._outbox = Outbox(self._robot.name)
+        record = self._outbox.put if self._recorded else forget
+        self._fleet = Lockstep(self._robot, self._scenario, record=record)
+        begin_standing(self._fleet)
+        self._run = self._fleet.run()
+        for truth in self._run:
+            if truth.scenario_s >= 0.0:
+                break
+        if self._writer is not None:
+            self._writer.take_from(self._outbox, len(self._outbox))
+
+
+def _writer(robot: RobotConfig, stack: ExitStack) -> RunWriter:
+    """Open a log in a temporary folder, as the recorder does."""
+    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="xrl-bench-")))
+    return stack.enter_context(
+        RunWriter(
+            folder,
+            topics.all_keys(robot.name),
+            offset_ns=0,
+            metadata={},
+            attachments={},
+            chunk_kib=robot.recorder.chunk_kib,
+        )
+    )

@@ -1,0 +1,209 @@
+"""Outcome of a case: the verdict and its figures, from the live bus.
+
+Not from the log: the recorder may be the service that died.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import msgspec
+
+from shared.bus.messages import Cause, JointEvent, Mode, RunEvent, RunEventKind, SimTruth
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import lead
+from shared.robot.trip_table import JOINT_TRIPS
+from tools.lab.studies.crash.cases import CRASH_S, REQUEST_S, CrashCase, CrashVerdict, scenario_of
+from tools.runs.standing import is_tipping
+from tools.runs.verdict import LATE_MAX_S, REAL_TIME_FACTOR_MIN
+
+SANK_M: Final = 0.05
+"""So far below where the torso was, and where the hand led, a robot has sunk. HOLD's springs
+and the hand give way by 0.01 m."""
+END_TOLERANCE_S: Final = 0.1
+UNSAFE: Final = (Mode.FAULT, Mode.DAMP, Mode.DISARMED)
+"""What no module that was not hit may come to."""
+
+
+class Heard(NamedTuple):
+    """Messages of a run."""
+
+    truth: Sequence[SimTruth]
+    events: Sequence[tuple[str, JointEvent]]
+    """With the module, in the order of each module."""
+    said: Sequence[RunEvent]
+    """Actions on the run."""
+    modes: Sequence[str]
+    """The modules at the end, as in `scenario_runner.LiveSnapshot`."""
+    died: Sequence[str] = ()
+    """Services that ended without a request."""
+
+
+class CrashResult(msgspec.Struct, frozen=True, kw_only=True):
+    """The figures of a case; None where there is nothing to measure.
+
+    "Before" and "after" refer to the crash; restarts come later.
+    """
+
+    verdict: CrashVerdict
+    fell_after_s: float | None = None
+    """From the crash to the fall."""
+    safe_ms: float | None = None
+    """From the crash to HOLD, slowest of the modules that were not hit; None: not all held."""
+    torque_step_nm: float | None = None
+    """Largest step of their torques as they went to HOLD, N m."""
+    torque_step_back_nm: float | None = None
+    """Largest step of any module's torque at a change of mode after the request, N m."""
+    leads_again_s: float | None = None
+    """From the restart to the last module's TRACK; None: not all track, or never ceased to."""
+    com_x_mm: tuple[float, float] | None = None
+    """Smallest and largest, after the crash."""
+    com_y_mm: tuple[float, float] | None = None
+    sank_mm: float | None = None
+    """How far the torso came below where it was at the crash and where the hand led to."""
+    sole_tilt_max_rad: float | None = None
+    in_real_time: bool = True
+    """False: the machine was too slow, and the figures are not those of a robot."""
+    remarks: tuple[str, ...] = ()
+    """Deviations from the expected outcome, as text."""
+    tries: int = 1
+    wall_s: float = 0.0
+    """Start and stop of the fleet included."""
+
+
+def as_expected(case: CrashCase, outcome: CrashResult) -> bool:
+    """Return True if the robot came out of it no worse than it has to."""
+    return outcome.verdict.badness <= case.expected.badness
+
+
+def unjudged(reason: str) -> CrashResult:
+    """Return the outcome of a run that cannot be judged."""
+    return CrashResult(verdict=CrashVerdict.UNJUDGED, remarks=(reason,))
+
+
+def measure(case: CrashCase, heard: Heard, robot: RobotConfig) -> CrashResult:
+    """Return what came of a run."""
+    truth = [row for row in heard.truth if row.scenario_s >= 0.0]
+    if not truth:
+        return unjudged("the scenario never began")
+    zero_ns = truth[0].t_ns - round(truth[0].scenario_s * NS_PER_S)
+    crash_s = _crash_s(case, heard.said)
+    if crash_s is None:
+        return unjudged("its moment never came: the modules did not track again in time")
+    after = [row for row in truth if row.scenario_s >= crash_s]
+    if not after:
+        return unjudged(f"ended at {truth[-1].scenario_s:.1f} s, before the crash")
+    crash_ns = zero_ns + round(crash_s * NS_PER_S)
+    request_ns = zero_ns + round(REQUEST_S * NS_PER_S)
+    reaction = [(name, e) for name, e in heard.events if crash_ns <= e.t_ns < request_ns]
+    safe_ms = _safe_ms(case, heard.events, crash_ns, request_ns)
+    steps = [_step(e) for name, e in reaction if name in case.others and e.mode_after == Mode.HOLD]
+    later = [(name, e) for name, e in heard.events if e.t_ns >= request_ns]
+    fell_at = next((row.scenario_s for row in truth if row.fallen), None)
+    standing = [row for row in after if not row.fallen] or after[:1]
+    scenario = scenario_of(case)
+    lowest_hand = min(lead(scenario, row.scenario_s).height for row in after)
+    sank = max(0.0, min(after[0].torso[2], lowest_hand) - min(row.torso[2] for row in standing))
+    last = truth[-1]
+    verdict = CrashVerdict.STOOD
+    remarks = []
+    if fell_at is not None:
+        verdict = CrashVerdict.FELL
+    elif last.scenario_s < scenario.duration - END_TOLERANCE_S:
+        return unjudged(f"ended at {last.scenario_s:.1f} s of {scenario.duration:g} s")
+    elif is_tipping(last, robot):
+        verdict = CrashVerdict.FELL
+        remarks.append("not down yet at the end, but tipping")
+    elif sank > SANK_M:
+        verdict = CrashVerdict.SANK
+    remarks += _remarks(case, safe_ms, reaction)
+    remarks += [f"{name} ended by itself" for name in heard.died]
+    leads = all(mode == "T" for mode in heard.modes)
+    if verdict is not CrashVerdict.FELL and not leads and case.leads_again:
+        remarks.append(f"does not lead again: {''.join(heard.modes)}")
+    tracks = [e.t_ns for _, e in later if e.mode_after == Mode.TRACK]
+    backs = [row.t_ns for row in heard.said if _is(row, RunEventKind.RESTARTED, REQUEST_S)]
+    x, y = ([1e3 * row.over[axis] for row in standing] for axis in (0, 1))
+    return CrashResult(
+        verdict=verdict,
+        fell_after_s=None if fell_at is None else fell_at - crash_s,
+        safe_ms=safe_ms,
+        torque_step_nm=max(steps, default=None),
+        torque_step_back_nm=max((_step(e) for _, e in later), default=None),
+        leads_again_s=(max(tracks) - backs[0]) / NS_PER_S if leads and tracks and backs else None,
+        com_x_mm=(min(x), max(x)),
+        com_y_mm=(min(y), max(y)),
+        sank_mm=1e3 * sank,
+        sole_tilt_max_rad=max(max(row.foot_right_tilt, row.foot_left_tilt) for row in standing),
+        in_real_time=last.real_time_factor >= REAL_TIME_FACTOR_MIN and last.late_s <= LATE_MAX_S,
+        remarks=tuple(remarks),
+    )
+
+
+def _is(row: RunEvent, kind: RunEventKind, since_s: float) -> bool:
+    return row.kind == kind and row.scenario_s >= since_s
+
+
+def _crash_s(case: CrashCase, said: Sequence[RunEvent]) -> float | None:
+    """Return the scenario time of the crash, s: of the triggered kill, if there is one."""
+    kills = [
+        row.scenario_s
+        for row in said
+        if row.kind == RunEventKind.KILLED and row.scenario_s < REQUEST_S - END_TOLERANCE_S
+    ]
+    if case.triggered_kill is not None:
+        led_up = sum(1 for row in scenario_of(case).kill if row.at < CRASH_S)
+        return kills[led_up] if len(kills) > led_up else None
+    return kills[0] if kills else CRASH_S
+
+
+def _safe_ms(
+    case: CrashCase, events: Sequence[tuple[str, JointEvent]], crash_ns: int, request_ns: int
+) -> float | None:
+    """Return the time until every module that was not hit has left TRACK for HOLD, ms."""
+    slowest = None
+    for module in case.others:
+        own = [event for name, event in events if name == module]
+        before = [event.mode_after for event in own if event.t_ns < crash_ns]
+        if before and before[-1] == Mode.HOLD:
+            took = 0.0
+        else:
+            holds = [
+                event.t_ns
+                for event in own
+                if crash_ns <= event.t_ns < request_ns and event.mode_after == Mode.HOLD
+            ]
+            if not holds:
+                return None
+            took = (holds[0] - crash_ns) / NS_PER_MS
+        slowest = max(slowest or 0.0, took)
+    return slowest
+
+
+def _remarks(
+    case: CrashCase, safe_ms: float | None, reaction: Sequence[tuple[str, JointEvent]]
+) -> list[str]:
+    """Return the unexpected changes of mode of modules that were not hit, as text."""
+    words = []
+    changed = sorted({name for name, _ in reaction if name in case.others})
+    if case.holds and case.others and safe_ms is None:
+        words.append("not all of the other modules held")
+    if not case.holds and changed:
+        words.append(f"left TRACK: {', '.join(changed)}")
+    words += [
+        f"{name} went to {Mode(event.mode_after).name}"
+        for name, event in reaction
+        if name in case.others and event.mode_after in UNSAFE
+    ]
+    words += [
+        f"{name} tripped: {Cause(event.cause).name}"
+        for name, event in reaction
+        if event.cause in JOINT_TRIPS
+    ]
+    return words
+
+
+def _step(event: JointEvent) -> float:
+    return max(abs(b - a) for a, b in zip(event.tau_before, event.tau_after, strict=True))
