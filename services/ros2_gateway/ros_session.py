@@ -92,11 +92,6 @@ class RosSession:
         with contextlib.suppress(zenoh.ZError):  # it timed out: the process leaves anyway
             self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub
 
-    @property
-    def is_linked(self) -> bool:
-        """True if a router is there; for display."""
-        return bool(list(self._session.info.routers_zid()))
-
     def show_node(self) -> None:
         """Appear in the graph as a node."""
         self._show(rmw.node_token(self._node))

@@ -120,10 +120,6 @@ def run(args: argparse.Namespace) -> int:
     return 0 if all(one.stood for one in counterfactuals) else FELL_EXIT_CODE
 
 
-def _name(task: Task) -> str:
-    return f"{task.moment.at_s:g} s"
-
-
 def scenario_of(log: RunLog) -> Scenario:
     """Return the scenario of a run.
 

@@ -36,7 +36,6 @@ OTHER_ERROR: Final = 0x8000_0000
 """An error that `AxisError` has no name for, or of a drive whose dialect is not known yet."""
 
 _UNHEARD: Final = -1
-_TRAJECTORY_DONE: Final = 0x80
 _FINE: Final = (ProcedureResult.SUCCESS, ProcedureResult.BUSY, ProcedureResult.CANCELLED)
 
 _FROM_06: Final[tuple[tuple[DriveError06, int], ...]] = (
