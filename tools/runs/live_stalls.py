@@ -27,6 +27,7 @@ class LiveStalls:
         self._watch: StallWatch | None = None
         self._finder = StallFinder(self.cores, self._gaps)
         self._held = 0
+        self._began_ns = 0
 
     @contextlib.contextmanager
     def watched(self, path: Path) -> Iterator[None]:
@@ -34,17 +35,24 @@ class LiveStalls:
         with StallWatch(path) as self._watch:
             yield
 
+    def begin(self) -> None:
+        """Find stalls from now on; services that start stand still for reasons of their own."""
+        self._began_ns = self._began_ns or now_ns()
+
     def hear(self, module: str, state: JointState) -> None:
         """Take a state of a module."""
-        self._finder.hear(module, state)
+        if self._began_ns:
+            self._finder.hear(module, state)
 
     def see(self, truth: SimTruth) -> None:
         """Take a state of the simulated world."""
-        self._finder.see(truth)
+        if self._began_ns:
+            self._finder.see(truth)
 
     def take(self) -> list[Stall]:
         """Return what was found since the last call."""
         found = self._finder.take(now_ns(), pace())
+        found = [stall for stall in found if 0 < self._began_ns <= stall.begin_ns]
         if found:
             self.found += found
             self._held = 0
@@ -78,7 +86,8 @@ class LiveStalls:
         if not self.found:
             return words
         most_ms = max(stall.lasted_ms for stall in self.found)
-        return f"{words}; {len(self.found)} stalls so far, {most_ms:.0f} ms at most"
+        so_far = f"{len(self.found)} stall{'s' * (len(self.found) > 1)} so far"
+        return f"{words}; {so_far}, {most_ms:.0f} ms at most"
 
     def _gaps(self) -> list[Gap]:
         return self._watch.take() if self._watch is not None else []

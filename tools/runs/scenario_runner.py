@@ -256,6 +256,7 @@ class ScenarioRunner:
             if self._truth is not None and self._truth.fallen:
                 return False
             if all(tracking) and standing:
+                self._stalls.begin()
                 if since is None:
                     since, before = time.monotonic(), idle_and_total()
                 self._note = "standing, settling"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -194,6 +195,23 @@ def test_the_live_line_tells_who_held_by_a_stall_and_forgets_it_after_moments() 
     assert live.words(track) == f"{words}: all six held"
     live.found.append(Stall(now - 3 * NS_PER_S, now - round(2.5 * NS_PER_S), MACHINE))
     assert live.words(hold) == ""
+
+
+def test_what_stands_still_before_the_modules_track_is_no_stall() -> None:
+    live = LiveStalls()
+    for state in states_of([(100, 250)]):
+        for module in MODULES:
+            live.hear(module, state)
+    assert live.take() == []
+    live.begin()
+    now = now_ns()
+    for module in MODULES:
+        for after_ns, cycle in ((0, 1), (ms(80), 2)):
+            live.hear(module, sample(JointState, t_ns=now + after_ns, seq=cycle, cycle=cycle))
+    deadline = time.monotonic() + 10.0
+    while not live.found and time.monotonic() < deadline:
+        live.take()
+    assert [stall.who for stall in live.found] == [SERVICES]
 
 
 def test_how_the_machine_carries_the_fleet_is_told_with_its_stalls() -> None:
