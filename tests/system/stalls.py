@@ -10,7 +10,6 @@ from __future__ import annotations
 import atexit
 import os
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -37,7 +36,7 @@ def start_watch() -> None:
     os.close(handle)
     atexit.register(Path(path).unlink)
     os.environ[FILE_VARIABLE] = path
-    subprocess.Popen([sys.executable, "-I", "-S", stall_watch.__file__, path])
+    subprocess.Popen(stall_watch.command(Path(path)))
 
 
 def has_stalled(since_ns: int) -> bool:

@@ -115,8 +115,9 @@ def idle_share(before: tuple[int, int]) -> float:
 def idle_and_total() -> tuple[int, int]:
     """Return the idle and all ticks of every core since the machine started.
 
-    What is niced counts as idle: it gives way to a fleet.
+    What is niced counts as idle: it gives way to a fleet that is not.
     """
     fields = Path("/proc/stat").read_text(encoding="ascii").splitlines()[0].split()[1:]
     ticks = [int(field) for field in fields]
-    return ticks[1] + ticks[3] + ticks[4], sum(ticks)
+    niced = ticks[1] if os.nice(0) == 0 else 0
+    return niced + ticks[3] + ticks[4], sum(ticks)

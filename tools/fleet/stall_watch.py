@@ -1,7 +1,7 @@
 """Idle real-time threads, one a core: what delays them is the machine, and nothing that runs on it.
 
-Run as a program (`python stall_watch.py FILE`) it appends a line for each gap, and ends with the
-process that started it. It imports the standard library alone, so that it is up at once.
+Run as a program (`python stall_watch.py FILE PID`) it appends a line for each gap, and ends with
+PID, the process that started it. It imports the standard library alone, so that it is up at once.
 """
 
 from __future__ import annotations
@@ -23,6 +23,9 @@ PRIORITY: Final = 90
 CORES_MAX: Final = 8
 """With more cores one thread wanders: so many wake-ups would be a load of their own."""
 ANY_CORE: Final = -1
+"""No thread was bound to a core."""
+UNSURE: Final = -2
+"""The same, and without real time: a busy machine looks like one that stands still."""
 _STEAL_EVERY: Final = 50
 _STEAL_FIELD: Final = 8
 _NS_PER_TICK: Final = 1_000_000_000 // os.sysconf("SC_CLK_TCK")
@@ -34,7 +37,7 @@ class Gap(NamedTuple):
     end_ns: int
     lasted_ns: int
     core: int
-    """`ANY_CORE`: no thread was bound to one."""
+    """Its number, `ANY_CORE` or `UNSURE`."""
     stolen_ns: int
     """So much of it the host of a virtual machine took away, by /proc/stat, in ticks of 10 ms."""
 
@@ -50,8 +53,9 @@ class StallWatch:
         """Start."""
         self._path.touch()
         self._file = self._path.open("rb")
+        # a session of its own: Ctrl-C in the terminal is for the tool alone, and Ctrl-Z no stall
         self._process = subprocess.Popen(
-            [sys.executable, "-I", "-S", __file__, str(self._path)], stdin=subprocess.DEVNULL
+            command(self._path), stdin=subprocess.DEVNULL, start_new_session=True
         )
         return self
 
@@ -69,6 +73,11 @@ class StallWatch:
         return [_parsed(line) for line in lines]
 
 
+def command(path: Path) -> list[str]:
+    """Return the program's words; it ends with this process."""
+    return [sys.executable, "-I", "-S", __file__, str(path), str(os.getpid())]
+
+
 def gaps_in(path: Path, from_ns: int = 0) -> list[Gap]:
     """Return what was written, from a time on; a last line that is not whole is left out."""
     lines = path.read_bytes().splitlines(keepends=True)
@@ -80,16 +89,16 @@ def _parsed(line: bytes) -> Gap:
     return Gap(*map(int, line.split()))
 
 
-def watch(path: Path) -> None:
+def watch(path: Path, parent: int) -> None:
     """Write gaps until the process that started this one is no more."""
-    parent = os.getppid()
     descriptor = os.open(path, os.O_WRONLY | os.O_APPEND)
     cores = sorted(os.sched_getaffinity(0))
     # A thread without real time waits its turn: on its core it would take other work for a stall.
-    bound = _takes_real_time() and len(cores) <= CORES_MAX
+    real_time = _takes_real_time()
+    bound = real_time and len(cores) <= CORES_MAX
     for core in cores[1:] if bound else ():
         threading.Thread(target=_watch_core, args=(descriptor, core, parent)).start()
-    _watch_core(descriptor, cores[0] if bound else ANY_CORE, parent)
+    _watch_core(descriptor, cores[0] if bound else ANY_CORE if real_time else UNSURE, parent)
 
 
 def _takes_real_time() -> bool:
@@ -100,7 +109,7 @@ def _takes_real_time() -> bool:
 
 
 def _watch_core(descriptor: int, core: int, parent: int) -> None:
-    if core != ANY_CORE:
+    if core >= 0:
         os.sched_setaffinity(0, {core})
     looks, stolen_ns, last_ns = 0, _stolen_ns(core), time.monotonic_ns()
     while os.getppid() == parent:
@@ -119,7 +128,7 @@ def _watch_core(descriptor: int, core: int, parent: int) -> None:
 
 def _stolen_ns(core: int) -> int:
     """Return the time stolen from a core since the machine started; of all cores together."""
-    name = b"cpu " if core == ANY_CORE else b"cpu%d " % core
+    name = b"cpu%d " % core if core >= 0 else b"cpu "
     for line in Path("/proc/stat").read_bytes().splitlines():
         if line.startswith(name):
             fields = line.split()
@@ -128,4 +137,4 @@ def _stolen_ns(core: int) -> int:
 
 
 if __name__ == "__main__":
-    watch(Path(sys.argv[1]))
+    watch(Path(sys.argv[1]), int(sys.argv[2]))

@@ -85,7 +85,7 @@ def draw(log: RunLog, name: str, summary: Summary, path: Path) -> None:
     _modes(axes[-1], log, zero_ns, end_s)
     plots = [*axes[:4], *axes[-2:]]
     _events(plots, log.messages(topics.RUN_EVENT))
-    _stalls(plots, summary["stalls"], end_s)
+    _stalls(plots, summary["stalls"])
     if network:
         _network(axes[4], network, zero_ns, end_s)
         _shade(plots, network, zero_ns, end_s)
@@ -214,14 +214,14 @@ def _events(axes: Any, events: list[RunEvent]) -> None:
         )
 
 
-def _stalls(axes: Any, stalls: Sequence[dict[str, Any]], end_s: float) -> None:
-    """Shade stalls, and the time for which modules held because of them."""
+def _stalls(axes: Any, stalls: Sequence[dict[str, Any]]) -> None:
+    """Shade stalls, and the time that is judged apart because of them."""
     for row in stalls:
         begin, end = row["at_s"], row["at_s"] + row["lasted_ms"] / 1e3
         for axis in axes:
             axis.axvspan(begin, end, color=STALLED_COLOUR, alpha=0.8, lw=0.0, zorder=0)
             if row["modules_held"]:
-                axis.axvspan(begin, row["held_until_s"] or end_s, alpha=0.15,
+                axis.axvspan(begin, row["apart_until_s"], alpha=0.15,
                              color=STALLED_COLOUR, lw=0.0, zorder=0)  # fmt: skip
         if row["modules_held"]:
             axes[0].annotate(

@@ -51,7 +51,13 @@ class LiveStalls:
 
     def take(self) -> list[Stall]:
         """Return what was found since the last call."""
-        found = self._finder.take(now_ns(), pace())
+        return self._kept(self._finder.take(now_ns(), pace()))
+
+    def rest(self) -> list[Stall]:
+        """Return what was found at the end of a run."""
+        return self.take() + self._kept(self._finder.rest())
+
+    def _kept(self, found: list[Stall]) -> list[Stall]:
         found = [stall for stall in found if 0 < self._began_ns <= stall.begin_ns]
         if found:
             self.found += found

@@ -34,6 +34,7 @@ from tools.fleet.pace import IDLE_LEAST, CoresFullError, IdleMeter, idle_and_tot
 from tools.fleet.proxy_client import ProxyClient
 from tools.fleet.supervise import SupervisedFleet
 from tools.runs.live_stalls import LiveStalls
+from tools.runs.stalls import Stall
 
 READY_TIMEOUT_S: Final = 45.0
 """Longer than all that a planner waits after the first five drop-outs: a machine may stall."""
@@ -216,6 +217,7 @@ class ScenarioRunner:
             self._follow(scenario_s)
             time.sleep(POLL_S)
         meter.sample(self._pids.values())
+        self._tell_stalls(self._stalls.rest())
         self._say(RunEventKind.FINISHED, self._scenario.name, "")
         time.sleep(LAST_WORDS_S)
         return EndOfRun(meter.share_pct, ended_at_s)
@@ -303,8 +305,8 @@ class ScenarioRunner:
         self._start_ns = self._truth.t_ns - round(self._truth.scenario_s * NS_PER_S)
         self._say(RunEventKind.STARTED, self._scenario.name, "")
 
-    def _look_for_stalls(self) -> None:
-        for stall in self._stalls.take():
+    def _tell_stalls(self, found: Iterable[Stall]) -> None:
+        for stall in found:
             self._said += 1
             event = stall.event(self._said, self._start_ns or stall.begin_ns + NS_PER_S)
             self.said.append(event)
@@ -312,7 +314,6 @@ class ScenarioRunner:
 
     def _listen(self) -> None:
         """Receive new messages and show them."""
-        self._look_for_stalls()
         for module, latest in self._states.items():
             state = latest.take()
             if state is not None:
@@ -335,6 +336,7 @@ class ScenarioRunner:
             self._show(LiveSnapshot(truth, modes, note))
         elif time.monotonic() - self._truth_at_s > SILENT_S and self._start_ns:
             raise RunError(f"the simulator has said nothing for {SILENT_S:.0f} s; see its log")
+        self._tell_stalls(self._stalls.take())
 
     def _act(self, row: Kill | Restart | Push | Fault | Inject) -> None:
         """Do what is due; the simulator does pushes and faults, and they are only recorded here."""

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from services.joint.loop import READ_TIMEOUT_S
 from shared.bus import topics
-from shared.bus.code_names import name_of
 from shared.bus.messages import (
     Cause,
     JointEvent,
@@ -30,12 +29,17 @@ from shared.bus.messages import (
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.mcap_log.sequence_stats import KeyCount
 from shared.robot.joints import MODULES
-from tools.fleet.stall_watch import ANY_CORE, GAP_NS, Gap
+from tools.fleet.stall_watch import ANY_CORE, GAP_NS, UNSURE, Gap
 from tools.runs.run_log import RunLog
 
 MACHINE: Final = "the machine"
 SERVICES: Final = "all joint services"
 SIMULATOR: Final = "the simulator"
+ALL: Final = "all services"
+"""Joint services and simulator."""
+A_THREAD: Final = "a thread"
+WORLD_STOPS: Final = (MACHINE, ALL, SIMULATOR)
+"""While these stand still the simulated world does."""
 CYCLE_MAX_NS: Final = round(READ_TIMEOUT_S * NS_PER_S)
 """Longest cycle of a joint service that runs: its drive is silent."""
 TRUTH_NS: Final = round(NS_PER_S / topics.SIM_TRUTH.rate_hz)
@@ -43,9 +47,14 @@ PERIOD_NS: Final = round(NS_PER_S / topics.JOINT_STATE.rate_hz)
 ALIVE_NS: Final = NS_PER_S
 """A module that was silent for longer before a stall has no part in it."""
 MERGE_NS: Final = 50 * NS_PER_MS
-"""So late two ways of finding one stall tell it."""
+"""Two ways of finding one stall report it within this time of each other."""
+LASTED_MAX_MS: Final = 1e9
 DROP_OUT_NS: Final = 150 * NS_PER_MS
 """A module that loses TRACK so soon after a stall does so for it: commands grow too old."""
+EXCUSE_MIN_MS: Final = 30.0
+"""A shorter stall makes no command 50 ms old: most are some 10 ms old when they are used."""
+EXCUSED_MAX_NS: Final = 5 * NS_PER_S
+"""Modules that do not track again so long after a stall hold for a reason of their own."""
 CATCH_UP_NS: Final = NS_PER_S
 """So long after the modules track again the robot catches up with the hand."""
 STALL_SHOWN_NS: Final = 2 * NS_PER_S
@@ -62,7 +71,7 @@ class Stall(NamedTuple):
     begin_ns: int
     end_ns: int
     who: str
-    """`MACHINE`, one of its cores, `SERVICES` or `SIMULATOR`."""
+    """`MACHINE`, some of its cores, `ALL`, `SERVICES` or `SIMULATOR`."""
     stolen_ms: float = 0.0
     """So much of it was taken by the host of a virtual machine."""
 
@@ -98,11 +107,12 @@ def stalls_of(events: Iterable[RunEvent]) -> list[Stall]:
             continue
         try:
             lasted_ms, stolen_ms = float(words[0]), float(words[3])
-            begin_ns = event.t_ns - round(lasted_ms * NS_PER_MS)
-        except (ValueError, OverflowError):  # written by hand: infinite, or no number
+        except ValueError:  # written by hand
             continue
-        found.append(Stall(begin_ns, event.t_ns, event.subject, stolen_ms))
-    return found
+        if 0.0 < lasted_ms < LASTED_MAX_MS and 0.0 <= stolen_ms < LASTED_MAX_MS:
+            begin_ns = event.t_ns - round(lasted_ms * NS_PER_MS)
+            found.append(Stall(begin_ns, event.t_ns, event.subject, stolen_ms))
+    return sorted(found)
 
 
 class Silence:
@@ -116,6 +126,12 @@ class Silence:
         """Take the longest time in which the count of a sender that runs grows by one."""
         self._step_ns = step_ns
         self.last_ns, self._count = -1, -1
+        self._silent_in_a_row = 0
+
+    @property
+    def is_slow(self) -> bool:
+        """True if one silence follows the other: it is its pace, and no stall."""
+        return self._silent_in_a_row > 1
 
     def feed(self, t_ns: int, count: int) -> tuple[int, int] | None:
         """Return begin and end of the silence before a message, if it is a stall."""
@@ -125,7 +141,9 @@ class Silence:
         self.last_ns, self._count = t_ns, count
         silent_ns = t_ns - last_ns - (steps - 1) * self._step_ns
         if last_ns < 0 or steps < 0 or silent_ns <= self._step_ns + GAP_NS:
+            self._silent_in_a_row = 0
             return None
+        self._silent_in_a_row += 1
         return last_ns, last_ns + silent_ns
 
 
@@ -180,7 +198,7 @@ class StallFinder:
     def see(self, truth: SimTruth) -> None:
         """Take a state of the simulated world."""
         silent = self._world.feed(truth.t_ns, truth.seq)
-        if silent is not None:
+        if silent is not None and not self._world.is_slow:
             self._pending.append(Stall(*silent, SIMULATOR))
 
     def take(self, now_ns: int, pace: float) -> list[Stall]:
@@ -192,24 +210,34 @@ class StallFinder:
         """
         for gap in self._gaps():
             end_ns, lasted_ns = int(pace * gap.end_ns), int(pace * gap.lasted_ns)
-            who = MACHINE if gap.core == ANY_CORE else f"core {gap.core}"
+            who = {ANY_CORE: MACHINE, UNSURE: A_THREAD}.get(gap.core, f"core {gap.core}")
             stolen_ms = pace * gap.stolen_ns / NS_PER_MS
             self._pending.append(Stall(end_ns - lasted_ns, end_ns, who, stolen_ms))
-        if not self._pending or now_ns < MERGE_NS + max(row.end_ns for row in self._pending):
-            return []
+        groups = _overlapping(self._pending)
+        done = [group for group in groups if now_ns >= MERGE_NS + max(row.end_ns for row in group)]
+        self._pending = [row for group in groups if group not in done for row in group]
+        return merged([row for group in done for row in group], self._cores)
+
+    def rest(self) -> list[Stall]:
+        """Return what no other way of finding it can add to any more: the run is over."""
         found, self._pending = merged(self._pending, self._cores), []
         return found
 
 
 def merged(stalls: Iterable[Stall], cores: int) -> list[Stall]:
-    """Return stalls that overlap as one: the machine's if it, or all its cores, had a part in it.
+    """Return stalls that overlap as one, of all that stood still.
 
-    A core's goes before that of services, and theirs before the simulator's.
+    What a thread without real time saw alone is left out.
 
     Args:
         stalls: in any order.
         cores: that are watched, each by itself.
     """
+    found = (_joined(group, cores) for group in _overlapping(stalls))
+    return [stall for stall in found if stall.who != A_THREAD]
+
+
+def _overlapping(stalls: Iterable[Stall]) -> list[list[Stall]]:
     groups: list[list[Stall]] = []
     end_ns = -1
     for stall in sorted(stalls):
@@ -218,16 +246,22 @@ def merged(stalls: Iterable[Stall], cores: int) -> list[Stall]:
             end_ns = stall.end_ns
         groups[-1].append(stall)
         end_ns = max(end_ns, stall.end_ns)
-    return [_joined(group, cores) for group in groups]
+    return groups
 
 
 def _joined(group: Sequence[Stall], cores: int) -> Stall:
     names = {row.who for row in group}
-    cores_of = sorted(names - {MACHINE, SERVICES, SIMULATOR})
-    if MACHINE in names or len(cores_of) >= max(cores, 2):
+    numbers = sorted(int(name.removeprefix("core ")) for name in names if name.startswith("core "))
+    on_cores = [row for row in group if row.who.startswith("core ")]
+    together = on_cores and max(r.begin_ns for r in on_cores) < min(r.end_ns for r in on_cores)
+    if MACHINE in names or (len(numbers) >= cores and together):
         who = MACHINE
+    elif numbers:
+        who = f"core{'s' * (len(numbers) > 1)} {', '.join(map(str, numbers))}"
+    elif {SERVICES, SIMULATOR} <= names:
+        who = ALL
     else:
-        who = " and ".join(cores_of) or (SERVICES if SERVICES in names else SIMULATOR)
+        who = next(name for name in (SERVICES, SIMULATOR, A_THREAD) if name in names)
     return Stall(
         min(row.begin_ns for row in group),
         max(row.end_ns for row in group),
@@ -249,7 +283,11 @@ class Disturbance(NamedTuple):
 
 
 def disturbances(log: RunLog, begin_ns: int, end_ns: int) -> list[Disturbance]:
-    """Return what each stall of a part of a run made of it.
+    """Return what each stall made of a part of a run, also of one that came before the part.
+
+    A drop-out is a stall's doing only if commands grew too old right after it, it was long enough,
+    and not the joint services alone stood still: what makes all six wait may be our own fault.
+    After a kill or a fault none is: it may be that one's.
 
     Args:
         log: the run.
@@ -257,36 +295,47 @@ def disturbances(log: RunLog, begin_ns: int, end_ns: int) -> list[Disturbance]:
         end_ns: of the part; what a stall made ends there at the latest.
     """
     events: list[RunEvent] = log.messages(topics.RUN_EVENT)
-    stalls = [row for row in stalls_of(events) if begin_ns <= row.begin_ns <= end_ns]
+    stalls = [row for row in stalls_of(events) if row.begin_ns <= end_ns]
     if not stalls:
         return []
-    kills = [row.t_ns for row in events if row.kind == RunEventKind.KILLED]
-    transitions = {name: log.messages(topics.JOINT_EVENT, name) for name in MODULES}
+    own = (RunEventKind.KILLED, RunEventKind.FAULTED)
+    limit_ns = min([row.t_ns for row in events if row.kind in own] + [end_ns])
+    transitions = [log.messages(topics.JOINT_EVENT, name) for name in MODULES]
     found = []
     for stall in stalls:
-        limit_ns = min([t_ns for t_ns in kills if t_ns >= stall.begin_ns] + [end_ns])
-        backs_ns = [
-            back_ns
-            for rows in transitions.values()
-            if (back_ns := _back_ns(rows, stall)) is not None
-        ]
-        until_ns = max(backs_ns, default=stall.end_ns)
-        held_until_ns = int(until_ns) if backs_ns and until_ns < limit_ns else None
-        catch_up_ns = CATCH_UP_NS if backs_ns else PERIOD_NS
-        last_ns = int(min(until_ns + catch_up_ns, limit_ns))
-        found.append(Disturbance(stall, stall.begin_ns, last_ns, held_until_ns, len(backs_ns)))
+        backs_ns = [] if stall.who == SERVICES else _backs_ns(transitions, stall, limit_ns)
+        last_ns, held_until_ns = stall.end_ns + PERIOD_NS, None
+        if backs_ns:
+            most_ns = min(stall.end_ns + EXCUSED_MAX_NS, limit_ns)
+            held_until_ns = int(max(backs_ns)) if max(backs_ns) <= most_ns else None
+            last_ns = min(most_ns, (held_until_ns or most_ns) + CATCH_UP_NS)
+        if last_ns >= begin_ns:
+            last_ns = min(last_ns, end_ns)
+            found.append(Disturbance(stall, stall.begin_ns, last_ns, held_until_ns, len(backs_ns)))
     return found
 
 
-def _back_ns(rows: Sequence[JointEvent], stall: Stall) -> float | None:
-    """Return when a module that a stall made hold tracked again; infinite if it never did."""
-    dropped = False
-    for row in rows:
-        if dropped and row.mode_after == Mode.TRACK:
-            return row.t_ns
-        in_time = stall.begin_ns <= row.t_ns <= stall.end_ns + DROP_OUT_NS
-        dropped |= in_time and row.mode_before == Mode.TRACK and row.mode_after != Mode.DAMP
-    return math.inf if dropped else None
+def _backs_ns(
+    transitions: Sequence[Sequence[JointEvent]], stall: Stall, limit_ns: int
+) -> list[float]:
+    """Return when each module that a stall made hold tracked again; infinite if it never did."""
+    found: dict[int, float] = {}
+    stale = False
+    for module, rows in enumerate(transitions):
+        for row in rows:
+            if module in found and found[module] == math.inf and row.mode_after == Mode.TRACK:
+                found[module] = row.t_ns
+            if _is_excused(row, stall) and row.t_ns < limit_ns:
+                found.setdefault(module, math.inf)
+                stale |= row.cause == Cause.COMMAND_STALE
+    enough = stale and stall.lasted_ms >= EXCUSE_MIN_MS
+    return list(found.values()) if enough else []
+
+
+def _is_excused(row: JointEvent, stall: Stall) -> bool:
+    in_time = stall.begin_ns <= row.t_ns <= stall.end_ns + DROP_OUT_NS
+    into_hold = row.mode_before == Mode.TRACK and row.mode_after == Mode.HOLD
+    return in_time and into_hold and row.cause in (Cause.COMMAND_STALE, Cause.HOLD_ALL)
 
 
 def inside(rows: Iterable[Disturbance], times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -308,8 +357,9 @@ def as_dicts(
         truth: of the part that is judged.
         zero_ns: of the times, which are s.
     """
-    lost = _lost(log, rows)
     times_ns = np.array([row.t_ns for row in truth])
+    rows = [row for row in rows if row.begin_ns >= times_ns[0]]
+    lost = _lost(log, rows)
     found = []
     for row, missing in zip(rows, lost, strict=True):
         first, last = np.searchsorted(times_ns, (row.begin_ns, row.end_ns + 1))
@@ -321,6 +371,7 @@ def as_dicts(
             "stolen_ms": row.stall.stolen_ms,
             "modules_held": row.held,
             "held_until_s": row.held_until_ns and (row.held_until_ns - zero_ns) / NS_PER_S,
+            "apart_until_s": (row.end_ns - zero_ns) / NS_PER_S,
             "operator_peak_n": max((abs(one.operator_force[2]) for one in meanwhile), default=None),
             "com_x_max_mm": max((1e3 * abs(one.over[0]) for one in meanwhile), default=None),
             "messages_lost": missing,
@@ -336,9 +387,11 @@ def _said(words: str, values: dict[str, Any]) -> str:
         who = "all six" if values["modules_held"] == len(MODULES) else values["modules_held"]
         until = values["held_until_s"]
         parts[0] += f": {who} held" + (f" until {until:.2f} s" if until is not None else "")
+        if until is None:
+            parts.append("and did not track again soon")
         if values["operator_peak_n"] is not None:
-            parts.append(f"hand at most {values['operator_peak_n']:.1f} N then")
-            parts.append(f"COM x at most {values['com_x_max_mm']:.1f} mm")
+            parts.append(f"hand force up to {values['operator_peak_n']:.1f} N meanwhile")
+            parts.append(f"COM x up to {values['com_x_max_mm']:.1f} mm")
     if values["messages_lost"]:
         parts.append(f"messages lost: {values['messages_lost']}")
     return ", ".join(parts)
@@ -361,26 +414,31 @@ def _lost(log: RunLog, rows: Sequence[Disturbance]) -> list[int]:
     return found
 
 
-def drop_outs(log: RunLog, rows: Sequence[Disturbance], zero_ns: int, end_ns: int) -> list[str]:
-    """Return a line for each time that modules left TRACK, and no stall was the reason.
+def drop_outs(
+    log: RunLog, rows: Sequence[Disturbance], zero_ns: int, begin_ns: int, end_ns: int
+) -> list[str]:
+    """Return a line for each time that modules held for old commands, and no stall was the reason.
 
     Args:
         log: the run.
         rows: what the stalls made of it.
-        zero_ns: from here on; times are s since then.
+        zero_ns: of the times, which are s.
+        begin_ns: from here on.
         end_ns: up to here.
     """
+    excused = [row.stall for row in rows if row.held]
     found = sorted(
-        (event.t_ns, module, name_of(Cause, event.cause))
+        (event.t_ns, module)
         for module in MODULES
         for event in log.messages(topics.JOINT_EVENT, module)
-        if event.mode_before == Mode.TRACK and zero_ns <= event.t_ns < end_ns
+        if event.mode_before == Mode.TRACK
+        and event.mode_after == Mode.HOLD
+        and event.cause in (Cause.COMMAND_STALE, Cause.HOLD_ALL)
+        and begin_ns <= event.t_ns < end_ns
+        and not any(_is_excused(event, stall) for stall in excused)
     )
-    apart = inside(rows, np.array([t_ns for t_ns, *_ in found], np.int64))
-    groups: list[list[tuple[int, str, str]]] = []
-    for row, is_apart in zip(found, apart, strict=True):
-        if is_apart:
-            continue
+    groups: list[list[tuple[int, str]]] = []
+    for row in found:
         if not groups or row[0] - groups[-1][0][0] > TOGETHER_NS:
             groups.append([])
         groups[-1].append(row)
@@ -388,20 +446,22 @@ def drop_outs(log: RunLog, rows: Sequence[Disturbance], zero_ns: int, end_ns: in
     sent_ns = np.array([row.t_ns for row in statuses], np.int64)
     lines = []
     for group in groups:
-        modules = [module for _, module, _ in group]
+        modules = [module for _, module in group]
         who = "all six" if len(set(modules)) == len(MODULES) else ", ".join(modules)
-        why = ", ".join(sorted({cause for *_, cause in group}))
-        at_ns = group[0][0]
-        silent_ms = _longest_gap_ms(sent_ns, at_ns - DROP_OUT_NS, at_ns)
-        known = "no stall was measured then"
-        if silent_ms:
-            known = f"the planner sent nothing for {silent_ms:.0f} ms"
-        lines.append(f"{(at_ns - zero_ns) / NS_PER_S:.2f} s: {who} left TRACK, {why}; {known}")
+        known = _planners_silence(sent_ns, group[0][0]) or "no stall was measured then"
+        at_s = (group[0][0] - zero_ns) / NS_PER_S
+        lines.append(f"{at_s:.2f} s: {who} held without a stall; {known}")
     return lines
 
 
-def _longest_gap_ms(sent_ns: NDArray[np.int64], begin_ns: int, end_ns: int) -> float:
-    """Return the longest gap between messages of a time, ms; 0.0 if each came as it should."""
-    near = sent_ns[(sent_ns >= begin_ns) & (sent_ns <= end_ns + DROP_OUT_NS)]
-    longest_ns = int(np.diff(near).max(initial=0))
-    return longest_ns / NS_PER_MS if longest_ns > PERIOD_NS + GAP_NS else 0.0
+def _planners_silence(sent_ns: NDArray[np.int64], at_ns: int) -> str:
+    """Return how long the planner sent nothing around a time; empty if it sent as it should."""
+    place = int(np.searchsorted(sent_ns, at_ns))
+    if place == len(sent_ns):
+        return "the planner sent nothing any more"
+    near = sent_ns[(sent_ns >= at_ns - DROP_OUT_NS) & (sent_ns <= at_ns)]
+    before = sent_ns[max(place - 1 - len(near), 0) : place + 1]
+    longest_ns = int(np.diff(before).max(initial=0))
+    if longest_ns <= PERIOD_NS + GAP_NS:
+        return ""
+    return f"the planner sent nothing for {longest_ns / NS_PER_MS:.0f} ms"

@@ -34,6 +34,7 @@ from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog
 from tools.runs.soundness import soundness, why_not_sound
 from tools.runs.stalls import (
+    WORLD_STOPS,
     Disturbance,
     Stall,
     as_dicts,
@@ -43,9 +44,13 @@ from tools.runs.stalls import (
     stalls_of,
 )
 from tools.runs.standing import why_not_standing
+from tools.runs.verdict_limits import LIMITS
 
 Array = NDArray[np.float64]
 Summary = dict[str, Any]
+
+KILLED, RESTARTED = RunEventKind.KILLED, RunEventKind.RESTARTED
+FAULTED = RunEventKind.FAULTED
 
 REAL_TIME_FACTOR_MIN: Final = 0.99
 LATE_MAX_S: Final = 0.05
@@ -124,7 +129,7 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
         "real_time_factor": last.real_time_factor,
         "world_time_lost_s": last.late_s,
         "in_real_time": _in_real_time(
-            last, [row for row in stalls_of(events) if row.end_ns > zero_ns]
+            last, [row for row in stalls_of(events) if zero_ns < row.end_ns <= last.t_ns]
         ),
     }
     times_ns = np.array([row.t_ns for row in truth])
@@ -167,39 +172,48 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
     summary["sequence_gaps"] = sum(count.missing for count in log.gaps().values())
     summary["stalls"] = as_dicts(log, disturbed, truth, zero_ns)
     summary["across_stalls"] = _across(summary, events, disturbed)
-    kill_ns = kills[0].t_ns if kills else last.t_ns
-    summary["drop_outs"] = [] if network else drop_outs(log, disturbed, zero_ns, kill_ns)
+    done_ns = [row.t_ns for row in events if row.kind in (KILLED, FAULTED)]
+    until_ns = min([*done_ns, last.t_ns])
+    summary["drop_outs"] = []
+    if not network and not log.metadata.get("run", {}).get("lockstep"):
+        begin_ns = max(zero_ns, truth[0].t_ns)
+        summary["drop_outs"] = drop_outs(log, disturbed, zero_ns, begin_ns, until_ns)
     return summary
 
 
 def _in_real_time(last: SimTruth, stalls: Sequence[Stall]) -> bool:
-    """Return True if the world kept up with the clock, but for the stalls."""
-    stood_still_s = sum(row.lasted_ms for row in stalls) / 1e3
-    wall_s = last.scenario_s / max(last.real_time_factor, 1e-9)
-    ran_s = max(wall_s - stood_still_s, 1e-9)
-    factor = last.scenario_s / ran_s if stalls else last.real_time_factor
+    """Return True if the world kept up with the clock, but for the stalls in which it stopped."""
+    stood_still_s = sum(row.lasted_ms for row in stalls if row.who in WORLD_STOPS) / 1e3
+    factor = last.real_time_factor
+    if stood_still_s and last.scenario_s > 0.0:
+        wall_s = last.scenario_s / max(factor, 1e-9)
+        factor = last.scenario_s / max(wall_s - stood_still_s, 1e-9)
     return factor >= REAL_TIME_FACTOR_MIN and last.late_s - stood_still_s <= LATE_MAX_S
 
 
 def _across(
     summary: Summary, events: Sequence[RunEvent], disturbed: Sequence[Disturbance]
 ) -> list[str]:
-    """Return the keys of the figures that a stall made what they are."""
-    lost = sum(row["messages_lost"] for row in summary["stalls"])
-    found = ["sequence_gaps"] if lost and lost >= summary["sequence_gaps"] else []
-    handover_s = (summary["handover_max_ms"] or 0.0) / 1e3
-    for kind, lasted_s, keys in (
-        (RunEventKind.KILLED, handover_s, ("handover_max_ms", "handover_torque_step_nm")),
-        (RunEventKind.RESTARTED, summary["reengage_s"] or 0.0, ("reengage_s",)),
-    ):
-        begins_ns = [event.t_ns for event in events if event.kind == kind][:1]
-        if any(
-            row.begin_ns <= begin_ns + lasted_s * NS_PER_S and row.stall.end_ns >= begin_ns
+    """Return the keys of the figures that would be within their limits but for a stall."""
+    found = []
+    for kind, key, unit_s in ((KILLED, "handover_max_ms", 1e-3), (RESTARTED, "reengage_s", 1.0)):
+        begins_ns = [event.t_ns for event in events if event.kind == kind]
+        if not begins_ns or summary[key] is None:
+            continue
+        begin_ns, end_ns = begins_ns[0], begins_ns[0] + summary[key] * unit_s * NS_PER_S
+        overlaps_ns = [
+            max(0.0, min(end_ns, row.stall.end_ns) - max(begin_ns, row.begin_ns))
             for row in disturbed
-            for begin_ns in begins_ns
-        ):
-            found += keys
-    return found
+        ]
+        limit = next(row.limit for row in LIMITS if row.key == key)
+        if summary[key] - sum(overlaps_ns) / NS_PER_S / unit_s <= limit:
+            found.append(key)
+    return found + _lost_in_stalls(summary)
+
+
+def _lost_in_stalls(summary: Mapping[str, Any]) -> list[str]:
+    lost = sum(row["messages_lost"] for row in summary["stalls"])
+    return ["sequence_gaps"] if lost and lost >= summary["sequence_gaps"] else []
 
 
 def fell(summary: Mapping[str, Any]) -> bool:
@@ -247,9 +261,13 @@ def joined(parts: Sequence[Summary], counts: Iterable[KeyCount]) -> Summary:
                 }
         elif not isinstance(found[0], bool):
             summary[key] = min(found) if key in LEAST else max(found)
-    summary["stalls"] = [row for part in parts for row in part["stalls"]]
+    told = {(row["at_s"], row["who"]): row for part in parts for row in part["stalls"]}
+    summary["stalls"] = list(told.values())
+    summary["drop_outs"] = list(dict.fromkeys(line for p in parts for line in p["drop_outs"]))
     totals = sum(one.count for one in counted), sum(one.missing for one in counted)
     summary |= dict(zip(COUNTED, totals, strict=True))
+    across = {key for part in parts for key in part["across_stalls"]} - {"sequence_gaps"}
+    summary["across_stalls"] = sorted(across) + _lost_in_stalls(summary)
     fallen = [part["fallen_at_s"] for part in parts if part["fallen_at_s"] is not None]
     summary["fallen_at_s"] = min(fallen, default=None)
     stands = (last["stood"] or bool(last["unsound"])) and not fallen

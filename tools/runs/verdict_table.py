@@ -90,15 +90,17 @@ def stalls(summary: Summary) -> list[str]:
     After them each drop-out that no stall explains.
     """
     rows = summary["stalls"]
-    told = [row for row in rows if row["modules_held"] or row["messages_lost"]][:STALLS_MAX]
+    told = [row for row in rows if row["modules_held"] or row["messages_lost"]]
     rest = [row["lasted_ms"] for row in rows if row not in told]
-    lines = [row["said"] for row in told]
+    lines = [row["said"] for row in told[:STALLS_MAX]]
+    if len(told) > STALLS_MAX:
+        lines.append(f"{len(told) - STALLS_MAX} more stalls with consequences")
     if rest:
         stalls_are = "stall was" if len(rest) == 1 else "stalls were"
         lines.append(f"{len(rest)} {'more ' if told else ''}{stalls_are} without consequence: "
                      f"{max(rest):.0f} ms{' at most' if len(rest) > 1 else ''}")  # fmt: skip
     if told:
-        lines.append("The figures above leave out what a stall made of the run.")
+        lines.append("Figures marked led or held leave out what a stall made of the run.")
     lines += summary["drop_outs"]
     return lines
 

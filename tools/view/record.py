@@ -7,7 +7,8 @@ from typing import Any
 
 import msgspec
 
-from shared.bus.messages import Message
+from shared.bus import topics
+from shared.bus.messages import Message, RunEventKind
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
@@ -47,9 +48,12 @@ class RecordSource(Source):
         self.title = str(log.path)
         self._data = RunData(log)
         self._newest = Newest(robot)
-        wanted = [(topic, "") for topic in SHOWN]
+        wanted = [(topic, "") for topic in SHOWN if topic is not topics.RUN_EVENT]
         wanted += [(topic, module) for topic in SHOWN_OF_MODULES for module in MODULES]
         self._keys = [_Key(topic, m, log.messages(topic, m)) for topic, m in wanted]
+        stalls = [row for row in log.messages(topics.RUN_EVENT) if row.kind == RunEventKind.STALLED]
+        stalls.sort(key=lambda row: row.t_ns)  # each tells when it ended, and is told later
+        self._keys.append(_Key(topics.RUN_EVENT, "", stalls))
         self._marks = tuple(
             Mark(event.t, event.kind, event.text) for event in timeline_events(self._data)
         )

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from shared.bus import topics
 from shared.bus.messages import PlannerMode
-from shared.clock import NS_PER_S
 from shared.robot.joints import JOINTS, MODULES
 from tools.analysis.reports.page_model import TimelineEvent
 from tools.analysis.reports.run_data import RunData
@@ -120,7 +119,7 @@ def _world(run: RunData) -> Iterator[Violation]:
     if run.course is None:
         return
     t = run.course.t + run.at(run.course.zero_ns)
-    times_ns = np.round(t * NS_PER_S).astype(np.int64) + run.zero_ns
+    times_ns = np.array([row.t_ns for row in run.course.rows])
     leads = leading(run.log, times_ns)
     stalled = stalls.inside(stalls.disturbances(run.log, times_ns[0], times_ns[-1]), times_ns)
     inside = run.inside(t) & ~stalled

@@ -152,7 +152,7 @@ def _describe_run_event(event: RunEvent) -> str:
         RunEventKind.STALLED: "".join(stall.words for stall in stalls_of([event])),
     }
     other = f"{event.subject} {name_of(RunEventKind, event.kind)} {event.detail}"
-    return texts.get(_member(RunEventKind, event.kind), other.strip())
+    return texts.get(_member(RunEventKind, event.kind)) or other.strip()
 
 
 def _mode_changes(run: RunData) -> Iterator[TimelineEvent]:
