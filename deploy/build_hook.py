@@ -20,7 +20,7 @@ FILES = (
     "foxglove",
     "udev",
 )
-"""Of `deploy/`; they are installed into `shared/files/`, where `shared/places.py` finds them."""
+"""Names in `deploy/`. A wheel installs them into `shared/files/`; `shared/places.py` knows both."""
 
 
 class WheelFiles(BuildHookInterface):  # type: ignore[type-arg]  # hatchling names no configuration

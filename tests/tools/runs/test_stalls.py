@@ -33,24 +33,26 @@ from tests.tools.runs.test_impaired import judged, shown
 from tools import cli
 from tools.fleet.stall_watch import ANY_CORE, Gap
 from tools.runs import verdict, verdict_table
-from tools.runs.live_stalls import LiveStalls
+from tools.runs.live_stalls import (
+    A_THREAD,
+    MERGE_NS,
+    CommonSilence,
+    LiveStalls,
+    StallFinder,
+    merged,
+)
 from tools.runs.run_log import RunLog, read_run
 from tools.runs.stalls import (
-    A_THREAD,
     ALL,
     CATCH_UP_NS,
     EXCUSED_MAX_NS,
     MACHINE,
-    MERGE_NS,
     SERVICES,
     SIMULATOR,
-    CommonSilence,
     Disturbance,
     Stall,
-    StallFinder,
     disturbances,
     drop_outs,
-    merged,
     stalls_of,
 )
 from tools.runs.verdict_limits import LIMITS
@@ -469,7 +471,7 @@ def test_messages_lost_in_a_stall_name_it_and_stalls_without_effect_share_a_line
     assert "does not decide" not in words
 
 
-def test_a_demo_without_stalls_says_nothing_of_them(tmp_path: Path) -> None:
+def test_a_run_in_virtual_time_has_no_stalls_and_says_nothing_of_them(tmp_path: Path) -> None:
     assert cli.main(["sim", "--duration", "1", "--out", str(tmp_path)]) == 0
     summary = verdict.summarise(read_run(tmp_path / "run.mcap"), 1.0)
     assert (summary["stalls"], summary["across_stalls"], summary["drop_outs"]) == ([], [], [])
