@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 
-from services.simulator.operator import HandForce, Operator
+from services.simulator.physics.operator import HandForce, Operator
 from shared.config.files import load
 from shared.config.scenarios import Keyframe, Lead, Scenario
 from shared.places import DEFAULT_CONFIG
-from tools.runs.lockstep import Lockstep
+from tools.sim.lockstep import Lockstep
 
 LIMIT = 12.0  # N
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from shared.bus import topics
-from tools.runs.run_log import read_run
+from tools.logs.run_log import read_run
 
 
 def main(path: Path) -> None:

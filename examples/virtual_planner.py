@@ -12,7 +12,7 @@ from shared.bus.messages import Mode
 from shared.config.files import load
 from shared.config.scenarios import Keyframe, Kill, Restart, Scenario
 from shared.places import DEFAULT_CONFIG
-from tools.runs.lockstep import Lockstep
+from tools.sim.lockstep import Lockstep
 
 SQUAT = Scenario(
     name="example",

@@ -14,7 +14,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
-from shared.robot.joints import SIDES, side_of
+from shared.joints import SIDES, side_of
 
 PINNED_VARIABLE: Final = "XRL_PINNED"
 """Environment variable; with "1" the processes stay on their half of the processors. The fleet's

@@ -6,6 +6,7 @@ import ast
 import fnmatch
 import subprocess
 import sys
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -59,10 +60,10 @@ VENDORS = {
     "shtab": ["tools/verbs/completion.py"],
     "pyarrow": ["tools/export/parquet.py"],
     "mujoco": [
-        "services/simulator/world.py",
-        "services/simulator/body.py",
-        "services/simulator/foot_placement.py",
-        "services/simulator/soles.py",
+        "services/simulator/physics/world.py",
+        "services/simulator/physics/body.py",
+        "services/simulator/physics/foot_placement.py",
+        "services/simulator/physics/soles.py",
     ],
     "pinocchio": ["services/planner/law/model.py"],
     "aiohttp": ["tools/view/server.py"],
@@ -70,22 +71,22 @@ VENDORS = {
     "cvxpy": ["tools/lab/design/split_program.py"],
     "matplotlib": [
         "tools/output.py",
-        "tools/runs/figure.py",
+        "tools/judge/figure.py",
         "tools/lab/design/damping_picture.py",
         "tools/lab/studies/*/*picture.py",
     ],
-    "PIL": ["tools/analysis/reports/canvas.py", "tools/analysis/reports/moving_picture.py"],
+    "PIL": ["tools/judge/reports/canvas.py", "tools/judge/reports/moving_picture.py"],
     "casadi": [
         "services/planner/law/certificate.py",
         "services/planner/law/symbolic.py",
-        "services/simulator/axis_control.py",
-        "services/simulator/drivetrain.py",
+        "services/simulator/drives/axis_control.py",
+        "services/simulator/physics/drivetrain.py",
         "shared/robot/compiled_graph.py",
         "tools/graph_libraries.py",
     ],
     "odrive": ["services/joint/drivers/odrive_usb.py", "tools/bringup/usb_board.py"],
-    "mcap": ["shared/mcap_log/*.py", "tools/analysis/reexecution/rewritten.py"],
-    "foxglove": ["tools/analysis/reports/foxglove.py", "tools/view/foxglove_server.py"],
+    "mcap": ["shared/mcap_log/*.py", "tools/logs/reexecution/rewritten.py"],
+    "foxglove": ["tools/judge/reports/foxglove.py", "tools/view/foxglove_server.py"],
     "supervisor": ["tools/fleet/*.py"],
     "can": [
         "shared/can/unix_can.py",
@@ -105,87 +106,63 @@ NEEDS_EXTRA = {
     "tools/view/server.py": "view",
     "tools/view/foxglove_server.py": "foxglove",
     "tools/export/ros2_bag.py": "ros2",
-    "tools/analysis/reports/canvas.py": "plot",
-    "tools/analysis/reports/moving_*.py": "plot",
+    "tools/judge/reports/canvas.py": "plot",
+    "tools/judge/reports/moving_*.py": "plot",
     "tools/lab/learning/environment.py": "learn",
     "tools/lab/bench/transports/over_*.py": "bench",
 }
 """Modules that cannot be imported without an extra. Whoever imports one, by a function, has called
 `require` there. All others can be imported with the packages of `dependencies` alone."""
 
-LAWS = [
-    "services/joint/pd_law.py",
-    "services/joint/differential.py",
-    "services/joint/torque_limiter.py",
-    "services/joint/failsafe.py",
-    "services/joint/controller.py",
-    "services/joint/drive_setpoint.py",
-    "services/joint/joint_estimate.py",
-    "services/joint/drive_manager.py",
-    "services/joint/pendant.py",
-    "services/joint/drivers/axes_status.py",
-    "services/joint/drivers/firmware.py",
-    "services/joint/drivers/wired_drive.py",
-    "services/joint/setpoint_law.py",
-    "services/joint/sample_clock.py",
-    "shared/can/can_load.py",
-    "shared/robot/dropouts.py",
-    "shared/robot/fault_table.py",
+EDGES = [
+    "services/*/__main__.py",
+    "services/*/loop.py",
+    "services/joint/drivers/can_link.py",
+    "services/joint/drivers/odrive_can.py",
+    "services/joint/drivers/odrive_frames.py",
+    "services/joint/drivers/odrive_usb.py",
+    "services/joint/rearm_guard.py",
+    "services/network_proxy/*.py",
+    "services/planner/controller_file.py",
+    "services/recorder/auto_recover.py",
+    "services/recorder/host_watch.py",
+    "services/recorder/roster.py",
+    "services/ros2_gateway/ros_session.py",
+    "services/simulator/fronts/*.py",
+    "shared/robot/compiled_graph.py",
+]
+"""Where a service touches clock, bus, wires, threads or files. All its other modules are laws."""
+
+TOOL_LAWS = [
+    "shared/can/cansimple*.py",
+    "shared/mcap_log/encoding.py",
+    "shared/mcap_log/records.py",
+    "shared/mcap_log/sequence_stats.py",
     "tools/bringup/jogging.py",
-    "tools/tune/excitation.py",
-    "tools/tune/response.py",
     "tools/identify/body_fit.py",
     "tools/identify/body_statics.py",
     "tools/identify/estimates.py",
     "tools/identify/quasi_static.py",
     "tools/identify/sines.py",
-    "services/planner/controller.py",
+    "tools/lab/design/*.py",
     "tools/lab/learning/policy.py",
-    "services/planner/state_phases.py",
-    "services/planner/planner.py",
-    "services/harness/filter.py",
-    "services/ros2_gateway/conversions.py",
-    "services/ros2_gateway/gateway.py",
-    "services/ros2_gateway/inbound.py",
-    "services/ros2_gateway/rmw.py",
-    "shared/robot/capture_point.py",
-    "shared/robot/frames.py",
-    "shared/robot/remedies.py",
-    "shared/robot/robot_urdf.py",
-    "services/imu/attitude.py",
-    "services/joint/tracer.py",
-    "services/planner/snapshots.py",
-    "services/planner/checkpoint.py",
-    "shared/mcap_log/sequence_stats.py",
-    "shared/mcap_log/encoding.py",
-    "shared/mcap_log/records.py",
-    "services/recorder/disk_guard.py",
-    "tools/analysis/reexecution/compare.py",
-    "tools/analysis/reexecution/found.py",
-    "tools/analysis/reexecution/params.py",
-    "services/simulator/axis_bank.py",
-    "services/simulator/axis_control.py",
-    "services/simulator/axis_encoders.py",
-    "services/simulator/axis_conditions.py",
-    "services/simulator/axis_faults.py",
-    "services/simulator/axis_settings.py",
-    "services/simulator/dc_bus.py",
-    "services/simulator/fault_injector.py",
-    "services/simulator/operator.py",
-    "services/simulator/actuation.py",
-    "services/simulator/body.py",
-    "services/simulator/foot_placement.py",
-    "services/simulator/posture.py",
-    "services/simulator/drivetrain.py",
-    "services/simulator/plant.py",
-    "services/simulator/world.py",
-    *(
-        file
-        for file in SOURCES
-        if file.startswith(
-            ("services/planner/law/", "services/planner/watch/", "tools/lab/design/")
-        )
-    ),
+    "tools/logs/reexecution/compare.py",
+    "tools/logs/reexecution/found.py",
+    "tools/logs/reexecution/params.py",
+    "tools/tune/excitation.py",
+    "tools/tune/response.py",
+]
+
+
+def is_among(file: str, patterns: list[str]) -> bool:
+    return any(fnmatch.fnmatch(file, pattern) for pattern in patterns)
+
+
+LAWS = [
+    file
+    for file in SOURCES
+    if is_among(file, TOOL_LAWS)
+    or (file.startswith(("services/", "shared/robot/")) and not is_among(file, EDGES))
 ]
 """Pure: state, now, inputs -> outputs."""
 
@@ -221,31 +198,36 @@ def test_an_import_is_found_wherever_it_stands() -> None:
     assert found == {"a.b", "d.e.g", "d.e.h", ".i.j"}
 
 
-@pytest.mark.parametrize("file", IMPORTS)
-def test_imports_are_absolute(file: str) -> None:
-    assert [i.full for i in IMPORTS[file] if i.module.startswith(".")] == []
+def offenders(files: Iterable[str], wrong: Callable[[str, Import], bool]) -> set[tuple[str, str]]:
+    """Return file and import of all that break a rule."""
+    return {(file, i.full) for file in files for i in IMPORTS[file] if wrong(file, i)}
 
 
-@pytest.mark.parametrize("file", [file for file in IMPORTS if file.startswith("shared/")])
-def test_shared_imports_no_service_and_no_tool(file: str) -> None:
-    assert [i.full for i in IMPORTS[file] if i.top in ("services", "tools", "tests")] == []
+def in_folder(*folders: str) -> list[str]:
+    return [file for file in IMPORTS if file.startswith(folders)]
 
 
-@pytest.mark.parametrize("file", [file for file in IMPORTS if file.startswith("services/")])
-def test_a_service_imports_only_shared_and_itself(file: str) -> None:
-    own = f"services.{service_of(file)}."
-    foreign = [
-        imported.full
-        for imported in IMPORTS[file]
-        if imported.top in ("tools", "tests")
-        or (imported.top == "services" and not f"{imported.full}.".startswith(own))
-    ]
-    assert foreign == []
+def test_imports_are_absolute() -> None:
+    assert offenders(IMPORTS, lambda _, i: i.module.startswith(".")) == set()
 
 
-@pytest.mark.parametrize("file", [file for file in IMPORTS if file.startswith("tools/")])
-def test_a_tool_imports_no_test(file: str) -> None:
-    assert [i.full for i in IMPORTS[file] if i.top == "tests"] == []
+def test_shared_imports_no_service_and_no_tool() -> None:
+    above = ("services", "tools", "tests")
+    assert offenders(in_folder("shared/"), lambda _, i: i.top in above) == set()
+
+
+def test_a_service_imports_only_shared_and_itself() -> None:
+    def is_foreign(file: str, i: Import) -> bool:
+        own = f"services.{service_of(file)}."
+        return i.top in ("tools", "tests") or (
+            i.top == "services" and not f"{i.full}.".startswith(own)
+        )
+
+    assert offenders(in_folder("services/"), is_foreign) == set()
+
+
+def test_a_tool_imports_no_test() -> None:
+    assert offenders(in_folder("tools/"), lambda _, i: i.top == "tests") == set()
 
 
 LOADED = """
@@ -274,60 +256,50 @@ def test_a_service_holds_what_its_process_imports_and_nothing_else() -> None:
     assert files - loaded == set()
 
 
-def test_the_law_does_not_know_what_watches_it() -> None:
-    above = ("services.planner.watch.", "services.planner.planner.", "services.planner.loop.")
-    wrong = {
-        (file, imported.full)
-        for file, found in IMPORTS.items()
-        if file.startswith("services/planner/law/")
-        for imported in found
-        if f"{imported.full}.".startswith(above)
-    }
-    assert wrong == set()
+ORDER = {
+    "shared": ("config", "bus", "robot", "can", "network", "mcap_log"),
+    "services/planner": ("law", "watch"),
+    "services/simulator": ("drives", "physics", "fronts"),
+    "tools": (
+        "fleet", "keys", "pads", "logs", "judge", "export", "live", "sim", "bringup", "identify",
+        "tune", "hosts", "view", "lab", "verbs", "dev",
+    ),
+}  # fmt: skip
+"""Rooms of each storey, the lowest first: a room knows those before it. What lies beside rooms of
+`shared` and `tools` is below them all; in a service `TOPS` are above them."""
+TOPS = ("__main__", "loop", "planner")
 
 
-def test_no_module_imports_a_verb() -> None:
-    importers = {
-        file
-        for file, found in IMPORTS.items()
-        if any(i.full.startswith("tools.verbs.") for i in found)
-    }
-    assert importers == set(), "what two verbs share belongs beside them, not in one of them"
+@pytest.mark.parametrize("storey", ORDER)
+def test_a_room_imports_only_those_below_it(storey: str) -> None:
+    rooms = ORDER[storey]
+    found = {file.removeprefix(f"{storey}/").split("/")[0] for file in in_folder(f"{storey}/")}
+    assert {name for name in found if not name.endswith(".py")} == set(rooms)
+    package = storey.replace("/", ".")
 
+    def is_above(file: str, i: Import) -> bool:
+        own, other = (
+            (name.removeprefix(f"{package}.") + ".").split(".")[0]
+            for name in (file.replace("/", "."), i.full)
+        )
+        if not i.full.startswith(f"{package}.") or own == other:
+            return False
+        if own not in rooms:
+            return other in rooms and not package.startswith("services")
+        if other not in rooms:
+            return other in TOPS
+        return rooms.index(other) > rooms.index(own)
 
-ROOMS_BELOW = {
-    "fleet": (),
-    "runs": ("fleet",),
-    "analysis": ("fleet", "runs"),
-    "bringup": ("fleet",),
-    "lab": ("fleet", "runs", "analysis"),
-}
-"""Rooms of the tools, and the rooms that each may import."""
-
-
-@pytest.mark.parametrize("room", ROOMS_BELOW)
-def test_a_room_of_the_tools_imports_only_those_below_it(room: str) -> None:
-    above = {*ROOMS_BELOW, "verbs"} - {room, *ROOMS_BELOW[room]}
-    wrong = {
-        (file, imported.full)
-        for file, found in IMPORTS.items()
-        if file.startswith(f"tools/{room}/")
-        for imported in found
-        if any(f"{imported.full}.".startswith(f"tools.{other}.") for other in above)
-    }
-    assert wrong == set()
+    assert offenders(in_folder(f"{storey}/"), is_above) == set()
 
 
 def test_the_design_of_the_gains_knows_the_planners_law_and_no_other_service() -> None:
     allowed = ("services.planner.", "shared.", "tools.lab.design.", "tools.output.")
-    foreign = {
-        (file, imported.full)
-        for file, found in IMPORTS.items()
-        if file.startswith("tools/lab/design/")
-        for imported in found
-        if imported.top in PACKAGES and not f"{imported.full}.".startswith(allowed)
-    }
-    assert foreign == set()
+
+    def is_foreign(_: str, i: Import) -> bool:
+        return i.top in PACKAGES and not f"{i.full}.".startswith(allowed)
+
+    assert offenders(in_folder("tools/lab/design/"), is_foreign) == set()
 
 
 @pytest.mark.parametrize("vendor", VENDORS)
@@ -394,18 +366,26 @@ def test_what_needs_an_extra_is_imported_where_it_is_required() -> None:
     assert wrong == []
 
 
-@pytest.mark.parametrize("file", LAWS)
-def test_a_law_knows_no_clock_bus_thread_process_or_log(file: str) -> None:
-    impure = [
-        i.full for i in IMPORTS[file] if i.top in IMPURE or i.module in IMPURE or i.full in IMPURE
+def is_impure(_: str, i: Import) -> bool:
+    clock = i.full.startswith("shared.clock") and not i.name.startswith("NS_PER_")
+    return clock or bool(IMPURE & {i.top, i.module, i.full})
+
+
+def test_a_law_knows_no_clock_bus_thread_process_or_log() -> None:
+    """Of the clock it takes the units only."""
+    assert offenders(LAWS, is_impure) == set()
+
+
+def test_an_edge_is_one() -> None:
+    pure = [
+        pattern
+        for pattern in EDGES
+        if not offenders((file for file in SOURCES if fnmatch.fnmatch(file, pattern)), is_impure)
     ]
-    assert impure == []
-
-
-@pytest.mark.parametrize("file", LAWS)
-def test_a_law_takes_from_the_clock_its_units_only(file: str) -> None:
-    taken = [i.name for i in IMPORTS[file] if i.full.startswith("shared.clock")]
-    assert [name for name in taken if not name.startswith("NS_PER_")] == []
+    assert pure == []
+    assert [
+        pattern for pattern in TOOL_LAWS if not any(fnmatch.fnmatch(f, pattern) for f in LAWS)
+    ] == []
 
 
 def test_only_tools_write_to_the_terminal() -> None:

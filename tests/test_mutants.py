@@ -10,9 +10,18 @@ from typing import Any
 
 import pytest
 
-from shared.config.toml_file import read_toml
-from tools import mutants
-from tools.mutants import FILE, ROOT, Group, GroupResult, MutantsFile, Mutation, Reason, change_of
+from shared.toml_file import read_toml
+from tools.dev import mutants
+from tools.dev.mutants import (
+    FILE,
+    ROOT,
+    Group,
+    GroupResult,
+    MutantsFile,
+    Mutation,
+    Reason,
+    change_of,
+)
 from tools.terminal import Console
 
 DIFF = """--- services/joint/torque_limiter.py

@@ -17,7 +17,7 @@ from shared import revision
 from shared.places import CHECKOUT
 
 PACKAGES = ("services", "shared", "tools")
-LEFT_OUT = ("tools/mutants.py", "tools/reference/")
+LEFT_OUT = ("tools/dev/mutants.py", "tools/dev/reference/")
 """They work on the source tree."""
 NO_DATA = ("deploy/ros2/",)
 """Files that documentation names, and no process reads."""

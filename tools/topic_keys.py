@@ -10,7 +10,7 @@ from shared.bus import topics
 from shared.bus.topics import Topic
 from shared.config.robot_config import SERVICES
 from shared.exceptions import RunError
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 
 
 class TopicKey(NamedTuple):

@@ -21,13 +21,13 @@ from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig, expand
 from shared.config.sections import CanConfig
 from shared.extras import require
+from shared.joints import MODULES
 from shared.process import (
     StopFlag,
     freeze_garbage,
     run_service,
     service_parser,
 )
-from shared.robot.joints import MODULES
 
 
 def main() -> int:

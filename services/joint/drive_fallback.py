@@ -8,7 +8,7 @@ from services.joint import pd_law
 from services.joint.pd_law import Setpoint
 from shared.bus.messages import Mode
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import kind_of
+from shared.joints import kind_of
 
 HOLD_SHARE: Final = {"ankle": 1.0, "knee": 0.2, "hip": 0.0}
 """Fraction of the way from a drive's gains to HOLD's while its service leads.

@@ -21,9 +21,9 @@ from typing import Final
 from services.joint import pd_law
 from shared.bus.messages import JointCommand, Outside, Pair
 from shared.clamp import clamp
+from shared.config.gain_table import Bounds, ModuleBounds
 from shared.config.robot_config import RobotConfig
-from shared.robot.gain_table import Bounds, ModuleBounds
-from shared.robot.joints import kind_of
+from shared.joints import kind_of
 
 ROUNDING = 0.02
 """Share of a gain that is allowed beyond: the schedule interpolates between rounded nodes."""

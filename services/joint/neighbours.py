@@ -27,7 +27,7 @@ from services.joint.rearm_guard import mapped
 from shared.bus.messages import Mode, Pair
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import LOST_S
-from shared.robot.joints import MODULE_INDEX, MODULES, N_MODULES, kind_of
+from shared.joints import MODULE_INDEX, MODULES, N_MODULES, kind_of
 from shared.robot.limp_leg_support import SUPPORT_FOR
 
 STALE_NS: Final = 20 * NS_PER_MS

@@ -30,7 +30,7 @@ from shared.bus.messages import Pair
 from shared.clamp import clamp
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import kind_of
+from shared.joints import kind_of
 
 DOUBT_NS: Final = 100 * NS_PER_MS
 """Time for which a reason to hold must last: a stop does not reach all six in the same cycle, and

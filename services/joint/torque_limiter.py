@@ -13,7 +13,7 @@ import msgspec
 from shared.bus.messages import Pair
 from shared.clamp import clamp
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import kind_of
+from shared.joints import kind_of
 
 
 class TorqueLimits(msgspec.Struct, frozen=True):

@@ -17,12 +17,12 @@ from services.network_proxy.relay import Relay
 from shared import log, process, scheduling
 from shared.bus import session as bus
 from shared.bus import topics
-from shared.bus.links import DIRECTIONS, PAIRS, Pair, endpoint_through
 from shared.bus.traces import LinkEvent
 from shared.clock import NS_PER_MS, now_ns
 from shared.config.files import load
+from shared.config.impairment import Direction
 from shared.config.robot_config import RobotConfig, expand
-from shared.network.impairment import Direction
+from shared.links import DIRECTIONS, PAIRS, Pair, endpoint_through
 from shared.network.impairment_schedule import ImpairmentSchedule
 from shared.network.proxy_protocol import SOCKET
 

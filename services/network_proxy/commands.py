@@ -6,10 +6,10 @@ import math
 from typing import Final
 
 from shared.clock import NS_PER_S, now_ns
-from shared.config.toml_file import check_ranges
 from shared.exceptions import ConfigError
 from shared.network.impairment_schedule import ImpairmentSchedule
 from shared.network.proxy_protocol import Begin, Clear, Reply, Request, RequestedImpairment
+from shared.toml_file import check_ranges
 
 ASKED_MAX: Final = 64
 """Impairments at once: each costs a little with every message, and a line in every answer."""

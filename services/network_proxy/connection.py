@@ -8,7 +8,7 @@ from functools import partial
 
 from services.network_proxy.direction import Flow, Waiting
 from services.network_proxy.event_loop import READ, WRITE, Ready, SocketWatch
-from shared.network.impairment import Direction
+from shared.config.impairment import Direction
 
 
 class Connection:

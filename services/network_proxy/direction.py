@@ -7,7 +7,7 @@ from collections import deque
 from typing import Final, NamedTuple
 
 from services.network_proxy.wire import Splitter, carries_messages
-from shared.network.impairment import HELD, Direction, Impairer
+from shared.config.impairment import HELD, Direction, Impairer
 
 PENDING_MAX: Final = 262_144
 """Due bytes that wait for a slow receiver. Above it the sender is no longer read, as on a direct

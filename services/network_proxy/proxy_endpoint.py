@@ -8,9 +8,9 @@ import socket
 from typing import Any, NamedTuple
 
 from services.network_proxy.listener import SocketListener
-from shared.bus.links import Pair
 from shared.config.endpoints import host_and_port
 from shared.exceptions import BusError
+from shared.links import Pair
 
 
 class Address(NamedTuple):

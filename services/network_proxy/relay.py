@@ -12,7 +12,7 @@ from services.network_proxy.connection import Connection
 from services.network_proxy.direction import Flow, Waiting
 from services.network_proxy.event_loop import READ, SocketWatch
 from services.network_proxy.proxy_endpoint import ProxyEndpoint
-from shared.network.impairment import Direction
+from shared.config.impairment import Direction
 
 LINKS_MAX: Final = 16
 """Connections of one pair. In a partition a process that lives dials again each second or so,

@@ -20,6 +20,8 @@ from shared.bus.messages import (
 from shared.bus.session import open_session
 from shared.bus.traces import PlannerCheckpoint
 from shared.config import files as config_file
+from shared.config import gain_schedule
+from shared.joints import MODULES
 from shared.process import (
     StopFlag,
     add_injected,
@@ -27,8 +29,6 @@ from shared.process import (
     run_service,
     service_parser,
 )
-from shared.robot import gain_schedule
-from shared.robot.joints import MODULES
 
 
 def main() -> int:

@@ -3,7 +3,7 @@
 It runs inside the planner: in lockstep, live and from the log. Everything around it stays as it is:
 stance, load, assist, engagement and trips of the planner; certificate of the local gains
 (`services.planner.watch.controller_guard`); age rule, envelope and torque limits of the joint
-services. Joints are in the order of `shared.robot.joints`, the pose is p = [COM x y z; torso roll
+services. Joints are in the order of `shared.joints`, the pose is p = [COM x y z; torso roll
 pitch yaw].
 """
 

@@ -21,7 +21,7 @@ from shared.bus.messages import (
     Vector6,
     Wrench,
 )
-from shared.robot.joints import N_JOINTS
+from shared.joints import N_JOINTS
 from shared.robot.trip_table import PLANNER_TRIPS
 
 

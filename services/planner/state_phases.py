@@ -20,7 +20,7 @@ from typing import Final
 from services.planner.snapshots import PhasesState
 from shared.bus.messages import JointState, Pair
 from shared.clock import NS_PER_S
-from shared.robot.joints import N_MODULES
+from shared.joints import N_MODULES
 
 EVERY_TICKS: Final = 1024
 """Largest number of ticks between two comparisons: 4 s, in which two drives' clocks drift apart by

@@ -34,6 +34,7 @@ from shared.bus.arrivals import Arrivals
 from shared.bus.same_host import ports_here
 from shared.bus.session import open_session
 from shared.clock import keep_pace, now_ns, pace
+from shared.config import gain_schedule
 from shared.config.files import load
 from shared.config.robot_config import SERVICES
 from shared.config.sections import RecorderConfig
@@ -42,7 +43,6 @@ from shared.mcap_log import provenance
 from shared.mcap_log.files import FIRST
 from shared.mcap_log.writer import SCHEMA_VERSION, MessageSource, RunWriter
 from shared.process import StopFlag, run_service, service_parser
-from shared.robot import gain_schedule
 
 DRAIN_PERIOD_S: Final = 0.02
 """Bounds how late `log_time` is. 5, 10 and 20 ms cost the same CPU at 5000 messages/s."""

@@ -23,7 +23,7 @@ from shared.bus.messages import Estop, OperatorIntent
 from shared.bus.operator_key import require_operator
 from shared.clock import now_ns, sleep_until
 from shared.config.files import load
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 
 NICE: Final = 5
 """Control goes first."""

@@ -20,6 +20,7 @@ from shared.bus.messages import (
 )
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
+from shared.joints import AXES, MODULES, SIDES
 from shared.robot.frames import (
     ORIGIN,
     UPRIGHT,
@@ -28,7 +29,6 @@ from shared.robot.frames import (
     rotation_about,
     torso_pose,
 )
-from shared.robot.joints import AXES, MODULES, SIDES
 from shared.robot.remedies import reason_of, remedy_of
 from shared.robot.robot_urdf import cross_of
 

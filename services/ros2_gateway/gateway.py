@@ -13,7 +13,7 @@ from shared.bus.messages import JointState, Message, PlannerStatus, Wrench
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from shared.robot.robot_urdf import urdf
 
 STALE_NS: Final = 500 * NS_PER_MS

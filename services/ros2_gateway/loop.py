@@ -14,7 +14,7 @@ from shared.bus.messages import Estop, JointState, OperatorIntent, PlannerStatus
 from shared.bus.session import Latest, Publisher
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS
-from shared.robot.joints import N_MODULES
+from shared.joints import N_MODULES
 
 PERIOD_NS: Final = 10 * NS_PER_MS
 

@@ -5,20 +5,20 @@ from __future__ import annotations
 from contextlib import ExitStack
 from pathlib import Path
 
-from services.simulator.axis_bank import AxisBank
-from services.simulator.axis_settings import plant
-from services.simulator.body import body_of
-from services.simulator.cansimple_front import CanSimpleFront
-from services.simulator.fibre_endpoints import EmulatedBoard
-from services.simulator.fibre_front import FibreFront
-from services.simulator.fibre_port import FibreHub, FibrePort
-from services.simulator.harness_front import HarnessFront
-from services.simulator.imu_front import ImuFront
+from services.simulator.drives.axis_bank import AxisBank
+from services.simulator.drives.axis_settings import plant
+from services.simulator.fronts.cansimple_front import CanSimpleFront
+from services.simulator.fronts.fibre_endpoints import EmulatedBoard
+from services.simulator.fronts.fibre_front import FibreFront
+from services.simulator.fronts.fibre_port import FibreHub, FibrePort
+from services.simulator.fronts.harness_front import HarnessFront
+from services.simulator.fronts.imu_front import ImuFront
+from services.simulator.fronts.unix_can_hub import UnixCanHub
+from services.simulator.fronts.usb_standin import FOLDER
 from services.simulator.loop import SimulatorLoop, SimulatorPorts
-from services.simulator.plant import plant_from
-from services.simulator.unix_can_hub import UnixCanHub
-from services.simulator.usb_standin import FOLDER
-from services.simulator.world import World
+from services.simulator.physics.body import body_of
+from services.simulator.physics.plant import plant_from
+from services.simulator.physics.world import World
 from shared import log, scheduling
 from shared.bus import topics
 from shared.bus.messages import HandLead, OperatorIntent, SimControl, SimTruth
@@ -27,9 +27,9 @@ from shared.bus.traces import SimState
 from shared.config import files as config_file
 from shared.config import scenarios
 from shared.config.robot_config import RobotConfig, expand
+from shared.joints import MODULE_INDEX, N_JOINTS
 from shared.places import SCENARIOS
 from shared.process import StopFlag, freeze_garbage, run_service, service_parser
-from shared.robot.joints import MODULE_INDEX, N_JOINTS
 
 DEFAULT_SCENARIO = SCENARIOS / "stand.toml"
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from services.simulator.axis_bank import AxisBank
-from services.simulator.axis_conditions import OVER_TEMP_MARGIN, ROOM_TEMPERATURE
-from services.simulator.axis_faults import AXIS_NAMES
-from services.simulator.dc_bus import SUPPLY_VOLTAGE
+from services.simulator.drives.axis_bank import AxisBank
+from services.simulator.drives.axis_conditions import OVER_TEMP_MARGIN, ROOM_TEMPERATURE
+from services.simulator.drives.axis_faults import AXIS_NAMES
+from services.simulator.drives.dc_bus import SUPPLY_VOLTAGE
 from shared.config.scenarios import Fault
 from shared.exceptions import DriveError
-from shared.robot.joints import MODULE_INDEX
+from shared.joints import MODULE_INDEX
 
 _AT_ONCE: Final = {"watchdog": "WATCHDOG", "disarmed": "DISARM", "overspeed": "OVERSPEED"}
 """Momentary kinds, with the bank's fault."""

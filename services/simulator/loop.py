@@ -6,14 +6,14 @@ from collections.abc import Sequence
 
 import msgspec
 
-from services.simulator.axis_bank import AxisBank
-from services.simulator.cansimple_front import CanSimpleFront
+from services.simulator.drives.axis_bank import AxisBank
 from services.simulator.fault_injector import FaultInjector
-from services.simulator.fibre_port import FibreHub
-from services.simulator.harness_front import HarnessFront
-from services.simulator.imu_front import ImuFront
+from services.simulator.fronts.cansimple_front import CanSimpleFront
+from services.simulator.fronts.fibre_port import FibreHub
+from services.simulator.fronts.harness_front import HarnessFront
+from services.simulator.fronts.imu_front import ImuFront
+from services.simulator.physics.world import World
 from services.simulator.state import taken
-from services.simulator.world import World
 from shared.bus.messages import HandLead, OperatorIntent, SimControl, SimTruth, Vector4
 from shared.bus.session import Latest, Publisher
 from shared.bus.topics import SIM_STATE

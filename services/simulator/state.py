@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from services.simulator.axis_bank import AxisBank
-from services.simulator.led_hand import LedHand
-from services.simulator.world import World
+from services.simulator.drives.axis_bank import AxisBank
+from services.simulator.physics.led_hand import LedHand
+from services.simulator.physics.world import World
 from shared.bus.traces import SimState
 from shared.can.cansimple import AxisState
-from shared.robot.joints import N_JOINTS
+from shared.joints import N_JOINTS
 
 
 def taken(world: World, bank: AxisBank, t_ns: int, seq: int) -> SimState:

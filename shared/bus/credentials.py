@@ -19,8 +19,8 @@ from shared.bus.access import PRINCIPALS
 from shared.bus.topics import OPERATOR, VIEWER
 from shared.config.endpoints import ROBOT, filled
 from shared.config.robot_config import SERVICES, RobotConfig
-from shared.config.toml_file import Section, read_toml
 from shared.exceptions import BusError, ConfigError
+from shared.toml_file import Section, read_toml
 from shared.user import in_home
 
 AUTHORITY: Final = "authority.pem"

@@ -25,7 +25,7 @@ STRAIGHT: Vector4 = (0.0, 0.0, 0.0, 0.0)
 AS_CONFIGURED: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """A stance with the feet where the robot file has them."""
 Modules = tuple[Int64, Int64, Int64, Int64, Int64, Int64]
-"""One integer for each module, in `shared.robot.joints.MODULES` order."""
+"""One integer for each module, in `shared.joints.MODULES` order."""
 
 
 class Mode(IntEnum):

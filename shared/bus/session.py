@@ -31,7 +31,6 @@ from shared.bus.access import alive_prefix, token_key, tools_prefix
 from shared.bus.allow_list import resolved
 from shared.bus.codec import Decoder, encode
 from shared.bus.credentials import Credentials, read_credentials
-from shared.bus.links import PAIRS, Pair, endpoint_through
 from shared.bus.messages import Message
 from shared.bus.socket_linger import Address
 from shared.bus.tls_probe import LinkWatch
@@ -40,8 +39,9 @@ from shared.clock import keep_pace, now_ns
 from shared.config.endpoints import host_and_port
 from shared.config.robot_config import SERVICES, RobotConfig, expand
 from shared.exceptions import BusError, NonFiniteError
+from shared.joints import MODULES
+from shared.links import PAIRS, Pair, endpoint_through
 from shared.process import SOCKET_PATH_MAX
-from shared.robot.joints import MODULES
 from shared.run_directory import private_files
 
 M = TypeVar("M", bound=Message)
@@ -416,7 +416,7 @@ def open_session(
         connect: further endpoints to dial: those of such a tool.
         only: services to dial; None: all that this process talks to.
         injected: dial through the network proxy on the links that it serves
-            (`shared.bus.links.PAIRS`).
+            (`shared.links.PAIRS`).
 
     Raises:
         BusError: the name cannot be used, or the endpoint is taken, too long or not

@@ -8,7 +8,7 @@ from typing import Final
 import msgspec
 
 from shared.bus import messages, traces
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 
 
 class Priority(IntEnum):

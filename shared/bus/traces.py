@@ -109,7 +109,7 @@ class LinkEvent(Message, frozen=True):
     """A change of the impairment of one direction of a link."""
 
     link: str
-    """One direction, as named in `shared.bus.links`."""
+    """One direction, as named in `shared.links`."""
     requested: str
     """The link as requested: this direction, or a group of directions."""
     number: Int64

@@ -31,10 +31,6 @@ OVERVOLTAGE_MAX: Final = 59.92
 """V; the firmware's default on a 56 V board. Above it the output stage is not protected."""
 OVERSPEED_TOLERANCE: Final = 1.2
 """The firmware's default; closer to 1, a noisy estimate at vel_limit disarms."""
-CURRENT_RANGE: Final = 60.0
-"""A; the firmware's default of `motor.config.requested_current_range`: the largest current that a
-drive measures.
-"""
 SPINOUT_POWER: Final = 100.0
 """W; 10 as shipped. A motor that brakes with more than this, and takes more than this beyond the
 copper loss of its calibrated resistance, disarms: its encoder has slipped. A winding at 100 C has

@@ -1,8 +1,8 @@
 """A CAN bus on one host: python-can over a UNIX socket (docs/drives.md).
 
 `UnixCanBus` is the client, `can.Bus(interface="xrl_unix", channel=path)`; the bus itself is
-`services.simulator.unix_can_hub.UnixCanHub`, held by the simulator. The code that drives a real bus
-through socketcan drives this one unchanged.
+`services.simulator.fronts.unix_can_hub.UnixCanHub`, held by the simulator. The code that drives a
+real bus through socketcan drives this one unchanged.
 
 On the wire: SOCK_SEQPACKET; a packet carries one or several 16-byte frames in the layout of
 SocketCAN's `struct can_frame` (id and flags, length, three pad bytes, eight data bytes),

@@ -12,13 +12,12 @@ from typing import Any, Final
 
 import msgspec
 
-from shared.can.can_load import check_buses
-from shared.can.drive_settings import CURRENT_RANGE
+from shared.config.can_load import check_buses
 from shared.config.endpoints import PORT_MAX, ROBOT, RUN, is_endpoint, stray_braces
 from shared.config.robot_config import ENDPOINTS_OF_MODE, SERVICES, RobotConfig
 from shared.config.sections import LimitConfig
 from shared.exceptions import ConfigError
-from shared.robot.joints import KINDS, MODULES
+from shared.joints import KINDS, MODULES
 
 INTERFACES: Final = (
     "canalystii", "cantact", "etas", "gs_usb", "iscan", "ixxat", "kvaser", "neousys", "neovi",
@@ -29,6 +28,9 @@ INTERFACES: Final = (
 
 ROS2_DISTRIBUTIONS: Final = ("jazzy", "kilted", "lyrical")
 """Those whose messages on Zenoh the gateway knows (`services.ros2_gateway`)."""
+CURRENT_RANGE: Final = 60.0
+"""A; the firmware's default of `motor.config.requested_current_range`: the largest current that a
+drive measures."""
 LEADABLE: Final = (2, 4)
 """Rows of p that a person may lead: height and pitch."""
 _POWER_UP_TURNS: Final = 1.0

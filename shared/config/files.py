@@ -12,10 +12,10 @@ import msgspec
 import tomli_w
 
 from shared.config import checks as config_check
+from shared.config import gain_schedule
 from shared.config.robot_config import RobotConfig
-from shared.config.toml_file import parse_toml, read_toml
 from shared.exceptions import ConfigError
-from shared.robot import gain_schedule
+from shared.toml_file import parse_toml, read_toml
 
 
 def load(path: Path) -> RobotConfig:

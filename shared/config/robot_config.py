@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from shared.config.endpoints import RUN, filled, stray_braces
+from shared.config.gain_table import GainSchedule
 from shared.config.sections import (
     AssistConfig,
     BusConfig,
@@ -31,10 +32,9 @@ from shared.config.sections import (
     StandGains,
     TripsConfig,
 )
-from shared.config.toml_file import Section
 from shared.exceptions import BusError
-from shared.robot.gain_table import GainSchedule
-from shared.robot.joints import MODULES, kind_of
+from shared.joints import MODULES, kind_of
+from shared.toml_file import Section
 
 SERVICES = ("planner", "harness", "imu", "recorder", "simulator", *MODULES)
 """Every service that a fleet can have; each has an endpoint on the bus."""

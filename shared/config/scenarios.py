@@ -14,19 +14,20 @@ from typing import Annotated, Final, Literal, NamedTuple
 import msgspec
 import tomli_w
 
-from shared.bus.links import directions_of
-from shared.bus.messages import STRAIGHT, Vector4
+from shared.config.impairment import Impairment
 from shared.config.robot_config import SERVICES
-from shared.config.toml_file import Range, Section, check_ranges, read_toml
 from shared.exceptions import ConfigError
-from shared.network.impairment import Impairment
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
+from shared.links import directions_of
+from shared.toml_file import Range, Section, check_ranges, read_toml
 
 Time = Annotated[float, Range(0.0, 86_400.0, "s")]
 Force = Annotated[float, Range(-2000.0, 2000.0, "N")]
 
 ShiftLength = Annotated[float, Range(-0.1, 0.1, "m")]
 ShiftAngle = Annotated[float, Range(-0.3, 0.3, "rad")]
+Shift = tuple[float, float, float, float]
+"""Of x, y (m), roll and yaw (rad)."""
 
 SIGNALS = ("KILL", "STOP", "TERM", "INT")
 """Signals of a kill; STOP freezes the process instead."""
@@ -40,7 +41,7 @@ class Keyframe(Section, frozen=True):
     pitch: Annotated[float, Range(-1.5, 1.5, "rad")] = 0.0
     assist: Annotated[float, Range(0.0, 500.0, "N")] = 0.0
     """Weight that the operator rests on the harness and asks the robot to carry, N."""
-    shift: tuple[ShiftLength, ShiftLength, ShiftAngle, ShiftAngle] = STRAIGHT
+    shift: tuple[ShiftLength, ShiftLength, ShiftAngle, ShiftAngle] = (0.0, 0.0, 0.0, 0.0)
     """Where the operator asks COM x and y, m, and the torso's roll and yaw, rad, to be."""
 
 
@@ -123,7 +124,7 @@ class Inject(Impairment, frozen=True, kw_only=True):
     """The network does something to a link for a while."""
 
     link: str
-    """One or several directions (`shared.bus.links`), such as `planner->joints`."""
+    """One or several directions (`shared.links`), such as `planner->joints`."""
     at: Time
     duration: Annotated[float, Range(0.001, 86_400.0, "s")] | None = None
     """s; None: to the end of the run."""
@@ -164,7 +165,7 @@ class Lead(NamedTuple):
     pitch_rate: float
     assist: float
     """N"""
-    shift: Vector4 = STRAIGHT
+    shift: Shift = (0.0, 0.0, 0.0, 0.0)
     """x, y, m; roll, yaw, rad."""
 
 
@@ -192,7 +193,7 @@ def lead(scenario: Scenario, t: float) -> Lead:
     return Lead(last.height, 0.0, last.pitch, 0.0, last.assist, last.shift)
 
 
-def _eased(a: Vector4, b: Vector4, s: float) -> Vector4:
+def _eased(a: Shift, b: Shift, s: float) -> Shift:
     if a == b:
         return a
     x, y, roll, yaw = (start + (end - start) * s for start, end in zip(a, b, strict=True))

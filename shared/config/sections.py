@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Annotated, Final, Literal
 
-from shared.config.toml_file import Range, Section
+from shared.toml_file import Range, Section
 
 Mass = Annotated[float, Range(0.0, 200.0, "kg")]
 PayloadPlace = Annotated[float, Range(-0.3, 0.3, "m")]

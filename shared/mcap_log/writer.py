@@ -13,7 +13,7 @@ maps them to ns since 1970 so that viewers show dates: wall = monotonic + offset
 `publish_time` therefore means something only for senders on the recorder's host.
 
 A file whose writer was killed has no summary: `shared/mcap_log/recover.py` gives it
-one, and `tools/runs/run_log.py` reads it as it is. While it is written it is locked.
+one, and `tools/logs/run_log.py` reads it as it is. While it is written it is locked.
 """
 
 from __future__ import annotations

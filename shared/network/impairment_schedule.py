@@ -9,9 +9,9 @@ import math
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
-from shared.bus.links import directions_of
 from shared.bus.traces import LinkEvent
-from shared.network.impairment import Direction, Impairer, Impairment
+from shared.config.impairment import Direction, Impairer, Impairment
+from shared.links import directions_of
 
 
 class PendingImpairment(NamedTuple):
@@ -51,7 +51,7 @@ class ImpairmentSchedule:
         """Start an impairment now; return its number.
 
         Args:
-            link: of `shared.bus.links`.
+            link: of `shared.links`.
             what: the impairment.
             until: when it ends, on the owner's clock.
             now_ns: stamp of the events.
@@ -68,7 +68,7 @@ class ImpairmentSchedule:
         """Plan an impairment that `advance` starts when it is due; return its number.
 
         Args:
-            link: of `shared.bus.links`.
+            link: of `shared.links`.
             what: the impairment.
             begins: its start, on the owner's clock.
             until: its end, on the same.

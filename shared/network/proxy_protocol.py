@@ -6,8 +6,8 @@ from typing import Final, TypeAlias
 
 import msgspec
 
-from shared.bus.links import directions_of
 from shared.config.scenarios import Inject
+from shared.links import directions_of
 
 SOCKET: Final = "network_proxy.sock"
 """Name of the socket in the run directory of the fleet."""
@@ -51,7 +51,7 @@ class RequestedImpairment(msgspec.Struct, frozen=True):
     in_s: float = 0.0
     """Until it begins, s from now; 0: it has."""
     hidden: tuple[str, ...] = ()
-    """Its directions on which another one is in force (`shared.network.impairment.Direction`)."""
+    """Its directions on which another one is in force (`shared.config.impairment.Direction`)."""
 
     def standing(self) -> str:
         """Return what keeps it from being done now, and where; empty if nothing does."""

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple, TypeAlias
 
 from shared.bus.messages import Vector3, Vector6
 from shared.config.sections import GeometryConfig
-from shared.robot.joints import MODULE_INDEX, SIDES
+from shared.joints import MODULE_INDEX, SIDES
 from shared.robot.robot_model import side_sign
 
 Quaternion: TypeAlias = tuple[float, float, float, float]

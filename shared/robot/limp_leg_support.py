@@ -23,7 +23,7 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Final
 
-from shared.robot.joints import MODULES, kind_of
+from shared.joints import MODULES, kind_of
 
 
 class Support(IntEnum):

@@ -16,7 +16,7 @@ import math
 
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.config.sections import LimitConfig
-from shared.robot.joints import KINDS, SIDES
+from shared.joints import KINDS, SIDES
 
 MODULE_RADIUS = 0.08
 """m; a module is a ball of this radius: gives the links a rotational inertia (assumed)."""

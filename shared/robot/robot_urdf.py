@@ -2,7 +2,7 @@
 
 `torso` is the root. A module has two joints, theta about -y and phi about -x. A link without mass
 (`cross_of`) stands between the part above it and the part below, which has the module's name.
-The joints have the names and signs of q (`shared.robot.joints`).
+The joints have the names and signs of q (`shared.joints`).
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from xml.etree import ElementTree as ET
 from shared.bus.messages import Vector3
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import LimitConfig
+from shared.joints import SIDES, kind_of
 from shared.robot.frames import ORIGIN, leg_offsets
-from shared.robot.joints import SIDES, kind_of
 from shared.robot.robot_model import MODULE_RADIUS, ball_inertia, box_inertia
 
 THETA_AXIS: Final[Vector3] = (0.0, -1.0, 0.0)

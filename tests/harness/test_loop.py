@@ -14,8 +14,8 @@ import pytest
 from services.harness.__main__ import make_sensor
 from services.harness.filter import WrenchFilter
 from services.harness.loop import HarnessLoop
-from services.simulator.harness_front import BIAS_MAX, HarnessFront
-from services.simulator.unix_can_hub import UnixCanHub
+from services.simulator.fronts.harness_front import BIAS_MAX, HarnessFront
+from services.simulator.fronts.unix_can_hub import UnixCanHub
 from shared.bus.codec import Decoder
 from shared.bus.messages import Wrench
 from shared.can import sensor_loop

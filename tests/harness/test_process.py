@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from services.simulator.harness_front import HarnessFront
-from services.simulator.unix_can_hub import UnixCanHub
+from services.simulator.fronts.harness_front import HarnessFront
+from services.simulator.fronts.unix_can_hub import UnixCanHub
 from shared.bus import topics
 from shared.bus.messages import Tare, TareRequest, Wrench
 from shared.bus.session import open_session

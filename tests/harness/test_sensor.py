@@ -9,7 +9,7 @@ import can
 import pytest
 
 from services.harness.sensor import CanHarnessSensor
-from services.simulator.unix_can_hub import UnixCanHub
+from services.simulator.fronts.unix_can_hub import UnixCanHub
 from shared.can import loadcell_can
 from shared.can.can_sensor import DRAIN_MAX, RETRY_NS
 from shared.clock import NS_PER_MS, NS_PER_S

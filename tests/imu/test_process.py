@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from services.simulator.unix_can_hub import UnixCanHub
+from services.simulator.fronts.unix_can_hub import UnixCanHub
 from shared.bus import topics
 from shared.bus.messages import Attitude
 from shared.bus.session import open_session
 from shared.can import imu_can
 from shared.config.files import load, to_toml
+from shared.config.gain_schedule import path_beside, write
 from shared.config.robot_config import RobotConfig
-from shared.robot.gain_schedule import path_beside, write
 from tests.imu.robots import with_imu
 
 pytestmark = pytest.mark.system

@@ -9,8 +9,8 @@ import msgspec
 import pytest
 
 from shared.config import files as config_file
+from shared.config.gain_schedule import believing
 from shared.config.robot_config import RobotConfig
-from shared.robot.gain_schedule import believing
 from tests.conftest import ROBOT_FILE
 
 

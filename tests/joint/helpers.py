@@ -13,8 +13,8 @@ from services.joint.drivers.base import DriveReading, DriveStatus
 from services.joint.neighbours import UNKNOWN, NeighbourView
 from shared.bus.messages import JointCommand, Mode, Pair
 from shared.clock import NS_PER_S
+from shared.config.gain_schedule import believing
 from shared.config.robot_config import RobotConfig
-from shared.robot.gain_schedule import believing
 
 T0 = 1_000 * NS_PER_S
 SESSION = 7

@@ -12,8 +12,8 @@ from services.joint.snapshots import ControllerSnapshot
 from services.joint.torque_limiter import limits_of
 from services.joint.trips import JointTrips
 from shared.bus.messages import Cause, Mode
+from shared.config.gain_schedule import believing
 from shared.config.robot_config import RobotConfig
-from shared.robot.gain_schedule import believing
 from tests.joint.helpers import Bench
 
 COUPLED = (4.0, -6.0)

@@ -15,10 +15,10 @@ from services.joint.envelope import ROUNDING, Envelope
 from services.joint.failsafe import Event, Failsafe, timing_of
 from shared.bus.messages import JointCommand, Mode, Outside, Pair, Refusal
 from shared.config import files as config_file
+from shared.config.gain_schedule import believing
+from shared.config.gain_table import Bounds, ModuleBounds
 from shared.config.robot_config import RobotConfig
-from shared.robot.gain_schedule import believing
-from shared.robot.gain_table import Bounds, ModuleBounds
-from shared.robot.joints import MODULES, kind_of
+from shared.joints import MODULES, kind_of
 from tests.conftest import ROBOT_FILE
 from tests.joint.helpers import SESSION, T0, command
 

@@ -20,7 +20,7 @@ from services.joint.neighbours import (
     view_of,
 )
 from shared.bus.messages import Mode
-from shared.robot.joints import MODULES, kind_of
+from shared.joints import MODULES, kind_of
 from tests.joint.helpers import T0
 
 

@@ -23,7 +23,7 @@ from services.joint.rearm_guard import LastState, Pendant, RearmGuard
 from shared.bus.messages import JointCommand, Mode, Pair
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tests.joint.helpers import T0, command
 from tests.joint.test_loop import Rig, Stop
 

@@ -21,8 +21,8 @@ from services.joint.rearm_guard import (
     request_stop,
 )
 from shared.exceptions import FleetError
+from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
-from shared.robot.joints import MODULES
 from tools.fleet import process_table, procfs, supervise
 from tools.fleet.run_dir import RunDir
 from tools.fleet.supervise import SupervisedFleet

@@ -9,8 +9,8 @@ import pytest
 
 from services.joint.controller import JointController
 from shared.bus.messages import JointCommand
+from shared.config.gain_schedule import believing
 from shared.config.robot_config import RobotConfig
-from shared.robot.gain_schedule import believing
 from tests.joint.helpers import T0, Bench, command, with_service
 
 PERIOD_NS = 2_000_000

@@ -16,7 +16,7 @@ from services.joint.snapshots import ControllerSnapshot
 from shared.bus.messages import Mode, Pair
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import MODULES, kind_of
+from shared.joints import MODULES, kind_of
 from tests.joint.helpers import Bench
 
 SOFT_P: Pair = (500.0, 12.0)

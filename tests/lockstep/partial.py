@@ -13,16 +13,16 @@ from typing import Final, Literal
 import msgspec
 
 from services.joint.differential import joint_torque
-from shared.bus.links import Pair as Link
 from shared.bus.messages import Message, Mode, Pair, PlannerStatus, SimTruth
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Keyframe, Kill, Push, Restart, Scenario
 from shared.exceptions import RunError
-from shared.robot.joints import MODULE_INDEX, MODULES
+from shared.joints import MODULE_INDEX, MODULES
+from shared.links import Pair as Link
 from tools.lab.studies.sweeps.figures import Ending, com_max_mm, ending_of, operator_peak_n, step_nm
-from tools.runs.lockstep import FleetMoment, Lockstep, Record, forget
+from tools.sim.lockstep import FleetMoment, Lockstep, Record, forget
 
 FailureKind = Literal["links", "commands", "states", "frozen"]
 KINDS: Final[Mapping[FailureKind, str]] = {

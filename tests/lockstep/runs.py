@@ -10,15 +10,15 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from services.simulator.plant import PlantConfig
+from services.simulator.physics.plant import PlantConfig
 from shared.bus.messages import SimTruth
 from shared.config import scenarios
+from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Kill, Push, Restart, Scenario
-from shared.network.impairment import Impairment
-from tools.runs.lockstep import Lockstep
-from tools.runs.network import BASE
-from tools.runs.standing_start import begin_standing
+from tools.sim.lockstep import Lockstep
+from tools.sim.network import BASE
+from tools.sim.standing_start import begin_standing
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "deploy" / "scenarios"
 

@@ -6,14 +6,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from services.simulator.body import body_of
-from services.simulator.plant import IDEAL
-from services.simulator.world import World
+from services.simulator.physics.body import body_of
+from services.simulator.physics.plant import IDEAL
+from services.simulator.physics.world import World
 from shared.bus.messages import Cause, Mode, SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Scenario
 from tests.lockstep.runs import run, variant
-from tools.runs.lockstep import Lockstep
+from tools.sim.lockstep import Lockstep
 
 RESTING = variant(
     "stand",

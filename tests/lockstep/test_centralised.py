@@ -13,21 +13,21 @@ from services.joint.differential import joint_torque, motor_from_joint
 from services.joint.drive_manager import DriveAction, DriveCommand
 from services.joint.drivers.base import DriveReading, DriveStatus
 from services.planner.planner import Planner
-from services.simulator.plant import IDEAL, PlantConfig
+from services.simulator.physics.plant import IDEAL, PlantConfig
 from shared.bus.messages import JointState, Mode, Pair, PlannerMode, SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Scenario
-from shared.network.impairment import Impairment
 from shared.robot.robot_model import stand_pose
 from tests.joint.helpers import command
 from tests.lockstep.runs import push, variant
 from tests.planner.conftest import standing_torque
 from tests.test_architecture import IMPORTS, Import, imports_in
 from tools import cli
-from tools.runs.centralised.control import CentralPlanner, PassThrough
-from tools.runs.centralised.fleet import CONTROLS, SHIPPED, torques_only
-from tools.runs.lockstep import Lockstep
+from tools.sim.centralised.control import CentralPlanner, PassThrough
+from tools.sim.centralised.fleet import CONTROLS, SHIPPED, torques_only
+from tools.sim.lockstep import Lockstep
 
 ROOT = Path(__file__).resolve().parents[2]
 CYCLE_NS = 2 * NS_PER_MS
@@ -247,17 +247,17 @@ def test_once_it_leads_the_planner_leads_whatever_it_receives(robot: RobotConfig
 
 
 def knows_it(imports: list[Import]) -> bool:
-    return any(f"{one.full}.".startswith("tools.runs.centralised.") for one in imports)
+    return any(f"{one.full}.".startswith("tools.sim.centralised.") for one in imports)
 
 
 @pytest.mark.parametrize(
     "source",
     [
-        "from tools.runs.centralised.control import PassThrough",
-        "from tools.runs.centralised import fleet",
-        "from tools.runs import centralised",
-        "import tools.runs.centralised",
-        "def f():\n    import tools.runs.centralised.control as c",
+        "from tools.sim.centralised.control import PassThrough",
+        "from tools.sim.centralised import fleet",
+        "from tools.sim import centralised",
+        "import tools.sim.centralised",
+        "def f():\n    import tools.sim.centralised.control as c",
     ],
 )
 def test_every_importer_is_seen_however_it_is_written(source: str) -> None:
@@ -268,10 +268,10 @@ def test_every_importer_is_seen_however_it_is_written(source: str) -> None:
 def test_nothing_but_two_tools_knows_it_and_no_file_names_it() -> None:
     users = {file for file, imports in IMPORTS.items() if knows_it(imports)}
     assert users == {
-        "tools/runs/recorded_lockstep.py",
+        "tools/sim/recorded_lockstep.py",
         "tools/verbs/sim.py",
         "tools/lab/studies/sweeps/latency_trial.py",
-        "tools/runs/centralised/fleet.py",
+        "tools/sim/centralised/fleet.py",
     }
     for file in (*(ROOT / "deploy").glob("*.toml"), *(ROOT / "deploy" / "scenarios").glob("*")):
         assert "centralised" not in file.read_text(encoding="utf-8")

@@ -19,11 +19,11 @@ from shared.bus.messages import Cause, JointCommand, Message, Mode, PlannerStatu
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tests.lockstep import partial
 from tests.lockstep.partial import PartialCase
-from tools.runs.host_clock import HostClock
-from tools.runs.lockstep import FleetMoment, Lockstep
+from tools.sim.host_clock import HostClock
+from tools.sim.lockstep import FleetMoment, Lockstep
 
 HOUR_NS = 3600 * NS_PER_S
 HOSTS = ("planner", "harness", *MODULES)

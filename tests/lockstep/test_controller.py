@@ -13,7 +13,7 @@ import pytest
 from services.planner.controller import Action, Observation
 from services.planner.controller_file import controller_maker
 from services.planner.law.hocca import LawOutput
-from services.simulator.plant import PlantConfig, changed
+from services.simulator.physics.plant import PlantConfig, changed
 from shared.bus import topics
 from shared.bus.messages import Message, Mode, PlannerMode, PlannerStatus
 from shared.bus.topics import Topic
@@ -21,8 +21,8 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Kill, Push
 from tests.lockstep.runs import still
 from tools.lab.studies.sweeps import plants
-from tools.runs.lockstep import Lockstep
-from tools.runs.standing_start import begin_standing
+from tools.sim.lockstep import Lockstep
+from tools.sim.standing_start import begin_standing
 
 LQR = Path(__file__).parents[2] / "examples" / "lqr_controller.py"
 

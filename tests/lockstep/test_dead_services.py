@@ -7,7 +7,7 @@ import pytest
 from shared.bus.messages import Mode
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Kill, Push, Restart
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tests.lockstep.runs import push, run, variant
 from tools.lab.studies.sweeps.figures import Ending, ending_of
 

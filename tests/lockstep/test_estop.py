@@ -8,15 +8,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from services.simulator.plant import PlantConfig, changed
+from services.simulator.physics.plant import PlantConfig, changed
 from shared.bus.messages import Mode, SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Fault, Keyframe, Kill, Restart
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tests.lockstep.runs import at_rest, still
 from tools.lab.studies.sweeps import plants
-from tools.runs.lockstep import Lockstep
-from tools.runs.standing_start import begin_standing
+from tools.sim.lockstep import Lockstep
+from tools.sim.standing_start import begin_standing
 
 
 @pytest.mark.sampled(3)

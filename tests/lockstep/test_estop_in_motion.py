@@ -9,7 +9,7 @@ import pytest
 from shared.bus.messages import Mode
 from shared.config.robot_config import RobotConfig
 from tests.lockstep.runs import variant
-from tools.runs.lockstep import Lockstep
+from tools.sim.lockstep import Lockstep
 
 
 @pytest.mark.parametrize(("name", "at"), [("squat", 0.6), ("squat", 1.5), ("crawl", 1.0)])

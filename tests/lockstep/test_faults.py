@@ -9,8 +9,8 @@ from shared.bus.messages import Cause, DriveStatus, Mode
 from shared.can.cansimple import AxisState
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import FAULT_KINDS, Fault, FaultKind, Kill, Restart
+from shared.joints import MODULE_INDEX
 from shared.robot.fault_table import DRIVE_FAULTS
-from shared.robot.joints import MODULE_INDEX
 from tests.lockstep.runs import Run, run, still
 
 MODULE = "hip_left"

@@ -20,7 +20,7 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Keyframe, Scenario
 from tests.joint.helpers import T0
-from tools.runs.lockstep import Lockstep
+from tools.sim.lockstep import Lockstep
 
 TICK_NS = 4 * NS_PER_MS
 YES = [True] * 6

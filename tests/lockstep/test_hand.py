@@ -7,18 +7,18 @@ from pathlib import Path
 
 import pytest
 
-from services.simulator.led_hand import HEIGHT_MAX_RATE
+from services.simulator.physics.led_hand import HEIGHT_MAX_RATE
 from shared.bus import topics
 from shared.bus.messages import HandLead, Mode, SimTruth
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from tests.lockstep.runs import still
 from tools import cli
-from tools.runs import recorded_lockstep
-from tools.runs.hand_path import HandRow, hand_path
-from tools.runs.lockstep import FleetMoment, Lockstep
-from tools.runs.network import BASE
-from tools.runs.run_log import read_run
+from tools.logs.hand_path import HandRow, hand_path
+from tools.logs.run_log import read_run
+from tools.sim import recorded_lockstep
+from tools.sim.lockstep import FleetMoment, Lockstep
+from tools.sim.network import BASE
 
 PUSH, NO_PUSH = (0.0, 30.0, 0.0), (0.0, 0.0, 0.0)
 PATH = (

@@ -9,11 +9,11 @@ import pytest
 from shared.bus import topics
 from shared.bus.messages import Message, PlannerStatus, SimTruth, Tare, TareRequest, Wrench
 from shared.bus.topics import Topic
+from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Scenario
-from shared.network.impairment import Impairment
 from tests.lockstep.runs import still, variant
-from tools.runs.lockstep import Lockstep
+from tools.sim.lockstep import Lockstep
 
 
 def leaning(assist: float) -> Scenario:

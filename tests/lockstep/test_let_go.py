@@ -11,14 +11,14 @@ from typing import Any
 
 import pytest
 
-from services.simulator.plant import PlantConfig, changed
+from services.simulator.physics.plant import PlantConfig, changed
 from shared.bus.messages import PlannerMode, PlannerStatus, Trip
+from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe
-from shared.network.impairment import Impairment
 from tests.lockstep.runs import variant
-from tools.runs.lockstep import Lockstep
-from tools.runs.standing_start import begin_standing
+from tools.sim.lockstep import Lockstep
+from tools.sim.standing_start import begin_standing
 
 LET_GO_S = 3.0
 

@@ -10,10 +10,10 @@ import pytest
 from shared.bus.messages import Mode
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Fault, FaultKind, Keyframe, Kill
-from shared.robot.joints import MODULE_INDEX, MODULES
+from shared.joints import MODULE_INDEX, MODULES
 from tests.lockstep.runs import Run, kill, push, run, variant
 from tools.lab.studies.sweeps import plants
-from tools.runs.lockstep import Lockstep
+from tools.sim.lockstep import Lockstep
 
 PUSHED_AFTER = 1.0
 LASTING = 2.6

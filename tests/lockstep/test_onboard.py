@@ -10,9 +10,9 @@ from shared.bus.messages import Mode
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Kill, Restart
 from shared.exceptions import RunError
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tests.lockstep.runs import push, run, variant
-from tools.runs.lockstep import Lockstep
+from tools.sim.lockstep import Lockstep
 
 PUSHES = (push(3.6, 30.0, 0.0, 0.0), push(4.6, 0.0, 30.0, 0.0))
 

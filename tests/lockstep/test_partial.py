@@ -17,15 +17,15 @@ import random
 import pytest
 
 from services.planner.watch.engagement_fsm import GRACE_NS, WAITS_NS
-from shared.bus.links import ATTITUDES, DIRECTIONS, WRENCHES, directions_of
 from shared.bus.messages import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import MODULES, SIDES
+from shared.joints import MODULES, SIDES
+from shared.links import ATTITUDES, DIRECTIONS, WRENCHES, directions_of
 from tests.lockstep import partial
 from tests.lockstep.partial import KINDS, SUBSETS, PartialCase, run_case
 from tests.shared.mcap_log.runs import sample as sample_of
-from tools.runs.lockstep import FleetMoment
+from tools.sim.lockstep import FleetMoment
 
 LEGS = [tuple(module for module in MODULES if module.endswith(side)) for side in SIDES]
 ALWAYS = {"links": [*((module,) for module in MODULES), *LEGS]}

@@ -5,11 +5,11 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 
-from services.simulator.plant import PlantConfig, changed
+from services.simulator.physics.plant import PlantConfig, changed
 from shared.bus.messages import Mode, SimTruth
 from shared.config.robot_config import RobotConfig
 from tests.lockstep.runs import push, run, still
-from tools.runs.lockstep import Lockstep
+from tools.sim.lockstep import Lockstep
 
 
 def stand_without_planner(robot: RobotConfig, seconds: float) -> tuple[Lockstep, SimTruth]:

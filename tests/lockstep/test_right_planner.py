@@ -12,18 +12,18 @@ import pytest
 from services.joint.envelope import Envelope
 from services.joint.failsafe import Failsafe
 from services.planner.watch.trips import PlannerTrips
-from services.simulator.plant import PlantConfig, changed
+from services.simulator.physics.plant import PlantConfig, changed
 from shared.bus.messages import Cause, Outside, PlannerMode
+from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Keyframe, Push, Scenario
-from shared.network.impairment import Impairment
 from shared.robot.trip_table import JOINT_TRIPS
 from tests.lockstep.runs import kill, push, restart, variant
 from tools.lab.studies.sweeps import plants
 from tools.lab.studies.sweeps.push_range import PushRange
-from tools.runs.lockstep import Lockstep
-from tools.runs.network import BASE
-from tools.runs.standing_start import begin_standing
+from tools.sim.lockstep import Lockstep
+from tools.sim.network import BASE
+from tools.sim.standing_start import begin_standing
 
 DOWN = (Keyframe(at=0.0, height=1.188), Keyframe(at=1.5, height=0.95))
 

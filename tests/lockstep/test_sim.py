@@ -10,10 +10,10 @@ import pytest
 from shared.bus import topics
 from shared.bus.messages import PlannerStatus
 from shared.clock import NS_PER_S
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tools import cli
-from tools.runs import lockstep
-from tools.runs.run_log import read_run
+from tools.logs.run_log import read_run
+from tools.sim import lockstep
 
 NOT_HERE = (topics.ATTITUDE, topics.OPERATOR_INTENT, topics.TOOLS)
 """Periodic topics that a run in virtual time does not have: no IMU is fitted, the scenario requests
@@ -41,7 +41,7 @@ def test_a_run_is_recorded_judged_and_drawn(tmp_path: Path) -> None:
         if topic.recorded and topic.rate_hz > 0.0 and topic not in NOT_HERE
         if not log.count(topic.key(log.robot, MODULES[0] if topic.per_module else ""))
     }
-    assert lacking == set(), "publish it in tools/runs/virtual_*.py as the service does live"
+    assert lacking == set(), "publish it in tools/sim/virtual_*.py as the service does live"
 
 
 def test_a_frozen_planner_goes_on_in_its_session(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from services.simulator.plant import PlantConfig, changed
+from services.simulator.physics.plant import PlantConfig, changed
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Keyframe, Kill
 from tests.imu.robots import with_imu

@@ -98,7 +98,7 @@ def test_a_plain_average_of_the_legs_tips_the_soles(robot: RobotConfig) -> None:
     averaged = msgspec.structs.replace(
         robot, law=msgspec.structs.replace(robot.law, jacobian="average", split="diagonal")
     )
-    from tools.runs.lockstep import Lockstep  # noqa: PLC0415
+    from tools.sim.lockstep import Lockstep  # noqa: PLC0415
 
     world = Lockstep(averaged, still(5.0))
     tilt = 0.0

@@ -5,14 +5,14 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from services.simulator.plant import PlantConfig
+from services.simulator.physics.plant import PlantConfig
 from shared.bus.messages import PlannerMode
+from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe
-from shared.network.impairment import Impairment
 from tests.lockstep.runs import kill, push, restart, run, variant
 from tools.lab.studies.sweeps import plants
-from tools.runs.lockstep import Lockstep
+from tools.sim.lockstep import Lockstep
 
 Foot = tuple[float, float, float]
 

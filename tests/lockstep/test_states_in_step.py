@@ -11,9 +11,9 @@ from shared.bus.topics import Topic
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Kill, Restart
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tests.lockstep.runs import variant
-from tools.runs.lockstep import Lockstep
+from tools.sim.lockstep import Lockstep
 
 
 class Sent:

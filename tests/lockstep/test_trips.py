@@ -13,17 +13,17 @@ from typing import Any
 import msgspec
 import pytest
 
-from services.simulator.plant import PlantConfig, changed
+from services.simulator.physics.plant import PlantConfig, changed
 from shared.bus.messages import Cause, Mode, PlannerMode, PlannerStatus, Trip
 from shared.clock import NS_PER_S
+from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Push, Scenario
-from shared.network.impairment import Impairment
 from shared.robot.trip_table import JOINT_TRIPS, untripped
 from tests.lockstep.runs import still, variant
 from tools.lab.studies.sweeps.trips_trial import PLANTS, unfiltered
-from tools.runs.lockstep import Lockstep, Record, forget
-from tools.runs.standing_start import begin_standing
+from tools.sim.lockstep import Lockstep, Record, forget
+from tools.sim.standing_start import begin_standing
 
 RESTS_TWICE = changed(PlantConfig(), {"person.load_scale": 2.0})
 SHAKEN = [name for name in PLANTS if name != "rigid"]

@@ -11,10 +11,10 @@ from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Keyframe, Kill, Restart, Scenario
-from shared.robot.joints import MODULE_INDEX
+from shared.joints import MODULE_INDEX
 from tests.lockstep.runs import kill, variant
-from tools.runs.lockstep import Lockstep
-from tools.runs.standing_start import begin_standing
+from tools.sim.lockstep import Lockstep
+from tools.sim.standing_start import begin_standing
 
 SECOND = 99
 SQUAT = (

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from shared.bus.messages import SimTruth
+from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Scenario
-from shared.network.impairment import Impairment
 from tests.lockstep.runs import kill, restart, still
-from tools.runs.lockstep import Lockstep
-from tools.runs.standing_start import begin_standing
+from tools.sim.lockstep import Lockstep
+from tools.sim.standing_start import begin_standing
 
 CALM = still(1.5, height=1.1)
 HARD = still(1.5, height=1.0, kill=kill(0.4), restart=restart(0.9))

@@ -12,11 +12,11 @@ import pytest
 from scipy.signal import find_peaks
 
 from shared.bus.messages import Mode
+from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Keyframe, Push, Scenario
-from shared.network.impairment import Impairment
 from tests.lockstep.runs import Run, push, run, still, variant
-from tools.runs.lockstep import Lockstep
+from tools.sim.lockstep import Lockstep
 
 
 def one_late(module: str, delay_ms: float) -> tuple[Inject, ...]:

@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 
 from shared.bus.messages import Mode, Outside
+from shared.config.gain_schedule import believing
 from shared.config.robot_config import RobotConfig
-from shared.robot.gain_schedule import believing
 from tests.lockstep.runs import push, variant
 from tests.lockstep.wrong_planners import faults, wrong
-from tools.runs.lockstep import FleetMoment, Lockstep
-from tools.runs.network import BASE
+from tools.sim.lockstep import FleetMoment, Lockstep
+from tools.sim.network import BASE
 
 NAMES: Final = tuple(faults())
 EVERY: Final = 1 if os.environ.get("XRL_ALL_WRONG") else 15

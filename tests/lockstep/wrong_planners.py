@@ -12,7 +12,7 @@ import msgspec
 
 from services.planner.planner import Planner
 from shared.bus.messages import JointCommand, Pair
-from shared.robot.joints import MODULES, N_MODULES
+from shared.joints import MODULES, N_MODULES
 
 Commands = list[JointCommand]
 Fault = Callable[[Commands, int], Commands]

@@ -11,9 +11,9 @@ from services.network_proxy.event_loop import SocketWatch
 from services.network_proxy.listener import SocketListener
 from services.network_proxy.proxy_endpoint import Address, ProxyEndpoint
 from services.network_proxy.relay import Relay
-from shared.bus.links import Pair
 from shared.clock import NS_PER_MS
-from shared.network.impairment import Direction
+from shared.config.impairment import Direction
+from shared.links import Pair
 
 PAIR = Pair("planner", "knee_left")
 MESSAGE = bytes.fromhex("25 05 9d 01 21")

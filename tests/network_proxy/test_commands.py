@@ -15,11 +15,11 @@ import pytest
 from services.network_proxy.commands import ASKED_MAX, CommandHandler
 from services.network_proxy.control import ASKERS_MAX, ControlSocket
 from services.network_proxy.event_loop import SocketWatch
-from shared.bus.links import COMMANDS, DIRECTIONS
 from shared.bus.traces import LinkEvent
+from shared.config.impairment import Direction
 from shared.config.scenarios import Inject
 from shared.exceptions import FleetError
-from shared.network.impairment import Direction
+from shared.links import COMMANDS, DIRECTIONS
 from shared.network.impairment_schedule import ImpairmentSchedule
 from shared.network.proxy_protocol import LINE_MAX, SOCKET, Begin, Clear, List, Reply
 from tools.fleet.proxy_client import ProxyClient

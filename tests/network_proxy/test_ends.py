@@ -7,7 +7,7 @@ import socket
 import pytest
 
 from services.network_proxy.relay import LINKS_MAX
-from shared.network.impairment import Impairment
+from shared.config.impairment import Impairment
 from tests.network_proxy.rig import LEASE_NS, MESSAGE, WAIT_S, Rig, batch, heard, numbers
 
 CUT = Impairment(partition=True)

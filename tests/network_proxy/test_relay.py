@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from services.network_proxy.direction import PENDING_MAX, WAITING_MAX
-from shared.network.impairment import Impairment
+from shared.config.impairment import Impairment
 from tests.network_proxy.rig import DECLARE, MESSAGE, Rig, batch, heard, numbers
 
 

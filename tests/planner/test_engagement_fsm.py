@@ -9,8 +9,8 @@ from services.planner.watch.engagement_fsm import FORGET_NS, GRACE_NS, WAITS_NS,
 from shared.bus.messages import JointCommand, Mode, PlannerMode
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
+from shared.joints import MODULES
 from shared.robot.dropouts import Dropouts
-from shared.robot.joints import MODULES
 from tests.joint.helpers import Bench
 
 T = TypeVar("T")

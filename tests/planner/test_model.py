@@ -10,7 +10,7 @@ import pytest
 
 from services.planner.law.model import leg_geometry, load_pinocchio, q_tree
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import JOINTS, SIDES
+from shared.joints import JOINTS, SIDES
 from shared.robot.robot_model import mjcf
 from tests.planner import oracle
 from tests.planner.oracle import Array

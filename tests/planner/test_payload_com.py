@@ -8,8 +8,8 @@ import pytest
 
 from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.kinematics import Kinematics
+from shared.config.gain_schedule import inputs_of
 from shared.config.robot_config import RobotConfig
-from shared.robot.gain_schedule import inputs_of
 from shared.robot.robot_model import stand_pose
 from tests.planner import oracle
 from tests.planner.oracle import Array

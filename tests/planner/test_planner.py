@@ -21,9 +21,9 @@ from shared.bus.messages import (
     Wrench,
 )
 from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config import gain_schedule
 from shared.config.robot_config import RobotConfig
-from shared.robot import gain_schedule
-from shared.robot.joints import N_MODULES
+from shared.joints import N_MODULES
 from tests.planner.conftest import Closed, standing_torque
 from tests.planner.oracle import Array
 

@@ -14,7 +14,7 @@ from services.planner.watch.plausible import BEYOND_RAD, SPEED_MAX, Plausible
 from shared.bus.messages import Attitude, Mode, PlannerMode, Tare, Vector3, Wrench
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import N_JOINTS, N_MODULES
+from shared.joints import N_JOINTS, N_MODULES
 from tests.planner.conftest import Closed
 from tests.planner.test_planner import SESSION, START_NS, lead, receive_all, state
 

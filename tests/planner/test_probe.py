@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from services.planner.intents import Intents
 from services.planner.law.probe import NO_ROW, PROBE_S, ReferenceProbe
-from services.simulator.plant import PlantConfig
+from services.simulator.physics.plant import PlantConfig
 from shared.bus import topics
 from shared.bus.messages import JointState, Message, OperatorIntent, PlannerStatus
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Scenario
-from tools.runs.standing_start import begin_standing
+from tools.sim.standing_start import begin_standing
 from tools.tune.excitation import Excitation, SinePart
 from tools.tune.pose_probe import DIRECTIONS, ProbedLockstep, course_of
 

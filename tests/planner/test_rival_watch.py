@@ -16,7 +16,7 @@ from services.planner.watch.rival_watch import AGAIN_NS, RivalWatch
 from shared.bus.messages import JointState, PlannerMode, Refusal
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import N_MODULES
+from shared.joints import N_MODULES
 from tests.planner.conftest import Closed
 from tests.planner.oracle import Array
 from tests.planner.test_planner import SESSION, START_NS, lead, receive_all, state

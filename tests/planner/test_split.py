@@ -16,10 +16,10 @@ from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.kinematics import Kinematics
 from services.planner.law.split import GainSplit, ScheduledGains
 from shared.bus.messages import SplitSource
+from shared.config.gain_schedule import digest_of, inputs_of
+from shared.config.gain_table import GainSchedule
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.exceptions import ConfigError
-from shared.robot.gain_schedule import digest_of, inputs_of
-from shared.robot.gain_table import GainSchedule
 from shared.robot.robot_model import stand_pose
 from tests.planner.conftest import Closed
 from tests.planner.oracle import Array

@@ -20,7 +20,7 @@ from shared.config.sections import RecorderConfig
 from shared.mcap_log.writer import RunWriter
 from tests.shared.mcap_log import runs
 from tests.shared.mcap_log.runs import ROBOT, STATE_KEY, Queue, item
-from tools.runs.run_log import read_run
+from tools.logs.run_log import read_run
 
 CYCLE_NS = 20 * NS_PER_MS
 EVENT_KEY = topics.JOINT_EVENT.key(ROBOT, "knee_right")

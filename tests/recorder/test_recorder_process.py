@@ -24,7 +24,7 @@ from shared.exceptions import RunError
 from shared.places import DEFAULT_CONFIG
 from tests.shared.mcap_log import runs
 from tools import cli
-from tools.runs.run_log import RunLog, read_run
+from tools.logs.run_log import RunLog, read_run
 
 pytestmark = pytest.mark.system
 

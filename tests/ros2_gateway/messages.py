@@ -14,7 +14,7 @@ from shared.bus.messages import (
     Vector6,
     Wrench,
 )
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 
 ZERO6: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 

@@ -15,9 +15,9 @@ from services.ros2_gateway.conversions import Conversions
 from services.ros2_gateway.ros_types import RosTypes
 from shared.bus.messages import Cause, DriveStatus, Mode, PlannerMode, Trip
 from shared.config.robot_config import RobotConfig
+from shared.joints import JOINTS, MODULES
 from shared.robot import frames
 from shared.robot.frames import Quaternion
-from shared.robot.joints import JOINTS, MODULES
 from shared.robot.robot_urdf import cross_of
 from tests.ros2_gateway.messages import all_states, joint_state, planner_status, wrench
 from tests.ros2_gateway.others import read

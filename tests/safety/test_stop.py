@@ -10,7 +10,7 @@ from services.joint.drivers.base import DriveStatus
 from shared.bus.messages import Cause, Mode
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import kind_of
+from shared.joints import kind_of
 from tests.joint.helpers import Bench
 
 

@@ -18,9 +18,9 @@ from services.planner.planner import Planner
 from services.planner.watch.engagement_fsm import GRACE_NS, Engagement
 from shared.bus.messages import Cause, Mode, PlannerMode, Refusal, Wrench
 from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config.gain_schedule import believing
 from shared.config.robot_config import RobotConfig
-from shared.robot.gain_schedule import believing
-from shared.robot.joints import MODULES, kind_of
+from shared.joints import MODULES, kind_of
 from shared.robot.robot_model import stand_pose
 from tests.joint.helpers import SESSION, T0, Bench, command
 from tests.planner.test_planner import SESSION as PLANNER

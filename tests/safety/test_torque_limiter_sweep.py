@@ -10,7 +10,7 @@ import pytest
 from services.joint.torque_limiter import TorqueLimits, limit_differential, limit_torque, limits_of
 from shared.bus.messages import Pair
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import KINDS
+from shared.joints import KINDS
 
 ROUNDING = 1e-9
 HUGE = 1.7e308

@@ -18,8 +18,8 @@ from shared.bus.messages import Estop, JointCommand, JointEvent, Wrench
 from shared.bus.session import Latest, Publisher, Session, open_session
 from shared.config import files as config_file
 from shared.exceptions import BusError
+from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
-from shared.robot.joints import MODULES
 
 ROOT = Path(__file__).resolve().parents[2]
 ROBOT = config_file.load(DEFAULT_CONFIG)

@@ -11,8 +11,8 @@ import pytest
 from services.joint.drive_setpoint import GAIN_UPDATE_MIN_MS, DriveSetpointLaw
 from services.joint.drivers.resend_policy import GainRow, ResendPolicy
 from services.joint.pd_law import ZERO, Setpoint
-from shared.can.can_load import BLEND_HZ, BLEND_MAX, LOAD_MAX, BusLoad, bus_load, frame_bits
 from shared.can.cansimple import Command, arbitration_id, pack_input_pos, pack_two_floats
+from shared.config.can_load import BLEND_HZ, BLEND_MAX, LOAD_MAX, BusLoad, bus_load, frame_bits
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
 from tests.shared.test_config import Table, load_changed, setting

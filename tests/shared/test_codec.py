@@ -12,7 +12,7 @@ from shared.bus.codec import Decoder, encode
 from shared.bus.messages import JointCommand, Message
 from shared.bus.topics import JOINT_STATE, TOPICS, WRENCH, Topic, all_keys, keys
 from shared.exceptions import NonFiniteError
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 NOT_FINITE = (math.nan, math.inf, -math.inf)

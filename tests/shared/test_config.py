@@ -18,9 +18,9 @@ from shared.config import files as config_file
 from shared.config.checks import INTERFACES
 from shared.config.robot_config import RobotConfig, expand
 from shared.config.scenarios import Fault, Scenario
-from shared.config.toml_file import Range
 from shared.exceptions import ConfigError
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
+from shared.toml_file import Range
 from tests.conftest import ROBOT_FILE
 
 Table = dict[str, Any]

@@ -9,8 +9,8 @@ import pytest
 from services.planner.law.kinematics import Kinematics, Measured
 from services.planner.law.model import load_pinocchio, q_tree
 from shared.config.robot_config import RobotConfig
+from shared.joints import JOINTS, MODULES
 from shared.robot import frames
-from shared.robot.joints import JOINTS, MODULES
 from shared.robot.robot_model import stand_pose
 from shared.robot.robot_urdf import cross_of, urdf
 

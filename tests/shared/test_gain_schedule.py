@@ -16,11 +16,11 @@ import pytest
 import tomli_w
 
 from shared.config import files as config_file
+from shared.config import gain_schedule
+from shared.config.gain_schedule import digest_of, inputs_of
+from shared.config.gain_table import GainSchedule
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
-from shared.robot import gain_schedule
-from shared.robot.gain_schedule import digest_of, inputs_of
-from shared.robot.gain_table import GainSchedule
 from tests.conftest import ROBOT_FILE
 
 INPUTS = inputs_of(config_file.load(ROBOT_FILE))

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shared.bus.links import DIRECTIONS, GROUPS, PAIRS, directions_of
 from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config.impairment import HELD, QUEUE_MAX, Direction, Distribution, Impairer, Impairment
 from shared.exceptions import ConfigError
-from shared.network.impairment import HELD, QUEUE_MAX, Direction, Distribution, Impairer, Impairment
+from shared.links import DIRECTIONS, GROUPS, PAIRS, directions_of
 
 EVERY_NS = 4 * NS_PER_MS
 SIZE = 200

@@ -6,10 +6,10 @@ import math
 
 import pytest
 
-from shared.bus.links import COMMANDS, DIRECTIONS, WRENCHES
 from shared.bus.traces import LinkEvent
+from shared.config.impairment import Direction, Impairment
 from shared.exceptions import ConfigError
-from shared.network.impairment import Direction, Impairment
+from shared.links import COMMANDS, DIRECTIONS, WRENCHES
 from shared.network.impairment_schedule import ImpairmentSchedule
 from shared.network.proxy_protocol import RequestedImpairment
 

@@ -6,7 +6,7 @@ from shared.bus import topics
 from shared.bus.session import peers_of
 from shared.bus.topics import Topic
 from shared.config.robot_config import SERVICES
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 
 TOOL = "test"
 

@@ -10,7 +10,7 @@ import sys
 import pytest
 
 from shared import scheduling
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from shared.scheduling import SLICE_NS, TABLE, TIMER_SLACK_NS, half_of
 from tools.fleet.process_table import TABLE as PROCESSES
 from tools.fleet.process_table import load_table
@@ -113,7 +113,7 @@ def test_a_process_is_pinned_only_where_the_fleets_table_says_so(pinned: str) ->
     assert (same == "True") == (pinned == "1" or count == "1")
 
 
-@pytest.mark.parametrize("first", ["services.planner.planner", "tools.runs.lockstep", "tools.cli"])
+@pytest.mark.parametrize("first", ["services.planner.planner", "tools.sim.lockstep", "tools.cli"])
 def test_linear_algebra_runs_in_one_thread_whatever_is_imported_first(first: str) -> None:
     script = (
         f"import {first}, numpy as np\n"

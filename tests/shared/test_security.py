@@ -29,8 +29,8 @@ from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import BusSecurityConfig
 from shared.exceptions import BusError, ConfigError
+from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
-from shared.robot.joints import MODULES
 from tests.certified import certified, install_all, opened
 from tools.keys import certificates
 from tools.keys.authority import Authority

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.simulator import plant
+from services.simulator.physics import plant
 from shared.config import files, scenarios
 from shared.exceptions import ConfigError
 from shared.text_file import decoded, read_text

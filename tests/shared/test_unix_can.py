@@ -12,7 +12,7 @@ from pathlib import Path
 import can
 import pytest
 
-from services.simulator.unix_can_hub import UnixCanHub
+from services.simulator.fronts.unix_can_hub import UnixCanHub
 from shared.can.unix_can import REMOTE_FLAG, UnixCanBus, pack_frames, unpack_frames
 from shared.exceptions import FleetError
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from services.simulator.axis_bank import AxisBank
+from services.simulator.drives.axis_bank import AxisBank
 from shared.can.cansimple import AxisState, ControlMode, InputMode
 from shared.config.sections import DriveConfig
 

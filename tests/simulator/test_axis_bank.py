@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.simulator.axis_bank import AXIS_NAMES, FAULTS, AxisBank, AxisErrors
+from services.simulator.drives.axis_bank import AXIS_NAMES, FAULTS, AxisBank, AxisErrors
 from shared.can.cansimple import AxisError, AxisState, ControllerError, ControlMode, InputMode
 from shared.exceptions import DriveError
 from tests.simulator.banks import CPR, DRIVE, DT, ZERO, make_bank

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from services.simulator.axis_bank import AxisBank
-from services.simulator.axis_calibration import ENCODER_S, MOTOR_S
+from services.simulator.drives.axis_bank import AxisBank
+from services.simulator.drives.axis_calibration import ENCODER_S, MOTOR_S
 from shared.can.cansimple import AxisError, AxisState, EncoderError
 from tests.simulator.banks import DT, make_bank, step_for
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from services.simulator.axis_bank import AxisBank
+from services.simulator.drives.axis_bank import AxisBank
 from shared.can.cansimple import AxisState, ControlMode, InputMode
 from tests.simulator.banks import DRIVE, ZERO, make_bank
 

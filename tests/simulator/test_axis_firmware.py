@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.simulator.axis_bank import AxisBank
+from services.simulator.drives.axis_bank import AxisBank
 from shared.can.cansimple import AxisState, InputMode
 from tests.simulator.banks import CPR, DRIVE, DT, ZERO
 from tests.simulator.firmware import FirmwareAxis

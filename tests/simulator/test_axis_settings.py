@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from services.simulator.axis_settings import NAMES, Settings, configured
+from services.simulator.drives.axis_settings import NAMES, Settings, configured
 from shared.can.cansimple import AxisState
 from shared.exceptions import DriveError
 from tests.simulator.banks import CPR, DRIVE, DT, make_bank, step_for

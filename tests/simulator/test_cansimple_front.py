@@ -11,15 +11,15 @@ from pathlib import Path
 import can
 import pytest
 
-from services.simulator.axis_faults import BUS_FAULTS, FAULTS
-from services.simulator.cansimple_dialects import (
+from services.simulator.drives.axis_faults import BUS_FAULTS, FAULTS
+from services.simulator.fronts.cansimple_dialects import (
     SDO_ENDPOINTS,
     VERSION_06,
     DialectName,
     errors_06,
 )
-from services.simulator.cansimple_front import CanSimpleFront
-from services.simulator.unix_can_hub import UnixCanHub
+from services.simulator.fronts.cansimple_front import CanSimpleFront
+from services.simulator.fronts.unix_can_hub import UnixCanHub
 from shared.can import cansimple, cansimple_06
 from shared.can.cansimple import AxisState, Command, arbitration_id
 from shared.can.cansimple_06 import Command06, DriveError06, ProcedureResult, SdoOpcode

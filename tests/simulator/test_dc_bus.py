@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from services.simulator.axis_settings import PHASE_RESISTANCE
-from services.simulator.dc_bus import SUPPLY_RESISTANCE, SUPPLY_VOLTAGE
+from services.simulator.drives.axis_settings import PHASE_RESISTANCE
+from services.simulator.drives.dc_bus import SUPPLY_RESISTANCE, SUPPLY_VOLTAGE
 from shared.can.cansimple import AxisError, AxisState, MotorError, OdriveError
 from tests.simulator.banks import DT, make_bank, step_for
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.simulator.body import body_of
-from services.simulator.drivetrain import FlexibleDrivetrain
-from services.simulator.plant import IDEAL, Drivetrain, PlantConfig, changed
-from services.simulator.world import World
+from services.simulator.physics.body import body_of
+from services.simulator.physics.drivetrain import FlexibleDrivetrain
+from services.simulator.physics.plant import IDEAL, Drivetrain, PlantConfig, changed
+from services.simulator.physics.world import World
 from shared.config.robot_config import RobotConfig
 from tests.lockstep.runs import still
-from tools.runs.lockstep import Lockstep
+from tools.sim.lockstep import Lockstep
 
 DT = 1e-3
 QUIET = {"motor_friction": 0.0, "cogging": 0.0, "play": 0.0}

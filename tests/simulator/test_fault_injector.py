@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from services.simulator.axis_bank import AXIS_NAMES, AxisBank
-from services.simulator.axis_conditions import BOOT_S
-from services.simulator.axis_faults import AxisErrors as Registers
+from services.simulator.drives.axis_bank import AXIS_NAMES, AxisBank
+from services.simulator.drives.axis_conditions import BOOT_S
+from services.simulator.drives.axis_faults import AxisErrors as Registers
 from services.simulator.fault_injector import FaultInjector
 from shared.can.cansimple import (
     AxisError,
@@ -20,7 +20,7 @@ from shared.can.cansimple import (
     OdriveError,
 )
 from shared.config.scenarios import FAULT_KINDS, Fault
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tests.simulator.banks import DT, ZERO, make_bank
 
 FAILED = AxisError.MOTOR_FAILED

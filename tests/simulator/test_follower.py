@@ -7,7 +7,7 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.simulator.follower import BANDWIDTH, Follower
+from services.simulator.physics.follower import BANDWIDTH, Follower
 
 RATE_MAX = 0.5
 PLACES = st.floats(-10.0, 10.0)

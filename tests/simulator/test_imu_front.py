@@ -7,16 +7,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from services.imu.attitude import AttitudeLaw
-from services.simulator.body import body_of
-from services.simulator.imu_front import ImuFront
-from services.simulator.plant import ImuErrors, PlantConfig, changed
-from services.simulator.world import World
+from services.simulator.fronts.imu_front import ImuFront
+from services.simulator.physics.body import body_of
+from services.simulator.physics.plant import ImuErrors, PlantConfig, changed
+from services.simulator.physics.world import World
 from shared.bus.messages import Vector3
 from shared.can.imu_can import ImuAssembler
 from shared.config.robot_config import RobotConfig
 from tests.imu.robots import with_imu
 from tests.lockstep.runs import still
-from tools.runs.virtual_can import VirtualCan
+from tools.sim.virtual_can import VirtualCan
 
 EXACT = ImuErrors(tilt=(0.0, 0.0), noise=0.0)
 

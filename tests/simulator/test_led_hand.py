@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.simulator import led_hand
-from services.simulator.led_hand import LedHand
+from services.simulator.physics import led_hand
+from services.simulator.physics.led_hand import LedHand
 from shared.bus.messages import HandLead
 from shared.config.scenarios import Lead
 

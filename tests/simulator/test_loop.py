@@ -8,13 +8,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from services.simulator.axis_bank import AxisBank
-from services.simulator.body import body_of
-from services.simulator.cansimple_front import CanSimpleFront
-from services.simulator.harness_front import HarnessFront
+from services.simulator.drives.axis_bank import AxisBank
+from services.simulator.fronts.cansimple_front import CanSimpleFront
+from services.simulator.fronts.harness_front import HarnessFront
 from services.simulator.loop import SimulatorLoop, SimulatorPorts
-from services.simulator.plant import IDEAL
-from services.simulator.world import World
+from services.simulator.physics.body import body_of
+from services.simulator.physics.plant import IDEAL
+from services.simulator.physics.world import World
 from shared.can.cansimple import AxisState, ControlMode, InputMode
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Fault, Keyframe, Scenario

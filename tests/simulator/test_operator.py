@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from services.simulator.operator import Operator, Wearer
-from services.simulator.plant import IDEAL, Person
+from services.simulator.physics.operator import Operator, Wearer
+from services.simulator.physics.plant import IDEAL, Person
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Lead
 

@@ -9,14 +9,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from services.simulator.body import body_of
-from services.simulator.plant import IDEAL, PlantConfig, changed, load, plant_from, to_toml
-from services.simulator.world import World
+from services.simulator.physics.body import body_of
+from services.simulator.physics.plant import IDEAL, PlantConfig, changed, load, plant_from, to_toml
+from services.simulator.physics.world import World
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
 from tests.lockstep.runs import variant
 from tools.lab.studies.sweeps import plants
-from tools.runs.lockstep import Lockstep
+from tools.sim.lockstep import Lockstep
 
 WRONG = {
     "body.payload_scale": 0.85,

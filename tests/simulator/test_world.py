@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.simulator.body import body_of
-from services.simulator.plant import IDEAL, changed
-from services.simulator.world import World
+from services.simulator.physics.body import body_of
+from services.simulator.physics.plant import IDEAL, changed
+from services.simulator.physics.world import World
 from shared.bus.messages import SimTruth
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.config.scenarios import Keyframe, Push, Scenario
-from shared.robot.joints import JOINTS, SIDES
+from shared.joints import JOINTS, SIDES
 
 Array = NDArray[np.float64]
 

@@ -28,7 +28,7 @@ from shared.bus.codec import encode
 from shared.bus.messages import RunEvent, RunEventKind
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig, expand
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 
 PER_S: Final = 10_000
 HELD: Final = 500

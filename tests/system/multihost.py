@@ -25,23 +25,23 @@ from typing import Any, Final
 import msgspec
 import tomli_w
 
-from services.simulator.plant import PlantConfig
+from services.simulator.physics.plant import PlantConfig
 from shared.bus.session import open_session
 from shared.bus.topics import HOST_RECORDER
 from shared.clock import now_ns
 from shared.config import scenarios
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Push, Scenario
+from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
-from shared.robot.joints import MODULES
 from tests.certified import certified
 from tests.system.namespaces import Network
 from tools.fleet import process_table
 from tools.fleet.pace import run_at_fitting_pace
 from tools.fleet.parent_death import die_with_parent
 from tools.fleet.supervise import SupervisedFleet
-from tools.runs import experiment
-from tools.runs.scenario_runner import LiveSnapshot, ScenarioRunner
+from tools.live import experiment
+from tools.live.scenario_runner import LiveSnapshot, ScenarioRunner
 
 BODY: Final = "body"
 LEGS: Final = {

@@ -18,10 +18,10 @@ from typing import Final
 from shared.bus import topics
 from shared.bus.messages import Mode
 from shared.clock import NS_PER_S
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tools.fleet import stall_watch
 from tools.fleet.stall_watch import gaps_in
-from tools.runs.run_log import read_run
+from tools.logs.run_log import read_run
 
 NEVER_READY: Final = "not all six modules track after"
 """Said by whoever leads the fleet, with exit code 2."""

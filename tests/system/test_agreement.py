@@ -23,20 +23,20 @@ import pytest
 
 from shared.bus import topics
 from shared.bus.codec import Decoder
-from shared.bus.links import DIRECTIONS
 from shared.bus.messages import JointState
 from shared.bus.session import Publisher, Session, open_session
 from shared.clock import NS_PER_MS, NS_PER_S, now_ns
 from shared.config import files as config_file
+from shared.config.impairment import Impairer, Impairment
 from shared.config.scenarios import Inject
-from shared.network.impairment import Impairer, Impairment
+from shared.joints import MODULES
+from shared.links import DIRECTIONS
 from shared.network.proxy_protocol import SOCKET
 from shared.places import DEFAULT_CONFIG
-from shared.robot.joints import MODULES
 from tests.shared.mcap_log.runs import sample
 from tests.system.stalls import has_stalled, stalled_before_it_began
 from tools.fleet.proxy_client import ProxyClient
-from tools.runs.run_log import read_run
+from tools.logs.run_log import read_run
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(240)]
 

@@ -16,11 +16,11 @@ import pytest
 from shared.bus import topics
 from shared.bus.messages import PlannerStatus, Wrench
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tests.system.stalls import stalled_before_it_began
 from tools.fleet import procfs
-from tools.runs.run_log import read_run
-from tools.runs.stalls import stalls_of
+from tools.judge.stalls import stalls_of
+from tools.logs.run_log import read_run
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 

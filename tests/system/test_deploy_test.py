@@ -79,7 +79,7 @@ def test_all_parts_are_run_and_success_is_exit_code_0(root: Path) -> None:
     assert said.count("ruff called") == 2
     assert said.count("mypy called") == 1
     assert said.count("\npytest called") == 3
-    assert said.count("python called: -m tools.mutants --sample") == 1
+    assert said.count("python called: -m tools.dev.mutants --sample") == 1
     assert said.count("python called: -m tools.graph_libraries") == 1
 
 

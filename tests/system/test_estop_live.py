@@ -19,8 +19,8 @@ from shared.bus import topics
 from shared.bus.messages import JointState, Mode, SimTruth
 from shared.bus.session import Latest, open_session
 from shared.config.robot_config import RobotConfig
+from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
-from shared.robot.joints import MODULES
 from tests.system.verbs import xrl
 from tools.fleet import procfs
 from tools.fleet.supervise import SupervisedFleet

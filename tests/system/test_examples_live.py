@@ -21,8 +21,8 @@ from shared.bus.messages import JointState, Mode, PlannerMode, PlannerStatus, Si
 from shared.bus.session import open_session
 from shared.config.files import load
 from shared.config.robot_config import RobotConfig
+from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
-from shared.robot.joints import MODULES
 from shared.run_directory import RUN_DIR_VARIABLE
 from tests.system.waiting import wait_for
 from tools.fleet.supervise import SupervisedFleet

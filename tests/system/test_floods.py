@@ -21,8 +21,8 @@ from shared.bus.messages import JointState, Mode, SimTruth
 from shared.bus.session import Latest, Session, open_session
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
+from shared.joints import MODULES
 from shared.places import CHECKOUT, DEFAULT_CONFIG
-from shared.robot.joints import MODULES
 from tests.certified import certified
 from tools.fleet.supervise import SupervisedFleet
 

@@ -18,8 +18,8 @@ import pytest
 from shared.bus.topics import OPERATOR, VIEWER
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
+from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
-from shared.robot.joints import MODULES
 from tests.certified import certified, install_all
 from tests.system.waiting import wait_for
 from tools import cli

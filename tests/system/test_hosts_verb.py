@@ -20,8 +20,8 @@ from shared.bus.messages import JointState, Mode
 from shared.bus.session import Session, open_session
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
+from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
-from shared.robot.joints import MODULES
 from tests.certified import install_all
 from tests.system.test_hosts import with_drives_in
 from tests.system.waiting import wait_for
@@ -30,7 +30,7 @@ from tools import cli
 from tools.fleet import procfs
 from tools.fleet.supervise import SupervisedFleet
 from tools.keys.authority import Authority
-from tools.runs.run_log import read_run
+from tools.logs.run_log import read_run
 
 pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(240)]
 

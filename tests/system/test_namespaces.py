@@ -33,15 +33,15 @@ from shared.bus.messages import (
 )
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tests.shared.mcap_log.runs import ROBOT, sample, write
 from tests.system.multihost import BODY, LEGS, RECORDED, REPORT, Cut, Report
 from tests.system.namespaces import isolation, processes_in
 from tests.system.stalls import stalled_before_it_began
 from tools.fleet import procfs
-from tools.runs.joined_records import host_record, join
-from tools.runs.run_index import RunIndex
-from tools.runs.run_log import RunLog, read_run
+from tools.logs.joined_records import host_record, join
+from tools.logs.run_index import RunIndex
+from tools.logs.run_log import RunLog, read_run
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(240)]
 

@@ -20,8 +20,8 @@ from shared.bus.messages import Estop, JointCommand, JointEvent, JointState, Mod
 from shared.bus.session import open_session
 from shared.bus.traces import JointTrace
 from shared.clock import NS_PER_S
+from shared.config.gain_schedule import believing
 from shared.config.robot_config import RobotConfig
-from shared.robot.gain_schedule import believing
 from tests.joint.helpers import SESSION, command
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(60)]

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.tools.analysis.playback.bench import (
+from tests.tools.logs.playback.bench import (
     NAME,
     ROOT,
     STATE,
@@ -66,7 +66,7 @@ STANDS_STILL = """
 import os, signal, sys, time
 from pathlib import Path
 from shared.bus.session import open_session
-from tests.tools.analysis.playback.bench import LISTEN, ROBOT
+from tests.tools.logs.playback.bench import LISTEN, ROBOT
 with open_session(ROBOT, "ear", Path(sys.argv[1]), connect=[LISTEN]) as session:
     stream = session.stream(["replay/**"], capacity=1_000_000)
     while stream.take() is None:

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from shared.bus.messages import Mode
+from shared.joints import JOINTS, MODULES
 from shared.places import DEFAULT_CONFIG
-from shared.robot.joints import JOINTS, MODULES
 from tests.system.ros2_network import OtherNode, free_port, router, session
 from tests.system.waiting import wait_for
 

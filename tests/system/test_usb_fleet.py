@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tests.system.stalls import stalled_before_it_began
 from tests.usb import robot_file
 from tools.fleet import procfs

@@ -18,8 +18,8 @@ import pytest
 from shared.bus import topics
 from shared.bus.messages import Mode, RunEventKind
 from shared.places import CHECKOUT
-from tools.runs.hand_path import hand_path
-from tools.runs.run_log import read_run
+from tools.logs.hand_path import hand_path
+from tools.logs.run_log import read_run
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(240)]
 

@@ -22,8 +22,8 @@ from shared.bus.session import open_session
 from shared.can import cansimple
 from shared.can.cansimple import Command
 from shared.config.robot_config import RobotConfig, expand
+from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
-from shared.robot.joints import MODULES
 from tests.system.verbs import xrl
 from tools.bringup import bench, zeroing
 from tools.bringup.zeroing import DriveLook, look

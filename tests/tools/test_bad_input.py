@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
 from shared.exceptions import RunError
-from tests.tools.analysis.reexecution.test_golden import NEWEST
+from tests.tools.logs.reexecution.test_golden import NEWEST
 from tools import cli
+from tools.logs.run_log import RunLog, read_run
 from tools.output import write_atomically
-from tools.runs.run_log import RunLog, read_run
 
 RUN = str(NEWEST)
 LONG = "x" * 5000

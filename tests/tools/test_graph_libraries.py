@@ -11,9 +11,9 @@ import casadi as ca
 import pytest
 
 from services.planner.planner import Planner
-from services.simulator.body import body_of
-from services.simulator.plant import PlantConfig
-from services.simulator.world import World
+from services.simulator.physics.body import body_of
+from services.simulator.physics.plant import PlantConfig
+from services.simulator.physics.world import World
 from shared.config import scenarios
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
@@ -21,7 +21,7 @@ from shared.robot import compiled_graph
 from shared.robot.compiled_graph import FLAGS, SWITCH, CompiledGraph, library_of
 from tools import graph_libraries
 from tools.graph_libraries import build, compare, graphs_of
-from tools.runs.experiment import scenario_file
+from tools.live.experiment import scenario_file
 
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler here")
 

@@ -10,11 +10,11 @@ from typing import Any, Final
 import pytest
 
 from shared.exceptions import RunError
-from tests.tools.analysis.reexecution.test_golden import NEWEST
 from tests.tools.exit_codes import exit_code
+from tests.tools.logs.reexecution.test_golden import NEWEST
 from tests.tools.test_bad_input import made_up
-from tools.runs import verdict
-from tools.runs.run_log import read_run
+from tools.judge import verdict
+from tools.logs.run_log import read_run
 
 SCRIPT: Final = "<script>alert(1)</script>"
 HOSTILE: Final = f'[/b][bold red][link=x]\x1b]0;owned\x07\x1b[2J\x9b31m\u202e\r\nSTOOD {SCRIPT}&"'

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tools.analysis.playback.press import PRESSES, Press
 from tools.keyboard import Keyboard, understood
+from tools.logs.playback.press import PRESSES, Press
 
 TYPED = {b" ": Press.PAUSE, b"\x1b[C": Press.STEP, b"\x1bOA": Press.FASTER, b"q": Press.QUIT}
 

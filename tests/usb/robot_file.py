@@ -9,7 +9,7 @@ from typing import Final
 import msgspec
 
 from shared.config import files as config_file
-from shared.robot import gain_schedule
+from shared.config import gain_schedule
 from tests.conftest import ROBOT_FILE
 
 RATES: Final = (

@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from services.joint.drivers.base import Drive, DriveStatus, MotorTarget
-from services.simulator.axis_bank import AxisBank
-from services.simulator.fibre_endpoints import EmulatedBoard
-from services.simulator.fibre_front import FibreFront
-from services.simulator.fibre_port import FibreHub, FibrePort
-from services.simulator.usb_standin import build, load
+from services.simulator.drives.axis_bank import AxisBank
+from services.simulator.fronts.fibre_endpoints import EmulatedBoard
+from services.simulator.fronts.fibre_front import FibreFront
+from services.simulator.fronts.fibre_port import FibreHub, FibrePort
+from services.simulator.fronts.usb_standin import build, load
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import MODULES, N_JOINTS
+from shared.joints import MODULES, N_JOINTS
 
 __all__ = ["Control", "UsbRobot", "build", "load"]
 

@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.simulator.axis_bank import AxisBank
-from services.simulator.axis_settings import NAMES
-from services.simulator.fibre_endpoints import CODECS, EmulatedBoard
-from services.simulator.fibre_front import FibreFront, crc16
+from services.simulator.drives.axis_bank import AxisBank
+from services.simulator.drives.axis_settings import NAMES
+from services.simulator.fronts.fibre_endpoints import CODECS, EmulatedBoard
+from services.simulator.fronts.fibre_front import FibreFront, crc16
 from shared.can.cansimple import AxisError, AxisState
 from shared.config.robot_config import RobotConfig
 

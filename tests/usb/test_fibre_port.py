@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from services.simulator.axis_bank import AxisBank
-from services.simulator.fibre_endpoints import EmulatedBoard
-from services.simulator.fibre_front import FibreFront
-from services.simulator.fibre_port import LOOK_EVERY, FibreHub, FibrePort
+from services.simulator.drives.axis_bank import AxisBank
+from services.simulator.fronts.fibre_endpoints import EmulatedBoard
+from services.simulator.fronts.fibre_front import FibreFront
+from services.simulator.fronts.fibre_port import LOOK_EVERY, FibreHub, FibrePort
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError
 

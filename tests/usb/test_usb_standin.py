@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from services.simulator import usb_standin
+from services.simulator.fronts import usb_standin
 from shared.exceptions import FleetError
 
 

@@ -19,7 +19,7 @@ from shared import places
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig, expand
 from shared.exceptions import FleetError, XrlError
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tools.bringup import reach
 from tools.fleet import process_table, procfs
 from tools.fleet.run_dir import RunDir

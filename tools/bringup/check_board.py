@@ -18,8 +18,8 @@ from shared.can.cansimple import (
 from shared.can.drive_settings import AXES, WantedSetting, describe_value
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
-from shared.robot.joints import AXES as JOINT_AXES
-from shared.robot.joints import MODULE_INDEX
+from shared.joints import AXES as JOINT_AXES
+from shared.joints import MODULE_INDEX
 from tools.bringup.boards import FIRMWARE, Value, describe_firmware, is_known, number
 from tools.bringup.rows import Finding, FindingKind, judged, ok, warning, wrong
 

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Final
 
 from shared.bus import same_host
+from shared.config import gain_schedule
 from shared.config.robot_config import RobotConfig, expand
 from shared.exceptions import FleetError
-from shared.robot import gain_schedule
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tools.bringup.rows import Finding, judged, ok, warning, wrong
 from tools.fleet import process_table
 from tools.fleet.process_table import ListenPoint

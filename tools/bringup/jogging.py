@@ -22,7 +22,7 @@ from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import StandGains
 from shared.exceptions import DriveError
-from shared.robot.joints import AXES, kind_of
+from shared.joints import AXES, kind_of
 
 SETTLE_S: Final = 0.7
 """Held where it is before it moves, and again afterwards."""

@@ -16,8 +16,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-from services.simulator import usb_standin
-from services.simulator.axis_settings import Settings, plant
+from services.simulator.drives.axis_settings import Settings, plant
+from services.simulator.fronts import usb_standin
 from shared.config.robot_config import RobotConfig, expand
 from shared.config.sections import CanConfig
 from shared.exceptions import FleetError

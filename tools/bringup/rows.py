@@ -9,7 +9,7 @@ from typing import Final
 import msgspec
 
 from shared.can.drive_settings import AXES
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 
 
 class FindingKind(StrEnum):

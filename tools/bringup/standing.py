@@ -11,7 +11,7 @@ from services.planner.law.kinematics import Kinematics
 from shared.bus.messages import Pair
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.robot.joints import MODULE_INDEX, MODULES
+from shared.joints import MODULE_INDEX, MODULES
 from shared.robot.robot_model import stand_pose
 
 HEIGHT_TOLERANCE: Final = 1e-7

@@ -7,7 +7,7 @@ from typing import Final
 import msgspec
 
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import KINDS
+from shared.joints import KINDS
 from shared.robot.robot_model import HARD_STOP_MARGIN
 
 ROOM: Final = 0.02

@@ -10,7 +10,7 @@ from shared.can import drive_settings
 from shared.config.robot_config import RobotConfig, expand
 from shared.config.sections import CanConfig
 from shared.exceptions import DriveError, FleetError, MissingPackageError
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tools.bringup import (
     check_alike,
     check_board,

@@ -17,7 +17,7 @@ from shared.bus.messages import Pair
 from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_S, now_ns
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import kind_of
+from shared.joints import kind_of
 
 LOOK_S: Final = 0.3
 """A joint is watched for so long before it is taken to be still."""

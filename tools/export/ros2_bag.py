@@ -28,11 +28,11 @@ from shared.bus.topics import Topic
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
+from shared.joints import MODULES
 from shared.mcap_log.recover import clock_time
-from shared.robot.joints import MODULES
 from tools.export.stamps import stamped
-from tools.runs.run_index import RunIndex
-from tools.runs.run_log import SEE_INFO, RunLog, RunPart, parts_of
+from tools.logs.run_index import RunIndex
+from tools.logs.run_log import SEE_INFO, RunLog, RunPart, parts_of
 
 _EVER: Final = QosTime(9223372036, 854775807)
 

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_S
-from tools.runs.run_log import RunLog
+from tools.logs.run_log import RunLog
 
 _CLOCK_NS: Final = NS_PER_S
 

@@ -19,9 +19,9 @@ from shared.bus import topics
 from shared.clock import NS_PER_S
 from shared.exceptions import RunError
 from tools.export.stamps import stamped
-from tools.runs.run_index import RunIndex
-from tools.runs.run_log import SEE_INFO, RunLog, RunPart, parts_of
-from tools.runs.run_parts import zero_ns
+from tools.judge.run_parts import zero_ns
+from tools.logs.run_index import RunIndex
+from tools.logs.run_log import SEE_INFO, RunLog, RunPart, parts_of
 from tools.topic_keys import TopicKey
 
 TIME: Final = "time_s"

@@ -18,7 +18,7 @@ from shared.bus.messages import Estop, JointState, Mode
 from shared.bus.session import Session, open_session
 from shared.clock import now_ns
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from shared.user import user_name
 from tools.fleet import procfs
 

@@ -29,7 +29,7 @@ from shared.bus.session import Latest, Session, place_of_tool
 from shared.bus.topics import JOINT_STATE, PLANNER_STATUS, TOOLS, TOPICS
 from shared.clock import NS_PER_S, now_ns, pace
 from shared.exceptions import FleetError
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from shared.robot.remedies import reason_of, remedy_of
 from tools.fleet.bus_faults import BusFaults
 from tools.fleet.proxy_client import ProxyClient

@@ -16,18 +16,18 @@ from typing import Annotated, Literal, NamedTuple
 import msgspec
 
 from shared.bus import same_host
-from shared.bus.links import PAIRS, endpoint_through
 from shared.bus.topics import TOPICS
 from shared.config.endpoints import RUN, filled, host_and_port, stray_braces
 from shared.config.files import load
 from shared.config.robot_config import RobotConfig, expand
-from shared.config.toml_file import Range, Section, read_toml
 from shared.exceptions import ConfigError, FleetError
 from shared.extras import EXTRAS, require
+from shared.joints import MODULES
+from shared.links import PAIRS, endpoint_through
 from shared.network.proxy_protocol import SOCKET
 from shared.places import FILES
 from shared.process import SOCKET_PATH_MAX
-from shared.robot.joints import MODULES
+from shared.toml_file import Range, Section, read_toml
 
 TABLE = FILES / "processes.toml"
 """The process table of this checkout."""

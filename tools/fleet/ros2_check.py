@@ -12,7 +12,7 @@ from services.ros2_gateway.ros_session import NODE, RosSession
 from services.ros2_gateway.ros_types import RosTypes
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import BusError
-from shared.robot.joints import JOINTS
+from shared.joints import JOINTS
 
 LOOK_S: Final = 0.1
 LISTEN_S: Final = 2.0

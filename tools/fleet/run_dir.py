@@ -15,11 +15,11 @@ import msgspec
 
 from services.joint import neighbours, rearm_guard
 from services.joint.rearm_guard import LastState, RearmGuard
-from services.simulator import usb_standin
+from services.simulator.fronts import usb_standin
 from shared.clock import PACE_FILE
 from shared.config.robot_config import SERVICES
 from shared.exceptions import FleetError
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from shared.run_directory import check_own
 from tools.fleet.process_table import SUPERVISOR_SOCKET, UNIX, FleetPlan, is_listening
 

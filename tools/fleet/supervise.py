@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Self
 
 from services.joint import rearm_guard
-from services.simulator import usb_standin
+from services.simulator.fronts import usb_standin
 from shared import log
 from shared.exceptions import FleetError
 from shared.run_directory import FLEET_VARIABLE, check_own, private_files

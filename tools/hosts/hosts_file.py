@@ -10,9 +10,9 @@ from typing import Annotated, Final
 from shared.bus.access import PRINCIPALS
 from shared.bus.topics import HOST_RECORDER, OPERATOR, RECORDER, VIEWER
 from shared.config.robot_config import SERVICES, RobotConfig
-from shared.config.toml_file import Range, Section, read_toml
 from shared.exceptions import ConfigError
-from shared.robot.joints import MODULES, SIDES, side_of
+from shared.joints import MODULES, SIDES, side_of
+from shared.toml_file import Range, Section, read_toml
 
 _TOOLS: Final = (OPERATOR, VIEWER)
 _IPV4_BITS: Final = 32

@@ -19,10 +19,10 @@ from services.recorder.disk_guard import MIB
 from services.recorder.loop import free_bytes_at
 from shared.bus.credentials import NAMES, keys_folder
 from shared.config import files as config_file
+from shared.config import gain_schedule
 from shared.exceptions import XrlError
 from shared.places import CHECKOUT, IS_CHECKOUT
 from shared.revision import UNKNOWN, code
-from shared.robot import gain_schedule
 from tools.fleet.run_dir import SUPERVISOR_PID
 from tools.keys.bundle import held_files
 from tools.keys.inspection import look

@@ -12,9 +12,9 @@ from shared.bus.topics import RECORDER
 from shared.exceptions import FleetError, RunError
 from tools.hosts.layout import RECORDS
 from tools.hosts.remote import Remote
-from tools.runs.joined_records import HostRecord, host_record, join
-from tools.runs.run_files import runs_in
-from tools.runs.run_index import RunIndex
+from tools.logs.joined_records import HostRecord, host_record, join
+from tools.logs.run_files import runs_in
+from tools.logs.run_index import RunIndex
 
 _DATED: Final = re.compile(r"([0-9]{1,12}(?:\.[0-9]{1,12})?) (/.*)")
 """A time, s since 1970, and a folder."""

@@ -11,7 +11,7 @@ import msgspec
 from services.joint.drivers.base import DriveStatus
 from shared.bus.messages import Mode
 from shared.exceptions import FleetError
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tools.fleet.fleet_status import FleetStatus, ModuleStatus
 from tools.hosts.hosts_file import Hosts
 from tools.hosts.layout import RUN_DIR, UNIT

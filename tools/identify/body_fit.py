@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.robot.joints import AXES, JOINTS, N_JOINTS, SIDES
+from shared.joints import AXES, JOINTS, N_JOINTS, SIDES
 from tools.identify.body_statics import BodyStatics
 from tools.identify.quasi_static import SLOT_S, Moments
 

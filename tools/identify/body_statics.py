@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from services.planner.law.model import LegGeometry, leg_geometry
 from shared.config.robot_config import GRAVITY, RobotConfig
-from shared.robot.joints import N_LEG
+from shared.joints import N_LEG
 
 Array = NDArray[np.float64]
 

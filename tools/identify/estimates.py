@@ -8,7 +8,7 @@ from enum import Enum
 from typing import Final, NamedTuple
 
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tools.identify.body_fit import COM, COMPLIANCE, HARNESS, MASS, SCALE, ZEROS, BodyFit
 from tools.identify.sines import MASS_SD, YIELDS, JointFit
 

@@ -19,7 +19,7 @@ from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, DriveError
 from shared.extras import require
-from shared.robot.joints import AXES, MODULES
+from shared.joints import AXES, MODULES
 from tools.bringup import bench, jog_drive, limits
 from tools.bringup.jogging import MotionPlan, Sample, outside
 from tools.bringup.stops import within_stops

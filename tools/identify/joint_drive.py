@@ -16,7 +16,7 @@ from shared.bus.messages import Pair
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
-from shared.robot.joints import MODULE_INDEX, MODULES, N_JOINTS
+from shared.joints import MODULE_INDEX, MODULES, N_JOINTS
 from tools.bringup import jog_drive
 from tools.bringup.held_module import HeldModule
 from tools.bringup.jogging import MotionPlan, Sample, gentle

@@ -17,7 +17,7 @@ from shared.bus.session import Session
 from shared.clock import NS_PER_S, now_ns
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Lead, Scenario, lead
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tools.fleet.led_planner import LedPlanner
 from tools.identify.quasi_static import TimedRows
 

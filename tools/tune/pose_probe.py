@@ -13,7 +13,7 @@ from services.planner.intents import OperatorRequest
 from services.planner.law.kinematics import Kinematics
 from services.planner.law.model import BodyInertia
 from services.planner.law.probe import NO_ROW
-from services.simulator.plant import PlantConfig
+from services.simulator.physics.plant import PlantConfig
 from shared.bus import topics
 from shared.bus.messages import Message, PlannerMode, PlannerStatus
 from shared.bus.session import Session
@@ -24,8 +24,8 @@ from shared.config.scenarios import Keyframe, Scenario
 from shared.exceptions import RunError
 from shared.robot.robot_model import stand_pose
 from tools.fleet.led_planner import LedPlanner
-from tools.runs.lockstep import Lockstep
-from tools.runs.standing_start import begin_standing
+from tools.sim.lockstep import Lockstep
+from tools.sim.standing_start import begin_standing
 from tools.tune.excitation import Excitation
 
 Array = NDArray[np.float64]

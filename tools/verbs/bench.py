@@ -17,10 +17,10 @@ from rich.table import Table
 from rich.text import Text
 
 from shared.config import files as config_file
+from shared.config import gain_schedule
 from shared.exceptions import FAULT_EXIT_CODE
 from shared.extras import require
 from shared.places import CHECKOUT
-from shared.robot import gain_schedule
 from tools.lab.bench import bus_command, fleet_command, revisions, table
 from tools.lab.bench.flags import add_flags, write_rows
 from tools.lab.bench.parts import LOCKSTEP, LOCKSTEP_RECORDED, PARTS

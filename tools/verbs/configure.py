@@ -14,7 +14,7 @@ from shared.can import drive_settings
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, DriveError, FleetError
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tools.bringup import backup, bench, changes
 from tools.bringup.boards import FIRMWARE, Board, FoundBoards, describe_firmware, is_known
 from tools.bringup.changes import ChangeResult, SettingChange

@@ -22,9 +22,9 @@ from tools.lab.studies.crash import report
 from tools.lab.studies.crash.cases import CASES, CrashCase, CrashVerdict
 from tools.lab.studies.crash.report import JUNIT, RESULTS, Result
 from tools.lab.studies.crash.runner import run_case
+from tools.live import experiment
+from tools.live.scenario_runner import LiveSnapshot
 from tools.number_arguments import natural
-from tools.runs import experiment
-from tools.runs.scenario_runner import LiveSnapshot
 from tools.terminal import Console, marked
 from tools.verb_table import Subparsers, add_config, add_verb
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import FrameType
 
 from services.planner.controller_file import controller_maker
-from services.simulator.plant import plant_from
+from services.simulator.physics.plant import plant_from
 from shared.bus import topics
 from shared.bus.messages import PlannerStatus
 from shared.bus.session import Session
@@ -21,11 +21,12 @@ from shared.extras import require
 from tools.fleet.others import warn_of_others
 from tools.fleet.pace import add_pace
 from tools.fleet.supervise import SupervisedFleet
-from tools.runs import experiment, verdict, verdict_table
-from tools.runs.judgement import judge_run
-from tools.runs.live import run_live
-from tools.runs.live_view import LiveView
-from tools.runs.scenario_runner import EndOfRun, ScenarioRunner
+from tools.judge import verdict, verdict_table
+from tools.judge.judgement import judge_run
+from tools.live import experiment
+from tools.live.live import run_live
+from tools.live.live_view import LiveView
+from tools.live.scenario_runner import EndOfRun, ScenarioRunner
 from tools.terminal import Console, marked
 from tools.verb_table import Subparsers, add_verb
 from tools.view.serving import add_port, served_beside

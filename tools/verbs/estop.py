@@ -14,9 +14,9 @@ from shared.bus.session import open_session
 from shared.config.files import load
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError, XrlError
+from shared.joints import MODULES
 from shared.places import ROBOT_FILE
 from shared.process import StopFlag
-from shared.robot.joints import MODULES
 from tools.fleet.emergency_stop import GIVE_UP_S, BusStop, request_here, stop_all, wait_here
 from tools.fleet.run_dir import RunDir
 from tools.terminal import Console

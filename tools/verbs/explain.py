@@ -30,20 +30,20 @@ from shared.bus.messages import (
 )
 from shared.clock import NS_PER_MS
 from shared.config import files as config_file
+from shared.config import gain_schedule
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.robot import gain_schedule
-from shared.robot.joints import JOINTS, MODULES, N_JOINTS
+from shared.joints import JOINTS, MODULES, N_JOINTS
 from shared.robot.robot_model import stand_pose
 from shared.text_file import read_text
+from tools.judge.run_parts import zero_ns
 from tools.lab.design.push_limit import PushLimits
 from tools.lab.design.torque_breakdown import TorqueBreakdown, torque_breakdown
+from tools.logs import snapshot_text
+from tools.logs.recorded_robot import refuse_own_controller, robot_of
+from tools.logs.run_index import RunIndex
+from tools.logs.run_log import RunLog, RunPart
 from tools.number_arguments import finite, finite_numbers
-from tools.runs import snapshot_text
-from tools.runs.recorded_robot import refuse_own_controller, robot_of
-from tools.runs.run_index import RunIndex
-from tools.runs.run_log import RunLog, RunPart
-from tools.runs.run_parts import zero_ns
 from tools.terminal import Console, marked
 from tools.verb_table import RUN_HELP, Subparsers, add_config, add_verb
 

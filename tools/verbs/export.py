@@ -16,22 +16,16 @@ from shared.extras import require
 from shared.mcap_log.extended_copy import write_extended
 from shared.mcap_log.files import SUFFIX
 from shared.places import FILES
-from tools.analysis.reports import scene
 from tools.export.folders import whole_folder
 from tools.export.parquet import ParquetFile
-from tools.export.tables import (
-    FOR_REEXECUTION,
-    GRID_NAME,
-    CsvFile,
-    write_grid,
-    write_tables,
-)
+from tools.export.tables import FOR_REEXECUTION, GRID_NAME, CsvFile, write_grid, write_tables
+from tools.judge.reports import scene
+from tools.judge.run_parts import add_part, part_of
+from tools.logs.recorded_robot import robot_of
+from tools.logs.run_index import RunIndex
+from tools.logs.run_log import SEE_INFO, RunLog, RunPart, parts_of, read_part
 from tools.number_arguments import rate
 from tools.output import progress_along, write_atomically
-from tools.runs.recorded_robot import robot_of
-from tools.runs.run_index import RunIndex
-from tools.runs.run_log import SEE_INFO, RunLog, RunPart, parts_of, read_part
-from tools.runs.run_parts import add_part, part_of
 from tools.terminal import Console, marked
 from tools.topic_keys import keys_named
 from tools.verb_table import RUN_HELP, Subparsers, add_verb
@@ -218,7 +212,7 @@ def _write_bag(index: RunIndex, part: RunPart, args: argparse.Namespace, console
 def _draw(log: RunLog, out: Path, console: Console, *, with_curves: bool) -> None:
     """Draw the run's moving picture, with progress."""
     require("plot")
-    from tools.analysis.reports.moving_picture import write_gif  # noqa: PLC0415 - needs the extra
+    from tools.judge.reports.moving_picture import write_gif  # noqa: PLC0415 - needs the extra
 
     with Progress(console=console, transient=True) as shown:
         bar = shown.add_task("drawing", total=1.0)

@@ -11,12 +11,12 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from shared.config import files as config_file
+from shared.config import gain_schedule
+from shared.config.gain_table import GainSchedule
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, ConfigError
 from shared.extras import require
 from shared.places import refuse_shipped
-from shared.robot import gain_schedule
-from shared.robot.gain_table import GainSchedule
 from tools.lab.design import damping_picture, split_program
 from tools.lab.design.dynamic_certificate import DynamicCertificate
 from tools.lab.design.push_limit import DIRECTIONS, equivalent_slope

@@ -12,9 +12,9 @@ from rich.table import Table
 from rich.text import Text
 
 from shared.config import files as config_file
+from shared.config import gain_schedule
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, FleetError, RunError
-from shared.robot import gain_schedule
 from tools.fleet.status_table import tables
 from tools.hosts import hosts_file, installation, records, running
 from tools.hosts.hosts_file import Hosts

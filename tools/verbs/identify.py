@@ -24,7 +24,7 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Lead, Scenario
 from shared.exceptions import DECLINED_EXIT_CODE, RunError
 from shared.extras import require
-from shared.robot.joints import AXES, MODULES
+from shared.joints import AXES, MODULES
 from tools.bringup.bench import confirm
 from tools.bringup.jog_drive import Interrupts
 from tools.fleet.supervise import SupervisedFleet
@@ -34,11 +34,11 @@ from tools.identify.estimates import of_body, zero_corrections
 from tools.identify.motion import Motion
 from tools.identify.picture import draw_body
 from tools.identify.quasi_static import Moments, TimedRows, moments_of
+from tools.live import experiment
+from tools.logs.recorded_robot import robot_of
+from tools.logs.run_log import RunLog, read_run
 from tools.number_arguments import finite
 from tools.output import make_folder
-from tools.runs import experiment
-from tools.runs.recorded_robot import robot_of
-from tools.runs.run_log import RunLog, read_run
 from tools.terminal import Console
 from tools.verb_table import FLEET, Subparsers, add_config, add_run_dir, add_verb
 

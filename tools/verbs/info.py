@@ -17,15 +17,15 @@ from shared.exceptions import XrlError
 from shared.mcap_log.reader import LostBytes
 from shared.mcap_log.recover import clock_time, describe_lost, describe_passed_over
 from shared.mcap_log.writer import SCHEMA_VERSION
-from tools.analysis.logs.survey import FileFacts, Survey, TopicFacts
 from tools.guarded_streams import printable
-from tools.runs.host_clocks import HostClocks
-from tools.runs.host_clocks import describe as describe_clocks
-from tools.runs.impairment_intervals import impairments
-from tools.runs.run_files import files_in, files_of_run
-from tools.runs.run_index import RunIndex
-from tools.runs.run_log import NOTHING, RunLog, clocks_of
-from tools.runs.run_parts import zero_ns
+from tools.judge.run_parts import zero_ns
+from tools.logs.host_clocks import HostClocks
+from tools.logs.host_clocks import describe as describe_clocks
+from tools.logs.impairment_intervals import impairments
+from tools.logs.run_files import files_in, files_of_run
+from tools.logs.run_index import RunIndex
+from tools.logs.run_log import NOTHING, RunLog, clocks_of
+from tools.logs.survey import FileFacts, Survey, TopicFacts
 from tools.terminal import Console, marked
 from tools.verb_table import Subparsers, add_verb
 

@@ -9,12 +9,12 @@ from typing import Final
 from rich import box
 from rich.table import Table
 
-from shared.bus.links import GROUPS
 from shared.config.scenarios import Inject
 from shared.exceptions import ConfigError, RunError
+from shared.links import GROUPS
 from shared.network.proxy_protocol import RequestedImpairment
 from tools.fleet.proxy_client import ProxyClient
-from tools.runs.describe_inject import (
+from tools.live.describe_inject import (
     DISTRIBUTION,
     NUMBERS,
     SWITCHES,

@@ -15,7 +15,7 @@ from services.joint.differential import joint_from_motor
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, DriveError
-from shared.robot.joints import AXES, MODULES
+from shared.joints import AXES, MODULES
 from tools.bringup import bench, limits
 from tools.bringup.jog_drive import NOT_IDLE, Interrupts, JogResult, first_reading, jog_drive
 from tools.bringup.jogging import JogPlan, Sample, gentle, judge, outside, what_to_see

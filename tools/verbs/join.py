@@ -9,9 +9,9 @@ from rich.progress import Progress
 
 from shared.mcap_log.files import FIRST
 from tools.guarded_streams import printable
-from tools.runs.experiment import make_out
-from tools.runs.joined_records import host_record, join
-from tools.runs.run_index import RunIndex
+from tools.live.experiment import make_out
+from tools.logs.joined_records import host_record, join
+from tools.logs.run_index import RunIndex
 from tools.terminal import Console
 from tools.verb_table import RUN_HELP, Subparsers, add_verb
 

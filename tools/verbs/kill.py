@@ -6,7 +6,7 @@ import argparse
 import signal
 from typing import Final
 
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tools.fleet.supervise import SupervisedFleet
 from tools.verb_table import Subparsers, add_run_dir, add_verb
 

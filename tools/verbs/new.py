@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
-from services.simulator import plant
+from services.simulator.physics import plant
 from shared.exceptions import RunError
 from shared.places import FILES, ROBOT_FILE, SCENARIOS
 from tools import graph_libraries

@@ -8,8 +8,8 @@ from typing import Final
 
 from services.joint.rearm_guard import Pendant
 from shared.exceptions import FleetError
+from shared.joints import MODULES
 from shared.process import StopFlag
-from shared.robot.joints import MODULES
 from tools.fleet.emergency_stop import GIVE_UP_S, request_here, wait_here
 from tools.number_arguments import finite
 from tools.terminal import Console

@@ -20,16 +20,16 @@ from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig, expand
 from shared.exceptions import ConfigError, FleetError, RunError
 from shared.places import DEFAULT_CONFIG
-from tools.analysis.playback import arguments, guard, reading, selection
-from tools.analysis.playback.display import Display, introduce, summary, where
-from tools.analysis.playback.player import Player
-from tools.analysis.playback.press import PRESSES, Press
-from tools.analysis.playback.reading import Recording
-from tools.analysis.playback.schedule import Entry, Playhead, Schedule, Window, window
-from tools.analysis.playback.stream import EntryStream
 from tools.cli import INTERRUPTED
 from tools.fleet.supervise import SupervisedFleet
 from tools.keyboard import Keyboard
+from tools.logs.playback import arguments, guard, reading, selection
+from tools.logs.playback.display import Display, introduce, summary, where
+from tools.logs.playback.player import Player
+from tools.logs.playback.press import PRESSES, Press
+from tools.logs.playback.reading import Recording
+from tools.logs.playback.schedule import Entry, Playhead, Schedule, Window, window
+from tools.logs.playback.stream import EntryStream
 from tools.terminal import Console
 from tools.verb_table import Subparsers, add_verb
 

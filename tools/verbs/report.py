@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Final
 
 from shared.exceptions import RunError
-from tools.analysis.reports.page import render_parts
+from tools.judge.reports.page import render_parts
+from tools.judge.run_parts import add_part, part_of
+from tools.logs.run_index import RunIndex
 from tools.output import progress_along, write_atomically
-from tools.runs.run_index import RunIndex
-from tools.runs.run_parts import add_part, part_of
 from tools.terminal import Console, marked
 from tools.verb_table import RUN_HELP, Subparsers, add_verb
 

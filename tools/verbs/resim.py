@@ -16,22 +16,22 @@ from services.planner.controller_file import controller_maker
 from shared import revision
 from shared.bus.messages import Message
 from shared.exceptions import FAULT_EXIT_CODE, RunError
+from shared.joints import MODULES
 from shared.mcap_log import provenance
-from shared.robot.joints import MODULES
-from tools.analysis.reexecution import rewritten
-from tools.analysis.reexecution.compare import size
-from tools.analysis.reexecution.execution import Execution
-from tools.analysis.reexecution.origin import likely_reason
-from tools.analysis.reexecution.outcome import ReexecutionResult
-from tools.analysis.reexecution.params import with_params
-from tools.analysis.reexecution.ranges import RangeTask, execute_range, merged, ranges_of
+from tools.judge.run_parts import add_part, part_of
 from tools.lab.studies.sweeps.pool import cores, results
+from tools.live import experiment
+from tools.logs.recorded_robot import has_own_controller, robot_of
+from tools.logs.reexecution import rewritten
+from tools.logs.reexecution.compare import size
+from tools.logs.reexecution.execution import Execution
+from tools.logs.reexecution.origin import likely_reason
+from tools.logs.reexecution.outcome import ReexecutionResult
+from tools.logs.reexecution.params import with_params
+from tools.logs.reexecution.ranges import RangeTask, execute_range, merged, ranges_of
+from tools.logs.run_index import RunIndex
+from tools.logs.run_log import RunLog, parts_of, read_part
 from tools.number_arguments import count, finite
-from tools.runs import experiment
-from tools.runs.recorded_robot import has_own_controller, robot_of
-from tools.runs.run_index import RunIndex
-from tools.runs.run_log import RunLog, parts_of, read_part
-from tools.runs.run_parts import add_part, part_of
 from tools.terminal import Console, marked
 from tools.verb_table import RUN_HELP, Subparsers, add_verb
 

@@ -9,17 +9,19 @@ from pathlib import Path
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from services.planner.controller_file import controller_maker
-from services.simulator.plant import plant_from
+from services.simulator.physics.plant import plant_from
 from shared.bus import topics
 from shared.bus.messages import SimTruth
+from shared.config.impairment import Impairment
 from shared.exceptions import RunError
 from shared.extras import require
-from shared.network.impairment import Impairment
+from tools.judge import verdict, verdict_table
+from tools.live import experiment
+from tools.logs.hand_path import HandRow, hand_path
+from tools.logs.run_log import read_run
 from tools.number_arguments import finite
-from tools.runs import experiment, recorded_lockstep, verdict, verdict_table
-from tools.runs.centralised.fleet import CONTROLS, SHIPPED
-from tools.runs.hand_path import HandRow, hand_path
-from tools.runs.run_log import read_run
+from tools.sim import recorded_lockstep
+from tools.sim.centralised.fleet import CONTROLS, SHIPPED
 from tools.terminal import Console
 from tools.verb_table import Subparsers, add_verb
 

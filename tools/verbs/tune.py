@@ -10,22 +10,22 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from services.simulator.plant import IDEAL, PlantConfig, plant_from
+from services.simulator.physics.plant import IDEAL, PlantConfig, plant_from
 from shared import places
 from shared.bus.operator_key import require_operator
 from shared.bus.session import open_session
 from shared.config import files as config_file
+from shared.config import gain_schedule
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, RunError
 from shared.extras import require
-from shared.robot import gain_schedule
-from shared.robot.joints import AXES, MODULES
+from shared.joints import AXES, MODULES
 from tools.bringup import bench, jog_drive
 from tools.fleet.supervise import SupervisedFleet
 from tools.identify import joint_bench, joint_drive
+from tools.live import experiment
 from tools.number_arguments import finite
 from tools.output import make_folder, progress_along
-from tools.runs import experiment
 from tools.terminal import Console, marked
 from tools.tune import module_probe
 from tools.tune.excitation import Excitation, excitation

@@ -10,24 +10,24 @@ from pathlib import Path
 from services.planner.controller_file import ATTACHED, absolute, controller_maker, split_spec
 from services.ros2_gateway.inbound import acceptable
 from services.ros2_gateway.rmw import domain
-from services.simulator.plant import plant_from
+from services.simulator.physics.plant import plant_from
 from shared.bus.credentials import keys_folder
 from shared.bus.operator_key import require_operator
 from shared.bus.topics import HOST_RECORDER
 from shared.config import files as config_file
+from shared.config import gain_schedule
 from shared.config.robot_config import SERVICES, RobotConfig
 from shared.exceptions import BusError, FleetError, RunError
 from shared.extras import require
-from shared.robot import gain_schedule
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tools.fleet.fleet_status import OPEN
 from tools.fleet.others import warn_of_others
 from tools.fleet.pace import add_pace
 from tools.fleet.process_table import check_known, is_simulated, load_table
 from tools.fleet.supervise import SupervisedFleet
 from tools.keys.inspection import look
+from tools.live.experiment import add_controller, add_plant, make_out, scenario_file
 from tools.number_arguments import finite
-from tools.runs.experiment import add_controller, add_plant, make_out, scenario_file
 from tools.terminal import Console, marked
 from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
 from tools.view.live import LiveSource

@@ -10,25 +10,25 @@ import msgspec
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-from services.simulator.plant import PlantConfig
+from services.simulator.physics.plant import PlantConfig
 from shared.atomic_file import replace_file
 from shared.config import scenarios
 from shared.config.scenarios import Scenario
-from shared.config.toml_file import parse_toml
 from shared.exceptions import FELL_EXIT_CODE, RunError
 from shared.extras import require
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
+from shared.toml_file import parse_toml
+from tools.judge.run_parts import add_part, read_asked
 from tools.lab.studies.counterfactual import picture
 from tools.lab.studies.counterfactual.moments import moments_of
 from tools.lab.studies.counterfactual.run import Counterfactual, Task, counterfactual_of
 from tools.lab.studies.sweeps.pool import cores, results
+from tools.live.experiment import PLANT_FILE
+from tools.logs.hand_path import hand_path
+from tools.logs.recorded_robot import refuse_own_controller, robot_of, text_of
+from tools.logs.run_index import RunIndex
+from tools.logs.run_log import RunLog
 from tools.number_arguments import count, finite
-from tools.runs.experiment import PLANT_FILE
-from tools.runs.hand_path import hand_path
-from tools.runs.recorded_robot import refuse_own_controller, robot_of, text_of
-from tools.runs.run_index import RunIndex
-from tools.runs.run_log import RunLog
-from tools.runs.run_parts import add_part, read_asked
 from tools.terminal import Console, marked
 from tools.verb_table import RUN_HELP, Subparsers, add_verb
 

@@ -24,7 +24,7 @@ from shared.bus.session import open_session
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, DriveError, FleetError
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tools.bringup import bench
 from tools.bringup.stops import within_stops
 from tools.bringup.zeroing import DriveLook, is_right, look, outside, refusal, zero

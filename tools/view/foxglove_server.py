@@ -12,9 +12,9 @@ import msgspec
 from foxglove.websocket import ServerListener
 
 from shared.exceptions import FleetError
-from tools.analysis.reports import foxglove as encoding
-from tools.analysis.reports import scene
-from tools.analysis.reports.scene import RobotPose
+from tools.judge.reports import foxglove as encoding
+from tools.judge.reports import scene
+from tools.judge.reports.scene import RobotPose
 from tools.view.frame import Frame
 from tools.view.settings import FOXGLOVE_PORT, FRAMES_S, HOST
 from tools.view.source import Source

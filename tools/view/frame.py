@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from services.planner.law.kinematics import Kinematics
-from services.simulator.soles import SoleLoad
+from services.simulator.physics.soles import SoleLoad
 from shared.bus import topics
 from shared.bus.code_names import name_of
 from shared.bus.messages import (
@@ -27,10 +27,10 @@ from shared.bus.messages import (
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
+from shared.joints import MODULE_INDEX, MODULES
 from shared.robot.capture_point import capture_point
-from shared.robot.joints import MODULE_INDEX, MODULES
 from tools.fleet.fleet_status import module_status
-from tools.runs.stalls import STALL_SHOWN_NS, stalls_of
+from tools.judge.stalls import STALL_SHOWN_NS, stalls_of
 from tools.view.sole_estimate import SoleEstimate
 
 SHOWN: Final = (topics.PLANNER_STATUS, topics.WRENCH, topics.SIM_TRUTH, topics.RUN_EVENT)

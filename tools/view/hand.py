@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from services.simulator.led_hand import PUSH_EXPIRES_S
+from services.simulator.physics.led_hand import PUSH_EXPIRES_S
 from shared.bus.messages import HandLead
 from tools.view.source import Order
 

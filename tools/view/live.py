@@ -11,7 +11,7 @@ from shared.bus.session import Latest, Session, open_session
 from shared.bus.topics import Topic
 from shared.clock import now_ns
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tools.fleet.fleet_status import impairments
 from tools.fleet.supervise import SupervisedFleet
 from tools.view.frame import SHOWN, SHOWN_OF_MODULES, Frame, Newest, ShownProcess

@@ -15,7 +15,7 @@ from shared.clock import now_ns
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject
 from shared.exceptions import FleetError, XrlError
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tools.fleet.emergency_stop import BusStop, request_here
 from tools.fleet.proxy_client import ProxyClient
 from tools.fleet.supervise import SupervisedFleet

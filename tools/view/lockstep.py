@@ -14,9 +14,9 @@ from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Kill, Restart, Scenario
 from shared.exceptions import RunError
-from shared.robot.joints import MODULES
-from tools.runs.lockstep import Lockstep
-from tools.runs.standing_start import begin_standing
+from shared.joints import MODULES
+from tools.sim.lockstep import Lockstep
+from tools.sim.standing_start import begin_standing
 from tools.view.frame import Frame, Newest
 from tools.view.hand import HandOrders
 from tools.view.source import CUT_S, CUTS, Order, Source

@@ -12,10 +12,10 @@ from shared.bus.messages import Message, RunEventKind
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import MODULES
-from tools.analysis.reports.run_data import RunData
-from tools.analysis.reports.timeline import timeline_events
-from tools.runs.run_log import RunLog
+from shared.joints import MODULES
+from tools.judge.reports.run_data import RunData
+from tools.judge.reports.timeline import timeline_events
+from tools.logs.run_log import RunLog
 from tools.view.frame import SHOWN, SHOWN_OF_MODULES, Frame, Newest
 from tools.view.source import Mark, Model, Source
 

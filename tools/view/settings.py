@@ -11,4 +11,4 @@ FOXGLOVE_PORT: Final = 8765
 """That Foxglove offers."""
 FRAMES_S: Final = 30.0
 PAGE: Final = Path(__file__).parent / "page"
-UPLOT: Final = Path(__file__).parents[1] / "analysis" / "reports" / "vendor" / "uplot"
+UPLOT: Final = Path(__file__).parents[1] / "judge" / "reports" / "vendor" / "uplot"

@@ -10,9 +10,9 @@ import msgspec
 
 from shared.bus.messages import Mode
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import MODULES
-from tools.analysis.reports import scene
-from tools.analysis.reports.scene import RobotPose
+from shared.joints import MODULES
+from tools.judge.reports import scene
+from tools.judge.reports.scene import RobotPose
 from tools.view.frame import Frame
 
 _STILL: Final = RobotPose(

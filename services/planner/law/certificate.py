@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from services.planner.law.small_matrices import eigenvalue_min
 from shared.config.robot_config import RobotConfig
+from shared.joints import N_JOINTS
 from shared.robot.compiled_graph import CompiledGraph
-from shared.robot.joints import N_JOINTS
 
 Array = NDArray[np.float64]
 

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.law.small_matrices import positive_part
-from shared.robot.joints import N_JOINTS
+from shared.joints import N_JOINTS
 
 Array = NDArray[np.float64]
 

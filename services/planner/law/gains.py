@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from services.planner.law.kinematics import Kinematics
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import N_JOINTS
+from shared.joints import N_JOINTS
 
 Array = NDArray[np.float64]
 

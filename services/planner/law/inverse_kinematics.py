@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from services.planner.law.kinematics import Kinematics
 from services.planner.law.small_matrices import LuDecomposition
 from services.planner.law.symbolic import DAMPING
-from shared.robot.joints import JOINTS, N_JOINTS, N_LEG
+from shared.joints import JOINTS, N_JOINTS, N_LEG
 
 Array = NDArray[np.float64]
 

@@ -18,8 +18,8 @@ from services.planner.law import symbolic
 from services.planner.law.model import leg_geometry
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import GeometryConfig, LawConfig, MassConfig
+from shared.joints import N_LEG
 from shared.robot.compiled_graph import CompiledGraph
-from shared.robot.joints import N_LEG
 
 Array = NDArray[np.float64]
 

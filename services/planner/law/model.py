@@ -17,7 +17,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import SIDES
+from shared.joints import SIDES
 from shared.robot.robot_model import ankle_positions, mjcf
 
 Array = NDArray[np.float64]

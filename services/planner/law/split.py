@@ -19,11 +19,11 @@ from services.planner.law.certificate import Certificate, Margins
 from services.planner.law.gains import JointGains
 from shared.bus.messages import SplitSource
 from shared.clamp import clamp
+from shared.config import gain_schedule
+from shared.config.gain_table import GainSchedule
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
-from shared.robot import gain_schedule
-from shared.robot.gain_table import GainSchedule
-from shared.robot.joints import MODULES, N_JOINTS
+from shared.joints import MODULES, N_JOINTS
 
 Array = NDArray[np.float64]
 

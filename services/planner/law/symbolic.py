@@ -15,7 +15,7 @@ import numpy as np
 
 from services.planner.law.model import LegGeometry
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import N_JOINTS, N_LEG
+from shared.joints import N_JOINTS, N_LEG
 
 DAMPING: Final = 1e-4
 """Levenberg damping of the closed chain's system; bounds the step where the legs are nearly

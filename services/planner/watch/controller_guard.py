@@ -23,8 +23,8 @@ from services.planner.snapshots import GuardState
 from shared.bus.messages import SplitSource
 from shared.clamp import clamp
 from shared.config.sections import GeometryConfig
+from shared.joints import N_JOINTS
 from shared.robot.capture_point import capture_point
-from shared.robot.joints import N_JOINTS
 
 SUPPORT: Final = 0.5
 """Fraction of the soles within which the capture point and the rest in HOLD must be."""

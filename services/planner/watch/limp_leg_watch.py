@@ -13,7 +13,7 @@ import msgspec
 
 from shared.bus.messages import DriveStatus, JointState, Mode
 from shared.clock import NS_PER_MS
-from shared.robot.joints import N_MODULES
+from shared.joints import N_MODULES
 from shared.robot.limp_leg_support import SUPPORT_FOR, Support
 
 DISARMED_NS: Final = 200 * NS_PER_MS

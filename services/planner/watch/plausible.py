@@ -7,7 +7,7 @@ from typing import Final
 
 from shared.bus.messages import Attitude, JointState, Wrench
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import N_MODULES
+from shared.joints import N_MODULES
 
 BEYOND_RAD: Final = 0.5
 """Largest angle beyond a soft stop, from the joint's elasticity or an error of its zero."""

@@ -9,10 +9,10 @@ import numpy as np
 
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.drivers.odrive_can import ARM_GRACE_MS, OdriveCan
-from services.simulator.axis_bank import AxisBank
-from services.simulator.cansimple_dialects import DialectName
-from services.simulator.cansimple_front import CanSimpleFront
-from services.simulator.unix_can_hub import UnixCanHub
+from services.simulator.drives.axis_bank import AxisBank
+from services.simulator.fronts.cansimple_dialects import DialectName
+from services.simulator.fronts.cansimple_front import CanSimpleFront
+from services.simulator.fronts.unix_can_hub import UnixCanHub
 from shared.config.sections import CanConfig, DriveConfig
 
 DRIVE = DriveConfig(

@@ -16,7 +16,7 @@ from services.joint.drivers.can_link import FRAMES_PER_READ, RETRY_MS, receiver
 from services.joint.drivers.odrive_can import (
     OdriveCan,
 )
-from services.simulator.unix_can_hub import UnixCanHub
+from services.simulator.fronts.unix_can_hub import UnixCanHub
 from shared.can.cansimple import (
     AxisState,
     Command,

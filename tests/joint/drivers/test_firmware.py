@@ -14,7 +14,7 @@ from services.joint.drivers.firmware import (
     errors_from_06,
     judged,
 )
-from services.simulator.cansimple_dialects import VERSION_06
+from services.simulator.fronts.cansimple_dialects import VERSION_06
 from shared.can import cansimple, cansimple_06
 from shared.can.cansimple import AxisError, AxisState, Heartbeat
 from shared.can.cansimple_06 import DriveError06, Heartbeat06, ProcedureResult

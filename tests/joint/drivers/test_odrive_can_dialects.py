@@ -12,7 +12,7 @@ import pytest
 
 from services.joint.drivers.base import DriveStatus
 from services.joint.drivers.odrive_can import REBOOT_MS, RETRY_MS, OdriveCan
-from services.simulator.cansimple_dialects import DialectName
+from services.simulator.fronts.cansimple_dialects import DialectName
 from shared.can.cansimple import AxisError, AxisState
 from shared.config.sections import CanConfig
 from shared.exceptions import DriveError

@@ -12,8 +12,8 @@ import pytest
 from services.joint.drivers import can_link, odrive_can
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.drivers.odrive_can import OdriveCan
-from services.simulator.cansimple_dialects import DialectName
-from services.simulator.unix_can_hub import UnixCanHub
+from services.simulator.fronts.cansimple_dialects import DialectName
+from services.simulator.fronts.unix_can_hub import UnixCanHub
 from shared.can.cansimple import AxisState, ControlMode
 from shared.can.unix_can import Frame
 from shared.clock import NS_PER_MS

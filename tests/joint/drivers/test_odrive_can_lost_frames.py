@@ -18,7 +18,7 @@ import pytest
 
 from services.joint.drivers import can_link, odrive_can
 from services.joint.drivers.base import DriveStatus, MotorTarget
-from services.simulator.unix_can_hub import UnixCanHub
+from services.simulator.fronts.unix_can_hub import UnixCanHub
 from shared.can.cansimple import AxisState
 from shared.can.unix_can import Frame
 from shared.clock import NS_PER_MS

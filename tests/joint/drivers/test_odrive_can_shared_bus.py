@@ -13,9 +13,9 @@ import pytest
 
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.drivers.odrive_can import ARM_GRACE_MS, OdriveCan
-from services.simulator.axis_bank import AxisBank
-from services.simulator.cansimple_front import CanSimpleFront
-from services.simulator.unix_can_hub import UnixCanHub
+from services.simulator.drives.axis_bank import AxisBank
+from services.simulator.fronts.cansimple_front import CanSimpleFront
+from services.simulator.fronts.unix_can_hub import UnixCanHub
 from shared.can.cansimple import AxisState, Command, arbitration_id, pack_two_floats
 from shared.config.sections import CanConfig
 from tests.joint.drivers.rig import DRIVE, MS

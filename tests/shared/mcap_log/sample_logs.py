@@ -17,7 +17,7 @@ from shared.mcap_log.writer import RunWriter
 from tests.shared.mcap_log import runs
 from tests.shared.mcap_log.runs import Queue, sample
 from tools import cli
-from tools.runs.run_log import RunLog, read_run
+from tools.logs.run_log import RunLog, read_run
 
 SIM = (
     "sim --scenario stand --duration 0.8 --kill planner@0.2 --restart planner@0.45 "

@@ -19,8 +19,8 @@ from shared.mcap_log import recover
 from tests.shared.mcap_log import runs
 from tests.shared.mcap_log.runs import STATE_KEY, Killed
 from tools import cli
-from tools.analysis.logs.survey import Survey
-from tools.runs.run_log import read_run
+from tools.logs.run_log import read_run
+from tools.logs.survey import Survey
 from tools.verbs.info import as_json
 
 CUTS = 1000

@@ -11,7 +11,7 @@ from shared.exceptions import RunError
 from shared.mcap_log.extended_copy import NOTE, NewChannel, NewMessage, write_extended
 from tests.shared.mcap_log import runs
 from tests.shared.mcap_log.runs import ATTACHMENTS, OFFSET_NS, STATE_KEY, item
-from tools.runs.run_log import read_run
+from tools.logs.run_log import read_run
 
 SCHEMA = b"\n\x00\xff of any kind"
 CHANNEL = NewChannel("xrl/lab/scene/x", "x.Y", "protobuf", SCHEMA, "protobuf", {"why": "t"})

@@ -4,7 +4,7 @@ The rules are those of PlotJuggler 3 (3.9 to 3.17: DataLoadMCAP, nlohmann_parser
 data_load_mcap 1.2, parser_json 1.1.1). A run in virtual time is opened as it was recorded, as
 recovered after a cut, as exported with its scene, and split (the last second of it, for speed);
 and a file with a message of every topic. Foxglove's own library takes every schema in
-tests/tools/analysis/reports/test_scene.py.
+tests/tools/judge/reports/test_scene.py.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ import msgspec
 import pytest
 
 from shared.bus import topics
+from shared.joints import MODULES
 from shared.mcap_log import schema
-from shared.robot.joints import MODULES
 from tests.shared.mcap_log import runs, sample_logs
 from tests.shared.mcap_log.mcap_doctor import examined
 from tests.shared.mcap_log.plotjuggler import LAST, Opened, Refused, opened_by_3, opened_by_4
 from tests.shared.mcap_log.runs import OFFSET_NS, STATE_KEY, item
 from tests.shared.mcap_log.sample_logs import write_one
-from tools.runs.run_log import RunLog, read_run
+from tools.logs.run_log import RunLog, read_run
 
 VERSIONS = (opened_by_3, opened_by_4)
 KEPT_OUT = {"not chosen: no messages"}

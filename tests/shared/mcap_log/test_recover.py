@@ -18,7 +18,7 @@ from shared.mcap_log import recover
 from shared.mcap_log.recover import Interrupted
 from tests.shared.mcap_log import runs
 from tests.shared.mcap_log.runs import ATTACHMENTS, STATE_KEY, Queue, item
-from tools.runs.run_log import read_run
+from tools.logs.run_log import read_run
 
 LOGGER = logging.getLogger("test")
 

@@ -14,7 +14,7 @@ from shared.exceptions import RunError
 from shared.mcap_log import files
 from tests.shared.mcap_log import runs
 from tests.shared.mcap_log.runs import ATTACHMENTS, OFFSET_NS, STATE_KEY, Queue, item
-from tools.runs.run_log import read_run
+from tools.logs.run_log import read_run
 
 
 def test_every_recorded_topic_has_a_channel_and_a_schema(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import can
 import pytest
 
-from services.simulator.unix_can_hub import UnixCanHub
+from services.simulator.fronts.unix_can_hub import UnixCanHub
 from shared.can import cansimple, imu_can, loadcell_can
 from shared.can.cansimple import AxisState, Command, Heartbeat, arbitration_id
 from shared.can.cansimple_06 import Command06, Version, pack_version

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tests.tools.bringup.board_in_memory import as_wanted, healthy
 from tools.bringup.boards import Value
 from tools.bringup.check_alike import alike_rows

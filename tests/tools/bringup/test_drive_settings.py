@@ -7,7 +7,7 @@ import math
 import msgspec
 import pytest
 
-from services.simulator.axis_settings import (
+from services.simulator.drives.axis_settings import (
     AXIS_SETTINGS,
     NAMES,
     PHASE_RESISTANCE,
@@ -25,7 +25,7 @@ from shared.can.drive_settings import (
 )
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 
 TRAPS = (
     "controller.config.vel_limit",

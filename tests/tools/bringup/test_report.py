@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from shared.can.drive_settings import AXES
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tools.bringup.report import Report, report_of, show, verdict_line
 from tools.bringup.rows import Finding, FindingKind, merged, ok, warning, wrong
 from tools.terminal import Console

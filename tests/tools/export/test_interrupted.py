@@ -48,7 +48,7 @@ def test_a_folder_that_is_ended_half_way_is_not_there_and_is_written_the_next_ti
     ("words", "within"),
     [
         (["--gif", "out.gif"], "PIL.Image.Image.save"),
-        (["--scene", "-o", "out.mcap"], "tools.analysis.reports.scene.frames"),
+        (["--scene", "-o", "out.mcap"], "tools.judge.reports.scene.frames"),
     ],
 )
 def test_a_file_that_is_ended_half_way_leaves_the_one_that_was_there(

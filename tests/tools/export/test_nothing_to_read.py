@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from tools import cli
-from tools.analysis.reexecution import rewritten
-from tools.runs.run_log import NOTHING, RunIndex, RunLog
+from tools.logs.reexecution import rewritten
+from tools.logs.run_log import NOTHING, RunIndex, RunLog
 
 WRITERS = (
     "report --open no -o OUT",

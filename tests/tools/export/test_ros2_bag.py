@@ -13,11 +13,11 @@ from rosbags.highlevel import AnyReader
 from services.ros2_gateway.gateway import topics_of
 from shared.bus import topics
 from shared.bus.messages import JointState, PlannerStatus
-from shared.robot.joints import JOINTS, MODULES
+from shared.joints import JOINTS, MODULES
 from tests.ros2_gateway.others import TYPES, read
 from tools import cli
-from tools.analysis.reexecution import rewritten
-from tools.runs.run_log import read_run
+from tools.logs.reexecution import rewritten
+from tools.logs.run_log import read_run
 
 KNOWN = topics_of("")
 

@@ -16,9 +16,9 @@ from shared.clock import NS_PER_S
 from tests.tools.exit_codes import exit_code
 from tools import cli
 from tools.export.tables import FOR_REEXECUTION, HELD_S, columns_of
-from tools.runs.run_index import RunIndex
-from tools.runs.run_log import read_run
-from tools.runs.run_parts import zero_ns
+from tools.judge.run_parts import zero_ns
+from tools.logs.run_index import RunIndex
+from tools.logs.run_log import read_run
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:

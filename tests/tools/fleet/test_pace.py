@@ -12,7 +12,7 @@ from shared import clock
 from shared.exceptions import FleetError
 from tools.fleet import pace
 from tools.fleet.pace import CoresFullError, check_pace, usual_pace
-from tools.runs import live
+from tools.live import live
 
 
 @pytest.fixture(autouse=True)

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from shared.bus.links import PAIRS
 from shared.config.files import load
 from shared.config.robot_config import SERVICES
 from shared.exceptions import ConfigError, FleetError, MissingPackageError
+from shared.joints import MODULES
+from shared.links import PAIRS
 from shared.places import DEFAULT_CONFIG
-from shared.robot.joints import MODULES
 from tools.fleet import process_table
 from tools.fleet.run_dir import RunDir, supervisor_config
 

@@ -15,8 +15,8 @@ import pytest
 
 from services.joint.rearm_guard import LastState, RearmGuard, request_stop, stop_source
 from shared.exceptions import FleetError
+from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
-from shared.robot.joints import MODULES
 from shared.run_directory import FLEET_VARIABLE, check_own
 from tools import cli
 from tools.fleet import process_table, procfs

@@ -17,8 +17,8 @@ from pathlib import Path
 import pytest
 import tomli_w
 
+from shared.joints import MODULES
 from shared.places import CHECKOUT
-from shared.robot.joints import MODULES
 
 BODY = ["planner", "harness", "recorder"]
 LEGS = {side: [m for m in MODULES if m.endswith(f"_{side}")] for side in ("right", "left")}

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from services.joint.drive_manager import ArmingInhibit, DriveAction, DriveCommand
 from services.joint.drivers.base import DriveReading, MotorTarget
-from services.simulator.axis_bank import AxisBank
-from services.simulator.body import body_of
-from services.simulator.plant import PlantConfig
-from services.simulator.world import World
+from services.simulator.drives.axis_bank import AxisBank
+from services.simulator.physics.body import body_of
+from services.simulator.physics.plant import PlantConfig
+from services.simulator.physics.world import World
 from shared.bus.messages import Pair
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Scenario
-from shared.robot.joints import MODULES
-from tools.runs.virtual_drive import VirtualDrive
+from shared.joints import MODULES
+from tools.sim.virtual_drive import VirtualDrive
 
 STEP_NS = NS_PER_S // 1000
 STAND = Scenario("stand", "nothing", 10.0, (Keyframe(0.0, 1.188),))

@@ -10,7 +10,7 @@ from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.kinematics import Kinematics
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.exceptions import RunError
-from shared.robot.joints import JOINTS
+from shared.joints import JOINTS
 from shared.robot.robot_model import stand_pose
 from tests.planner.oracle import Array
 from tools.identify.body_fit import (

@@ -9,18 +9,18 @@ import msgspec
 import numpy as np
 import pytest
 
-from services.simulator.plant import PlantConfig
+from services.simulator.physics.plant import PlantConfig
 from shared.bus import topics
 from shared.bus.messages import Message
 from shared.bus.topics import Topic
 from shared.config import scenarios
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tests.conftest import ROBOT_FILE
 from tools.identify.body_fit import COM, HARNESS, MASS, SCALE, ZEROS, Record, fit
 from tools.identify.quasi_static import Moments, TimedRows, moments_of
 from tools.lab.studies.sweeps import plants
-from tools.runs.lockstep import Lockstep
+from tools.sim.lockstep import Lockstep
 
 PLANTS = 10
 

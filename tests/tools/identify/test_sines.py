@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from services.joint.drivers.base import DriveStatus
-from services.simulator.plant import PlantConfig, changed
+from services.simulator.physics.plant import PlantConfig, changed
 from shared.can.cansimple import AxisState
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
-from shared.robot.joints import MODULE_INDEX
+from shared.joints import MODULE_INDEX
 from tests.tools.identify.hung_robot import HungRobot
 from tests.tools.verbs.bench_drive import START, BenchDrive
 from tools.bringup import jog_drive

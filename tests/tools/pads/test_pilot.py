@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.simulator.led_hand import HEIGHTS, PITCHES
+from services.simulator.physics.led_hand import HEIGHTS, PITCHES
 from tools.pads.pilot import (
     ASSIST_RATE,
     DEAD_ZONE,

@@ -21,7 +21,7 @@ from shared.can.drive_settings import of_module
 from shared.config.robot_config import RobotConfig, expand
 from shared.config.sections import CanConfig
 from shared.exceptions import DriveError, FleetError
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tests.tools.bringup.board_in_memory import BoardInMemory, as_wanted
 from tools import cli
 from tools.bringup import backup, changes, reach

@@ -13,8 +13,8 @@ from shared.bus.messages import Mode
 from shared.bus.topics import VIEWER
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
+from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
-from shared.robot.joints import MODULES
 from tests.certified import certified, install_all
 from tests.tools.exit_codes import exit_code
 from tools.fleet.run_dir import Manifest, RunDir

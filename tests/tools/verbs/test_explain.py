@@ -16,13 +16,13 @@ from services.planner.law.kinematics import Kinematics
 from shared.bus import topics
 from shared.bus.messages import PlannerStatus
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import JOINTS, MODULES, N_JOINTS
+from shared.joints import JOINTS, MODULES, N_JOINTS
 from shared.robot.robot_model import stand_pose
 from tools import cli
+from tools.judge.run_parts import zero_ns
 from tools.lab.design.torque_breakdown import torque_breakdown
-from tools.runs.recorded_robot import robot_of
-from tools.runs.run_log import RunLog, read_run
-from tools.runs.run_parts import zero_ns
+from tools.logs.recorded_robot import robot_of
+from tools.logs.run_log import RunLog, read_run
 from tools.verbs import explain
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from shared.config import files as config_file
-from shared.robot import gain_schedule
+from shared.config import gain_schedule
 from tests.conftest import ROBOT_FILE
 
 TEXT = ROBOT_FILE.read_text(encoding="utf-8")

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from shared.bus.links import COMMANDS
 from shared.config.scenarios import Inject
+from shared.links import COMMANDS
 from shared.network.proxy_protocol import RequestedImpairment
 from tools import cli
 from tools.verbs import inject

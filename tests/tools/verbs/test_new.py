@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from services.simulator import plant
+from services.simulator.physics import plant
 from shared.config import files as config_file
 from shared.config import scenarios
 from shared.places import DEFAULT_CONFIG, SCENARIOS

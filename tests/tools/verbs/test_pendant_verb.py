@@ -16,7 +16,7 @@ import pytest
 from services.joint.neighbours import NeighbourRow, Neighbours
 from services.joint.rearm_guard import RearmGuard
 from shared.bus.messages import Mode
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tools import cli
 
 ROOT = Path(__file__).parents[3]

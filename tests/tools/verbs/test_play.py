@@ -17,7 +17,7 @@ from tests.certified import certified, opened
 from tests.shared.mcap_log import runs
 from tests.shared.mcap_log.runs import item, write
 from tools import cli
-from tools.analysis.playback import arguments, reading
+from tools.logs.playback import arguments, reading
 from tools.verbs import play
 
 LENGTH = 40

@@ -9,7 +9,7 @@ import pytest
 from tests.shared.mcap_log import runs
 from tests.shared.mcap_log.runs import STATE_KEY, Queue, item
 from tools import cli
-from tools.runs.run_log import read_run
+from tools.logs.run_log import read_run
 
 
 def test_the_copy_goes_beside_the_original_which_is_not_touched(

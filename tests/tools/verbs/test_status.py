@@ -25,7 +25,7 @@ from shared.bus.messages import (
 )
 from shared.bus.session import Latest, place_of_tool
 from shared.clock import NS_PER_S, now_ns
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from shared.robot.trip_table import JOINT_TRIPS
 from tools.fleet import procfs
 from tools.fleet.fleet_status import (

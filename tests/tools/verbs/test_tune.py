@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from services.simulator.plant import IDEAL, PlantConfig
+from services.simulator.physics.plant import IDEAL, PlantConfig
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError

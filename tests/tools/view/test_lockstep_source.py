@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from services.simulator.led_hand import HEIGHTS, PUSH_MAX
+from services.simulator.physics.led_hand import HEIGHTS, PUSH_MAX
 from shared.bus.messages import Mode
+from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
-from shared.robot.joints import MODULES
-from tools.runs.experiment import load_robot
+from tools.live.experiment import load_robot
 from tools.view.frame import Frame
 from tools.view.lockstep import LockstepSource
 from tools.view.source import Order

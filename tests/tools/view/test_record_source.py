@@ -9,16 +9,16 @@ import pytest
 
 from shared.bus import topics
 from shared.bus.messages import JointState, SimTruth
-from shared.robot.joints import MODULES
-from tests.tools.analysis.reports.runs import make, rewritten
-from tests.tools.runs.split_runs import recorded_in_parts
-from tools.runs.recorded_robot import robot_of
-from tools.runs.run_log import RunLog, read_run
-from tools.runs.stalls import MACHINE, Stall
+from shared.joints import MODULES
+from tests.tools.judge.reports.runs import make, rewritten
+from tests.tools.logs.split_runs import recorded_in_parts
+from tools.judge.stalls import MACHINE, Stall
+from tools.logs.recorded_robot import robot_of
+from tools.logs.run_log import RunLog, read_run
 from tools.view.record import RecordSource
 from tools.view.source import Order
 
-LOG = Path(__file__).parents[1] / "analysis" / "reexecution" / "golden" / "stand-v6c.mcap"
+LOG = Path(__file__).parents[1] / "logs" / "reexecution" / "golden" / "stand-v6c.mcap"
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,8 @@ from shared.bus.messages import SimTruth
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.robot.robot_model import stand_pose
 from tests.lockstep.runs import still
-from tools.runs.lockstep import Lockstep
-from tools.runs.standing_start import begin_standing
+from tools.sim.lockstep import Lockstep
+from tools.sim.standing_start import begin_standing
 from tools.view.sole_estimate import SoleEstimate, jacobian
 
 

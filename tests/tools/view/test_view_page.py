@@ -15,9 +15,9 @@ from shared.places import DEFAULT_CONFIG
 from tests.tools.view.browser import BROWSER, Page, browser
 from tests.tools.view.test_record_source import LOG
 from tools import cli
-from tools.runs.experiment import load_robot
-from tools.runs.recorded_robot import robot_of
-from tools.runs.run_log import read_run
+from tools.live.experiment import load_robot
+from tools.logs.recorded_robot import robot_of
+from tools.logs.run_log import read_run
 from tools.view.lockstep import LockstepSource
 from tools.view.record import RecordSource
 from tools.view.server import ViewServer

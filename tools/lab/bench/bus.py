@@ -14,8 +14,8 @@ import msgspec
 import numpy as np
 
 from shared.exceptions import RunError
+from shared.joints import MODULES
 from shared.places import CHECKOUT
-from shared.robot.joints import MODULES
 from tools.lab.bench.bus_process import PLANNER, WARM_UP_S, BusReport
 
 PATIENCE_S: Final = 20.0

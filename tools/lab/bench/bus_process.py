@@ -21,7 +21,7 @@ from shared import scheduling
 from shared.bus.codec import Decoder, encode
 from shared.bus.messages import JointCommand, JointState
 from shared.clock import NS_PER_S, NS_PER_US
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tools.lab.bench.transports.base import Transport, open_transport
 
 CYCLE_HZ: Final = 500.0

@@ -20,9 +20,9 @@ from shared.bus.messages import JointCommand
 from shared.bus.traces import JointTrace
 from shared.clock import NS_PER_MS
 from shared.exceptions import RunError
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tools.lab.bench.revisions import environment
-from tools.runs.run_log import RunLog, read_run
+from tools.logs.run_log import RunLog, read_run
 
 Array = NDArray[np.float64]
 

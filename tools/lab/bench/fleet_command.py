@@ -12,18 +12,18 @@ from rich.table import Table
 from rich.text import Text
 
 from shared.config import files as config_file
+from shared.config import gain_schedule
 from shared.exceptions import FAULT_EXIT_CODE
 from shared.extras import require
 from shared.places import CHECKOUT
-from shared.robot import gain_schedule
 from tools.fleet.others import warn_of_others
 from tools.fleet.pace import check_pace
+from tools.judge.verdict_table import digits
 from tools.lab.bench import fleet
 from tools.lab.bench.flags import add_flags, write_rows
 from tools.lab.bench.fleet import FleetRow, Turn
 from tools.lab.bench.revisions import its_config, unpacked
 from tools.number_arguments import finite
-from tools.runs.verdict_table import digits
 from tools.terminal import Console, marked
 from tools.verb_table import Subparsers
 

@@ -15,7 +15,7 @@ import msgspec
 from services.joint.drive_manager import DriveAction, DriveManager
 from services.joint.drivers.odrive_can import OdriveCan
 from services.planner.planner import Planner
-from services.simulator.unix_can_hub import UnixCanHub
+from services.simulator.fronts.unix_can_hub import UnixCanHub
 from shared.bus import topics
 from shared.bus.codec import Decoder, encode
 from shared.bus.messages import JointCommand, JointState, Message, Tare, Wrench
@@ -26,12 +26,12 @@ from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Scenario
 from shared.config.sections import CanConfig
+from shared.joints import MODULES
 from shared.mcap_log.writer import RunWriter
-from shared.robot.joints import MODULES
 from tools.lab.bench.timing import Repeated
-from tools.runs.lockstep import Lockstep, forget
-from tools.runs.recorded_lockstep import DRAIN_EVERY, Outbox
-from tools.runs.standing_start import begin_standing
+from tools.sim.lockstep import Lockstep, forget
+from tools.sim.recorded_lockstep import DRAIN_EVERY, Outbox
+from tools.sim.standing_start import begin_standing
 
 SECONDS: Final = 3.0
 """Recorded of the squat: on the way down and up."""

@@ -21,7 +21,7 @@ from shared.config import files as config_file
 from shared.config import scenarios
 from tools.lab.bench import parts
 from tools.lab.bench.timing import Cost, Repeated, measure, yardstick_us
-from tools.runs.experiment import scenario_file
+from tools.live.experiment import scenario_file
 
 FIRST_CALLS: Final = 50
 """Before a part is timed for the first time."""

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.law.kinematics import Kinematics
+from shared.config.gain_table import Bounds, ModuleBounds
 from shared.config.robot_config import GRAVITY, RobotConfig
-from shared.robot.gain_table import Bounds, ModuleBounds
-from shared.robot.joints import MODULES, N_LEG, kind_of
+from shared.joints import MODULES, N_LEG, kind_of
 from tools.lab.design.poses import PoseNode
 
 Array = NDArray[np.float64]

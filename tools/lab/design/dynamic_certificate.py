@@ -22,7 +22,7 @@ from services.planner.law.coupling import UncoupledGains
 from services.planner.law.model import BodyInertia
 from services.planner.law.split import CouplingGains
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tools.lab.design.poses import Poses
 from tools.lab.design.sampled_loop import (
     NO_HAND,

@@ -12,7 +12,7 @@ from services.planner.law.gains import GainLaw
 from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.kinematics import Kinematics
 from shared.config.robot_config import GRAVITY, RobotConfig
-from shared.robot.joints import N_JOINTS, N_LEG
+from shared.joints import N_JOINTS, N_LEG
 from shared.robot.robot_model import stand_pose
 
 Array = NDArray[np.float64]

@@ -29,7 +29,7 @@ from services.planner.law.certificate import motor_mean
 from services.planner.law.coupling import UncoupledGains
 from services.planner.law.kinematics import Kinematics
 from shared.config.robot_config import GRAVITY, RobotConfig
-from shared.robot.joints import MODULES, N_JOINTS, N_LEG, SIDES
+from shared.joints import MODULES, N_JOINTS, N_LEG, SIDES
 from shared.robot.robot_model import ankle_positions
 
 Array = NDArray[np.float64]

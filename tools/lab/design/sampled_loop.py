@@ -31,7 +31,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from services.planner.law.coupling import pole_gain
-from shared.robot.joints import N_JOINTS, N_LEG
+from shared.joints import N_JOINTS, N_LEG
 
 Array = NDArray[np.float64]
 

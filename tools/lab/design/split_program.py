@@ -24,12 +24,12 @@ from numpy.typing import NDArray
 
 from services.planner.law.certificate import Certificate, Margins
 from services.planner.law.split import CouplingGains, ScheduledGains
+from shared.config.gain_schedule import VERSION, digest_of, inputs_of
+from shared.config.gain_table import GainSchedule, LegGains
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.extras import late
-from shared.robot.gain_schedule import VERSION, digest_of, inputs_of
-from shared.robot.gain_table import GainSchedule, LegGains
-from shared.robot.joints import N_LEG
+from shared.joints import N_LEG
 from tools.lab.design import design_program
 from tools.lab.design.command_bounds import BoundsOverPoses
 from tools.lab.design.dynamic_certificate import Design, nodes_of

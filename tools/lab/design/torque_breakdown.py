@@ -21,7 +21,7 @@ from services.planner.law.split import GainSplit, LocalGains
 from shared.bus.messages import AS_CONFIGURED, Pair, Vector6
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.exceptions import RunError
-from shared.robot.joints import N_LEG, SIDES
+from shared.joints import N_LEG, SIDES
 from tools.lab.design.push_limit import PushLimits, limits_at
 
 Array = NDArray[np.float64]

@@ -18,19 +18,19 @@ import numpy as np
 from gymnasium import spaces
 
 from services.planner.controller import Action, Array, Observation
-from services.simulator.plant import PlantConfig
+from services.simulator.physics.plant import PlantConfig
 from shared.bus.messages import Mode, SimTruth
 from shared.config.files import load
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Scenario
 from shared.config.scenarios import load as load_scenario
+from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
-from shared.robot.joints import MODULES
 from tools.lab.learning.policy import ACTIONS, LARGEST, OBSERVED, acted, observed
 from tools.lab.studies.sweeps import plants
-from tools.runs.experiment import scenario_file
-from tools.runs.lockstep import Lockstep
-from tools.runs.standing_start import begin_standing
+from tools.live.experiment import scenario_file
+from tools.sim.lockstep import Lockstep
+from tools.sim.standing_start import begin_standing
 
 FALLEN: Final = -100.0
 """Reward of a fall."""

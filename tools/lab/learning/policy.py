@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from services.planner.controller import Action, Array, Observation
-from shared.robot.joints import N_JOINTS
+from shared.joints import N_JOINTS
 
 Policy = Callable[[Array], Array]
 """Returns an action (36,) in -1 .. 1 for an observation (56,)."""

@@ -20,7 +20,7 @@ from tests.shared.mcap_log.runs import ROBOT, sample, write
 from tests.tools.exit_codes import exit_code
 from tools.lab.bench import fleet, fleet_command
 from tools.lab.bench.fleet import FIGURES, Turn
-from tools.runs.run_log import read_run
+from tools.logs.run_log import read_run
 
 SUMMARY = {"planner_tick_us": {"median": 200.0, "p99": 400.0}, "fleet_cpu_pct": 90.0}
 

@@ -11,14 +11,14 @@ import pytest
 from shared.config import scenarios
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
+from shared.joints import MODULES
 from shared.places import CHECKOUT, DEFAULT_CONFIG
-from shared.robot.joints import MODULES
 from tools.lab.bench import parts, revisions, timing
 from tools.lab.bench.parts import PARTS, Part, Recorded
 from tools.lab.bench.revisions import Worker
 from tools.lab.bench.timing import Repeated, measure
 from tools.lab.bench.worker import Bench, Request
-from tools.runs.experiment import scenario_file
+from tools.live.experiment import scenario_file
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from services.joint.envelope import Envelope
 from services.planner.law.hocca import Hocca
 from shared.bus.messages import JointCommand, Outside
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tests.planner.conftest import Closed
 
 

@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from services.simulator.body import body_of
-from services.simulator.plant import NAMED, changed
-from services.simulator.world import World
+from services.simulator.physics.body import body_of
+from services.simulator.physics.plant import NAMED, changed
+from services.simulator.physics.world import World
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.config.scenarios import Keyframe, Push, Scenario
-from shared.robot.joints import N_JOINTS, N_LEG
+from shared.joints import N_JOINTS, N_LEG
 from tools.lab.design.poses import Poses
 from tools.lab.design.push_limit import DIRECTIONS, LoadedStand, equivalent_slope
 

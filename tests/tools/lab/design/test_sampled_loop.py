@@ -11,9 +11,9 @@ import pytest
 
 from services.planner.law.model import BodyInertia
 from services.planner.law.split import ScheduledGains
-from services.simulator.body import body_of
-from services.simulator.plant import IDEAL, PlantConfig, changed
-from services.simulator.world import World
+from services.simulator.physics.body import body_of
+from services.simulator.physics.plant import IDEAL, PlantConfig, changed
+from services.simulator.physics.world import World
 from shared.config.robot_config import RobotConfig
 from tests.lockstep.runs import still
 from tests.tools.lab.design import loop_oracle
@@ -36,7 +36,7 @@ from tools.lab.design.sampled_loop import (
 )
 from tools.lab.design.split_program import design_of
 from tools.lab.design.stability_margins import stability_margins_of
-from tools.runs.lockstep import Lockstep
+from tools.sim.lockstep import Lockstep
 
 
 @pytest.fixture(scope="module")

@@ -8,10 +8,10 @@ import pytest
 
 from services.planner.law.certificate import Margins
 from services.planner.law.inverse_kinematics import InverseKinematics
+from shared.config import gain_schedule
+from shared.config.gain_table import GainSchedule
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.robot import gain_schedule
-from shared.robot.gain_table import GainSchedule
 from shared.robot.robot_model import stand_pose
 from tests.planner.conftest import at_pose, com_height
 from tests.planner.oracle import Array

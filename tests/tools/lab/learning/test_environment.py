@@ -15,12 +15,12 @@ from shared.bus import topics
 from shared.bus.messages import JointCommand, JointState, Message
 from shared.bus.topics import Topic
 from shared.config.robot_config import GRAVITY, RobotConfig
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tests.lockstep.runs import still
 from tools.lab.learning.environment import FALLEN, BalanceEnv, standing_reward
 from tools.lab.learning.policy import ACTIONS, OBSERVED, PolicyController
-from tools.runs.lockstep import Lockstep
-from tools.runs.standing_start import begin_standing
+from tools.sim.lockstep import Lockstep
+from tools.sim.standing_start import begin_standing
 
 
 @pytest.fixture

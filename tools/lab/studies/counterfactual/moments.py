@@ -16,11 +16,11 @@ from shared.bus.traces import SimState
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.robot.joints import MODULES
-from tools.analysis.reexecution.joint import JointExecution
-from tools.analysis.reexecution.outcome import ReexecutionResult
-from tools.analysis.reexecution.planner import PlannerExecution
-from tools.runs.run_log import RunLog
+from shared.joints import MODULES
+from tools.logs.reexecution.joint import JointExecution
+from tools.logs.reexecution.outcome import ReexecutionResult
+from tools.logs.reexecution.planner import PlannerExecution
+from tools.logs.run_log import RunLog
 
 R = TypeVar("R")
 T = TypeVar("T")

@@ -10,8 +10,8 @@ import numpy as np
 from shared.bus import topics
 from shared.clock import NS_PER_S
 from tools.lab.studies.counterfactual.run import Counterfactual
+from tools.logs.run_log import RunLog
 from tools.output import new_figure, save_figure
-from tools.runs.run_log import RunLog
 
 STOOD, FELL = "#2e7d32", "#c0392b"
 

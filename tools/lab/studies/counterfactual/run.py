@@ -6,14 +6,14 @@ from typing import Final
 
 import msgspec
 
-from services.simulator.plant import PlantConfig
+from services.simulator.physics.plant import PlantConfig
 from shared.bus.messages import SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Kill, Scenario
 from tools.lab.studies.counterfactual.moments import Moment
-from tools.runs.hand_path import HandRow
-from tools.runs.lockstep import FleetMoment, Lockstep
-from tools.runs.network import BASE
+from tools.logs.hand_path import HandRow
+from tools.sim.lockstep import FleetMoment, Lockstep
+from tools.sim.network import BASE
 
 KILL_AFTER_S: Final = 1e-3
 

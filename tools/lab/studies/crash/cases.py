@@ -23,9 +23,9 @@ from shared.config.scenarios import (
     Restart,
     Scenario,
 )
+from shared.joints import MODULES, kind_of
 from shared.robot.fault_table import DRIVE_FAULTS
-from shared.robot.joints import MODULES, kind_of
-from tools.runs.scenario_runner import TriggeredKill
+from tools.live.scenario_runner import TriggeredKill
 
 CRASH_S: Final = 2.4
 REQUEST_S: Final = 5.0

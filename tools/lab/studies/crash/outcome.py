@@ -15,9 +15,9 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import lead
 from shared.robot.trip_table import JOINT_TRIPS
+from tools.judge.standing import is_tipping
+from tools.judge.verdict import LATE_MAX_S, REAL_TIME_FACTOR_MIN
 from tools.lab.studies.crash.cases import CRASH_S, REQUEST_S, CrashCase, CrashVerdict, scenario_of
-from tools.runs.standing import is_tipping
-from tools.runs.verdict import LATE_MAX_S, REAL_TIME_FACTOR_MIN
 
 SANK_M: Final = 0.05
 """So far below where the torso was, and where the hand led, a robot has sunk. HOLD's springs

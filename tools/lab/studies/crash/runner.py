@@ -10,20 +10,20 @@ from typing import Final
 
 import msgspec
 
-from services.simulator.plant import PlantConfig
+from services.simulator.physics.plant import PlantConfig
 from shared.bus import topics
 from shared.bus.codec import Decoder
 from shared.bus.messages import JointEvent, RunEvent, RunEventKind, SimTruth
 from shared.bus.session import Session
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError, RunError
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tools.fleet.supervise import SupervisedFleet
 from tools.fleet.supervisor_client import ServiceInfo
 from tools.lab.studies.crash.cases import CrashCase, CrashVerdict, scenario_of
 from tools.lab.studies.crash.outcome import CrashResult, Heard, as_expected, measure, unjudged
-from tools.runs.live import run_live
-from tools.runs.scenario_runner import LiveSnapshot, ScenarioRunner
+from tools.live.live import run_live
+from tools.live.scenario_runner import LiveSnapshot, ScenarioRunner
 
 Show = Callable[[LiveSnapshot], None]
 

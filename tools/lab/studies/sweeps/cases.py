@@ -7,9 +7,9 @@ from typing import Final
 
 import msgspec
 
+from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Kill, Push, Scenario
-from shared.network.impairment import Impairment
 from shared.robot.robot_model import stand_pose
 from tools.lab.studies.sweeps.push_range import SHARE, PushRange
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 from services.planner.law.certificate import DIRECTIONS
-from services.simulator.plant import IDEAL, PlantConfig
+from services.simulator.physics.plant import IDEAL, PlantConfig
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FELL_EXIT_CODE

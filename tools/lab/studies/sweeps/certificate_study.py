@@ -27,14 +27,14 @@ from services.planner.law.certificate import Certificate, Weakest
 from services.planner.law.gains import GainLaw
 from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.kinematics import Kinematics
-from services.simulator.body import body_of
-from services.simulator.plant import IDEAL, PlantConfig, changed
-from services.simulator.world import World
+from services.simulator.physics.body import body_of
+from services.simulator.physics.plant import IDEAL, PlantConfig, changed
+from services.simulator.physics.world import World
 from shared.bus.messages import Pair, SimTruth
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.config.scenarios import Keyframe, Push, Scenario
 from shared.exceptions import RunError
-from shared.robot.joints import MODULES, N_JOINTS, N_LEG
+from shared.joints import MODULES, N_JOINTS, N_LEG
 from shared.robot.robot_model import stand_pose
 from tools.output import new_figure, save_figure
 

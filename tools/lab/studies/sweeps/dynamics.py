@@ -21,9 +21,9 @@ from tools.lab.studies.sweeps.dynamics_trial import (
     run_trial,
 )
 from tools.lab.studies.sweeps.table import Row, code_of
+from tools.live import experiment
 from tools.number_arguments import count, natural
 from tools.output import new_figure, save_figure
-from tools.runs import experiment
 from tools.terminal import Console
 from tools.verb_table import add_config
 

@@ -21,18 +21,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.planner import Planner
-from services.simulator.plant import IDEAL, PlantConfig, changed
+from services.simulator.physics.plant import IDEAL, PlantConfig, changed
 from shared.bus.messages import Mode
+from shared.config.gain_schedule import believing
+from shared.config.gain_table import GainSchedule
+from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Push, Scenario
-from shared.network.impairment import Impairment
-from shared.robot.gain_schedule import believing
-from shared.robot.gain_table import GainSchedule
-from shared.robot.joints import N_LEG
+from shared.joints import N_LEG
 from tools.lab.design.dynamic_certificate import Condition, DynamicCertificate, nodes_of
 from tools.lab.design.sampled_loop import NOMINAL, HandModel
 from tools.lab.design.split_program import design_of
-from tools.runs.lockstep import Lockstep
+from tools.sim.lockstep import Lockstep
 
 HEIGHTS: Final = (0.95, 1.188)
 """m, of the torso."""

@@ -12,8 +12,8 @@ import msgspec
 from shared.bus.messages import JointEvent, SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE
-from tools.runs.lockstep import Watch
-from tools.runs.standing import is_tipping
+from tools.judge.standing import is_tipping
+from tools.sim.lockstep import Watch
 
 END_TOLERANCE_S: Final = 0.1
 

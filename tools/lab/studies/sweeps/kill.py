@@ -15,8 +15,8 @@ from tools.lab.studies.sweeps.outcome import KillResult, plant_of, run_case
 from tools.lab.studies.sweeps.prepare import needs_schedule, prepare
 from tools.lab.studies.sweeps.record import run_alone
 from tools.lab.studies.sweeps.table import code_of
+from tools.live import experiment
 from tools.number_arguments import count, natural
-from tools.runs import experiment
 from tools.terminal import Console
 from tools.verb_table import add_config
 

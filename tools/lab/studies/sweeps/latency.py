@@ -12,7 +12,7 @@ from typing import Final, TypeAlias
 import msgspec
 
 from shared.config.robot_config import RobotConfig
-from shared.config.toml_file import check_ranges
+from shared.toml_file import check_ranges
 from tools.lab.studies.sweeps import latency_picture, latency_report, plants, study
 from tools.lab.studies.sweeps.figures import ENDINGS, Ending, exit_code
 from tools.lab.studies.sweeps.latency_trial import (
@@ -28,8 +28,8 @@ from tools.lab.studies.sweeps.latency_trial import (
 )
 from tools.lab.studies.sweeps.record import run_alone
 from tools.lab.studies.sweeps.table import code_of
+from tools.live import experiment
 from tools.number_arguments import count, finite, natural
-from tools.runs import experiment
 from tools.terminal import Console
 from tools.verb_table import add_config
 

@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 import msgspec
 import numpy as np
 
-from services.simulator.plant import PlantConfig
+from services.simulator.physics.plant import PlantConfig
 from shared.bus.messages import (
     JointEvent,
     JointState,
@@ -29,10 +29,10 @@ from shared.bus.messages import (
 )
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_S
+from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Keyframe, Scenario
-from shared.network.impairment import Impairment
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tools.lab.studies.sweeps import plants
 from tools.lab.studies.sweeps.figures import (
     Ended,
@@ -46,8 +46,8 @@ from tools.lab.studies.sweeps.figures import (
     that_count,
 )
 from tools.lab.studies.sweeps.push_range import SHARE, PushRange
-from tools.runs.centralised.fleet import CentralisedLockstep
-from tools.runs.lockstep import Lockstep, Record, Watch
+from tools.sim.centralised.fleet import CentralisedLockstep
+from tools.sim.lockstep import Lockstep, Record, Watch
 
 SQUATS: Final = ((0.5, 0.0), (3.0, 0.24), (5.5, 0.0), (8.0, 0.24))
 """s, and m below the stand: as in the paper's Fig. 7, at its pace."""

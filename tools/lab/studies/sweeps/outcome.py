@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from services.simulator.plant import PlantConfig
-from services.simulator.world import World
+from services.simulator.physics.plant import PlantConfig
+from services.simulator.physics.world import World
 from shared.bus.messages import (
     JointEvent,
     Message,
@@ -18,7 +18,7 @@ from shared.bus.messages import (
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import MODULES, SIDES
+from shared.joints import MODULES, SIDES
 from tools.lab.studies.sweeps import plants
 from tools.lab.studies.sweeps.cases import KillCase, network_of, scenario_of
 from tools.lab.studies.sweeps.figures import (
@@ -31,7 +31,7 @@ from tools.lab.studies.sweeps.figures import (
     sole_tilt_max_rad,
     that_count,
 )
-from tools.runs.lockstep import Lockstep, Record, Watch
+from tools.sim.lockstep import Lockstep, Record, Watch
 
 
 class KillResult(Ended, frozen=True, kw_only=True):

@@ -11,10 +11,10 @@ from typing import Any, Final, Literal
 
 import msgspec
 
-from services.simulator.plant import PlantConfig, changed
-from shared.config.toml_file import Section, read_toml
+from services.simulator.physics.plant import PlantConfig, changed
 from shared.exceptions import ConfigError
 from shared.places import FILES
+from shared.toml_file import Section, read_toml
 
 RANGES_FILE: Final = FILES / "plants" / "ranges.toml"
 

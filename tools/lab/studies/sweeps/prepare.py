@@ -10,10 +10,10 @@ from typing import TypeAlias
 
 import msgspec
 
+from shared.config import gain_schedule
+from shared.config.gain_table import GainSchedule
 from shared.config.robot_config import RobotConfig
 from shared.extras import require
-from shared.robot import gain_schedule
-from shared.robot.gain_table import GainSchedule
 from tools.lab.design import split_program
 from tools.lab.studies.sweeps import pool
 

@@ -13,16 +13,16 @@ import msgspec
 import numpy as np
 from rich.table import Table as Printed
 
-from services.simulator import plant as plants
-from services.simulator.plant import PlantConfig, plant_from
+from services.simulator.physics import plant as plants
+from services.simulator.physics.plant import PlantConfig, plant_from
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from tools.lab.studies.sweeps import study
 from tools.lab.studies.sweeps.push_trial import MODES, POSES, PushResult, PushTrial, run_trial
 from tools.lab.studies.sweeps.table import Row, code_of
+from tools.live import experiment
 from tools.number_arguments import degrees, finite
 from tools.output import new_figure, save_figure
-from tools.runs import experiment
 from tools.terminal import Console
 from tools.verb_table import add_config
 

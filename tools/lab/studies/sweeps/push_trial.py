@@ -13,7 +13,7 @@ from typing import Final
 import msgspec
 
 from services.planner.law.split import ScheduledGains
-from services.simulator.plant import PlantConfig
+from services.simulator.physics.plant import PlantConfig
 from shared.bus.messages import SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Kill, Push, Scenario
@@ -22,8 +22,8 @@ from tools.lab.design.poses import Poses
 from tools.lab.design.push_limit import LoadedStand, PushLimits, limits_along
 from tools.lab.studies.sweeps.figures import Ending, ending_of
 from tools.lab.studies.sweeps.push_range import com_height
-from tools.runs.lockstep import FleetMoment, Lockstep
-from tools.runs.network import BASE
+from tools.sim.lockstep import FleetMoment, Lockstep
+from tools.sim.network import BASE
 
 POSES: Final = {"stand": (1.188, 0.0), "squat": (0.95, 0.0), "crawl": (0.79, 1.2)}
 """Torso height, m, and pitch, rad."""

@@ -7,15 +7,15 @@ from typing import Protocol, TypeVar
 
 import msgspec
 
-from services.simulator.plant import PlantConfig
+from services.simulator.physics.plant import PlantConfig
 from shared.bus.messages import SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Scenario
 from tools.lab.studies.sweeps import study
 from tools.lab.studies.sweeps.figures import Ended, exit_code
-from tools.runs import experiment
-from tools.runs.lockstep import Record, Watch
-from tools.runs.recorded_lockstep import AFTER_FALL_S, judge_in_lockstep, record_run
+from tools.live import experiment
+from tools.sim.lockstep import Record, Watch
+from tools.sim.recorded_lockstep import AFTER_FALL_S, judge_in_lockstep, record_run
 from tools.terminal import Console, marked
 
 Outcome_co = TypeVar("Outcome_co", bound=Ended, covariant=True)

@@ -30,9 +30,9 @@ from tools.lab.studies.sweeps.robust_trial import (
 )
 from tools.lab.studies.sweeps.table import Row, code_of
 from tools.lab.studies.sweeps.wilson import wilson
+from tools.live import experiment
 from tools.number_arguments import count, finite, natural
 from tools.output import new_figure, save_figure
-from tools.runs import experiment
 from tools.terminal import Console, marked
 from tools.verb_table import add_config
 

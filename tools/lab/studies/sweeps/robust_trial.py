@@ -9,11 +9,11 @@ from typing import Final
 
 import msgspec
 
-from services.simulator.plant import PlantConfig, changed
+from services.simulator.physics.plant import PlantConfig, changed
 from shared.bus.messages import SimTruth
+from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Kill, Push, Scenario
-from shared.network.impairment import Impairment
 from tools.lab.studies.sweeps import plants
 from tools.lab.studies.sweeps.figures import (
     Ended,
@@ -26,7 +26,7 @@ from tools.lab.studies.sweeps.figures import (
     that_count,
 )
 from tools.lab.studies.sweeps.push_range import PushRange
-from tools.runs.lockstep import Lockstep, Record, Watch, forget
+from tools.sim.lockstep import Lockstep, Record, Watch, forget
 
 KINDS: Final = ("squat", "crawl", "lean")
 DELAY_MAX_MS: Final = 10.0

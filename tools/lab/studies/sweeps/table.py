@@ -34,7 +34,7 @@ def code_of(*modules: str) -> tuple[str, ...]:
     """Return all of our code that some modules of the tools run: the parts for `code_digest`.
 
     Args:
-        modules: by name, such as `tools.runs.lockstep`.
+        modules: by name, such as `tools.sim.lockstep`.
 
     Returns:
         Services and shared, and of the tools the files of these modules and of all that they

@@ -17,7 +17,7 @@ from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE, RunError
 from tools.lab.studies.sweeps import study
 from tools.lab.studies.sweeps.table import Row, code_of
 from tools.lab.studies.sweeps.trips_trial import PLANTS, TROUBLES, TripResult, run_trial
-from tools.runs import experiment
+from tools.live import experiment
 from tools.terminal import Console, marked
 from tools.verb_table import add_config
 

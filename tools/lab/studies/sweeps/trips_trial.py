@@ -11,19 +11,19 @@ from typing import Any, Final, NamedTuple
 
 import msgspec
 
-from services.simulator.plant import IDEAL, PlantConfig, changed
+from services.simulator.physics.plant import IDEAL, PlantConfig, changed
 from shared.bus.messages import STRAIGHT, Cause, Message, Mode, PlannerStatus, SimTruth, Trip
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_S
 from shared.config import scenarios
+from shared.config.gain_schedule import believing
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Push, Scenario
 from shared.exceptions import RunError
 from shared.places import SCENARIOS
-from shared.robot.gain_schedule import believing
 from shared.robot.trip_table import JOINT_TRIPS, untripped
-from tools.runs.lockstep import Lockstep
-from tools.runs.standing_start import begin_standing
+from tools.sim.lockstep import Lockstep
+from tools.sim.standing_start import begin_standing
 
 SMALL_ERRORS: Final[Mapping[str, Any]] = {
     "encoder.zero_errors": [math.radians(0.5) * (-1) ** i for i in range(12)],

@@ -9,7 +9,7 @@ import pytest
 from shared.config import scenarios
 from shared.config.robot_config import OPTIONAL, SERVICES
 from shared.config.scenarios import FAULT_KINDS, Fault, FaultKind, Kill
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tools.lab.studies.crash.cases import (
     BACK_S,
     CASES,

@@ -10,7 +10,7 @@ import pytest
 from shared.bus.messages import Cause, JointEvent, Mode, RunEvent, RunEventKind, SimTruth
 from shared.config import scenarios
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tools.lab.studies.crash.cases import (
     BACK_S,
     CASES,

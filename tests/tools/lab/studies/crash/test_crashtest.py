@@ -14,14 +14,14 @@ from shared.bus.messages import Mode, RunEvent, RunEventKind
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Kill
 from shared.exceptions import RunError
-from shared.robot.joints import MODULES
+from shared.joints import MODULES
 from tests.tools.test_cli import assert_one_line_error, xrl
 from tools.fleet.supervisor_client import ServiceInfo
 from tools.lab.studies.crash import report, runner
 from tools.lab.studies.crash.cases import CASES, CrashCase, CrashVerdict, scenario_of
 from tools.lab.studies.crash.outcome import CrashResult
 from tools.lab.studies.crash.report import Result
-from tools.runs.scenario_runner import ScenarioRunner, TriggeredKill
+from tools.live.scenario_runner import ScenarioRunner, TriggeredKill
 from tools.terminal import Console
 from tools.verbs import crashtest
 

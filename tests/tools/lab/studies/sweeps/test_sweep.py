@@ -17,9 +17,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from shared.config import gain_schedule
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.robot import gain_schedule
 from tests.tools.exit_codes import exit_code
 from tools import cli
 from tools.lab.studies.sweeps import cases, pool

@@ -11,23 +11,23 @@ import numpy as np
 import pytest
 
 from services.planner.law.kinematics import Kinematics
-from services.simulator.body import body_of
-from services.simulator.plant import IDEAL
-from services.simulator.world import World
+from services.simulator.physics.body import body_of
+from services.simulator.physics.plant import IDEAL
+from services.simulator.physics.world import World
 from shared.bus.messages import SimTruth
 from shared.clock import NS_PER_S
 from shared.config import scenarios
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.config.scenarios import Keyframe, Push, Scenario, lead
 from shared.robot.robot_model import stand_pose
+from tools.judge.standing import is_tipping
 from tools.lab.studies.sweeps import cases
 from tools.lab.studies.sweeps.cases import KillCase, KillCases
 from tools.lab.studies.sweeps.figures import Ending, exit_code
 from tools.lab.studies.sweeps.outcome import FootLoads, run_case
 from tools.lab.studies.sweeps.push_range import PushRange
-from tools.runs import lockstep
-from tools.runs.lockstep import Lockstep
-from tools.runs.standing import is_tipping
+from tools.sim import lockstep
+from tools.sim.lockstep import Lockstep
 
 
 @pytest.fixture(scope="module")

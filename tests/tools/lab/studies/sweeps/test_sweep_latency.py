@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from shared.bus.links import DIRECTIONS
 from shared.bus.messages import JointEvent, Mode
 from shared.config import scenarios
 from shared.config.robot_config import RobotConfig
+from shared.links import DIRECTIONS
 from tools import cli
 from tools.lab.studies.sweeps import kill, latency, latency_picture
 from tools.lab.studies.sweeps.latency_trial import (
@@ -27,7 +27,7 @@ from tools.lab.studies.sweeps.latency_trial import (
     hold_share,
     robot_of,
 )
-from tools.runs.lockstep import Lockstep
+from tools.sim.lockstep import Lockstep
 
 ROOT = Path(__file__).resolve().parents[5]
 GOOD = Network(0.0, 0.0, 0.0)
@@ -267,11 +267,11 @@ def test_the_digest_has_every_tool_that_decides_a_run_and_no_picture() -> None:
         ),
         (
             latency.CODE,
-            {"tools/lab/studies/sweeps/latency_trial.py", "tools/runs/centralised/control.py"},
+            {"tools/lab/studies/sweeps/latency_trial.py", "tools/sim/centralised/control.py"},
         ),
     ):
         runs = ("lockstep", "network", "virtual_drive", "virtual_harness", "virtual_network")
-        assert {"services", "shared", *(f"tools/runs/{name}.py" for name in runs)} | own <= {*code}
+        assert {"services", "shared", *(f"tools/sim/{name}.py" for name in runs)} | own <= {*code}
         assert [part for part in code if "picture" in part or "report" in part] == []
 
 

@@ -1,0 +1,1 @@
+"""The drives' firmware and the motors, twelve axes at a time."""

@@ -1,0 +1,328 @@
+"""Twelve emulated ODrive axes: state machine, watchdogs, checks and errors (docs/drives.md).
+
+Firmware 0.5.6; the traps are kept on purpose: OVERSPEED disarms in torque mode too, a disarmed axis
+floats while its sibling keeps its torque, the watchdog runs in IDLE as well, re-arming does not
+zero `input_torque`, setting a mode moves `input_pos` to the motor, an axis can be in IDLE with
+`axis_error` 0, a lost encoder keeps its last reading and returns without the turns made meanwhile,
+and a restart restores the saved settings.
+
+Pure: no clock, no I/O. Axes 2i and 2i + 1 are axis0 and axis1 of module i, one ODrive.
+Units at the motor: turns, turn/s, N m, A.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.simulator.drives.axis_calibration import SEQUENCES, Calibration
+from services.simulator.drives.axis_conditions import Conditions
+from services.simulator.drives.axis_control import AxisControl
+from services.simulator.drives.axis_encoders import AxisEncoders
+from services.simulator.drives.axis_faults import (
+    AXIS_NAMES,
+    BUS_FAULTS,
+    FAULTS,
+    AxisErrors,
+    controller_fault,
+)
+from services.simulator.drives.axis_settings import Settings, configured
+from services.simulator.drives.dc_bus import DEAD_VOLTAGE, DcBus
+from shared.can.cansimple import (
+    AxisError,
+    AxisState,
+    ControllerError,
+    Heartbeat,
+    InputMode,
+)
+from shared.config.sections import DriveConfig
+from shared.exceptions import DriveError
+from shared.joints import N_JOINTS
+
+__all__ = ["AXIS_NAMES", "FAULTS", "AxisBank", "AxisErrors"]
+
+Vector = NDArray[np.float64]
+
+
+class AxisBank:
+    """State of all axes; every array is indexed by axis, shape (12,).
+
+    The arrays without an underscore may be read at any time. `input_pos`, `input_vel`,
+    `input_torque`, the gains and the limits may also be written between steps; other settings
+    are set by name in `settings`; modes, states and errors change by the methods only.
+    """
+
+    def __init__(
+        self,
+        drive: DriveConfig,
+        *,
+        encoder_counts_per_turn: int,
+        watchdog: bool = True,
+        settings: Settings | None = None,
+        zeroed: bool = True,
+        motor_signs: Sequence[int] = (1,) * N_JOINTS,
+    ) -> None:
+        """Power the drives up, calibrated, in IDLE.
+
+        Args:
+            drive: the robot file's `[drive]`.
+            encoder_counts_per_turn: of the encoders themselves.
+            watchdog: True if the drives' watchdogs run.
+            settings: of the drives; None: as the services need them (`configured`).
+            zeroed: True if their zero was written (`drive.zero_mark_turns`). Else they know the
+                motor's angle within a turn only, as after any loss of power.
+            motor_signs: sign of each motor's count and of its zero mark.
+        """
+        self.settings = settings or configured(
+            drive, encoder_counts_per_turn=encoder_counts_per_turn, watchdog=watchdog
+        )
+        n = N_JOINTS
+        self._encoders = encoders = AxisEncoders(self.settings, encoder_counts_per_turn)
+        self._control = control = AxisControl(self.settings, encoders)
+        self._zeroed = zeroed
+        mark = round(drive.zero_mark_turns * encoder_counts_per_turn)
+        self.counts_from = encoders.counts_from
+        self.counts_from[:] = mark * np.array(motor_signs)
+        self.bus = DcBus(self.settings, control.power, control.mechanical)
+        self.state = [AxisState.IDLE] * n
+        self.faults = [AxisErrors()] * n
+        self.control_mode = control.control_mode
+        self.input_mode = self.settings.axis("controller.config.input_mode")
+        self.input_pos, self.input_vel = control.input_pos, control.input_vel
+        self.input_torque, self.torque = control.input_torque, control.torque
+        self.pos_gain, self.vel_gain = control.pos_gain, control.vel_gain
+        self.vel_integrator_gain = control.vel_integrator_gain
+        self.vel_limit, self.current_lim = control.vel_limit, control.current_lim
+        self.pos_estimate, self.vel_estimate = encoders.pos_estimate, encoders.vel_estimate
+        self.encoder_turns, self.connected = encoders.turns, control.connected
+        self.now_s = -math.inf
+        self.calibration = Calibration(self.settings)
+        self.conditions = Conditions(self.settings, control, encoders)
+        self._fed_s = [0.0] * n
+        self._timeouts_s = [math.inf] * n
+        self._shortest_s = math.inf
+        self._seen = -1
+
+    @property
+    def regulates(self) -> bool:
+        """True if any axis has a position or velocity loop: it wants every step of the world."""
+        return self._control.regulates()
+
+    def step(self, now_s: float, pos_turns: Vector, vel_turns: Vector) -> Vector:
+        """Advance to `now_s`: true motor position and velocity in, motor torque out.
+
+        The first call sets the clock, feeds the watchdogs and starts the estimators at
+        the true values. The array returned is overwritten by the next step.
+        """
+        control = self._control
+        if self.now_s == -math.inf:
+            self.now_s = now_s
+            self._fed_s = [now_s] * N_JOINTS
+            self._encoders.start(pos_turns, vel_turns)
+            if not self._zeroed:
+                for axis in range(N_JOINTS):
+                    self._encoders.lose_turns(axis)
+        else:
+            dt_s = now_s - self.now_s
+            self.now_s = now_s
+            if dt_s > 0.0:
+                self._encoders.estimate(dt_s, pos_turns)
+        if self.calibration.running or not self.conditions.all_well:
+            self._apply_conditions()
+        self._check_watchdogs()
+        too_fast, least, most = control.control()
+        if too_fast:
+            for axis in control.overspeed():
+                self._fail(axis, FAULTS["OVERSPEED"])
+            _, least, most = control.control()
+        control.integrate()
+        for drive, why in self.bus.check(least, most).items():
+            for axis in _both(2 * drive):
+                self._fail(axis, BUS_FAULTS[why])
+        return self.torque
+
+    # ---- requests of a front
+
+    def feed(self, axis: int) -> None:
+        """Feed an axis's watchdog: any CAN frame to it does."""
+        self._fed_s[axis] = self.now_s
+
+    def request_state(self, axis: int, state: int) -> None:
+        """Ask for a state: IDLE, CLOSED_LOOP_CONTROL or a calibration.
+
+        Closed loop with any error present is refused: the axis stays IDLE. Closed loop of an
+        axis that is not calibrated, an encoder's calibration before its motor's, and any
+        other state is INVALID_STATE and leads to IDLE.
+        """
+        if axis >> 1 in self.conditions.down:
+            return
+        fault = self.faults[axis]
+        self.faults[axis] = fault = fault._replace(axis=fault.axis & ~AxisError.INVALID_STATE)
+        self.calibration.stop(axis)
+        if state == AxisState.IDLE:
+            self._disarm(axis)
+        elif state == AxisState.CLOSED_LOOP_CONTROL:
+            if not self.calibration.ready(axis):
+                self._fail(axis, AxisErrors(AxisError.INVALID_STATE))
+            elif fault == AxisErrors():
+                self._arm(axis)
+        elif state in SEQUENCES:
+            self._disarm(axis)
+            turns = float(self.encoder_turns[axis])
+            states = SEQUENCES[AxisState(state)]
+            self._become(axis, self.calibration.begin(axis, states, self.now_s, turns))
+        elif state != AxisState.UNDEFINED:
+            self._fail(axis, AxisErrors(AxisError.INVALID_STATE))
+
+    def set_modes(self, axis: int, control_mode: int, input_mode: int) -> None:
+        """Set the controller's modes; only PASSTHROUGH is emulated, others are an error.
+
+        Position mode, also where it was on already, sets `input_pos` to where the motor is.
+        """
+        if input_mode != InputMode.PASSTHROUGH or control_mode not in (1, 2, 3):
+            self._fail(axis, controller_fault(ControllerError.INVALID_INPUT_MODE))
+            return
+        below = f"axis{axis & 1}.controller.config"
+        self.settings.set(axis >> 1, f"{below}.control_mode", control_mode)
+        self.settings.set(axis >> 1, f"{below}.input_mode", input_mode)
+        self._control.stay(axis)
+
+    def set_count(self, axis: int, count: float) -> None:
+        """Tell an axis that its encoder reads so many counts here; `input_pos` stays."""
+        self._encoders.set_count(axis, count)
+
+    def clear_errors(self, axis: int) -> None:
+        """Clear all errors of the axis's ODrive: the firmware clears both axes.
+
+        A cause that lasts (heat, a lost encoder, the bus) sets its error again at the next step.
+        """
+        for each in _both(axis):
+            self.faults[each] = AxisErrors()
+
+    def estop(self, axis: int) -> None:
+        """Disarm one axis with ESTOP_REQUESTED; its sibling goes on."""
+        self._fail(axis, FAULTS["ESTOP"])
+
+    def reboot(self, axis: int) -> None:
+        """Restart the axis's ODrive.
+
+        Both axes float, inputs are zero, errors gone, settings as saved; it says nothing and
+        takes no request for `BOOT_S`, then it is IDLE.
+        """
+        drive = axis >> 1
+        for each in _both(axis):
+            self._disarm(each)
+            self.state[each] = AxisState.UNDEFINED
+            self.faults[each] = AxisErrors()
+            self.input_pos[each] = self.input_vel[each] = self.input_torque[each] = 0.0
+            self._control.connected[each] = 0.0
+        self.settings.restore(drive)
+        for each in _both(axis):
+            self.calibration.restart(each)
+            self._encoders.lose_turns(each)
+        self.conditions.boot(drive, self.now_s)
+
+    def is_responding(self, axis: int) -> bool:
+        """Return True if the axis's ODrive communicates: powered, started, plugged in."""
+        return axis not in self.conditions.silent
+
+    def heartbeat(self, axis: int) -> Heartbeat:
+        """Return the axis's heartbeat."""
+        fault = self.faults[axis]
+        return Heartbeat(
+            fault.axis,
+            self.state[axis],
+            fault.motor != 0,
+            fault.encoder != 0,
+            fault.controller != 0,
+            trajectory_done=True,
+        )
+
+    # ---- what happens to the drives
+
+    def inject(self, axis: str, error: str) -> None:
+        """Fault an axis, by its name in `AXIS_NAMES` and the fault's name in `FAULTS`.
+
+        Raises:
+            DriveError: there is no such axis or fault.
+        """
+        if axis not in AXIS_NAMES:
+            raise DriveError(f"no axis {axis!r}; there are {', '.join(AXIS_NAMES)}")
+        if error not in FAULTS:
+            raise DriveError(f"no fault {error!r} for {axis}; there are {', '.join(FAULTS)}")
+        self._fail(AXIS_NAMES.index(axis), FAULTS[error])
+
+    def supply(self, drive: int, volts: float) -> None:
+        """Set the voltage of an ODrive's supply; below `DEAD_VOLTAGE` it is off, later boots."""
+        self.bus.supply[drive] = volts
+        self.bus.changed()
+        if volts < DEAD_VOLTAGE:
+            self.reboot(2 * drive)
+            self.conditions.power_off(drive)
+        elif self.conditions.is_off(drive):
+            self.conditions.boot(drive, self.now_s)
+
+    # ---- within a step
+
+    def _apply_conditions(self) -> None:
+        """Handle rare changes: drives that start, conditions, calibrations."""
+        for drive in self.conditions.come_up(self.now_s):
+            for axis in _both(2 * drive):
+                self.state[axis] = AxisState.IDLE
+                self._fed_s[axis] = self.now_s
+        for axis, fault in self.conditions.failing():
+            self._fail(axis, fault)
+        for axis in list(self.calibration.running):
+            turns = float(self.encoder_turns[axis])
+            self._become(axis, self.calibration.advance(axis, self.now_s, turns))
+
+    def _check_watchdogs(self) -> None:
+        """Disarm axes whose watchdog was not fed."""
+        if self._seen != self.settings.version:
+            self._seen = self.settings.version
+            enabled = self.settings.axis("config.enable_watchdog") > 0.0
+            timeouts = self.settings.axis("config.watchdog_timeout")
+            self._timeouts_s = np.where(enabled, timeouts, math.inf).tolist()
+            self._shortest_s = min(self._timeouts_s)
+        if min(self._fed_s) < self.now_s - self._shortest_s:
+            for axis, (fed_s, timeout_s) in enumerate(
+                zip(self._fed_s, self._timeouts_s, strict=True)
+            ):
+                if fed_s < self.now_s - timeout_s:
+                    self._fail(axis, FAULTS["WATCHDOG"])
+
+    def _become(self, axis: int, outcome: AxisState | AxisErrors) -> None:
+        """Take the state that a calibration is at, or the fault that it ended with."""
+        if isinstance(outcome, AxisErrors):
+            self._fail(axis, outcome)
+        else:
+            self.state[axis] = outcome
+
+    def _arm(self, axis: int) -> None:
+        """Enter closed loop; `input_torque` is left as it stands, as the firmware does."""
+        self._control.arm(axis)
+        self.state[axis] = AxisState.CLOSED_LOOP_CONTROL
+        self.feed(axis)
+
+    def _disarm(self, axis: int) -> None:
+        """Let the phases float."""
+        self.state[axis] = AxisState.IDLE
+        self._control.armed[axis] = 0.0
+        self.torque[axis] = 0.0
+
+    def _fail(self, axis: int, fault: AxisErrors) -> None:
+        """Latch a fault and disarm this axis alone; a drive that is down has no registers."""
+        if axis >> 1 in self.conditions.down:
+            return
+        self.faults[axis] = self.faults[axis].with_(fault)
+        self.calibration.stop(axis)
+        self._disarm(axis)
+
+
+def _both(axis: int) -> tuple[int, int]:
+    """Return both axes of the ODrive that an axis belongs to."""
+    first = axis & ~1
+    return first, first + 1

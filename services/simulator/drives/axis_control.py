@@ -1,0 +1,197 @@
+"""Control law of the emulated axes (docs/drives.md), as one graph over all twelve.
+
+Firmware 0.5.6, pass-through: torque = input_torque + vel_gain (clamp(input_vel +
+pos_gain (input_pos - pos)) - vel) + integrator, clamped to current_lim; input_vel and
+input_torque are each clamped to the same limits first. The firmware runs its loop at 8 kHz;
+here it is evaluated once a step.
+
+The current loop's 1 ms is left out, because it changes no joint's motion: a step's torque acts at
+once. The estimates are those of `services.simulator.drives.axis_encoders`.
+
+Pure: no clock, no I/O. Arrays are indexed by axis, shape (12,). Units at the motor: turns,
+turn/s, N m, A.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Final
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from services.simulator.drives.axis_encoders import AxisEncoders
+from services.simulator.drives.axis_settings import Settings
+from shared.can.cansimple import ControlMode
+from shared.joints import N_JOINTS
+from shared.robot.compiled_graph import CompiledGraph
+
+Vector = NDArray[np.float64]
+
+FIRMWARE_RATE_HZ: Final = 8000.0
+INTEGRATOR_DECAY: Final = 0.99
+"""Per firmware cycle in which the torque is limited."""
+
+_SETTINGS: Final = (
+    "controller.config.control_mode",
+    "controller.config.pos_gain",
+    "controller.config.vel_gain",
+    "controller.config.vel_integrator_gain",
+    "controller.config.vel_limit",
+    "controller.config.enable_vel_limit",
+    "controller.config.enable_torque_mode_vel_limit",
+    "controller.config.enable_overspeed_error",
+    "controller.config.vel_limit_tolerance",
+    "controller.config.vel_integrator_limit",
+    "motor.config.current_lim",
+    "motor.config.torque_constant",
+    "motor.config.phase_resistance",
+)
+"""The axis settings that the law reads."""
+
+
+class AxisControl:
+    """Inputs and torque of all axes; no state machine, no errors.
+
+    Attributes:
+        armed: 1.0 in closed loop: also the factor of the torque.
+        connected: 1.0 once in closed loop since it started up: from then on the controller sees the
+            encoder, in IDLE as well.
+        derating: fraction of current_lim that heat leaves.
+        power: electrical power of each motor, W.
+        mechanical: mechanical power of each motor, W.
+    """
+
+    def __init__(self, settings: Settings, encoders: AxisEncoders) -> None:
+        """Take the settings, and the estimates that the law uses."""
+        n = N_JOINTS
+        self._settings, self._encoders = settings, encoders
+        self._seen = -1
+        self._pos = encoders.pos_estimate
+        self.control_mode = settings.axis("controller.config.control_mode")
+        self.pos_gain = settings.axis("controller.config.pos_gain")
+        self.vel_gain = settings.axis("controller.config.vel_gain")
+        self.vel_integrator_gain = settings.axis("controller.config.vel_integrator_gain")
+        self.vel_limit = settings.axis("controller.config.vel_limit")
+        self.current_lim = settings.axis("motor.config.current_lim")
+        self.input_pos, self.input_vel, self.input_torque = np.zeros(n), np.zeros(n), np.zeros(n)
+        self.armed, self.connected = np.zeros(n), np.zeros(n)
+        self.derating = np.ones(n)
+        self.integrator = np.zeros(n)
+        self._dt_s = 0.0
+        self._graph = graph = CompiledGraph(law_graph())
+        columns = [settings.axis(name) for name in _SETTINGS]
+        live = (
+            encoders.pos_estimate, encoders.vel_estimate, self.input_pos, self.input_vel,
+            self.input_torque, self.armed, self.connected, self.derating, self.integrator,
+        )  # fmt: skip
+        for index, array in enumerate((*columns, *live)):
+            graph.bind(index, array)
+        self._step = graph.arguments[-1]
+        (
+            self.torque, self._integrated, self._overspeed, self.power, self.mechanical,
+            self._extremes,
+        ) = graph.results  # fmt: skip
+
+    def regulates(self) -> bool:
+        """Return True if any axis in closed loop has a position or velocity loop."""
+        if self._seen != self._settings.version:
+            self._seen = self._settings.version
+            self._regulates = (self.control_mode >= ControlMode.VELOCITY).astype(np.float64)
+        return bool(np.dot(self._regulates, self.armed) > 0.0)
+
+    def stay(self, axis: int) -> None:
+        """Make where the motor is its target, in position mode: `control_mode_updated`."""
+        if self.control_mode[axis] >= ControlMode.POSITION:
+            self.input_pos[axis] = self._pos[axis]
+
+    def arm(self, axis: int) -> None:
+        """Let an axis's torque through, from where it is; `input_torque` stays as it stands."""
+        self.stay(axis)
+        self.integrator[axis] = 0.0
+        self.armed[axis] = self.connected[axis] = 1.0
+
+    def control(self) -> tuple[float, float, float]:
+        """Compute torques, powers and who is too fast; the integrators stay as they are.
+
+        Returns:
+            How many axes are beyond their OVERSPEED limit (`overspeed` says which), and the least
+            and the most power of an axis, W.
+        """
+        if self._dt_s != self._encoders.dt_s:
+            self._dt_s = self._encoders.dt_s
+            self._step[:] = self._dt_s, INTEGRATOR_DECAY ** (FIRMWARE_RATE_HZ * self._dt_s)
+        self._graph()
+        too_fast, least, most = self._extremes.tolist()
+        return too_fast, least, most
+
+    def integrate(self) -> None:
+        """Take over the integrators that the last `control` arrived at."""
+        self.integrator[:] = self._integrated
+
+    def overspeed(self) -> list[int]:
+        """Return the axes beyond their OVERSPEED limit; in IDLE it is checked all the same."""
+        return np.flatnonzero(self._overspeed).tolist()
+
+
+@functools.cache
+def law_graph() -> ca.Function:
+    """Return the law: settings, estimates, inputs and state of twelve axes -> one step.
+
+    Torque (zero where an axis is not in closed loop), integrator, 1 where it is too fast, power,
+    mechanical power, W; and over all axes how many are too fast, the least and the most power.
+    """
+    names = [name.rpartition(".")[2] for name in _SETTINGS]
+    inputs = (
+        "pos", "vel", "input_pos", "input_vel", "input_torque", "armed", "connected", "derating",
+        "integrator",
+    )  # fmt: skip
+    of = {name: ca.SX.sym(name, N_JOINTS) for name in (*names, *inputs)}
+    step = ca.SX.sym("step", 2)
+    dt_s, decay = step[0], step[1]
+    vel, vel_limit = of["vel"], of["vel_limit"]
+    limit = of["current_lim"] * of["torque_constant"] * of["derating"]
+    position = of["control_mode"] >= ControlMode.POSITION
+    regulates = of["control_mode"] >= ControlMode.VELOCITY
+    torque = _clamp(of["input_torque"], -limit, limit)
+    # in torque mode no axis is driven beyond its velocity limit: vel_gain (+-vel_limit - vel)
+    slowed = _clamp(torque, -of["vel_gain"] * (vel_limit + vel), of["vel_gain"] * (vel_limit - vel))
+    limited = ca.logic_and(of["enable_torque_mode_vel_limit"] > 0.0, ca.logic_not(regulates))
+    torque = ca.if_else(limited, slowed, torque)
+    # the velocity loop, under it the position loop, where the mode has them
+    clamp = ca.if_else(of["enable_vel_limit"] > 0.0, vel_limit, ca.inf)
+    wanted = ca.if_else(position, of["pos_gain"] * (of["input_pos"] - of["pos"]), 0.0)
+    wanted += _clamp(of["input_vel"], -clamp, clamp)
+    v_err = ca.if_else(regulates, _clamp(wanted, -clamp, clamp) - vel, 0.0)
+    # the firmware empties the integrator in torque mode; it decays where the torque is limited
+    integrator = ca.if_else(regulates, of["integrator"], 0.0)
+    torque += v_err * of["vel_gain"] + integrator
+    saturated = ca.fabs(torque) > limit
+    gained = v_err * of["vel_integrator_gain"] * dt_s * of["armed"]
+    integrator = ca.if_else(saturated, integrator * decay, integrator + gained)
+    most = of["vel_integrator_limit"]
+    torque = _clamp(torque, -limit, limit) * of["armed"]
+    tolerance = ca.if_else(of["enable_overspeed_error"] > 0.0, of["vel_limit_tolerance"], ca.inf)
+    too_fast = (ca.fabs(vel) > vel_limit * tolerance) * of["connected"]
+    mechanical = 2.0 * math.pi * vel * torque
+    copper = 1.5 * of["phase_resistance"] / of["torque_constant"] ** 2
+    power = copper * torque * torque + mechanical
+    extremes = ca.vertcat(ca.sum1(too_fast), ca.mmin(power), ca.mmax(power))
+    return ca.Function(
+        "axes",
+        [*of.values(), step],
+        [
+            ca.densify(one)
+            for one in (
+                torque, _clamp(integrator, -most, most), too_fast, power, mechanical, extremes,
+            )
+        ],
+        {"cse": True},
+    )  # fmt: skip
+
+
+def _clamp(value: ca.SX, low: ca.SX, high: ca.SX) -> ca.SX:
+    """Return a value within its limits; of a NaN, NaN, as the firmware's `std::clamp` does."""
+    return ca.if_else(value < low, low, ca.if_else(value > high, high, value))

@@ -1,0 +1,237 @@
+"""Settings of the emulated drives by the firmware's names: a plain table {name: value}.
+
+What ODrive ships with firmware 0.5.6; what this robot wants instead is in
+`shared.can.drive_settings`. One column for each name, for all drives at once: the emulation reads
+its limits from the columns, a front reads and writes single values by name.
+
+Source: the configuration structs of firmware 0.5.6 (odriverobotics/ODrive). The over-voltage
+level is that of the 56 V board.
+
+The spinout thresholds are kept and not acted on: the emulated windings do not warm, so that
+SPINOUT_DETECTED comes by injection only. `encoder.config.direction` has no effect on the motion,
+as on a calibrated drive; it is the sign that currents are reported with.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.can import drive_settings
+from shared.can.drive_settings import Need, Value
+from shared.config.sections import DriveConfig
+from shared.exceptions import DriveError
+from shared.joints import MODULE_INDEX, MODULES, N_JOINTS
+
+__all__ = [
+    "AXIS_SETTINGS", "DRIVE_SETTINGS", "NAMES", "N_DRIVES", "PHASE_RESISTANCE", "Settings", "Value",
+    "configured", "plant",
+]  # fmt: skip
+
+Vector = NDArray[np.float64]
+
+N_DRIVES: Final = len(MODULES)
+
+AXIS_SETTINGS: Final[Mapping[str, Value]] = {
+    "config.enable_watchdog": False,
+    "config.watchdog_timeout": 0.0,
+    "config.startup_motor_calibration": False,
+    "config.startup_encoder_offset_calibration": False,
+    "config.startup_closed_loop_control": False,
+    "config.can.node_id": 0,
+    "config.can.heartbeat_rate_ms": 100,
+    "config.can.encoder_rate_ms": 10,
+    "controller.config.control_mode": 3,
+    "controller.config.input_mode": 1,
+    "controller.config.pos_gain": 20.0,
+    "controller.config.vel_gain": 1.0 / 6.0,
+    "controller.config.vel_integrator_gain": 1.0 / 3.0,
+    "controller.config.vel_integrator_limit": math.inf,
+    "controller.config.vel_limit": 2.0,
+    "controller.config.vel_limit_tolerance": 1.2,
+    "controller.config.enable_vel_limit": True,
+    "controller.config.enable_overspeed_error": True,
+    "controller.config.enable_torque_mode_vel_limit": True,
+    "controller.config.spinout_electrical_power_threshold": 10.0,
+    "controller.config.spinout_mechanical_power_threshold": -10.0,
+    "motor.config.pre_calibrated": False,
+    "motor.config.pole_pairs": 7,
+    "motor.config.torque_constant": 0.04,
+    "motor.config.current_lim": 10.0,
+    "motor.config.phase_resistance": 0.0,
+    "motor.fet_thermistor.config.enabled": True,
+    "motor.fet_thermistor.config.temp_limit_lower": 100.0,
+    "motor.fet_thermistor.config.temp_limit_upper": 120.0,
+    "encoder.config.mode": 0,
+    "encoder.config.cpr": 8192,
+    "encoder.config.bandwidth": 1000.0,
+    "encoder.config.direction": 0,
+    "encoder.config.pre_calibrated": False,
+}
+"""Settings of each axis, below `axis0.` and `axis1.`: the default, whose type is the setting's."""
+
+DRIVE_SETTINGS: Final[Mapping[str, Value]] = {
+    "config.dc_bus_undervoltage_trip_level": 8.0,
+    "config.dc_bus_overvoltage_trip_level": 59.92,
+    "config.dc_max_positive_current": math.inf,
+    "config.dc_max_negative_current": -0.01,
+    "config.max_regen_current": 0.0,
+    "config.enable_brake_resistor": False,
+    "config.brake_resistance": 2.0,
+    "can.config.baud_rate": 250_000,
+}
+"""Settings of the whole ODrive."""
+
+NAMES: Final = (
+    *DRIVE_SETTINGS,
+    *(f"axis{axis}.{name}" for axis in (0, 1) for name in AXIS_SETTINGS),
+)
+"""Every setting of one ODrive."""
+
+PHASE_RESISTANCE: Final = 0.1
+"""ohm; assumed, of a motor with this torque constant. Calibration finds it, nobody sets it."""
+DIRECTION: Final = 1
+"""+1 or -1 by how a motor's phases are wired. Calibration finds it, nobody sets it."""
+
+_TRUTH: Final = {"true": True, "false": False}
+
+
+class Settings:
+    """The settings of all drives.
+
+    Attributes:
+        version: counts the values that were set by name; who derives something from a
+            column looks here for whether it still holds.
+    """
+
+    def __init__(self) -> None:
+        """Start with what ODrive ships."""
+        self.version = 0
+        self._axes = {name: np.full(N_JOINTS, float(v)) for name, v in AXIS_SETTINGS.items()}
+        self._drives = {name: np.full(N_DRIVES, float(v)) for name, v in DRIVE_SETTINGS.items()}
+        self._saved: list[dict[str, Value]] = [self.table(drive) for drive in range(N_DRIVES)]
+
+    def axis(self, name: str) -> Vector:
+        """Return an axis setting's column (12,): a view that may be read at any time."""
+        return self._axes[name]
+
+    def drive(self, name: str) -> Vector:
+        """Return a drive setting's column (6,): a view that may be read at any time."""
+        return self._drives[name]
+
+    def fill(self, name: str, value: Value) -> None:
+        """Set a value on all drives, or on all axes; `name` as in the two tables."""
+        column = self._axes.get(name)
+        (self._drives[name] if column is None else column)[:] = value
+        self.version += 1
+
+    def get(self, drive: int, name: str) -> Value:
+        """Return a setting of a drive (0 .. 5) by its name in `NAMES`, in its own type.
+
+        Raises:
+            DriveError: there is no such setting.
+        """
+        column, row, default = self._find(drive, name)
+        value = column[row]
+        return type(default)(value)
+
+    def set(self, drive: int, name: str, value: Value) -> None:
+        """Set a setting of a drive by its name in `NAMES`.
+
+        Raises:
+            DriveError: there is no such setting, or the value is not of its type.
+        """
+        column, row, default = self._find(drive, name)
+        number = float(value)
+        whole = isinstance(default, int)
+        if math.isnan(number) or (whole and not number.is_integer()):
+            raise DriveError(f"{name} = {value!r}: it wants a {type(default).__name__}")
+        column[row] = bool(value) if isinstance(default, bool) else number
+        self.version += 1
+
+    def current(self, axis: int, torque: float) -> float:
+        """Return the current that an axis (0 .. 11) reports for a motor torque, A.
+
+        The firmware reverses the torque where the encoder's calibration found reversed phases
+        (Motor::update), so the current has that sign.
+        """
+        amperes = float(torque / self._axes["motor.config.torque_constant"][axis])
+        return -amperes if self._axes["encoder.config.direction"][axis] < 0.0 else amperes
+
+    def table(self, drive: int) -> dict[str, Value]:
+        """Return every setting of a drive by name."""
+        return {name: self.get(drive, name) for name in NAMES}
+
+    def save(self, drive: int) -> None:
+        """Keep a drive's settings over a restart, as `save_configuration` does."""
+        self._saved[drive] = self.table(drive)
+
+    def restore(self, drive: int) -> None:
+        """Restore a drive's saved settings, as a restart does."""
+        for name, value in self._saved[drive].items():
+            self.set(drive, name, value)
+
+    def _find(self, drive: int, name: str) -> tuple[Vector, int, Value]:
+        """Return the column, the row in it, and the default of a setting."""
+        head, _, rest = name.partition(".")
+        if name in DRIVE_SETTINGS:
+            return self._drives[name], drive, DRIVE_SETTINGS[name]
+        if head in ("axis0", "axis1") and rest in AXIS_SETTINGS:
+            return self._axes[rest], 2 * drive + int(head[-1]), AXIS_SETTINGS[rest]
+        near = difflib.get_close_matches(name, NAMES, n=1)
+        hint = f"; the nearest is {near[0]}" if near else ""
+        raise DriveError(f"no setting {name!r}{hint}")
+
+
+def configured(
+    drive: DriveConfig, *, encoder_counts_per_turn: int, watchdog: bool = True
+) -> Settings:
+    """Return the settings that the services rely on, saved on every drive.
+
+    Args:
+        drive: the robot file's `[drive]`.
+        encoder_counts_per_turn: of the robot file's `[joint]`.
+        watchdog: whether the drives' watchdogs run, if they have a timeout.
+    """
+    settings = Settings()
+    need = Need(drive, encoder_counts_per_turn, watchdog)
+    for name, value in drive_settings.of_every_drive(need).items():
+        settings.fill(name, value)
+    settings.fill("motor.config.phase_resistance", PHASE_RESISTANCE)
+    settings.fill("encoder.config.direction", DIRECTION)
+    for index in range(N_DRIVES):
+        settings.save(index)
+    return settings
+
+
+def plant(settings: Settings, words: str) -> None:
+    """Set and save one setting of one drive, as a person may have left it.
+
+    Args:
+        settings: of all drives.
+        words: MODULE.NAME=VALUE, as "knee_left.axis0.controller.config.vel_limit=2".
+
+    Raises:
+        DriveError: there is no such module or setting, or it cannot have that value.
+    """
+    target, _, text = words.partition("=")
+    module, _, name = target.strip().partition(".")
+    if module not in MODULE_INDEX:
+        near = difflib.get_close_matches(module, MODULES, n=1)
+        hint = f"; the nearest is {near[0]}" if near else f"; one of {', '.join(MODULES)}"
+        raise DriveError(f"{words!r}: no module {module!r}{hint}")
+    drive = MODULE_INDEX[module]
+    default = settings.get(drive, name)
+    text = text.strip().lower()
+    try:
+        value = _TRUTH[text] if isinstance(default, bool) else float(text)
+    except (KeyError, ValueError):
+        kind = "true or false" if isinstance(default, bool) else "a number"
+        raise DriveError(f"{words!r}: {name} = {text!r}; it wants {kind}") from None
+    settings.set(drive, name, value)
+    settings.save(drive)

@@ -1,0 +1,1 @@
+"""How drives and sensors are seen from outside: CAN frames, USB endpoints."""

@@ -1,0 +1,265 @@
+"""The two dialects of CANSimple as the emulated drives speak them.
+
+Firmware 0.5 and 0.6 share set-points, limits and gains; `DIALECTS` holds what differs. A trap of
+0.5.6: its encoder frames say 0, 0 from each start-up until the first closed loop. Endpoint ids of
+0.6 come with each firmware's `flat_endpoints.json`; the emulation's are `SDO_ENDPOINTS`.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Mapping
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.simulator.drives.axis_bank import AxisBank
+from services.simulator.drives.axis_faults import AxisErrors
+from services.simulator.drives.axis_settings import AXIS_SETTINGS, DRIVE_SETTINGS, Value
+from shared.can import cansimple, cansimple_06
+from shared.can.cansimple import (
+    AxisError,
+    AxisState,
+    Command,
+    ControllerError,
+    EncoderError,
+    MotorError,
+    OdriveError,
+)
+from shared.can.cansimple_06 import (
+    Command06,
+    DriveError06,
+    Heartbeat06,
+    ProcedureResult,
+    SdoOpcode,
+    Version,
+)
+from shared.exceptions import DriveError
+
+DialectName = Literal["0.5", "0.6"]
+Vector = NDArray[np.float64]
+Answer = Callable[[AxisBank, int], bytes]
+Setter = Callable[[AxisBank, int, bytes], None]
+
+VERSION_06: Final = Version(protocol=2, hardware=(4, 4, 58), firmware=(0, 6, 10), unreleased=0)
+
+_ERRORS_06: Final[tuple[tuple[str, int, DriveError06], ...]] = (
+    ("axis", AxisError.WATCHDOG_TIMER_EXPIRED, DriveError06.WATCHDOG_TIMER_EXPIRED),
+    ("axis", AxisError.ESTOP_REQUESTED, DriveError06.ESTOP_REQUESTED),
+    ("motor", MotorError.DRV_FAULT, DriveError06.DRV_FAULT),
+    ("motor", MotorError.FET_THERMISTOR_OVER_TEMP, DriveError06.INVERTER_OVER_TEMP),
+    ("motor", MotorError.MOTOR_THERMISTOR_OVER_TEMP, DriveError06.MOTOR_OVER_TEMP),
+    ("motor", MotorError.I_BUS_OUT_OF_RANGE, DriveError06.DC_BUS_OVER_REGEN_CURRENT),
+    ("encoder", EncoderError.ABS_SPI_COM_FAIL, DriveError06.MISSING_ESTIMATE),
+    ("encoder", EncoderError.CPR_POLEPAIRS_MISMATCH, DriveError06.CALIBRATION_ERROR),
+    ("controller", ControllerError.OVERSPEED, DriveError06.VELOCITY_LIMIT_VIOLATION),
+    ("controller", ControllerError.INVALID_INPUT_MODE, DriveError06.BAD_CONFIG),
+    ("controller", ControllerError.SPINOUT_DETECTED, DriveError06.SPINOUT_DETECTED),
+    ("odrive", OdriveError.DC_BUS_UNDER_VOLTAGE, DriveError06.DC_BUS_UNDER_VOLTAGE),
+    ("odrive", OdriveError.DC_BUS_OVER_VOLTAGE, DriveError06.DC_BUS_OVER_VOLTAGE),
+    ("odrive", OdriveError.DC_BUS_OVER_REGEN_CURRENT, DriveError06.DC_BUS_OVER_REGEN_CURRENT),
+    ("odrive", OdriveError.DC_BUS_OVER_CURRENT, DriveError06.DC_BUS_OVER_CURRENT),
+)
+"""A bit of a 0.5 register, and what 0.6 calls it."""
+
+SDO_ENDPOINTS: Final[Mapping[int, str]] = dict(
+    enumerate(("vbus_voltage", "ibus", *DRIVE_SETTINGS, *AXIS_SETTINGS), start=1)
+)
+"""Endpoint ids of the emulated 0.6 drive; an axis's settings are those of the addressed node."""
+
+_READINGS: Final = ("vbus_voltage", "ibus")
+
+
+class Dialect(NamedTuple):
+    """Frames that a firmware encodes in its own way."""
+
+    heartbeat: Answer
+    estimates: Callable[[AxisBank], tuple[Vector, Vector]]
+    """Position and velocity of all axes (12,) as their frames have them."""
+    answers: Mapping[int, Answer]
+    """By command, to a request for data."""
+    sdo: Callable[[AxisBank, int, bytes], bytes | None] | None
+    """Takes 0x004 and returns the payload of 0x005, if there is an answer."""
+    setters: Mapping[int, Setter]
+    """By command, in place of the front's own."""
+
+
+def errors_06(fault: AxisErrors) -> DriveError06:
+    """Return 0.5's registers as 0.6 has them."""
+    errors = DriveError06.NONE
+    for register, bit, error in _ERRORS_06:
+        if getattr(fault, register) & bit:
+            errors |= error
+    return errors
+
+
+def _heartbeat_05(bank: AxisBank, axis: int) -> bytes:
+    return cansimple.pack_heartbeat(bank.heartbeat(axis))
+
+
+def _heartbeat_06(bank: AxisBank, axis: int) -> bytes:
+    fault = bank.faults[axis]
+    result = ProcedureResult.SUCCESS
+    if bank.state[axis] not in (AxisState.IDLE, AxisState.UNDEFINED):
+        result = ProcedureResult.BUSY
+    elif fault.axis & AxisError.INVALID_STATE:
+        ready = bank.calibration.ready(axis)
+        result = ProcedureResult.INVALID_STATE if ready else ProcedureResult.NOT_CALIBRATED
+    elif fault.encoder & EncoderError.CPR_POLEPAIRS_MISMATCH:
+        result = ProcedureResult.POLE_PAIR_CPR_MISMATCH
+    elif fault != AxisErrors():
+        result = ProcedureResult.DISARMED
+    return cansimple_06.pack_heartbeat(
+        Heartbeat06(errors_06(fault), bank.state[axis], result, trajectory_done=True)
+    )
+
+
+def _estimates_05(bank: AxisBank) -> tuple[Vector, Vector]:
+    """Return the controllers' estimates, which 0.5.6 reports: zero before they have run."""
+    connected = bank.connected > 0.0
+    return np.where(connected, bank.pos_estimate, 0.0), np.where(connected, bank.vel_estimate, 0.0)
+
+
+def _estimates_06(bank: AxisBank) -> tuple[Vector, Vector]:
+    return bank.pos_estimate, bank.vel_estimate
+
+
+def _encoder_estimates_05(bank: AxisBank, axis: int) -> bytes:
+    pos, vel = _estimates_05(bank)
+    return cansimple.pack_two_floats(pos[axis], vel[axis])
+
+
+def _encoder_estimates_06(bank: AxisBank, axis: int) -> bytes:
+    return cansimple.pack_two_floats(bank.pos_estimate[axis], bank.vel_estimate[axis])
+
+
+def _encoder_count(bank: AxisBank, axis: int) -> bytes:
+    per_turn = int(bank.settings.axis("encoder.config.cpr")[axis])
+    count = round(bank.encoder_turns[axis] * per_turn)
+    return cansimple.pack_two_ints(count, count % per_turn)
+
+
+def _iq(bank: AxisBank, axis: int) -> bytes:
+    iq = bank.settings.current(axis, bank.torque[axis])
+    return cansimple.pack_two_floats(iq, iq)
+
+
+def _vbus(bank: AxisBank, axis: int) -> bytes:
+    return cansimple.pack_two_floats(*bank.bus.state(axis >> 1))
+
+
+def _motor_error(bank: AxisBank, axis: int) -> bytes:
+    return cansimple.pack_motor_error(bank.faults[axis].motor)
+
+
+def _encoder_error(bank: AxisBank, axis: int) -> bytes:
+    return cansimple.pack_u32(bank.faults[axis].encoder).ljust(8, b"\0")
+
+
+def _controller_error(bank: AxisBank, axis: int) -> bytes:
+    return cansimple.pack_u32(bank.faults[axis].controller).ljust(8, b"\0")
+
+
+def _version(_bank: AxisBank, _axis: int) -> bytes:
+    return cansimple_06.pack_version(VERSION_06)
+
+
+def _error(bank: AxisBank, axis: int) -> bytes:
+    errors = errors_06(bank.faults[axis])
+    return cansimple_06.pack_error(errors, errors)
+
+
+def _temperature(bank: AxisBank, axis: int) -> bytes:
+    celsius = bank.conditions.temperature[axis]
+    return cansimple.pack_two_floats(celsius, celsius)
+
+
+def _torques(bank: AxisBank, axis: int) -> bytes:
+    torque = bank.torque[axis]
+    return cansimple.pack_two_floats(torque, torque)
+
+
+def _powers(bank: AxisBank, axis: int) -> bytes:
+    return cansimple.pack_two_floats(*bank.bus.powers(axis))
+
+
+def _sdo(bank: AxisBank, axis: int, data: bytes) -> bytes | None:
+    """Read or write an endpoint; one that does not exist, or a write, has no answer."""
+    opcode, endpoint, value = cansimple_06.unpack_sdo(data)
+    name = SDO_ENDPOINTS.get(endpoint)
+    if name is None:
+        return None
+    drive = axis >> 1
+    if opcode == SdoOpcode.READ:
+        if name in _READINGS:
+            reading: Value = bank.bus.state(drive)[_READINGS.index(name)]
+        else:
+            reading = bank.settings.get(drive, _full(name, axis))
+        layout = sdo_layout(reading)
+        return cansimple_06.pack_sdo(0, endpoint, struct.pack(layout, reading).ljust(4, b"\0"))
+    if opcode == SdoOpcode.WRITE and name not in _READINGS:
+        full = _full(name, axis)
+        layout = sdo_layout(bank.settings.get(drive, full))
+        number: Value = struct.unpack_from(layout, value.ljust(4, b"\0"))[0]
+        try:
+            bank.settings.set(drive, full, number)
+        except DriveError:  # not a number: a drive says nothing either
+            return None
+    return None
+
+
+def _set_absolute_position(bank: AxisBank, axis: int, data: bytes) -> None:
+    turns = cansimple.unpack_float(data)
+    if math.isfinite(turns):
+        bank.set_count(axis, turns * bank.settings.axis("encoder.config.cpr")[axis])
+
+
+def _full(name: str, axis: int) -> str:
+    return name if name in DRIVE_SETTINGS else f"axis{axis & 1}.{name}"
+
+
+def sdo_layout(value: Value) -> str:
+    """Return the `struct` layout of an endpoint with such a value."""
+    if isinstance(value, bool):
+        return "<?"
+    return "<I" if isinstance(value, int) else "<f"
+
+
+_BOTH: Final[Mapping[int, Answer]] = {
+    Command.GET_IQ: _iq,
+    Command.GET_VBUS: _vbus,
+}
+
+DIALECTS: Final[Mapping[DialectName, Dialect]] = {
+    "0.5": Dialect(
+        _heartbeat_05,
+        _estimates_05,
+        {
+            **_BOTH,
+            Command.GET_ENCODER_ESTIMATES: _encoder_estimates_05,
+            Command.GET_MOTOR_ERROR: _motor_error,
+            Command.GET_ENCODER_ERROR: _encoder_error,
+            Command.GET_ENCODER_COUNT: _encoder_count,
+            Command.GET_CONTROLLER_ERROR: _controller_error,
+        },
+        None,
+        {},
+    ),
+    "0.6": Dialect(
+        _heartbeat_06,
+        _estimates_06,
+        {
+            **_BOTH,
+            Command.GET_ENCODER_ESTIMATES: _encoder_estimates_06,
+            Command06.GET_VERSION: _version,
+            Command06.GET_ERROR: _error,
+            Command06.GET_TEMPERATURE: _temperature,
+            Command06.GET_TORQUES: _torques,
+            Command06.GET_POWERS: _powers,
+        },
+        _sdo,
+        {Command06.SET_ABSOLUTE_POSITION: _set_absolute_position},
+    ),
+}

@@ -1,0 +1,255 @@
+"""The CAN side of the emulated drives: frames to and from an `AxisBank` (docs/drives.md)."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.simulator.drives.axis_bank import AxisBank
+from services.simulator.drives.axis_settings import N_DRIVES
+from services.simulator.fronts.cansimple_dialects import DIALECTS, DialectName, Setter
+from services.simulator.fronts.unix_can_hub import UnixCanHub
+from shared.can import cansimple
+from shared.can.cansimple import Command
+from shared.can.cansimple_06 import Command06
+from shared.can.unix_can import REMOTE_FLAG, pack_frames
+from shared.joints import N_JOINTS
+
+_DATA_BYTES = 8
+_SDO_BYTES = 4
+_EARLY_S = 1e-6  # a period that is over but for rounding is over
+_S_PER_MS = 1e-3
+_TORQUE = struct.Struct("<f").unpack_from
+_FLAGGED_ID = REMOTE_FLAG | cansimple.NODE_MASK << cansimple.COMMAND_BITS | cansimple.COMMAND_MASK
+
+
+class CanSimpleFront:
+    """Applies received frames to the bank and sends its estimates and heartbeats.
+
+    `nodes[i]` maps the CAN node ids on `hubs[i]` to axes of the bank. A drive that does not
+    communicate (no power, starting up, cable out) neither receives nor sends. An axis's settings
+    give its rates: `config.can.encoder_rate_ms`, `config.can.heartbeat_rate_ms`.
+    """
+
+    def __init__(
+        self,
+        bank: AxisBank,
+        hubs: Sequence[UnixCanHub],
+        nodes: Sequence[Mapping[int, int]],
+        *,
+        heartbeat_period_ms: int | None = None,
+        dialect: DialectName = "0.5",
+    ) -> None:
+        """Put the drives on their buses.
+
+        Args:
+            bank: the drives.
+            hubs: the buses.
+            nodes: for each bus, the axis (0 .. 11) of each node on it.
+            heartbeat_period_ms: of all axes, if their settings are to have another.
+            dialect: which firmware's CANSimple they speak.
+        """
+        self._bank = bank
+        self._dialect = DIALECTS[dialect]
+        setters = {**_SETTERS, **self._dialect.setters}
+        self._buses = [_Bus(hub, node, setters) for hub, node in zip(hubs, nodes, strict=True)]
+        self._next_heartbeat_s = [-math.inf] * N_JOINTS
+        self._next_encoder_s = [-math.inf] * N_JOINTS
+        self._heartbeat_from_s = -math.inf
+        self._seen = -1
+        if heartbeat_period_ms is not None:
+            bank.settings.fill("config.can.heartbeat_rate_ms", heartbeat_period_ms)
+        for node in nodes:
+            for number, axis in node.items():
+                bank.settings.set(axis >> 1, f"axis{axis & 1}.config.can.node_id", number)
+        for drive in range(N_DRIVES):
+            bank.settings.save(drive)
+
+    def receive(self) -> None:
+        """Apply all frames that have arrived; in each mailbox the newest wins."""
+        bank, silent = self._bank, self._bank.conditions.silent
+        for bus in self._buses:
+            mailboxes = bus.mailboxes
+            for can_id, data in bus.hub.poll():
+                mailbox = mailboxes.get(can_id)
+                if mailbox is None:
+                    self._answer(bus, can_id, data)
+                elif mailbox[0] not in silent:
+                    axis, setter = mailbox
+                    bank.feed(axis)
+                    # The firmware reads its eight-byte buffer whatever the frame's length.
+                    setter(bank, axis, data.ljust(_DATA_BYTES, b"\0"))
+
+    def send_encoders(self) -> None:
+        """Send the encoder estimates of all axes that are due, in one packet per bus."""
+        bank = self._bank
+        self._read_periods()
+        now_s, silent = bank.now_s, bank.conditions.silent
+        due_s, periods_s = self._next_encoder_s, self._encoder_periods_s
+        pos, vel = (column.tolist() for column in self._dialect.estimates(bank))
+        for bus in self._buses:
+            if not bus.hub.clients:
+                continue
+            fields: list[float] = []
+            for encoder_id, axis in bus.encoders:
+                due = due_s[axis]
+                if now_s >= due - _EARLY_S and axis not in silent:
+                    due_s[axis] = (due if due > now_s else now_s) + periods_s[axis]
+                    fields += (encoder_id, _DATA_BYTES, pos[axis], vel[axis])
+            if len(fields) == bus.encoder_fields:
+                bus.hub.broadcast_packet(bus.encoder_packet(*fields))
+            elif fields:
+                layout = struct.Struct("<" + "IB3xff" * (len(fields) // 4))
+                bus.hub.broadcast_packet(layout.pack(*fields))
+
+    def send_heartbeats(self, now_s: float) -> None:
+        """Send the heartbeat of each axis whose period has passed by `now_s`."""
+        if now_s < self._heartbeat_from_s:
+            return
+        bank, due_s = self._bank, self._next_heartbeat_s
+        self._read_periods()
+        for bus in self._buses:
+            frames = []
+            for node, axis in bus.nodes.items():
+                if now_s >= due_s[axis]:
+                    due_s[axis] = max(due_s[axis], now_s) + self._heartbeat_periods_s[axis]
+                    if bank.is_responding(axis):
+                        can_id = cansimple.arbitration_id(node, Command.HEARTBEAT)
+                        frames.append((can_id, self._dialect.heartbeat(bank, axis)))
+            if frames:
+                bus.hub.broadcast(frames)
+        due = (due_s[axis] for bus in self._buses for axis in bus.axes)
+        self._heartbeat_from_s = min(due, default=math.inf)
+
+    def _read_periods(self) -> None:
+        """Take the periods from the settings, if these have changed; 0 is never."""
+        settings = self._bank.settings
+        if self._seen == settings.version:
+            return
+        self._seen = settings.version
+        self._heartbeat_from_s = -math.inf
+        self._encoder_periods_s = _periods_s(settings.axis("config.can.encoder_rate_ms"))
+        self._heartbeat_periods_s = _periods_s(settings.axis("config.can.heartbeat_rate_ms"))
+        for due_s, periods_s in (
+            (self._next_encoder_s, self._encoder_periods_s),
+            (self._next_heartbeat_s, self._heartbeat_periods_s),
+        ):
+            for axis, period_s in enumerate(periods_s):
+                if period_s == math.inf or due_s[axis] == math.inf:
+                    due_s[axis] = period_s if period_s == math.inf else self._bank.now_s
+
+    def _answer(self, bus: _Bus, can_id: int, data: bytes) -> None:
+        """Answer a frame that sets nothing, if it is one that has an answer."""
+        node, command = cansimple.split_id(can_id)
+        axis = bus.nodes.get(node)
+        if axis is None or can_id & ~_FLAGGED_ID or not self._bank.is_responding(axis):
+            return
+        self._bank.feed(axis)
+        answer = self._dialect.answers.get(command)
+        reply: bytes | None = None
+        if answer is not None and (can_id & REMOTE_FLAG or not data):
+            reply_id, reply = can_id & ~REMOTE_FLAG, answer(self._bank, axis)
+        elif command == Command06.RX_SDO and self._dialect.sdo is not None:
+            reply_id = cansimple.arbitration_id(node, Command06.TX_SDO)
+            reply = self._dialect.sdo(self._bank, axis, data.ljust(_SDO_BYTES, b"\0"))
+        if reply is not None:
+            bus.hub.broadcast_packet(pack_frames([(reply_id, reply)]))
+
+
+def _periods_s(periods_ms: NDArray[np.float64]) -> list[float]:
+    """Return periods in s; 0 ms is never."""
+    return [ms * _S_PER_MS if ms > 0.0 else math.inf for ms in periods_ms.tolist()]
+
+
+class _Bus:
+    """A hub with its axes, and values computed once."""
+
+    def __init__(
+        self, hub: UnixCanHub, nodes: Mapping[int, int], setters: Mapping[int, Setter]
+    ) -> None:
+        self.hub = hub
+        self.nodes = dict(nodes)
+        self.axes = tuple(nodes.values())
+        self.mailboxes = {
+            cansimple.arbitration_id(node, command): (axis, setter)
+            for node, axis in nodes.items()
+            for command, setter in setters.items()
+        }
+        self.encoders = [
+            (cansimple.arbitration_id(node, Command.GET_ENCODER_ESTIMATES), axis)
+            for node, axis in nodes.items()
+        ]
+        self.encoder_fields = 4 * len(self.encoders)
+        self.encoder_packet = struct.Struct("<" + "IB3xff" * len(self.encoders)).pack
+
+
+def _set_state(bank: AxisBank, axis: int, data: bytes) -> None:
+    bank.request_state(axis, cansimple.unpack_u32(data))
+
+
+def _set_modes(bank: AxisBank, axis: int, data: bytes) -> None:
+    bank.set_modes(axis, *cansimple.unpack_two_ints(data))
+
+
+def _set_input_pos(bank: AxisBank, axis: int, data: bytes) -> None:
+    pos, vel, torque = cansimple.unpack_input_pos(data)
+    bank.input_pos[axis] = pos
+    bank.input_vel[axis] = vel
+    bank.input_torque[axis] = torque
+
+
+def _set_input_vel(bank: AxisBank, axis: int, data: bytes) -> None:
+    bank.input_vel[axis], bank.input_torque[axis] = cansimple.unpack_two_floats(data)
+
+
+def _set_input_torque(bank: AxisBank, axis: int, data: bytes) -> None:
+    bank.input_torque[axis] = _TORQUE(data)[0]
+
+
+def _set_limits(bank: AxisBank, axis: int, data: bytes) -> None:
+    bank.vel_limit[axis], bank.current_lim[axis] = cansimple.unpack_two_floats(data)
+
+
+def _set_pos_gain(bank: AxisBank, axis: int, data: bytes) -> None:
+    bank.pos_gain[axis] = cansimple.unpack_float(data)
+
+
+def _set_vel_gains(bank: AxisBank, axis: int, data: bytes) -> None:
+    bank.vel_gain[axis], bank.vel_integrator_gain[axis] = cansimple.unpack_two_floats(data)
+
+
+def _set_count(bank: AxisBank, axis: int, data: bytes) -> None:
+    bank.set_count(axis, cansimple.unpack_two_ints(data)[0])
+
+
+def _estop(bank: AxisBank, axis: int, _data: bytes) -> None:
+    bank.estop(axis)
+
+
+def _clear_errors(bank: AxisBank, axis: int, _data: bytes) -> None:
+    bank.clear_errors(axis)
+
+
+def _reboot(bank: AxisBank, axis: int, _data: bytes) -> None:
+    bank.reboot(axis)
+
+
+_SETTERS: Final[dict[int, Setter]] = {
+    Command.ESTOP: _estop,
+    Command.SET_AXIS_STATE: _set_state,
+    Command.SET_CONTROLLER_MODE: _set_modes,
+    Command.SET_INPUT_POS: _set_input_pos,
+    Command.SET_INPUT_VEL: _set_input_vel,
+    Command.SET_INPUT_TORQUE: _set_input_torque,
+    Command.SET_LIMITS: _set_limits,
+    Command.REBOOT: _reboot,
+    Command.SET_LINEAR_COUNT: _set_count,
+    Command.CLEAR_ERRORS: _clear_errors,
+    Command.SET_POS_GAIN: _set_pos_gain,
+    Command.SET_VEL_GAINS: _set_vel_gains,
+}

@@ -1,0 +1,194 @@
+"""The USB plugs of the emulated drives: UNIX sockets, one packet per bulk transfer.
+
+A plug is a listening socket whose file name is the drive's serial number; the stand-in for libusb
+(`libusb_standin.c`) is the other end. `FibreHub` is all plugs of one simulator; it polls them
+together.
+"""
+
+from __future__ import annotations
+
+import errno
+import select
+import socket
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from services.simulator.fronts.fibre_front import FibreFront
+from shared.exceptions import FleetError
+from shared.run_directory import private_files
+
+PACKET_BYTES: Final = 64
+"""A full-speed bulk transfer."""
+LOOK_EVERY: Final = 8
+"""Polls from one look at the plugs themselves to the next: new clients, boards that went silent."""
+
+_BACKLOG = 16
+_PACKETS = 64  # a client that floods the link must not hold up the simulator
+
+
+class FibrePort:
+    """The USB plug of one board.
+
+    While the board does not respond (`AxisBank.is_responding`: no power, booting, cable pulled)
+    the plug is out: every client loses the drive, and finds it again when it is back.
+
+    Raises:
+        FleetError: the path cannot be listened on.
+    """
+
+    def __init__(self, front: FibreFront, path: Path) -> None:
+        self.path = path
+        self.front = front
+        self.clients: dict[int, socket.socket] = {}
+        """Processes that see this drive, by descriptor."""
+        self.listener: socket.socket | None = None
+        """None while the plug is out."""
+        self.plug()
+
+    @property
+    def right(self) -> bool:
+        """True if the plug is in while the board talks, and out while it does not."""
+        return self.front.board.is_responding == (self.listener is not None)
+
+    def plug(self) -> None:
+        """Put the plug in; clients find the drive when they next look."""
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        listener.setblocking(False)
+        try:
+            self._clear_stale()
+            with private_files():
+                listener.bind(str(self.path))
+            listener.listen(_BACKLOG)
+        except OSError as error:
+            listener.close()
+            raise FleetError(
+                f"USB port: cannot listen on {self.path}: {error}; its directory must exist, be "
+                "writable and short enough, and no other simulator may hold it"
+            ) from error
+        self.listener = listener
+
+    def unplug(self) -> None:
+        """Pull the plug: every client loses the drive at once."""
+        if self.listener is None:
+            return
+        self.path.unlink(missing_ok=True)
+        self.listener.close()
+        self.listener = None
+        for client in self.clients.values():
+            client.close()
+        self.clients.clear()
+
+    def admit(self) -> socket.socket | None:
+        """Take one client from the queue, if there is one."""
+        if self.listener is None:
+            return None
+        try:
+            client, _ = self.listener.accept()
+        except OSError:
+            return None
+        client.setblocking(False)
+        self.clients[client.fileno()] = client
+        return client
+
+    def serve(self, client: socket.socket) -> bool:
+        """Answer the client's packets that have arrived; return False if the client is gone."""
+        answer = self.front.answer
+        try:
+            for _ in range(_PACKETS):
+                packet = client.recv(PACKET_BYTES)
+                if not packet:
+                    return False
+                reply = answer(packet)
+                if reply is not None:
+                    client.send(reply)
+        except BlockingIOError:
+            pass  # all is answered; or it does not read, and loses its answers as on a real bus
+        except OSError:
+            return False
+        return True
+
+    def _clear_stale(self) -> None:
+        """Remove a socket file that nobody listens on."""
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
+            probe.setblocking(False)
+            if probe.connect_ex(str(self.path)) == errno.ECONNREFUSED:
+                self.path.unlink(missing_ok=True)
+
+
+class FibreHub:
+    """All USB plugs of one simulator.
+
+    While nobody is connected a poll costs nearly nothing: the plugs have waited for longer.
+    """
+
+    def __init__(self, ports: Sequence[FibrePort]) -> None:
+        self.ports = tuple(ports)
+        self._epoll = select.epoll()
+        self._talking: dict[int, tuple[FibrePort, socket.socket]] = {}  # by descriptor
+        self._polls = 0
+        for port in self.ports:
+            self._listen(port)
+
+    @property
+    def clients(self) -> int:
+        """How many connections there are, over all drives."""
+        return len(self._talking)
+
+    def fileno(self) -> int:
+        """Return the descriptor that is readable when there is something for `poll`."""
+        return self._epoll.fileno()
+
+    def poll(self) -> None:
+        """Answer all requests that have come; now and then look at the plugs. Never waits."""
+        self._polls += 1
+        if self._polls % LOOK_EVERY == 0:
+            for port in self.ports:
+                if not port.right:
+                    self._turn(port)
+        elif not self._talking:
+            return
+        for descriptor, _event in self._epoll.poll(0):
+            talk = self._talking.get(descriptor)
+            if talk is None:
+                self._admit(descriptor)
+            else:
+                self._serve(descriptor, *talk)
+
+    def close(self) -> None:
+        """Pull all plugs for good."""
+        for port in self.ports:
+            port.unplug()
+        self._talking.clear()
+        self._epoll.close()
+
+    def _turn(self, port: FibrePort) -> None:
+        """Put a plug in or pull it, as its board has it."""
+        if port.listener is None:
+            port.plug()
+            self._listen(port)
+            return
+        for descriptor in port.clients:
+            self._talking.pop(descriptor, None)
+        port.unplug()  # a closed socket leaves the epoll by itself
+
+    def _listen(self, port: FibrePort) -> None:
+        if port.listener is not None:
+            self._epoll.register(port.listener, select.EPOLLIN)
+
+    def _admit(self, descriptor: int) -> None:
+        """Admit a client where one has come."""
+        for port in self.ports:
+            if port.listener is not None and port.listener.fileno() == descriptor:
+                client = port.admit()
+                if client is not None:
+                    self._talking[client.fileno()] = (port, client)
+                    self._epoll.register(client, select.EPOLLIN)
+
+    def _serve(self, descriptor: int, port: FibrePort, client: socket.socket) -> None:
+        """Answer one packet; a board that has gone silent answers nothing more."""
+        if not port.right:
+            self._turn(port)
+        elif not port.serve(client):
+            del self._talking[descriptor], port.clients[descriptor]
+            client.close()

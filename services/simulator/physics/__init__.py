@@ -1,0 +1,1 @@
+"""Bodies, soles, drivetrains and the person: MuJoCo and what surrounds it."""

@@ -1,0 +1,194 @@
+"""The true robot: the robot file with the plant's errors applied.
+
+The world steps this and holds no robot file, so a controller's model and the truth can differ in
+every number. The generated model (`shared.robot.robot_model`) is the nominal one; masses, friction,
+floor and feet are changed on it here.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.simulator.physics.plant import (
+    RIGID,
+    DriveErrors,
+    Drivetrain,
+    EncoderErrors,
+    Person,
+    PlantConfig,
+)
+from shared.bus.messages import Vector3
+from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.config.sections import OperatorConfig
+from shared.extras import late
+from shared.joints import JOINTS, MODULES, SIDES
+from shared.robot.robot_model import ankle_positions, mjcf, stand_pose
+
+if TYPE_CHECKING:
+    import mujoco
+else:
+    mujoco = late("mujoco")
+
+Array = NDArray[np.float64]
+
+
+MINOR_FRICTION = (0.005, 0.0001)
+"""m; of a contact's torsion and rolling."""
+STICTION_TIME = 0.004
+"""Time constant of the friction between sole and floor, s: twice the least at a 1 ms step.
+
+MuJoCo leaves the term dJ/dt v out of a contact's acceleration. A sole under a turning leg therefore
+creeps, by the leg's centripetal acceleration times about half of this time. With the contact's own
+20 ms the feet crept back by 1.9 mm a squat, at any time step and `impratio`; now by 0.16 mm.
+"""
+
+
+class Body(NamedTuple):
+    """The true robot and what stands behind its harness."""
+
+    model: mujoco.MjModel
+    timestep: float
+    """Duration of one call of `World.step`, s; the model's own is a `steps`th of it."""
+    steps: int
+    weight: float
+    """N"""
+    stand_height: float
+    """m, torso origin above the ankles at the start."""
+    stand_q: Array
+    """(12,) rad, close to that stand."""
+    ankles: Array
+    """(2, 3) m, right and left, where they stand."""
+    foot_yaws: tuple[float, float]
+    """rad"""
+    harness_point: Vector3
+    hoist_s: float
+    hand: OperatorConfig
+    motor_from_joint: Array
+    """(12, 12) turns/rad, with the motors' signs."""
+    counts_per_turn: int
+    """Counts of an encoder per turn."""
+    drivetrain: Drivetrain
+    drive: DriveErrors
+    encoder: EncoderErrors
+    person: Person
+    seed: int
+
+
+def body_of(config: RobotConfig, plant: PlantConfig) -> Body:
+    """Return the true robot.
+
+    Args:
+        config: the robot as its controllers know it.
+        plant: how the truth differs.
+    """
+    spec = mujoco.MjSpec.from_string(mjcf(config))
+    spec.option.timestep = config.simulation.timestep / plant.steps
+    _set_gravity(spec, plant)
+    _set_masses(spec, config, plant)
+    _set_joints(spec, plant)
+    ankles, yaws = _feet(config, plant)
+    _set_floor(spec, config, plant, ankles)
+    model = spec.compile()
+    signs = np.array(config.motor_signs())[:, None]
+    return Body(
+        model=model,
+        timestep=config.simulation.timestep,
+        steps=plant.steps,
+        weight=float(model.body_mass.sum()) * GRAVITY,
+        stand_height=config.simulation.stand_height,
+        stand_q=np.array(stand_pose(config, config.simulation.stand_height)),
+        ankles=ankles,
+        foot_yaws=yaws,
+        harness_point=config.geometry.harness_point,
+        hoist_s=config.simulation.hoist_s,
+        hand=config.simulation.operator,
+        motor_from_joint=signs * _motor_from_joint(config.joint.gear_ratio),
+        counts_per_turn=config.joint.encoder_counts_per_turn,
+        drivetrain=plant.drivetrain,
+        drive=plant.drive,
+        encoder=plant.encoder,
+        person=plant.person,
+        seed=plant.seed,
+    )
+
+
+def _set_gravity(spec: mujoco.MjSpec, plant: PlantConfig) -> None:
+    """Lean gravity: a floor that rises along x by a pulls the robot towards -x."""
+    x, y = (math.sin(angle) for angle in plant.floor.slope)
+    spec.option.gravity = [-GRAVITY * x, -GRAVITY * y, -GRAVITY * math.sqrt(1.0 - x * x - y * y)]
+
+
+def _set_masses(spec: mujoco.MjSpec, config: RobotConfig, plant: PlantConfig) -> None:
+    errors = plant.body
+    torso = spec.body("torso")
+    true = config.torso_mass + (errors.payload_scale - 1.0) * config.mass.payload
+    scale = true / config.torso_mass
+    torso.mass *= scale
+    torso.inertia = torso.inertia * scale
+    torso.ipos = torso.ipos + np.array(errors.com_offset)
+    for body in spec.bodies:
+        body.mass *= errors.mass_scale
+        body.inertia = body.inertia * errors.mass_scale
+
+
+def _set_joints(spec: mujoco.MjSpec, plant: PlantConfig) -> None:
+    drivetrain = plant.drivetrain
+    rigid = drivetrain.stiffness == RIGID
+    friction, damping = drivetrain.joint_friction, drivetrain.joint_damping
+    for name in JOINTS:
+        joint = spec.joint(name)
+        joint.armature = drivetrain.rotor_inertia if rigid else 0.0
+        joint.frictionloss = friction + (drivetrain.motor_friction if rigid else 0.0)
+        joint.damping[0] = damping + (drivetrain.motor_damping if rigid else 0.0)
+
+
+def _feet(config: RobotConfig, plant: PlantConfig) -> tuple[Array, tuple[float, float]]:
+    """Return the ankles (2, 3), m, and how the feet are turned, rad.
+
+    The world is midway between them in x and y, and on the left one's floor.
+    """
+    ankles = np.array(ankle_positions(config))
+    half = 0.5 * (np.array(plant.feet.offset_right) - np.array(plant.feet.offset_left))
+    ankles[:, :2] += (half[:2], -half[:2])
+    ankles[SIDES.index("right"), 2] += plant.floor.step
+    return ankles, (float(half[2]), float(-half[2]))
+
+
+def _set_floor(spec: mujoco.MjSpec, config: RobotConfig, plant: PlantConfig, ankles: Array) -> None:
+    floor = plant.floor
+    grounds, soles = [spec.geom("floor")], [spec.geom(f"sole_{side}") for side in SIDES]
+    step = floor.step
+    if step != 0.0:
+        # the lower foot stands on the plane, the higher one on a block
+        low, high = (1, 0) if step > 0.0 else (0, 1)
+        plane = grounds[0]
+        plane.pos = [0.0, 0.0, float(ankles[low, 2]) - config.geometry.foot_height]
+        top = float(ankles[high, 2]) - config.geometry.foot_height
+        half = [0.5, 0.25, abs(step) / 2.0]
+        block = spec.worldbody.add_geom(
+            name="step", type=mujoco.mjtGeom.mjGEOM_BOX, size=half,
+            pos=[float(ankles[high, 0]), float(ankles[high, 1]), top - half[2]],
+        )  # fmt: skip
+        grounds.append(block)
+    for sole in soles:
+        sole.contype = sole.conaffinity = 0  # only the pairs named here touch
+        for ground in grounds:
+            torsional, rolling = MINOR_FRICTION
+            spec.add_pair(
+                geomname1=ground.name, geomname2=sole.name, condim=sole.condim,
+                friction=[floor.friction, floor.friction, torsional, rolling, rolling],
+                solref=[floor.contact_time, 1.0], solreffriction=[STICTION_TIME, 1.0],
+            )  # fmt: skip
+
+
+def _motor_from_joint(gear_ratio: float) -> Array:
+    """Return the differential (12, 12): motor turns from joint angles in rad.
+
+    Per module, m1 = N (q_theta + q_phi), m2 = N (q_theta - q_phi), in turns.
+    """
+    pair = np.array([[1.0, 1.0], [-1.0, 1.0]]) * gear_ratio / (2.0 * math.pi)
+    return np.asarray(np.kron(np.eye(len(MODULES)), pair), float)

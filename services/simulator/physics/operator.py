@@ -1,0 +1,119 @@
+"""The simulated operator: a hand that leads, and weight rested on the harness.
+
+The hand is a clipped spring-damper between a path and the harness point, in height and
+pitch (docs/simulator.md#reference-scenario). Behind it is a person with a mass. Pure.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+from services.simulator.physics.plant import Person
+from shared.bus.messages import Vector3
+from shared.clamp import clamp
+from shared.config.scenarios import Lead
+from shared.config.sections import OperatorConfig
+
+
+class HandForce(NamedTuple):
+    """The hand's force and moment on the torso."""
+
+    force_z: float
+    """N, world, at the harness point."""
+    moment_pitch: float
+    """N m about the torso's pitch axis."""
+
+
+REACH_S: Final = 0.4
+"""Time constant with which a hand that grips the robot joins the path."""
+
+
+class Wearer:
+    """The person's own mass behind the hand, which yields to the robot's force.
+
+    It grips the robot where that is and joins the path. From then on d is its height above the
+    path:  m d'' = -m w^2 d - 2 zeta m w d' - f
+    """
+
+    def __init__(self, person: Person) -> None:
+        """Take the person; without a mass the path is followed exactly."""
+        w = 2.0 * math.pi * person.leg_frequency_hz
+        self._per_mass = 1.0 / person.mass if person.mass > 0.0 else 0.0
+        self._k, self._b = w * w, 2.0 * person.leg_damping_ratio * w
+        self._load_scale, self._load_lag_s = person.load_scale, person.load_lag_s
+        self.above = 0.0
+        """m"""
+        self.reach = 0.0
+        """m, the path is so far off still, since it took hold: gone before a scenario starts."""
+        self._holds = False
+        self.rate = 0.0
+        """m/s"""
+        self.load_n = 0.0
+        """What rests on the harness, N."""
+
+    def take_hold(self, above: float) -> None:
+        """Grip the robot where it is, `above` the path, m, unless the hand grips already."""
+        if not self._holds:
+            self._holds, self.reach = True, above
+
+    def go_on(self, above: float, rate: float, load_n: float) -> None:
+        """Go on as somebody who has hold of it; m, m/s, N."""
+        self._holds = True
+        self.above, self.rate, self.load_n = above, rate, load_n
+
+    def motion(self) -> tuple[float, float]:
+        """Return how far the hand is above its path, m, and its rate, m/s."""
+        return self.above + self.reach, self.rate - self.reach / REACH_S
+
+    def step(self, dt: float, force_on_robot: float, assist: float) -> None:
+        """Advance by one step.
+
+        Args:
+            dt: step, s.
+            force_on_robot: of the hand, N, up.
+            assist: requested by the person, N; the person rests part of it, with a delay.
+        """
+        if self._per_mass:
+            acceleration = -self._per_mass * force_on_robot - self._k * self.above
+            self.rate = (self.rate + dt * acceleration) / (1.0 + dt * self._b)
+            self.above += dt * self.rate
+        self.reach -= self.reach * dt / REACH_S
+        wanted = self._load_scale * assist
+        lag = self._load_lag_s
+        self.load_n += (wanted - self.load_n) * (min(1.0, dt / lag) if lag > 0.0 else 1.0)
+
+
+class Operator:
+    """The hand's spring-damper."""
+
+    def __init__(self, hand: OperatorConfig, harness_point: Vector3) -> None:
+        """Take the spring-damper and where on the torso it acts, m, torso axes."""
+        self._hand = hand
+        self._point = harness_point
+
+    def force(
+        self, wanted: Lead, height: float, rate: float, pitch: float, pitch_rate: float
+    ) -> HandForce:
+        """Return the hand's force.
+
+        Args:
+            wanted: where the hand leads: torso height and pitch.
+            height: of the harness point above the ankles, m.
+            rate: of the harness point, vertical, m/s.
+            pitch: of the torso, rad.
+            pitch_rate: rad/s.
+        """
+        x, _, z = self._point
+        sine, cosine = math.sin(wanted.pitch), math.cos(wanted.pitch)
+        point_height = wanted.height - x * sine + z * cosine
+        point_rate = wanted.height_rate - (x * cosine + z * sine) * wanted.pitch_rate
+        hand = self._hand
+        force = hand.k_z * (point_height - height) + hand.b_z * (point_rate - rate)
+        moment = hand.k_pitch * (wanted.pitch - pitch) + hand.b_pitch * (
+            wanted.pitch_rate - pitch_rate
+        )
+        return HandForce(
+            clamp(force, -hand.force_max, hand.force_max),
+            clamp(moment, -hand.moment_max, hand.moment_max),
+        )

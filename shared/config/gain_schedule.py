@@ -1,0 +1,198 @@
+"""The certified gain schedule: a file beside the robot's, made offline by `xrl gains`.
+
+Local joint stiffnesses over COM height and torso pitch (docs/law.md#gain-split). The file holds the
+parameters from which it was computed; a robot that differs is refused until `xrl gains` has run
+again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from shared.atomic_file import replace_file
+from shared.config.gain_table import GainSchedule, ModuleBounds
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import ConfigError
+from shared.joints import MODULES, kind_of
+from shared.text_file import read_text
+from shared.toml_file import check_ranges
+
+VERSION = 2
+"""Version of the file and of the program that makes it; a file of another version is made again."""
+
+
+def inputs_of(config: RobotConfig) -> dict[str, Any]:
+    """Return everything that the schedule depends on, by dotted key."""
+    law, limits = config.law, config.limits
+    table = {
+        "mass": msgspec.to_builtins(config.mass),
+        "geometry": msgspec.to_builtins(config.geometry),
+        "certificate": {
+            "K_required": config.certificate.K_required,
+            "onboard_fraction": config.certificate.onboard_fraction,
+            "k_q_fraction_max": config.certificate.k_q_fraction_max,
+        },
+        "law": {
+            "K_p": law.K_p,
+            "K_0": law.K_0,
+            "B_p": law.B_p,
+            "S": law.S,
+            "jacobian": law.jacobian,
+            "damping_lambda": law.damping_lambda,
+            "load_sharing_moment_arms": law.load_sharing_moment_arms,
+        },
+        "robustness": msgspec.to_builtins(config.robustness),
+        "stand": {
+            kind: [*gains.k_p, *gains.k_d]
+            for kind, gains in (
+                ("ankle", config.stand.ankle), ("knee", config.stand.knee),
+                ("hip", config.stand.hip),
+            )
+        },
+        "joint": {"armature": config.joint.armature},
+        "planner": {"rate_hz": config.planner.rate_hz},
+        "harness": {"low_pass_hz": config.harness.low_pass_hz},
+        "drive": {"encoder_bandwidth": config.drive.encoder_bandwidth},
+        "assist": {"force_max": config.assist.force_max},
+        "joint_service": {
+            "k_p_max": config.joint_service.k_p_max,
+            "rate_hz": config.joint_service.rate_hz,
+            "hold_stiffens_theta": config.joint_service.hold_stiffens_theta,
+        },
+        "limits": {
+            kind: [*limit.phi, *limit.theta]
+            for kind, limit in (
+                ("ankle", limits.ankle), ("knee", limits.knee), ("hip", limits.hip),
+            )
+        },
+    }  # fmt: skip
+    flat = {
+        f"{section}.{key}": value for section, part in table.items() for key, value in part.items()
+    }
+    if not any(config.mass.payload_com):
+        del flat["mass.payload_com"]  # younger than schedules that are still right
+    plain: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(flat))
+    return plain
+
+
+def digest_of(inputs: dict[str, Any]) -> str:
+    """Return the SHA-256 of the inputs."""
+    return hashlib.sha256(msgspec.json.encode(inputs, order="sorted")).hexdigest()
+
+
+def path_beside(robot_file: Path) -> Path:
+    """Return the schedule's file of a robot file: lab.toml -> lab.gains.json."""
+    return robot_file.with_suffix(".gains.json")
+
+
+def read(path: Path) -> GainSchedule | None:
+    """Read a schedule; return None if there is no such file.
+
+    Raises:
+        ConfigError: the file cannot be read, or its tables do not fit together.
+    """
+    again = "make it again: `xrl gains`"
+    try:
+        schedule = msgspec.json.decode(read_text(path), type=GainSchedule)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise ConfigError(str(path), "(file)", f"cannot be read: {error}", again) from None
+    except (msgspec.DecodeError, UnicodeError) as error:
+        raise ConfigError(str(path), "(file)", f"is no gain schedule: {error}", again) from None
+    for name, nodes in (("z", schedule.z), ("pitch", schedule.pitch)):
+        if len(nodes) < 2 or any(b <= a for a, b in pairwise(nodes)):
+            raise ConfigError(str(path), name, "the nodes do not rise", again)
+    try:
+        check_ranges(str(path), schedule)
+    except ConfigError as error:
+        expected = f"{error.expected}; {again}"
+        raise ConfigError(error.file, error.key, error.found, expected) from None
+    sizes = {len(row) for row in schedule.D}
+    if len(schedule.D) != len(schedule.z) or sizes != {len(schedule.pitch)}:
+        raise ConfigError(str(path), "D", "does not fit its nodes", again)
+    if schedule.bounds is not None:
+        _check_bounds(path, schedule.bounds, again)
+    return schedule
+
+
+def _check_bounds(path: Path, bounds: dict[str, ModuleBounds], again: str) -> None:
+    kinds = sorted(set(map(kind_of, MODULES)))
+    if sorted(bounds) != kinds:
+        found = f"are for {', '.join(sorted(bounds)) or 'nothing'}"
+        raise ConfigError(str(path), "bounds", found, f"for {', '.join(kinds)}; {again}")
+    for kind, row in bounds.items():
+        if not (row.theta[0] < row.theta[1] and row.tau_ff):
+            raise ConfigError(str(path), f"bounds.{kind}", "theta has no parts", again)
+
+
+def write(path: Path, schedule: GainSchedule) -> None:
+    """Write a schedule, one node a line; the file is whole or not there."""
+    parts = [
+        f'"{name}": {msgspec.json.encode(getattr(schedule, name)).decode()}'
+        for name in GainSchedule.__struct_fields__
+        if name != "D"
+    ]
+    rows = ",\n".join(
+        "[" + ",\n ".join(msgspec.json.encode(node).decode() for node in row) + "]"
+        for row in schedule.D
+    )
+    parts.append(f'"D": [\n{rows}\n]')
+    text = "{" + ",\n".join(parts) + "}\n"
+    try:
+        replace_file(path, text.encode())
+    except OSError as error:
+        found = f"cannot be written: {error.strerror}"
+        raise ConfigError(str(path), "(file)", found, "a folder that you may write to") from None
+
+
+def why_stale(config: RobotConfig) -> str:
+    """Return why the robot's schedule does not fit the robot, in words; "" if it does."""
+    schedule = config.gain_schedule
+    if schedule is None:
+        return "there is no gain schedule"
+    if schedule.version == VERSION and config.law.lead_easing > schedule.lead_easing:
+        most, asked = schedule.lead_easing, config.law.lead_easing
+        return f"the gain schedule was made for law.lead_easing up to {most}, not {asked}"
+    if schedule.version != VERSION:
+        return f"the gain schedule is of version {schedule.version}, not {VERSION}"
+    inputs = inputs_of(config)
+    if schedule.digest == digest_of(inputs):
+        return ""
+    for key, value in inputs.items():
+        if schedule.inputs.get(key) != value:
+            return f"the gain schedule was made for {key} = {schedule.inputs.get(key)}, not {value}"
+    return "the gain schedule's digest is not that of its inputs"
+
+
+def believing(config: RobotConfig) -> RobotConfig:
+    """Return the robot with joint services that accept any command within their limits.
+
+    For commands that the shipped law never sends: another control, or gains under study.
+    """
+    if config.gain_schedule is None:
+        return config
+    schedule = msgspec.structs.replace(config.gain_schedule, bounds=None)
+    return msgspec.structs.replace(config, gain_schedule=schedule)
+
+
+def require(config: RobotConfig, robot_file: Path) -> None:
+    """Refuse a robot whose gain split needs a schedule that it has not.
+
+    Raises:
+        ConfigError: naming the difference and the command to run.
+    """
+    if config.law.split != "certified":
+        return
+    stale = why_stale(config)
+    schedule = config.gain_schedule
+    if not stale and schedule is not None and schedule.bounds is None:
+        stale = "has no bounds by which the joint services judge commands"
+    if stale:
+        right = f"run `xrl gains --config {robot_file}`"
+        raise ConfigError(str(path_beside(robot_file)), "(file)", stale, right)

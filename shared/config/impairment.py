@@ -1,0 +1,237 @@
+"""Models a bad network: delay, jitter, loss, partitions; seeded. Pure.
+
+Terms are those of tc-netem where it has them. One class serves the modelled network of lockstep and
+the network proxy on the wire, so that both behave alike (docs/networks.md). In lockstep it acts on
+messages; on the wire it acts on Zenoh's batches: messages that are sent at once travel, and are
+lost, together.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from decimal import Decimal
+from typing import Annotated, Final, Literal
+
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.toml_file import Range, Section
+
+Share = Annotated[float, Range(0.0, 1.0, "(1 is 100 %)")]
+Ms = Annotated[float, Range(0.0, 60_000.0, "ms")]
+Distribution = Literal["uniform", "normal", "pareto"]
+
+HELD: Final = 1 << 62
+"""Release time, ns, of what waits for the end of a partition."""
+ROUNDING: Final = 1e-9
+"""Relative, of shares: 1 - 0.9 is not quite 0.1."""
+QUEUE_MAX: Final = 1000
+"""Messages that wait for a slow line; what comes on top is lost, as in netem."""
+
+
+class Impairment(Section, frozen=True, kw_only=True):
+    """Impairment of one direction of a link; by default none."""
+
+    delay_ms: Ms = 0.0
+    jitter_ms: Ms = 0.0
+    """uniform: delay +- jitter; normal, pareto: the standard deviation. Nothing comes before it
+    was sent: with less delay than jitter, the share that would has none."""
+    distribution: Distribution = "uniform"
+    loss: Share = 0.0
+    """Probability that a message never comes."""
+    burst: Annotated[float, Range(1.0, 10_000.0, "messages")] = 1.0
+    """Mean length of a row of losses (a Gilbert chain); 1: each by itself."""
+    duplicate: Share = 0.0
+    """Probability that a message is duplicated; each copy has a delay of its own."""
+    reorder: Share = 0.0
+    """Probability that a message has no delay and so overtakes those before it."""
+    rate: Annotated[float, Range(0.0, 1e10, "bytes/s")] = 0.0
+    """Bytes a second that the line carries; 0: any."""
+    ordered: bool = False
+    """A late message holds up those behind it, and a partition holds them all back until its
+    end, as on a stream (TCP); but nothing that `loss` takes is sent again. Without it:
+    overtaken and lost, as datagrams are."""
+    partition: bool = False
+    """Nothing passes."""
+
+    def describe(self) -> str:
+        """Return the impairment as `--inject` takes it: `delay=30ms loss=20%`; `nothing`."""
+        words = [
+            f"{name}={_digits(value, places)}{unit}"
+            for name, value, standard, places, unit in (
+                ("delay", self.delay_ms, 0.0, 0, "ms"),
+                ("jitter", self.jitter_ms, 0.0, 0, "ms"),
+                ("loss", self.loss, 0.0, 2, "%"),
+                ("burst", self.burst, 1.0, 0, ""),
+                ("duplicate", self.duplicate, 0.0, 2, "%"),
+                ("reorder", self.reorder, 0.0, 2, "%"),
+                ("rate", self.rate, 0.0, 0, ""),
+            )
+            if value != standard
+        ]
+        if self.distribution != "uniform":
+            words.append(f"distribution={self.distribution}")
+        words += [name for name in ("ordered", "partition") if getattr(self, name)]
+        return " ".join(words) or "nothing"
+
+    def fault(self) -> str:
+        """Return a contradiction or a setting without effect, with its remedy; empty if none."""
+        late = self.delay_ms or self.jitter_ms
+        alone = Impairment(partition=self.partition, ordered=self.ordered).describe()
+        if self.partition and self.describe() != alone:
+            return f"{self.describe()}; in a partition nothing passes: leave out all but ordered"
+        if self.ordered and self.reorder:
+            return "ordered, and reorder; on a stream nothing overtakes: leave one out"
+        if self.burst > 1.0 and not 0.0 < self.loss < 1.0:
+            return f"burst {self.burst:g}, and a loss of {self.loss:g}; give a loss between 0 and 1"
+        least = self.loss / (1.0 - self.loss) * (1.0 - ROUNDING) if self.loss < 1.0 else 1.0
+        if 1.0 < self.burst < least:
+            found = f"loss {_digits(self.loss, 2)}% in rows of {self.burst:g}, and less than one"
+            return f"{found} message between them; give a burst of {math.ceil(least)} or more"
+        if self.reorder and not late:
+            return "reorder, and no delay that others could overtake; give a delay"
+        if self.distribution != "uniform" and not self.jitter_ms:
+            return f"distribution {self.distribution}, and no jitter; give a jitter"
+        if self.ordered and not (late or self.rate or self.partition):
+            return "ordered, and nothing late or held back; give a delay, a rate or a partition"
+        return ""
+
+
+def _digits(value: float, places: int) -> str:
+    """Return a number times 10**places; its digits, read again, are the same number."""
+    return f"{Decimal(repr(value)).scaleb(places).normalize():f}"
+
+
+class Impairer:
+    """Decides when each message of one direction comes out, and how often."""
+
+    def __init__(self, what: Impairment, seed: str) -> None:
+        """Begin; the same seed decides the same."""
+        self.what = what
+        self.passed = self.lost = 0
+        """Messages that came out, or will; and messages that were lost. A duplicated message counts
+        once.
+        """
+        self._random = random.Random(seed)
+        self._in_burst = False
+        self._line_free_ns = 0
+        self._last_ns = 0
+
+    def passes(self, now_ns: int, size: int) -> tuple[int, ...]:
+        """Take a message in; return when it comes out, ns: never, once or twice.
+
+        Args:
+            now_ns: any monotonic clock; it must not go back.
+            size: bytes of the message, for `rate`.
+        """
+        what = self.what
+        if (what.partition and not what.ordered) or (what.loss and self._is_lost()):
+            self.lost += 1
+            return ()
+        if what.rate and self._line_free_ns - now_ns > QUEUE_MAX * size * NS_PER_S / what.rate:
+            self.lost += 1
+            return ()
+        twice = what.duplicate and self._random.random() < what.duplicate
+        self.passed += 1
+        release_ns = self._release_ns(now_ns, size)
+        return (release_ns, self._release_ns(now_ns, size)) if twice else (release_ns,)
+
+    def delays(self, now_ns: int) -> int:
+        """Return when a link's own traffic comes out, ns: in order, never lost.
+
+        Such traffic opens, declares and keeps alive; it takes the mean delay. `HELD` in a
+        partition.
+        """
+        if self.what.partition:
+            return HELD
+        release_ns = now_ns + round(self.what.delay_ms * NS_PER_MS)
+        self._last_ns = max(self._last_ns, release_ns)
+        return self._last_ns
+
+    def drop(self) -> None:
+        """Count one as lost that has passed and will not come out after all: its link is gone."""
+        self.passed -= 1
+        self.lost += 1
+
+    def _release_ns(self, now_ns: int, size: int) -> int:
+        what = self.what
+        if what.partition:
+            return HELD
+        if what.rate:
+            self._line_free_ns = max(now_ns, self._line_free_ns) + round(
+                size * NS_PER_S / what.rate
+            )
+            now_ns = self._line_free_ns
+        if what.reorder and self._random.random() < what.reorder:
+            return now_ns
+        delay_ms = what.delay_ms
+        if what.jitter_ms:
+            delay_ms = max(0.0, delay_ms + what.jitter_ms * self._spread())
+        release_ns = now_ns + round(delay_ms * NS_PER_MS)
+        if what.ordered:
+            release_ns = self._last_ns = max(release_ns, self._last_ns)
+        return release_ns
+
+    def _spread(self) -> float:
+        """Return a draw: uniform in -1..1, else of mean 0 and standard deviation 1."""
+        if self.what.distribution == "normal":
+            return self._random.gauss(0.0, 1.0)
+        if self.what.distribution == "pareto":
+            return (self._random.paretovariate(3.0) - 1.5) / math.sqrt(0.75)
+        return self._random.uniform(-1.0, 1.0)
+
+    def _is_lost(self) -> bool:
+        """Return whether the next message is lost; with bursts a chain of two states."""
+        what = self.what
+        if what.burst <= 1.0:
+            return self._random.random() < what.loss
+        leaves = 1.0 / what.burst
+        enters = what.loss * leaves / (1.0 - what.loss)
+        turns = self._random.random() < (leaves if self._in_burst else enters)
+        self._in_burst ^= turns
+        return self._in_burst
+
+
+class Direction:
+    """One direction of a link, and its present impairment.
+
+    Several impairments may be requested at once; one is active: a partition before all others,
+    otherwise the one that started last. When it ends, the next by that rule is active. The owner of
+    the queue keeps a stream in order over such a change.
+    """
+
+    def __init__(self, name: str, seed: int) -> None:
+        """Begin unimpaired.
+
+        Args:
+            name: of `shared.links`.
+            seed: of all that will be decided here.
+        """
+        self.name = name
+        self.active: Impairer | None = None
+        """What decides now; None: everything passes at once."""
+        self._seed = f"{seed} {name}"
+        self._asked: dict[int, Impairer] = {}
+
+    def begin(self, number: int, what: Impairment) -> None:
+        """Add an impairment; `end` removes it by its number."""
+        self._asked[number] = Impairer(what, f"{self._seed} {number}")
+        self._choose()
+
+    def end(self, number: int) -> Impairer | None:
+        """End an impairment and return it with its counts; None if it is not there."""
+        ended = self._asked.pop(number, None)
+        self._choose()
+        return ended
+
+    def requested(self, number: int) -> Impairer | None:
+        """Return the impairment with a number, active or not; None if it is over."""
+        return self._asked.get(number)
+
+    def passes(self, now_ns: int, size: int) -> tuple[int, ...]:
+        """Take a message in; return when it comes out, ns. As `Impairer.passes`."""
+        return (now_ns,) if self.active is None else self.active.passes(now_ns, size)
+
+    def _choose(self) -> None:
+        asked = self._asked.values()
+        cut = [impairer for impairer in asked if impairer.what.partition]
+        self.active = next(reversed(cut or [*asked]), None)

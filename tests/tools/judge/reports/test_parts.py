@@ -1,0 +1,244 @@
+"""A run that is read in parts has the page, the verdict and the scene of the whole."""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from shared.bus import topics
+from shared.bus.messages import DriveStatus, JointState
+from shared.clock import NS_PER_S
+from shared.exceptions import RunError
+from tests.tools.judge.reports import pages, runs
+from tests.tools.judge.reports.runs import Made
+from tools import cli
+from tools.judge import verdict
+from tools.judge.judgement import summarise_parts
+from tools.judge.reports import scene
+from tools.judge.reports.page import render, render_parts
+from tools.judge.reports.page_model import Line, PageModel, PageWindow
+from tools.judge.reports.run_data import RunData
+from tools.judge.reports.signals import Span
+from tools.judge.run_parts import zero_ns
+from tools.logs.recorded_robot import robot_of
+from tools.logs.run_index import RunIndex
+from tools.logs.run_log import RunLog, RunPart, parts_of, read_part
+
+PART_S = 0.9
+
+
+@pytest.fixture(scope="module")
+def in_parts(log: RunLog) -> str:
+    return render_parts(log.index, part_s=PART_S)
+
+
+def section(page: str, name: str) -> list[str]:
+    found = re.search(rf'<section id="{name}">(.*?)</section>', page, re.S)
+    assert found is not None
+    return re.findall(r"<(?:span|td)[^>]*>([^<]+)<", found[1])
+
+
+def test_the_sentence_of_the_verdict_is_that_of_the_whole(page: str, in_parts: str) -> None:
+    whole, parts = (re.search(r'id="verdict">([^<]+)<', one) for one in (page, in_parts))
+    assert whole is not None
+    assert parts is not None
+    assert parts[1] == whole[1]
+
+
+def test_the_timeline_is_that_of_the_whole(page: str, in_parts: str) -> None:
+    assert len(section(page, "timeline")) > 10
+    whole, parts = (
+        [re.sub(r"[\d.]+ s in total", "", row) for row in section(one, "timeline")]
+        for one in (page, in_parts)
+    )
+    assert parts == whole
+
+
+def test_the_messages_counted_are_those_of_the_whole(page: str, in_parts: str) -> None:
+    assert section(in_parts, "lost") == section(page, "lost")
+
+
+def test_panels_and_lines_are_those_of_the_whole(page: str, in_parts: str) -> None:
+    whole, parts = pages.data_of(page), pages.data_of(in_parts)
+    assert [panel["title"] for panel in parts["panels"]] == [
+        panel["title"] for panel in whole["panels"]
+    ]
+    for title, label in (("COM", "x"), ("Height", "torso"), ("Command age", "knee_left")):
+        (t, values), (t_all, values_all) = (
+            pages.line(data, title, label) for data in (parts, whole)
+        )
+        # at a scale of hours a bin's extremes are shown; every one of them is kept
+        assert np.nanmin(values) == pytest.approx(np.nanmin(values_all), abs=1e-3)
+        assert np.nanmax(values) == pytest.approx(np.nanmax(values_all), abs=1e-3)
+        assert (t[0], t[-1]) == pytest.approx((t_all[0], t_all[-1]), abs=0.01)
+
+
+def test_the_bars_are_those_of_the_whole(page: str, in_parts: str) -> None:
+    title = "Modes of the six services"
+    whole, parts = (pages.panel(pages.data_of(one), title) for one in (page, in_parts))
+    for row, row_all in zip(parts["rows"], whole["rows"], strict=True):
+        assert [span[2] for span in row["spans"]] == [span[2] for span in row_all["spans"]]
+        edges, edges_all = (np.array([span[:2] for span in r["spans"]]) for r in (row, row_all))
+        np.testing.assert_allclose(edges, edges_all, atol=0.005)
+
+
+def test_the_verdict_is_that_of_the_whole(log: RunLog, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tools.judge.judgement.parts_of", partial(parts_of, part_s=PART_S))
+    duration_s = 6.0
+    whole = verdict.summarise(log, duration_s)
+    cut = parts_of(log.index, RunPart(4.0), part_s=PART_S)
+    parts = verdict.joined(
+        [verdict.summarise(part, duration_s) for part in cut], log.gaps().values()
+    )
+    assert set(parts) == set(whole)
+    counted = summarise_parts(log.index, duration_s)
+    for key in ("messages_recorded", "sequence_gaps"):
+        assert counted[key] == whole[key], key
+    for key in ("stood", "why_not", "hold_entries", "handover_ms", "reengage_s", "links_impaired"):
+        assert parts[key] == whole[key], key
+    for key in ("operator_peak_n", "alive_com_x_max_mm", "hold_com_x_max_mm", "torso_height_min_m"):
+        assert parts[key] == pytest.approx(whole[key]), key
+
+
+def test_a_part_before_the_scenario_is_no_reason_not_to_judge_the_run(log: RunLog) -> None:
+    found = summarise_parts(log.index, 1.0)
+    assert found["stood"]
+
+
+def test_the_scene_of_the_parts_is_that_of_the_whole(log: RunLog) -> None:
+    robot = robot_of(log)
+    whole = [m for m in scene.messages([log], robot) if m.channel == scene.STATE]
+    parts = [
+        m for m in scene.messages(parts_of(log.index, part_s=PART_S), robot)
+        if m.channel == scene.STATE
+    ]  # fmt: skip
+    assert abs(len(parts) - len(whole)) <= 1 + log.index.length_s / PART_S
+    times = [m.log_ns for m in parts]
+    assert times == sorted(set(times))
+
+
+def test_a_part_of_a_run_has_the_time_of_the_whole_and_all_events(
+    made: Made, log: RunLog, tmp_path: Path
+) -> None:
+    out = tmp_path / "part.html"
+    words = ["--from", "1", "--to", "2", "-o", str(out), "--open", "no"]
+    assert cli.main(["report", str(made.path), *words]) == 0
+    assert 'id="verdict">A part of a run, and its figures: no verdict<' in out.read_text()
+    data = pages.data_of(out.read_text())
+    assert data["span"] == pytest.approx([1.0, 2.0], abs=1e-6)
+    t, values = pages.line(data, "COM", "x")
+    assert t[0] >= 1.0
+    assert t[-1] <= 2.001
+    assert np.isfinite(values).any()
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--from", "5", "--to", "2"), "the smaller one"),
+        (("--from", "900"), "it holds"),
+        (("--to", "-900"), "it holds"),
+    ],
+)
+def test_a_part_that_is_not_there_is_told_with_what_is(
+    made: Made, words: tuple[str, ...], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["report", str(made.path), *words, "--open", "no"]) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_a_run_too_long_to_be_read_at_once_says_what_to_give(
+    log: RunLog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tools.logs.run_log.WHOLE_MAX_S", 1.0)
+    with pytest.raises(RunError, match="--from and --to"):
+        read_part(log.index, RunPart())
+    assert read_part(log.index, RunPart(0.5, 1.2)).keys()
+
+
+def test_events_are_in_every_part_and_all_other_messages_in_one(log: RunLog) -> None:
+    index = RunIndex(log.path)
+    counts: dict[str, int] = {}
+    for part in parts_of(index, part_s=PART_S, margin_s=0.0):
+        for key in part.keys():  # noqa: SIM118 - a log is no mapping
+            counts[key] = counts.get(key, 0) + part.count(key)
+            if key.endswith("/event"):
+                assert part.count(key) == log.count(key)
+    periodic = [key for key in log.keys() if not key.endswith("/event")]  # noqa: SIM118
+    assert {key: counts[key] for key in periodic if counts[key] != log.count(key)} == {}
+
+
+def test_time_zero_is_that_of_the_scenario(log: RunLog) -> None:
+    assert zero_ns(log.index) == verdict.course(log).zero_ns
+
+
+def test_a_panel_without_data_in_the_first_part_has_its_unit_and_note_from_a_later_one() -> None:
+    model = PageModel(Span(0.0, 2.0))
+    model.leave_out("Age", "nothing yet")
+    assert model.left_out == [("Age", "nothing yet")]
+    line = Line("x", np.array([1.2, 1.4]), np.array([0.0, 3.0]), 0)
+    model.plot("Age", "ms", [line], note="how old", if_empty="none")
+    assert model.left_out == []
+    (panel,) = model.as_data([])["panels"]
+    assert (panel["unit"], panel["note"]) == ("ms", "how old")
+
+
+def test_a_counter_goes_on_from_where_the_part_before_it_ended() -> None:
+    """Each part counts from its margin on, which is the end of the part before."""
+    model = PageModel(Span(0.0, 2.0))
+    parts = (
+        (PageWindow(0.0, 1.0), [0.0, 0.5, 0.9, 1.1], [0.0, 1.0, 3.0, 4.0]),
+        (PageWindow(1.0, 2.0), [0.9, 1.1, 1.5, 1.9], [0.0, 1.0, 1.0, 6.0]),
+    )
+    for window, t, values in parts:
+        model.window = window
+        line = Line("late", np.array(t), np.array(values), 0, counts_up=True)
+        model.plot("Late", "count", [line], needs_count=True)
+    data = model.as_data([])
+    _, seen = pages.line(data, "Late", "late")
+    assert seen[-1] == pytest.approx(9.0, abs=1e-3), "3 in the first part, 6 in the second"
+    assert (np.diff(seen) >= 0.0).all()
+
+
+def test_before_the_drives_are_armed_no_soft_stop_is_passed(log: RunLog, tmp_path: Path) -> None:
+    """A robot that hangs unarmed has its joints anywhere."""
+
+    def hanging(name: str, payload: bytes) -> bytes:
+        if not name.endswith("/state") or "joint" not in name:
+            return payload
+        state = msgspec.json.decode(payload, type=JointState)
+        if state.t_ns > armed_ns:
+            return payload
+        beyond = msgspec.structs.replace(state, q=(9.0, 9.0), drive=int(DriveStatus.IDLE))
+        return msgspec.json.encode(beyond)
+
+    armed_ns = RunData(log).zero_ns - NS_PER_S
+    hung = runs.rewritten(log, tmp_path, payload=hanging)
+    for page in (render(hung), render_parts(hung.index, part_s=PART_S)):
+        assert "beyond a soft stop" not in page
+
+
+def test_a_change_across_a_silence_at_the_edge_of_a_part_has_its_row(
+    log: RunLog, tmp_path: Path
+) -> None:
+    """The planner is dead for longer than a part and its margins."""
+    begin_ns = RunData(log).zero_ns + NS_PER_S
+    key = topics.PLANNER_STATUS.key(log.robot)
+    heard = [
+        (t_ns, topics.PLANNER_STATUS.name, body)
+        for t_ns, body, _ in log.raw(key)
+        if not begin_ns <= t_ns < begin_ns + 4 * NS_PER_S
+    ]
+    others = lambda name: name != topics.PLANNER_STATUS.name  # noqa: E731
+    quiet = runs.rewritten(log, tmp_path, keep=others, more=heard)
+    whole, parts = (
+        [row for row in section(page, "timeline") if "planner: " in row]
+        for page in (render(quiet), render_parts(quiet.index, part_s=PART_S))
+    )
+    assert whole
+    assert parts == whole

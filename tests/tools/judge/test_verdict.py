@@ -1,0 +1,143 @@
+"""A verdict that sees: what it is to stand, and how soundly a robot stood."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from services.simulator.physics.body import body_of
+from services.simulator.physics.plant import IDEAL
+from services.simulator.physics.world import World
+from shared.bus.messages import SimTruth
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Push
+from tests.lockstep.runs import still
+from tools import cli
+from tools.judge import verdict, verdict_table
+from tools.judge.soundness import _longest_s, shaking_of, why_not_sound
+from tools.judge.standing import why_not_standing
+from tools.judge.verdict_limits import LIMITS, SOUND
+from tools.logs.run_log import read_run
+from tools.terminal import Console
+
+
+@pytest.fixture(scope="module")
+def upright(robot: RobotConfig) -> SimTruth:
+    return World(body_of(robot, IDEAL), still(1.0)).truth(0, 1.0, 0.0)
+
+
+def test_a_robot_upright_on_its_soles_stands(robot: RobotConfig, upright: SimTruth) -> None:
+    assert why_not_standing(upright, robot) == ""
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"fallen": True}, "down"),
+        ({"com": (0.13, 0.0, 1.0)}, "beyond the soles"),
+        ({"foot_left_tilt": 0.06}, "a sole is up"),
+        ({"angles": (0.0, -0.6, 0.0)}, "turned"),
+        ({"angles": (0.0, 1.7, 0.0)}, "turned"),
+        ({"angles": (0.31, 0.0, 0.0)}, "turned"),
+        ({"angles": (0.0, 0.0, -0.31)}, "turned"),
+    ],
+)
+def test_what_is_no_standing_is_named(
+    robot: RobotConfig, upright: SimTruth, changes: dict[str, object], why: str
+) -> None:
+    assert why in why_not_standing(msgspec.structs.replace(upright, **changes), robot)
+
+
+@pytest.mark.parametrize("hz", [2.0, 20.0, 60.0])
+def test_shaking_is_what_is_above_the_laws_band(hz: float) -> None:
+    t_s = np.arange(0.0, 3.0, 0.004)
+    tau = np.stack([10.0 * np.sin(2 * np.pi * hz * t_s), np.full(len(t_s), 40.0)], axis=1)
+    found = shaking_of((1e9 * t_s).astype(np.int64), tau)[-1]
+    through = hz / np.hypot(hz, 8.0)  # one pole
+    assert found[0] == pytest.approx(10.0 / np.sqrt(2.0) * through, rel=0.25)
+    assert found[1] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_run_is_judged_by_how_it_stands_at_its_end(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Pushed by 250 N as the scenario ends, it is not down yet, and will be."""
+    words = ("--scenario", "stand", "--duration", "1.5", "--push", "1:0.8:250,0,0")
+    assert cli.main(["sim", *words, "--out", str(tmp_path / "out")]) == 1
+    log = read_run(tmp_path / "out" / "run.mcap")
+    summary = verdict.summarise(log, 1.5)
+    assert summary["fallen_at_s"] is None
+    assert summary["stood"] is False
+    assert summary["why_not"]
+    assert "DOES NOT STAND" in capsys.readouterr().out
+
+
+def test_a_sound_run_has_figures_within_their_limits(tmp_path: Path) -> None:
+    assert cli.main(["sim", "--duration", "4", "--out", str(tmp_path)]) == 0
+    summary = verdict.summarise(read_run(tmp_path / "run.mcap"), 4.0)
+    assert summary["torque_at_limit_ms"] == 0.0
+    assert 0.05 < summary["shaking_nm"] < 5.0
+    assert 0.05 < summary["sinking_m_s"] < 0.3, "it is led down"
+    console = Console(width=120, record=True)
+    verdict_table.show(summary, console)
+    text = console.export_text()
+    assert all(word in text for word in ("torque above 8 Hz", "at its limit", "fastest way down"))
+
+
+def test_motors_at_their_limit_are_no_sound_standing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A knee limp, the other carries all: it stands, and not as it is to."""
+    flags = ("--fault", "knee_left:disarmed@1.5", "--duration", "4")
+    assert cli.main(["sim", *flags, "--out", str(tmp_path)]) == 3
+    summary = verdict.summarise(read_run(tmp_path / "run.mcap"), 4.0)
+    assert (summary["stood"], summary["fallen_at_s"], summary["why_not"]) == (False, None, "")
+    assert "torque at its limit" in summary["unsound"]
+    output = capsys.readouterr().out
+    assert "STOOD, BUT NOT SOUNDLY" in output
+    assert "(limit 50)" in output
+
+
+@pytest.mark.parametrize(
+    ("changes", "code"),
+    [
+        ({"stood": True}, 0),
+        ({"fallen_at_s": 2.0}, 1),
+        ({"why_not": "a sole is up, by 0.06 rad"}, 1),
+        ({"unsound": "torque at its limit: 90 ms (limit 50)"}, 3),
+        ({}, 3),
+    ],
+    ids=["stood", "fell", "tips at the end", "not soundly", "not finished"],
+)
+def test_only_a_fall_is_exit_code_1(changes: dict[str, object], code: int) -> None:
+    summary = {"stood": False, "fallen_at_s": None, "why_not": "", "unsound": ""}
+    assert verdict.exit_code(summary | changes) == code
+
+
+@pytest.mark.parametrize("key", SOUND)
+def test_each_figure_of_soundness_is_judged_by_its_limit(key: str) -> None:
+    (limit,) = (row for row in LIMITS if row.key == key)
+    calm = dict.fromkeys(SOUND, 0.0)
+    assert why_not_sound(calm | {key: limit.limit}) == ""
+    assert limit.what in why_not_sound(calm | {key: 1.01 * limit.limit})
+    assert why_not_sound(dict.fromkeys(SOUND)) == "", "of which nothing is known"
+
+
+def test_hard_pushes_are_reported(tmp_path: Path) -> None:
+    """130 N from the side keep a knee's motors at their limit."""
+    push = Push(at=0.5, duration=0.5, force=(0.0, 130.0, 0.0))
+    words = f"{push.at:g}:{push.duration:g}:0,130,0"
+    cli.main(["sim", "--duration", "2", "--push", words, "--out", str(tmp_path)])
+    summary = verdict.summarise(read_run(tmp_path / "run.mcap"), 2.0)
+    assert summary["torque_at_limit_ms"] > 50.0
+
+
+def test_nothing_is_reported_of_a_gap_in_the_log() -> None:
+    """A service that was dead for 2 s between two torques at the limit."""
+    t_ns = (1e9 * np.array([0.0, 0.004, 0.008, 2.0, 2.004])).astype(np.int64)
+    assert _longest_s(t_ns, np.ones(5, bool)) == pytest.approx(0.008)
+    tau = np.array([[10.0, 0.0]] * 3 + [[90.0, 0.0]] * 2)
+    assert shaking_of(t_ns, tau).max() == 0.0

@@ -1,0 +1,121 @@
+"""Names, globs, prefixes and remaps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shared.bus import topics
+from shared.exceptions import RunError
+from tools.logs.playback.selection import check_prefix, choose, clock_key, short, targets
+
+KEYS = tuple(topics.all_keys("lab"))
+STATES = topics.keys(topics.JOINT_STATE, "lab")
+WRENCH = "xrl/lab/harness/wrench"
+
+
+def test_without_names_all_is_chosen_in_its_order() -> None:
+    assert choose(KEYS, (), ()) == KEYS
+
+
+@pytest.mark.parametrize("name", ["joint/*/state", "xrl/lab/joint/*/state", "joint/**/state"])
+def test_a_glob_chooses_every_module(name: str) -> None:
+    assert choose(KEYS, [name], ()) == STATES
+
+
+def test_a_star_stays_within_its_section() -> None:
+    with pytest.raises(RunError, match="no such topic"):
+        choose(KEYS, ["*state"], ())
+    assert choose(KEYS, ["joint/**ate"], ()) == STATES
+
+
+def test_exclude_goes_over_topics() -> None:
+    left = choose(KEYS, ["joint/*/state"], ["joint/knee_*/state"])
+    assert [short(key) for key in left] == [
+        f"joint/{module}/state" for module in ("ankle_right", "hip_right", "ankle_left", "hip_left")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "nearest"),
+    [("joint/*/stat", "joint/*/state"), ("wrench", "harness/wrench"), ("e-stop", "estop")],
+)
+@pytest.mark.parametrize("flag", ["--topics", "--exclude", "--remap"])
+def test_an_unknown_name_is_refused_with_the_nearest(name: str, nearest: str, flag: str) -> None:
+    refuse: Callable[[], object] = {
+        "--topics": lambda: choose(KEYS, [name], ()),
+        "--exclude": lambda: choose(KEYS, (), [name]),
+        "--remap": lambda: targets(KEYS, "replay", [f"{name}=a/b"], "lab"),
+    }[flag]
+    with pytest.raises(RunError, match=f"{flag} .*no such topic") as caught:
+        refuse()
+    assert str(caught.value).endswith(nearest)
+
+
+def test_a_topic_that_this_log_does_not_hold_may_be_excluded_but_not_be_all_that_is_left() -> None:
+    assert choose(STATES, (), ["estop", "joint/*/event"]) == STATES
+    with pytest.raises(RunError, match=r"nothing is left.*joint/\*/state"):
+        choose(STATES, ["estop"], ())
+
+
+def test_the_prefix_stands_before_every_key_and_no_prefix_leaves_them() -> None:
+    assert targets([WRENCH], check_prefix("replay"), (), "lab") == {WRENCH: f"replay/{WRENCH}"}
+    assert targets([WRENCH], check_prefix("/a/b/"), (), "lab") == {WRENCH: f"a/b/{WRENCH}"}
+    assert targets([WRENCH], check_prefix(""), (), "lab") == {WRENCH: WRENCH}
+    assert (clock_key("replay"), clock_key("")) == ("replay/clock", "clock")
+
+
+@pytest.mark.parametrize(
+    "prefix", ["xrl", "xrl/lab", "/xrl/", "a b", "a//b", "**", "a/*", "@/x", "?"]
+)
+def test_a_prefix_that_is_none_or_where_live_keys_are_is_refused(prefix: str) -> None:
+    with pytest.raises(RunError, match="--prefix"):
+        check_prefix(prefix)
+
+
+@given(st.text(alphabet="xrl/ab*@ ", max_size=8))
+def test_no_prefix_makes_a_key_that_a_service_subscribes_to(prefix: str) -> None:
+    try:
+        checked = check_prefix(prefix)
+    except RunError:
+        return
+    for target in targets(KEYS, checked, (), "lab").values():
+        assert not checked or not target.startswith("xrl/")
+
+
+def test_a_remap_gives_one_topic_another_name() -> None:
+    found = targets(KEYS, "replay", ["harness/wrench=harness/was"], "lab")
+    assert found[WRENCH] == "replay/xrl/lab/harness/was"
+    assert sum(key != target.removeprefix("replay/") for key, target in found.items()) == 1
+
+
+def test_a_star_in_a_remap_stands_for_the_same_in_both() -> None:
+    found = targets(STATES, "r", ["joint/*/state=was/*/x"], "lab")
+    assert found["xrl/lab/joint/knee_left/state"] == "r/xrl/lab/was/knee_left/x"
+
+
+def test_two_topics_may_change_places_but_not_become_one() -> None:
+    one, other = KEYS[0], KEYS[1]
+    swap = [f"{short(one)}={short(other)}", f"{short(other)}={short(one)}"]
+    found = targets(KEYS, "", swap, "lab")
+    assert (found[one], found[other]) == (other, one)
+    with pytest.raises(RunError, match="both become"):
+        targets(KEYS, "", swap[:1], "lab")
+
+
+@pytest.mark.parametrize(
+    "remap",
+    ["a", "=b", "harness/wrench=", "joint/*/state=a", "harness/wrench=a/*", "harness/wrench=a b",
+     "harness/wrench=a/**", "harness/wrench=a//b", "joint/*/state=*/*"],
+)  # fmt: skip
+def test_a_remap_that_is_none_is_refused(remap: str) -> None:
+    with pytest.raises(RunError, match=r"--remap|both become"):
+        targets(KEYS, "replay", [remap], "lab")
+
+
+def test_a_remap_of_what_is_not_played_is_refused() -> None:
+    with pytest.raises(RunError, match="not among what is played"):
+        targets(STATES, "replay", ["harness/wrench=a"], "lab")

@@ -1,0 +1,28 @@
+"""Executing a service of a log again, to its end."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from shared.config.robot_config import RobotConfig
+from tools.logs.recorded_robot import robot_of
+from tools.logs.reexecution.execution import Execution
+from tools.logs.reexecution.outcome import ReexecutionResult
+from tools.logs.run_log import RunLog
+
+
+def executed(
+    log: RunLog,
+    name: str,
+    tolerance: float = 0.0,
+    *,
+    parts: Iterable[RunLog] = (),
+    robot: RobotConfig | None = None,
+    exact: bool = True,
+) -> ReexecutionResult:
+    """Execute a service; from a log, or from its parts one after the other."""
+    execution = Execution(robot or robot_of(log), name, tolerance, exact=exact)
+    for part in parts or (log,):
+        for _ in execution.run(part):
+            pass
+    return execution.outcome

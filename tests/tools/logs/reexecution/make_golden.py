@@ -1,0 +1,61 @@
+"""Makes a golden log: `python -m tests.tools.logs.reexecution.make_golden RUN.mcap OUT.mcap`.
+
+RUN.mcap is `xrl sim --scenario stand --duration 1`. A second of it is kept, of the topics that
+re-execution needs, with the traces of two modules; nothing of the machine but its processor.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Final
+
+from shared.bus import topics
+from shared.clock import NS_PER_S
+from tools.logs.reexecution import rewritten
+from tools.logs.run_log import RunLog, read_run
+
+KEPT_FROM_S: Final = 2.3
+TRACED: Final = ("knee_left", "hip_left")
+TOPICS: Final = (
+    topics.PLANNER_STATUS,
+    topics.PLANNER_CHECKPOINT,
+    topics.JOINT_STATE,
+    topics.JOINT_COMMAND,
+    topics.JOINT_EVENT,
+    topics.WRENCH,
+)
+RUN_FACTS: Final = ("schema_version", "robot", "scenario", "lockstep", "cpu_model")
+
+
+def shortened(log: RunLog) -> RunLog:
+    """Leave out of a log what the golden one does not need."""
+    begin_ns = log.began_ns() + round(KEPT_FROM_S * NS_PER_S)
+    kept = {key for topic in TOPICS for key in topics.keys(topic, log.robot)}
+    kept |= {topics.JOINT_TRACE.key(log.robot, module) for module in TRACED}
+    for key, series in list(log._series.items()):
+        rows = [row for row in log.raw(key) if row[0] >= begin_ns and key in kept]
+        series.received_ns = [row[0] for row in rows]
+        series.payloads = [row[1] for row in rows]
+        series.seq = [row[2] for row in rows]
+    log.metadata = {
+        "run": {name: log.metadata["run"][name] for name in RUN_FACTS},
+        "clock": log.metadata["clock"],
+    }
+    log.attachments.pop("model.xml", None)
+    return log
+
+
+def main() -> None:
+    """Write it."""
+    source, out = map(Path, sys.argv[1:])
+    rewritten.write(
+        shortened(read_run(source)),
+        out,
+        {},
+        {"made_by": "tests.tools.logs.reexecution.make_golden"},
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,99 @@
+"""Bit for bit: what counts as a difference, and how far apart two floats are."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shared.bus.messages import JointEvent
+from shared.bus.traces import PlannerCheckpoint
+from tools.logs.reexecution.compare import Comparison, ulp
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+
+
+def event(tau: float = 1.5, **changes: object) -> JointEvent:
+    fields = {
+        "t_ns": 7, "seq": 1, "mode_before": 1, "mode_after": 2, "cause": 2, "age_ns": 5,
+        "tau_before": (0.0, 0.0), "tau_after": (tau, -2.0),
+    }  # fmt: skip
+    return JointEvent(**(fields | changes))  # type: ignore[arg-type]
+
+
+@given(value=finite)
+def test_neighbouring_floats_are_one_ulp_apart_and_a_float_none_from_itself(value: float) -> None:
+    assert ulp(value, value) == 0
+    above = math.nextafter(value, math.inf)
+    if math.isfinite(above):
+        assert ulp(value, above) == ulp(above, value) == 1
+
+
+def test_ulps_are_counted_through_zero() -> None:
+    assert ulp(-5e-324, 5e-324) == 2
+    assert ulp(1, 2.0) is None
+
+
+def test_equal_messages_agree() -> None:
+    comparison = Comparison()
+    assert comparison.take("k", 1, event(), event())
+    assert (comparison.compared, comparison.differing, comparison.first) == (1, 0, None)
+
+
+@given(value=finite)
+def test_the_last_bit_of_a_number_is_a_difference_that_names_its_field(value: float) -> None:
+    other = math.nextafter(value, math.inf)
+    if not math.isfinite(other):
+        return
+    comparison = Comparison()
+    assert not comparison.take("joint/hip_left/event", 9, event(value), event(other))
+    first = comparison.first
+    assert first is not None
+    assert (first.field, first.tick, first.t_ns, first.ulp) == ("tau_after[0]", 9, 7, 1)
+    assert (first.recorded, first.recomputed) == (value, other)
+
+
+def test_minus_zero_is_not_zero() -> None:
+    comparison = Comparison()
+    assert not comparison.take("k", 1, event(0.0), event(-0.0))
+
+
+@pytest.mark.parametrize(("apart", "agrees"), [(0.9e-6, True), (1.1e-6, False)])
+def test_a_tolerance_is_for_numbers(apart: float, agrees: bool) -> None:
+    comparison = Comparison(1e-6)
+    assert comparison.take("k", 1, event(1.0), event(1.0 + apart)) is agrees
+    assert not comparison.take("k", 1, event(), event(cause=3))
+
+
+def test_first_and_largest_are_kept() -> None:
+    comparison = Comparison()
+    for tick, change in enumerate((1e-3, 5.0, 2.0)):
+        comparison.take("k", tick, event(1.0), event(1.0 + change))
+    assert comparison.first is not None
+    assert comparison.first.tick == 0
+    assert comparison.largest["k", "tau_after[0]"].tick == 1
+    assert comparison.differing == 3
+
+
+def test_a_memory_is_compared_value_by_value() -> None:
+    def snapshot(x: float) -> PlannerCheckpoint:
+        text = msgspec.json.encode({"law": {"q": [1.0, x]}}).decode()
+        return PlannerCheckpoint(t_ns=1, seq=1, session=3, snapshot=text)
+
+    comparison = Comparison()
+    comparison.take("planner/checkpoint", 4, snapshot(2.0), snapshot(3.0))
+    assert comparison.first is not None
+    assert comparison.first.field == "snapshot.law.q[1]"
+
+
+def test_a_long_value_is_cut_in_words() -> None:
+    comparison = Comparison()
+    one, other = (
+        PlannerCheckpoint(t_ns=1, seq=1, session=3, snapshot=text) for text in ("", "x" * 999)
+    )
+    comparison.take("k", 1, one, other)
+    assert comparison.first is not None
+    assert len(comparison.first.describe()) < 200

@@ -1,0 +1,249 @@
+"""A run's services executed again: every tick equal, and a changed parameter seen."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from services.simulator.physics.plant import PlantConfig, changed
+from shared.bus import topics
+from shared.config.impairment import Impairment
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Fault, Kill, Restart
+from shared.exceptions import FAULT_EXIT_CODE
+from shared.joints import MODULES
+from shared.mcap_log import provenance
+from tests.imu.robots import with_imu
+from tests.lockstep.runs import still
+from tests.shared.mcap_log.runs import state
+from tests.tools.exit_codes import exit_code
+from tests.tools.logs.reexecution.executions import executed
+from tools import cli
+from tools.logs.reexecution.outcome import ReexecutionResult
+from tools.logs.reexecution.params import with_params
+from tools.logs.reexecution.ranges import execute_range, merged, ranges_of
+from tools.logs.run_log import WHOLE, RunLog, RunPart, parts_of, read_run
+from tools.sim.recorded_lockstep import simulate
+from tools.verbs import resim
+
+
+@pytest.fixture(scope="module")
+def recorded(robot: RobotConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Record a run with a dead planner, a dead joint service and a fault in it, on a slope."""
+    scenario = still(
+        5.0,
+        height=1.1,
+        kill=(Kill(service="planner", at=1.0), Kill(service="knee_left", at=2.5)),
+        restart=(Restart(service="planner", at=1.5), Restart(service="knee_left", at=2.601)),
+        fault=(Fault(module="hip_right", kind="link_lost", at=4.3),),
+    )
+    folder = tmp_path_factory.mktemp("resim")
+    simulate(
+        with_imu(robot),
+        scenario,
+        Impairment(delay_ms=1.0, jitter_ms=0.5),
+        3,
+        folder,
+        true_plant=changed(PlantConfig(), {"floor.slope": [0.03, -0.02]}),
+    )
+    return folder / "run.mcap"
+
+
+@pytest.fixture
+def log(recorded: Path) -> RunLog:
+    return read_run(recorded)
+
+
+def edited(log: RunLog, key: str, change: list[Any]) -> None:
+    """Change the decoded messages of a key: others in their places, or some left out."""
+    series = log._series[key]
+    assert series.decoded is not None
+    if len(change) < len(series.decoded):
+        kept = {id(message) for message in change}
+        rows = zip(series.decoded, series.received_ns, strict=True)
+        series.received_ns = [received for message, received in rows if id(message) in kept]
+    series.decoded = change
+
+
+@pytest.mark.parametrize("name", ["planner", "knee_left"])
+def test_a_run_read_in_parts_is_executed_like_the_whole(log: RunLog, name: str) -> None:
+    parts = parts_of(log.index, part_s=0.7)
+    outcome, whole = executed(log, name, parts=parts), executed(log, name)
+    assert outcome.comparison.first is None
+    assert (outcome.ticks, outcome.skipped, outcome.starts) == (
+        whole.ticks, whole.skipped, whole.starts,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("range_s", [1.3, 3.0])
+def test_ranges_side_by_side_execute_every_tick_once_as_one_after_the_other(
+    log: RunLog, range_s: float
+) -> None:
+    """Each begins at a memory before it: what begins at a dead planner finds the next one's."""
+    names = ("planner", "knee_left", "hip_right")
+    tasks = ranges_of(log.index, WHOLE, names, 0.0, range_s=range_s, workers=4)
+    assert len(tasks) in {4, 8}, "as many for each worker"
+    assert len(ranges_of(log.index, WHOLE, names, 0.0, workers=4)) == 1, "it is short"
+    found = merged([pickle.loads(pickle.dumps(execute_range(task))) for task in tasks])  # noqa: S301
+    for outcome, name in zip(found, names, strict=True):
+        whole = executed(log, name)
+        assert outcome.comparison.first is None
+        assert outcome.ticks == whole.ticks
+        assert outcome.skipped == whole.skipped
+        assert outcome.lost_inputs == 0
+        assert outcome.comparison.compared == whole.comparison.compared
+
+
+def test_the_first_difference_is_that_of_the_first_range_that_has_one() -> None:
+    parts = [ReexecutionResult("planner", 0.0, exact=True) for _ in range(3)]
+    for part, q in zip(parts[1:], (0.2, 0.7), strict=True):
+        recorded = msgspec.structs.replace(state(1), q=(0.1, 0.0))
+        part.comparison.take("x", 7, recorded, msgspec.structs.replace(recorded, q=(q, 0.0)))
+        part.ticks = 5
+    (whole,) = merged([[part] for part in parts])
+    assert whole.comparison.first is not None
+    assert whole.comparison.first.recomputed == 0.2
+    (largest,) = whole.comparison.largest.values()
+    assert largest.recomputed == 0.7
+    assert (whole.ticks, whole.comparison.differing) == (10, 2)
+
+
+def test_a_part_of_a_run_is_executed_from_its_first_memory_on(log: RunLog) -> None:
+    part = RunLog(log.index, RunPart(3.0, 5.0), margin_s=1.0)
+    outcome = executed(log, "planner", parts=[part])
+    assert outcome.comparison.first is None
+    assert outcome.ticks > 100
+    assert outcome.lost_inputs == 0
+
+
+@pytest.mark.parametrize("name", resim.SERVICES)
+def test_every_tick_of_a_run_with_restarts_holds_and_a_fault_is_equal_bit_for_bit(
+    log: RunLog, name: str
+) -> None:
+    outcome = executed(log, name)
+    assert outcome.comparison.first is None
+    assert outcome.ticks > 900
+    assert outcome.lost_inputs == 0
+    assert outcome.skipped <= 4  # before the first memory of each planner
+    restarted = name in ("planner", "knee_left")
+    assert outcome.starts == (2 if restarted else 1)
+    assert outcome.comparison.compared > outcome.ticks // 3
+
+
+def test_in_the_record_a_service_began_out_of_step_and_was_brought_into_it(log: RunLog) -> None:
+    phases = [row.state_phase for row in log.messages(topics.JOINT_COMMAND, "knee_left")]
+    assert (phases[0], phases[-1]) == (0, 1)
+
+
+def test_the_planner_of_the_record_knew_the_slope(log: RunLog) -> None:
+    assert log.messages(topics.PLANNER_STATUS)[-1].slope == pytest.approx((0.03, -0.02), abs=0.02)
+
+
+def test_an_attitude_missing_in_the_log_is_reported(log: RunLog) -> None:
+    key = topics.ATTITUDE.key(log.robot)
+    second = [row for row in log.messages(topics.PLANNER_STATUS) if row.session != 1]
+    taken = second[300].attitude_seq
+    edited(log, key, [row for row in log.messages(topics.ATTITUDE) if row.seq != taken])
+    outcome = executed(log, "planner")
+    assert outcome.lost_inputs == 1
+    assert outcome.comparison.first is None
+
+
+def test_one_bit_in_one_recorded_command_is_found_where_it_was_taken(log: RunLog) -> None:
+    key = topics.JOINT_COMMAND.key(log.robot, "hip_left")
+    commands = list(log.messages(topics.JOINT_COMMAND, "hip_left"))
+    at = len(commands) // 2
+    a, b = commands[at].q_ref
+    commands[at] = msgspec.structs.replace(commands[at], q_ref=(a, b + 2.3e-16 * max(1.0, abs(b))))
+    edited(log, key, commands)
+    outcome = executed(log, "hip_left")
+    first = outcome.comparison.first
+    assert first is not None
+    assert commands[at].t_ns <= first.t_ns <= commands[at].t_ns + 200_000_000
+    assert executed(log, "hip_right").comparison.first is None
+
+
+def test_a_state_missing_in_the_log_is_reported_and_execution_resumes_at_the_next_snapshot(
+    log: RunLog,
+) -> None:
+    key = topics.JOINT_STATE.key(log.robot, "ankle_left")
+    states = list(log.messages(topics.JOINT_STATE, "ankle_left"))
+    statuses = log.messages(topics.PLANNER_STATUS)
+    second = [status for status in statuses if status.session != statuses[0].session]
+    taken = second[300].state_seq[MODULES.index("ankle_left")]
+    edited(log, key, [state for state in states if state.seq != taken])
+    outcome = executed(log, "planner")
+    assert outcome.lost_inputs == 1
+    assert outcome.starts == 3
+    assert 0 < outcome.skipped < 300
+    assert outcome.comparison.first is None
+
+
+def test_a_trace_that_the_log_lacks_does_not_let_the_service_go_on_from_a_guess(
+    log: RunLog,
+) -> None:
+    key = topics.JOINT_TRACE.key(log.robot, "ankle_left")
+    traces = list(log.messages(topics.JOINT_TRACE, "ankle_left"))
+    del traces[70]
+    edited(log, key, traces)
+    outcome = executed(log, "ankle_left")
+    assert outcome.starts == 2
+    assert outcome.comparison.first is None
+
+
+def test_a_difference_is_told_with_its_likely_reason_and_none_without(
+    recorded: Path,
+    robot: RobotConfig,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    versions = provenance.packages()
+    reason = f"numpy {versions['numpy']}, here 0.1"
+    words = ["resim", str(recorded), "--service", "planner", "--until-first-difference"]
+    monkeypatch.setattr(provenance, "packages", lambda: versions | {"numpy": "0.1"})
+    assert exit_code(words) == 0
+    assert reason not in capsys.readouterr().out
+    other = with_params(with_imu(robot), ["gains.k_p_x=2000"], "")
+    monkeypatch.setattr(resim, "robot_of", lambda _log: other)
+    assert exit_code(words) == FAULT_EXIT_CODE
+    assert reason in capsys.readouterr().out
+
+
+def test_a_changed_gain_changes_what_comes_out_from_the_first_tick_with_an_error_on(
+    log: RunLog, recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "changed.mcap"
+    changed_gain = ["--param", "gains.k_p_x=2000"]
+    code = cli.main(
+        ["resim", str(recorded), "--service", "planner", *changed_gain, "--out", str(out)]
+    )
+    assert code == 0
+    text = capsys.readouterr().out
+    assert "planner, first at" in text
+    assert "largest changes" in text
+    new = read_run(out)
+    assert new.metadata["resim"]["params"] == "gains.k_p_x=2000"
+    assert new.count(topics.SIM_TRUTH.key(log.robot)) == log.count(topics.SIM_TRUTH.key(log.robot))
+    old_commands = log.messages(topics.JOINT_COMMAND, "ankle_left")
+    new_commands = new.messages(topics.JOINT_COMMAND, "ankle_left")
+    assert 0.9 * len(old_commands) < len(new_commands) <= len(old_commands)
+    changed = {(c.session, c.seq): c for c in new_commands}
+    same = [c for c in old_commands if changed.get((c.session, c.seq)) == c]
+    assert len(same) < 0.5 * len(old_commands)
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_a_run_reports_how_many_of_its_cycles_were_traced(log: RunLog, module: str) -> None:
+    cycles = sum(len(trace.cycles) for trace in log.messages(topics.JOINT_TRACE, module))
+    states = log.messages(topics.JOINT_STATE, module)
+    expected = sum(state.cycle for state in states if _is_last(states, state))
+    assert cycles >= expected - 20 * 2
+
+
+def _is_last(states: list[Any], state: Any) -> bool:
+    index = states.index(state)
+    return index + 1 == len(states) or states[index + 1].cycle < state.cycle

@@ -1,1 +1,0 @@
-"""Analysis of logs: survey, reports, playback, re-execution."""

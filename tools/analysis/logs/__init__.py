@@ -1,1 +1,0 @@
-"""Surveys of logs, without holding them in memory."""

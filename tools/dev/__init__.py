@@ -1,0 +1,1 @@
+"""For those who work on this code: reference pages, mutants."""

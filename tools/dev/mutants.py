@@ -1,0 +1,277 @@
+"""`./deploy/mutants`: small changes to the code that keeps the robot standing must fail a test.
+
+The mutants are mutmut's. `tests/mutants.toml` names modules, by group the tests that hold them,
+and every mutant that may live, with the reason. A group runs in a folder of its own, which holds
+links to the project and mutmut's settings.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tomllib
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Final, NamedTuple
+
+import msgspec
+import tomli_w
+
+from shared.exceptions import FAULT_EXIT_CODE, RunError, XrlError
+from shared.toml_file import Section, read_toml
+from tools.number_arguments import count
+from tools.terminal import Console, marked
+
+ROOT: Final = Path(__file__).resolve().parents[2]
+FILE: Final = ROOT / "tests" / "mutants.toml"
+LEAST_SHARE: Final = 0.95
+"""Mutation score that is asked for: the share of mutants that fail a test."""
+SAMPLE: Final = "*__mutmut_7"
+"""The seventh mutant of every function that has seven: what CI runs."""
+DEAD: Final = frozenset(("killed", "timeout", "segfault"))
+UNTRIED: Final = "not checked"
+LINKED: Final = ("services", "shared", "tests", "tools", "deploy", "docs", "README.md")
+EXAMPLES: Final = """examples:
+  ./deploy/mutants                      all groups; an hour on two cores
+  ./deploy/mutants --group joint        one of them
+  ./deploy/mutants --only '*Failsafe*'  mutants by name
+  ./deploy/mutants --survivors          those that lived the last time
+  ./deploy/mutants --resume             go on with what was stopped
+"""
+
+
+class Group(Section, frozen=True):
+    """Modules, and the tests that are to hold them."""
+
+    name: str
+    modules: tuple[str, ...]
+    tests: tuple[str, ...]
+    without: tuple[str, ...] = ()
+    """Folders in these whose tests are about other modules."""
+
+
+class Mutation(Section, frozen=True, order=True):
+    """What a mutant is."""
+
+    function: str
+    """As mutmut names it, such as `services.joint.torque_limiter.x_limit_torque`."""
+    was: str
+    """The lines of code, stripped and joined by a space."""
+    becomes: str
+
+
+class Reason(Section, frozen=True):
+    """Why some mutants may live."""
+
+    why: Annotated[str, msgspec.Meta(min_length=20)]
+    lives: tuple[Mutation, ...]
+
+
+class MutantsFile(Section, frozen=True):
+    """The whole file."""
+
+    group: tuple[Group, ...]
+    reason: tuple[Reason, ...] = ()
+
+
+class GroupResult(NamedTuple):
+    """What became of a group."""
+
+    counts: Counter[str]
+    """Mutants by mutmut's word for what became of them."""
+    alive: list[tuple[str, Mutation]]
+    """Names and changes of those that live."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the groups; 0 if few live, and each of them is in the file."""
+    args = _parser().parse_args(argv)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as Ctrl-C does
+    console = Console(highlight=False)
+    try:
+        listed = read_toml(FILE, MutantsFile)
+        known = {group.name: group for group in listed.group}
+        names = args.group or ([listed.group[0].name] if args.sample else list(known))
+        for name in names:
+            if name not in known:
+                raise RunError(f"--group {name}: there are {', '.join(known)}")
+        return _judge([_run(known[name], args, console) for name in names], listed, args, console)
+    except XrlError as error:
+        console.print(f"mutants: {error}", style="red")
+        return error.exit_code
+    except KeyboardInterrupt:
+        console.print("stopped; go on with: ./deploy/mutants --resume")
+        return 130
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="./deploy/mutants",
+        description=__doc__.split("\n", 1)[0] if __doc__ else None,
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--group", action="append", help="only this group; may be repeated")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--only", metavar="PATTERN", help="only mutants whose name matches")
+    which.add_argument("--sample", action="store_true", help="a fixed sample of the first group")
+    which.add_argument("--survivors", action="store_true", help="those that lived the last time")
+    which.add_argument("--resume", action="store_true", help="go on with a run that was stopped")
+    parser.add_argument("--children", type=count, default=os.cpu_count(), help="processes")
+    parser.add_argument(
+        "--out", type=Path, default=ROOT / "out" / "mutants", help="folder (out/mutants)"
+    )
+    return parser
+
+
+def _run(group: Group, args: argparse.Namespace, console: Console) -> GroupResult:
+    """Run one group."""
+    folder = args.out.resolve() / group.name
+    patterns = [args.only] if args.only else [SAMPLE] if args.sample else []
+    if args.survivors:
+        patterns = [name for name, status in _statuses(folder) if status not in {*DEAD, UNTRIED}]
+        if not patterns:
+            raise RunError(f"group {group.name}: none lived the last time, or it never ran")
+    elif not args.resume and folder.exists():
+        shutil.rmtree(folder)
+    _prepare(group, folder)
+    console.print(
+        marked("[bold]{}[/]: {} modules; log: {}/run.log", group.name, len(group.modules), folder)
+    )
+    _mutmut_run(folder, ["--max-children", str(args.children), *patterns], console)
+    ran = [row for row in _statuses(folder) if row[1] != UNTRIED]
+    alive = [
+        (name, change_of(name, _mutmut(folder, "show", name)))
+        for name, status in ran
+        if status not in DEAD
+    ]
+    return GroupResult(Counter(status for _, status in ran), alive)
+
+
+def _prepare(group: Group, folder: Path) -> None:
+    """Make a group's folder: links to the project, and mutmut's settings."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in LINKED:
+        link = folder / name
+        if not link.is_symlink():
+            link.symlink_to(ROOT / name)
+    for module in group.modules:
+        if not (ROOT / module).is_file():
+            raise RunError(f"{FILE.name}, group {group.name}: there is no {module}")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    settings = {
+        "source_paths": ["services", "shared"],
+        "only_mutate": list(group.modules),
+        "also_copy": ["tools", "deploy", "docs", "README.md"],
+        "pytest_add_cli_args": [
+            "-m", "not system", "-p", "no:cacheprovider", "--hypothesis-profile", "mutants",
+            *(f"--ignore={folder}" for folder in group.without),
+        ],
+        "pytest_add_cli_args_test_selection": list(group.tests),
+        "timeout_multiplier": 8.0,
+        "timeout_constant": 20.0,  # beside other work
+    }  # fmt: skip
+    text = tomli_w.dumps({"tool": {"pytest": project["tool"]["pytest"], "mutmut": settings}})
+    (folder / "pyproject.toml").write_text(text, encoding="utf-8")
+
+
+def _mutmut_run(folder: Path, words: Sequence[str], console: Console) -> None:
+    """Run mutmut; its own words go into run.log, its count is shown.
+
+    Raises:
+        RunError: it failed before the first mutant.
+    """
+    command = [sys.executable, "-m", "mutmut", "run", *words]
+    with (
+        (folder / "run.log").open("w", encoding="utf-8") as log,
+        subprocess.Popen(
+            command,
+            cwd=folder,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,  # with the processes of its own that it leaves behind
+        ) as process,
+        console.status("mutating, and running the tests as they are") as status,
+    ):
+        assert process.stdout is not None  # noqa: S101 - it is a pipe
+        try:
+            for line in process.stdout:
+                log.write(line)
+                if "/" in line and "🎉" in line:
+                    status.update(line.strip())
+        except BaseException:
+            os.killpg(process.pid, signal.SIGKILL)
+            raise
+    if process.returncode != 0:
+        last = (folder / "run.log").read_text(encoding="utf-8").strip().splitlines()[-3:]
+        raise RunError(f"mutmut ended with {process.returncode}: {' / '.join(last)}")
+
+
+def _mutmut(folder: Path, *words: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-m", "mutmut", *words],
+        cwd=folder, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    return done.stdout
+
+
+def _statuses(folder: Path) -> list[tuple[str, str]]:
+    """Return each mutant of a group with mutmut's word for what became of it."""
+    if not folder.exists():
+        return []
+    lines = _mutmut(folder, "results", "--all", "true").splitlines()
+    pairs = [line.strip().partition(": ") for line in lines if "__mutmut_" in line]
+    return [(name, status) for name, _, status in pairs]
+
+
+def change_of(name: str, shown: str) -> Mutation:
+    """Return what a mutant changes.
+
+    Args:
+        name: mutmut's, such as `services.joint.torque_limiter.x_limit_torque__mutmut_3`.
+        shown: its unified diff.
+    """
+    lines = [line for line in shown.splitlines() if not line.startswith(("---", "+++"))]
+    was, becomes = (
+        " ".join(line[1:].strip() for line in lines if line.startswith(sign)) for sign in "-+"
+    )
+    return Mutation(name.rpartition("__mutmut_")[0], was, becomes)
+
+
+def _judge(
+    groups: Sequence[GroupResult], told: MutantsFile, args: argparse.Namespace, console: Console
+) -> int:
+    """Print the score and who lives; return the exit code."""
+    counts = sum((found.counts for found in groups), Counter[str]())
+    total, dead = counts.total(), sum(counts[word] for word in DEAD)
+    if not total:
+        raise RunError("no mutant has such a name")
+    listed = {change for reason in told.reason for change in reason.lives}
+    alive = [row for found in groups for row in found.alive]
+    unlisted = [(name, change) for name, change in alive if change not in listed]
+    for name, change in unlisted:
+        console.print(f"lives: {name}", style="red")
+        console.print(f"  - {change.was}\n  + {change.becomes}", markup=False, soft_wrap=True)
+    whole = not (args.only or args.sample or args.survivors or args.group)
+    stale = listed - {change for _, change in alive} if whole else set()
+    for change in sorted(stale):
+        text = f"listed, and does not live: {change.function}: {change.becomes}"
+        console.print(text, markup=False, soft_wrap=True)
+    console.print(
+        f"{dead} of {total} mutants fail a test ({dead / total:.1%}); {len(alive)} live, "
+        f"{len(alive) - len(unlisted)} of them for a reason in {FILE.relative_to(ROOT)}"
+    )
+    low = dead < LEAST_SHARE * total and not (args.only or args.survivors)
+    if low:
+        console.print(f"at least {LEAST_SHARE:.0%} are to fail one", style="red")
+    return FAULT_EXIT_CODE if unlisted or stale or low else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

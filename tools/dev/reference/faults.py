@@ -1,0 +1,84 @@
+"""The page of faults: what goes wrong, what then happens, what a person does, from the tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+from shared.config.files import load
+from shared.config.scenarios import FAULT_KINDS
+from shared.config.sections import TripLimit, TripsConfig
+from shared.places import DEFAULT_CONFIG
+from shared.robot.fault_table import DRIVE_FAULTS, LOSSES
+from shared.robot.trip_table import JOINT_TRIPS, PLANNER_TRIPS, TripRow
+from tools.dev.reference.field_docs import one_line
+
+_INTRODUCTION: Final = """\
+# Faults
+
+`xrl faults` prints this page's tables. Lockstep tests hold the robot to each row of the first two
+tables, and `xrl crashtest` does so live. A module that lost torque is never re-armed automatically,
+even if its service restarts: a person mends the cause, then restarts the service.
+
+## A fault of a drive
+
+The module goes to FAULT and the planner holds the other five. An axis that disarms floats; its
+sibling keeps its torque until the service idles it, at once. To see one:
+`xrl sim --fault knee_left:encoder@4`.
+"""
+_LOSSES: Final = """
+## A lost process or link, and the emergency stop
+"""
+_TRIPS: Final = """
+## Trips
+
+A trip takes the robot out of being led: a module, or the planner, notices that a quantity is beyond
+its limit, and all six modules go to HOLD. Limits are those of `[trips]` in `deploy/robot.toml`.
+"""
+
+
+def page() -> str:
+    """Return the page in Markdown."""
+    return "\n".join(_lines()).rstrip() + "\n"
+
+
+def _lines() -> Iterator[str]:
+    yield _INTRODUCTION
+    yield "| fault | what it is | the drive | limp | zero lost | cause | what a person does |"
+    yield "|---|---|---|---|---|---|---|"
+    for kind, row in DRIVE_FAULTS.items():
+        cells = (
+            f"`{kind}`",
+            FAULT_KINDS[kind].about,
+            row.drive,
+            "yes" if row.limp else "no",
+            "yes" if row.zero_lost else "no",
+            f"`{row.cause.name}`",
+            row.recovery,
+        )
+        yield _row(cells)
+    yield _LOSSES
+    yield "| lost | its module, or all six | the others | what you see | recovery |"
+    yield "|---|---|---|---|---|"
+    for name, loss in LOSSES.items():
+        yield _row((name, *loss))
+    yield _TRIPS
+    yield "| trip | noticed by | measured | limit | what a person does |"
+    yield "|---|---|---|---|---|"
+    limits = load(DEFAULT_CONFIG).trips
+    for cause, trip in JOINT_TRIPS.items():
+        yield _trip(cause.name, "the module", trip, limits)
+    for number, trip in PLANNER_TRIPS.items():
+        yield _trip(number.name, "the planner", trip, limits)
+
+
+def _trip(name: str, by: str, row: TripRow, limits: TripsConfig) -> str:
+    limit: TripLimit = getattr(limits, row.key)
+    lasting = f" for {limit.after_ms:g} ms" if limit.after_ms else ""
+    side = "below" if row.least else "above"
+    shown = f"{side} {limit.limit:g} {row.unit}{lasting}"
+    return _row((f"`{name}`", by, row.measured, shown, row.recovery))
+
+
+def _row(cells: tuple[str, ...]) -> str:
+    return "| " + " | ".join(one_line(cell) for cell in cells) + " |"

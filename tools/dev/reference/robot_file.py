@@ -1,0 +1,201 @@
+"""The page of the robot file: every key with type, unit, range and default."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Annotated, Any, Final, Literal, get_args, get_origin, get_type_hints
+
+import msgspec
+
+from shared.config import files as config_file
+from shared.config.gain_schedule import inputs_of
+from shared.config.robot_config import RobotConfig
+from shared.places import DEFAULT_CONFIG
+from shared.toml_file import Range
+from tools.dev.reference.field_docs import field_docs, one_line, summary
+
+_INTRODUCTION: Final = """\
+# The robot file
+
+`deploy/robot.toml` holds the whole robot; `--config FILE` names another one. An unknown key or an
+impossible value is refused with the file, the key, the value and what would be right. `assumed`
+lists the values that the paper does not give; measure them on your robot and take them off the
+list.
+
+A unit of `1` is a plain number. *Default* is what holds when the key is missing; a key without a
+default must be there. *Shipped* is the value in `deploy/robot.toml`.
+
+After a change of one of these run `xrl gains`, because the gain schedule beside the file depends on
+them: {inputs}.
+`law.lead_easing` does so only beyond the value for which the schedule was made.
+"""
+_LONGEST: Final = 60
+"""Characters of a shipped value that fit a cell."""
+_NOT_IN_THE_FILE: Final = "gain_schedule"
+"""Read from the file beside it (`shared.config.gain_schedule`)."""
+
+
+def page() -> str:
+    """Return the page in Markdown."""
+    text = DEFAULT_CONFIG.read_text(encoding="utf-8")
+    shipped = _Shipped(text)
+    lines = [_INTRODUCTION.format(inputs=_schedule_inputs()), "## Top level", ""]
+    lines += _table(RobotConfig, "", shipped)
+    for name, hint in get_type_hints(RobotConfig, include_extras=True).items():
+        section = _section(hint)
+        if section is not None and name != _NOT_IN_THE_FILE:
+            lines += _sections(section, name, shipped)
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _schedule_inputs() -> str:
+    """Return the keys on which the gain schedule depends; a whole table as `[table]`."""
+    config = config_file.load(DEFAULT_CONFIG)
+    keys: dict[str, list[str]] = {}
+    aside = msgspec.structs.replace(config.mass, payload_com=(0.1, 0.0, 0.0))
+    # a key that the schedule forgets while it is zero counts as well
+    for key in inputs_of(msgspec.structs.replace(config, mass=aside)):
+        section, _, name = key.partition(".")
+        keys.setdefault(section, []).append(name)
+    shown = []
+    for section, names in keys.items():
+        whole = {field.name for field in msgspec.structs.fields(getattr(config, section))}
+        named = [f"`{section}.{name}`" for name in names]
+        shown += [f"`[{section}]`"] if whole.issubset(names) else named
+    return ", ".join(shown)
+
+
+class _Shipped:
+    """Values and comments of the shipped file, by full key."""
+
+    def __init__(self, text: str) -> None:
+        self.values: dict[str, str] = {}
+        self.comments: dict[str, str] = {}
+        above: list[str] = []
+        table = ""
+        for line in _joined(text.splitlines()):
+            if re.match(r"#\s*[\w.]+\s*=", line):
+                continue  # a key that is commented out
+            if line.startswith("#"):
+                above.append(line.lstrip("# "))
+                continue
+            header = re.match(r"\[+([\w.]+)\]+\s*(?:#\s*(.*))?$", line)
+            entry = re.match(r"([\w.]+)\s*=\s*(.*?)(?:\s+#\s*([^\"]*))?$", line)
+            if header:
+                table = header[1] + "."
+                self._comment(header[1], above, header[2])
+            elif entry:
+                key = table + entry[1]
+                self.values.setdefault(key, entry[2])
+                self._comment(key, above, entry[3])
+            above = []
+
+    def _comment(self, key: str, above: list[str], beside: str | None) -> None:
+        text = " ".join([*above, beside or ""]).strip()
+        if text:
+            self.comments.setdefault(key, one_line(text))
+
+
+def _joined(lines: list[str]) -> Iterator[str]:
+    """Yield the lines, with an array over several lines on one."""
+    pending = ""
+    for line in lines:
+        pending = f"{pending} {line.strip()}".strip() if pending else line.strip()
+        code = pending.partition("#")[0]
+        if not pending.startswith("#") and "=" in code and code.count("[") > code.count("]"):
+            continue
+        yield pending
+        pending = ""
+
+
+def _section(hint: Any) -> type[msgspec.Struct] | None:
+    """Return the struct of a table, of an array of tables or of a table of tables."""
+    for part in (hint, *get_args(hint)):
+        if isinstance(part, type) and issubclass(part, msgspec.Struct):
+            return part
+    return None
+
+
+def _sections(section: type[msgspec.Struct], key: str, shipped: _Shipped) -> Iterator[str]:
+    yield f"## [{key}]\n"
+    yield summary(section) + "\n"
+    yield from _table(section, f"{key}.", shipped)
+    for name, hint in get_type_hints(section, include_extras=True).items():
+        part = _section(hint)
+        if part is not None and not _same_as_sibling(section, name):
+            yield from _sections(part, f"{key}.{name}", shipped)
+
+
+def _same_as_sibling(section: type[msgspec.Struct], name: str) -> bool:
+    """Return True if an earlier field has the same struct: its table is shown once."""
+    hints = get_type_hints(section, include_extras=True)
+    earlier = [other for other in hints if other == name or hints[other] == hints[name]]
+    return earlier[0] != name
+
+
+def _table(section: type[msgspec.Struct], prefix: str, shipped: _Shipped) -> Iterator[str]:
+    docs = field_docs(section)
+    hints = get_type_hints(section, include_extras=True)
+    fields = {field.name: field for field in msgspec.structs.fields(section)}
+    yield "| key | type | unit | range | default | shipped | meaning |"
+    yield "|---|---|---|---|---|---|---|"
+    for name, hint in hints.items():
+        if name == _NOT_IN_THE_FILE:
+            continue
+        if _section(hint) is not None:
+            yield f"| `{name}` | table | | | | | {docs.get(name, '') or _see(prefix, name)} |"
+            continue
+        kind, unit, limits = _described(hint)
+        default = _default(fields[name])
+        value = shipped.values.get(prefix + name, "")
+        value = f"`{value}`" if value and len(value) <= _LONGEST else ""
+        meaning = _meaning(docs.get(name, ""), shipped.comments.get(prefix + name, ""))
+        yield f"| `{name}` | {kind} | {unit} | {limits} | {default} | {value} | {meaning} |"
+    yield ""
+
+
+def _see(prefix: str, name: str) -> str:
+    return f"see `[{prefix}{name}]`"
+
+
+def _meaning(doc: str, comment: str) -> str:
+    return doc or comment
+
+
+def _default(field: msgspec.structs.FieldInfo) -> str:
+    if field.required:
+        return ""
+    value = field.default_factory() if field.default is msgspec.NODEFAULT else field.default
+    if isinstance(value, tuple):
+        return f"`[{', '.join(map(repr, value))}]`"
+    return f"`{value!r}`" if not isinstance(value, bool) else f"`{str(value).lower()}`"
+
+
+def _described(hint: Any) -> tuple[str, str, str]:
+    """Return type, unit and range of a key."""
+    origin, args = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        limits = next(meta for meta in args[1:] if isinstance(meta, Range))
+        return args[0].__name__, limits.unit, f"{limits.low:g} .. {limits.high:g}"
+    if origin is Literal:
+        return " or ".join(f"`{_toml(value)}`" for value in args), "", ""
+    if origin is tuple:
+        return _array(args)
+    if origin is dict:
+        return f"table of {_described(args[1])[0]}", "", ""
+    return getattr(hint, "__name__", str(hint)), "", ""
+
+
+def _array(args: tuple[Any, ...]) -> tuple[str, str, str]:
+    if args[-1] is Ellipsis:
+        kind, unit, limits = _described(args[0])
+        return f"array of {kind}", unit, limits
+    parts = [_described(part) for part in args]
+    kind = parts[0][0]
+    units, ranges = (list(dict.fromkeys(part[i] for part in parts)) for i in (1, 2))
+    return f"array of {len(parts)}: {kind}", ", ".join(units), "; ".join(ranges)
+
+
+def _toml(value: object) -> str:
+    return f'"{value}"' if isinstance(value, str) else str(value)

@@ -1,0 +1,121 @@
+"""The page of topics and messages, from `shared.bus.topics` and the message structs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from enum import IntEnum
+from typing import Final, get_args, get_origin, get_type_hints
+
+import msgspec
+
+from shared.bus import messages, topics
+from shared.bus.topics import Topic
+from shared.joints import MODULES
+from shared.mcap_log.schema import ENUMERATIONS
+from tools.dev.reference.field_docs import field_docs, one_line, summary
+
+ENUMS: Final[tuple[type[IntEnum], ...]] = tuple(
+    sorted(set(ENUMERATIONS.values()), key=lambda enum: enum.__name__)
+)
+
+_INTRODUCTION: Final = """\
+# Topics and messages
+
+Every key on the bus is `xrl/<robot>/<topic>`; `*` stands for a module's name. Payloads are JSON,
+SI units, times in ns on the sender's monotonic clock, enumerations as integers. A suffix is a unit
+(`_ns`, `_ms`, `_s`, `_n` for newtons). The rate is the nominal one of `deploy/robot.toml`.
+All topics are recorded unless the table says otherwise.
+"""
+
+
+def page() -> str:
+    """Return the page in Markdown."""
+    return "\n".join(_lines()).rstrip() + "\n"
+
+
+def _lines() -> Iterator[str]:
+    yield _INTRODUCTION
+    yield "| topic | message | rate | priority | from | to | purpose |"
+    yield "|---|---|---|---|---|---|---|"
+    for topic in topics.TOPICS:
+        yield _topic_row(topic)
+    yield ""
+    yield "## Messages\n"
+    yield "Each message begins with the two fields of the base:\n"
+    yield from _fields(messages.Message, own=True)
+    for kind in dict.fromkeys(topic.type for topic in topics.TOPICS):
+        yield from _message(kind)
+    yield "## Enumerations\n"
+    for enum in ENUMS:
+        yield from _enumeration(enum)
+
+
+def _topic_row(topic: Topic) -> str:
+    rate = f"{topic.rate_hz:g} Hz" if topic.rate_hz else "event"
+    recorded = "" if topic.recorded else " (not recorded)"
+    link = f"[{topic.type.__name__}](#{topic.type.__name__.lower()})"
+    priority = topic.priority.name.lower().replace("_", " ")
+    why = f"{one_line(topic.why)}{recorded}"
+    sides = f"{_names(topic.writers)} | {_names(topic.readers)}"
+    return f"| `{topic.name}` | {link} | {rate} | {priority} | {sides} | {why} |"
+
+
+def _names(names: Sequence[str]) -> str:
+    if tuple(names) == MODULES:
+        return "all modules"
+    return ", ".join("its module" if name == "*" else name for name in names)
+
+
+def _message(kind: type[msgspec.Struct]) -> Iterator[str]:
+    names = ", ".join(f"`{topic.name}`" for topic in topics.TOPICS if topic.type is kind)
+    yield f"### {kind.__name__}\n"
+    yield f"On {names}. {summary(kind)}\n"
+    yield from _fields(kind)
+    for part in _parts(kind):
+        yield f"### {part.__name__}\n"
+        yield f"Part of [{kind.__name__}](#{kind.__name__.lower()}). {summary(part)}\n"
+        yield from _fields(part, own=True)
+
+
+def _parts(kind: type[msgspec.Struct]) -> Iterator[type[msgspec.Struct]]:
+    """Yield the structs that a message's fields hold."""
+    for hint in get_type_hints(kind).values():
+        for part in (hint, *get_args(hint)):
+            if isinstance(part, type) and issubclass(part, msgspec.Struct):
+                yield part
+
+
+def _fields(kind: type[msgspec.Struct], *, own: bool = False) -> Iterator[str]:
+    docs, hints = field_docs(kind), get_type_hints(kind)
+    base = () if own else messages.Message.__struct_fields__
+    fields = [name for name in kind.__struct_fields__ if name not in base]
+    if not fields:
+        yield "No fields of its own.\n"
+        return
+    yield "| field | type | meaning |"
+    yield "|---|---|---|"
+    for name in fields:
+        enum = ENUMERATIONS.get((kind, name))
+        shown = f"[{enum.__name__}](#{enum.__name__.lower()})" if enum else _type(hints[name])
+        yield f"| `{name}` | {shown} | {docs.get(name, '')} |"
+    yield ""
+
+
+def _type(hint: object) -> str:
+    if get_origin(hint) is not tuple:
+        return getattr(hint, "__name__", str(hint))
+    args = get_args(hint)
+    if args[-1] is Ellipsis:
+        return f"{_type(args[0])}[]"
+    return f"{_type(args[0])}[{len(args)}]"
+
+
+def _enumeration(enum: type[IntEnum]) -> Iterator[str]:
+    docs = field_docs(enum)
+    yield f"### {enum.__name__}\n"
+    yield f"{summary(enum)}\n"
+    yield "| value | name | meaning |"
+    yield "|---|---|---|"
+    for member in enum:
+        yield f"| {member.value} | `{member.name}` | {docs.get(member.name, '')} |"
+    yield ""

@@ -1,0 +1,1 @@
+"""What a run was worth: verdict, soundness, stalls, figures, report."""

@@ -1,0 +1,221 @@
+"""First time at which each figure exceeds its limit, for the timeline. Pure.
+
+The search for the cause of a fall begins at the earliest violation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.bus import topics
+from shared.bus.messages import PlannerMode
+from shared.joints import JOINTS, MODULES
+from tools.judge import stalls
+from tools.judge.reports.page_model import TimelineEvent
+from tools.judge.reports.run_data import RunData
+from tools.judge.reports.signals import Array
+from tools.judge.verdict import leading
+from tools.judge.verdict_limits import LIMITS
+
+TOGETHER_S: Final = 0.1
+"""Equal violations of several modules or joints within this time share one row."""
+TORQUE_DURATION_MIN_S: Final = 0.02
+"""Shorter times at the torque limit, in total, are not reported."""
+AT_LIMIT: Final = 0.999
+"""Fraction of a module's torque limit from which the torque counts as limited."""
+
+TORQUE: Final = "torque at its limit"
+
+ALLOWED: Final = {row.key: (row.limit, row.unit) for row in LIMITS}
+WORLD: Final = (
+    ("COM x", "com", 0, 1e3, "alive_com_x_max_mm", "hold_com_x_max_mm"),
+    ("COM y", "com", 1, 1e3, "alive_com_y_max_mm", "hold_com_y_max_mm"),
+    ("roll", "angles", 0, 1.0, "alive_roll_max_rad", ""),
+    ("yaw", "angles", 2, 1.0, "alive_yaw_max_rad", ""),
+    ("right sole's tilt", "foot_right_tilt", 0, 1.0, "alive_sole_tilt_max_rad", ""),
+    ("left sole's tilt", "foot_left_tilt", 0, 1.0, "alive_sole_tilt_max_rad", ""),
+    ("operator's force", "operator_force", 2, 1.0, "operator_peak_n", ""),
+)
+"""(name, field of `SimTruth`, index in the field, scale, key of the verdict's limit while the
+planner leads, key while it does not lead); an empty key: no limit."""
+
+
+class Violation(NamedTuple):
+    """Time that one figure spent beyond its limit."""
+
+    what: str
+    """The limit."""
+    name: str
+    """The figure, module or joint."""
+    t: float
+    """First time beyond the limit, s."""
+    duration_s: float
+    """Total time beyond the limit."""
+    least: float = math.inf
+    """Least value, of a figure that has a lower limit."""
+
+    def joined(self, later: Violation) -> Violation:
+        """Return it with what a later part of the run has of it."""
+        return self._replace(
+            duration_s=self.duration_s + later.duration_s, least=min(self.least, later.least)
+        )
+
+
+class LimitViolations:
+    """The violations of a run, whose parts are taken one after the other.
+
+    The simulated world has the limits of the verdict (docs/results.md#targets); torques, joints
+    and margins have those of the robot file.
+    """
+
+    def __init__(self) -> None:
+        self._found: dict[tuple[str, str], Violation] = {}
+
+    def take(self, run: RunData) -> None:
+        """Take a run, or the next part of it."""
+        for find in (_world, _torques, _stops, _margins):
+            for new in find(run):
+                old = self._found.get((new.what, new.name))
+                self._found[new.what, new.name] = new if old is None else old.joined(new)
+
+    def events(self) -> Iterator[TimelineEvent]:
+        """Yield the first violation of each limit, in no order."""
+        found = [one for one in self._found.values() if one.duration_s >= _duration_min_s(one)]
+        for group in _together(found):
+            yield _event(group)
+
+
+def limit_violations(run: RunData) -> list[TimelineEvent]:
+    """Return the first violation of each limit of a whole run, in no order."""
+    found = LimitViolations()
+    found.take(run)
+    return list(found.events())
+
+
+def first_violation(what: str, name: str, t: Array, beyond: NDArray[np.bool_]) -> Violation | None:
+    """Return the first time beyond a limit and the total duration; None if there is none.
+
+    Args:
+        what: the limit.
+        name: the figure, module or joint.
+        t: times, s, not falling.
+        beyond: True where the limit is exceeded; one for each time.
+    """
+    if not beyond.any():
+        return None
+    steps = np.append(np.diff(t), 0.0)
+    usual = float(np.median(steps[:-1])) if len(steps) > 1 else 0.0
+    duration = float(np.minimum(steps, 5.0 * usual)[beyond].sum())
+    return Violation(what, name, float(t[int(np.argmax(beyond))]), duration)
+
+
+def _world(run: RunData) -> Iterator[Violation]:
+    """Yield violations of the verdict's limits, over the time that the verdict judges."""
+    if run.course is None:
+        return
+    t = run.course.t + run.at(run.course.zero_ns)
+    times_ns = np.array([row.t_ns for row in run.course.rows])
+    leads = leading(run.log, times_ns)
+    stalled = stalls.inside(stalls.disturbances(run.log, times_ns[0], times_ns[-1]), times_ns)
+    inside = run.inside(t) & ~stalled
+    for name, field, index, scale, leading_key, other_key in WORLD:
+        rows = np.array([getattr(row, field) for row in run.course.rows], dtype=np.float64)
+        values = np.abs(rows if rows.ndim == 1 else rows[:, index]) * scale
+        for key, mask, condition in (
+            (leading_key, leads, "while the planner leads"),
+            (other_key, ~leads, "while the planner does not lead"),
+        ):
+            if not key:
+                continue
+            most, unit = ALLOWED[key]
+            what = f"over {most:g} {unit}, the limit {condition}"
+            found = first_violation(what, name, t, (values > most) & mask & inside)
+            if found is not None:
+                yield found
+
+
+def _torques(run: RunData) -> Iterator[Violation]:
+    if run.robot is None:
+        return
+    most = run.robot.joint.tau_module_max
+    for module in MODULES:
+        (tau,) = run.columns(topics.JOINT_STATE, module, "tau")
+        if not len(tau):
+            continue
+        t = run.times(topics.JOINT_STATE, module)
+        at_limit = np.abs(tau).sum(axis=1) >= AT_LIMIT * most
+        what = f"{TORQUE} of {most:g} N m"
+        found = first_violation(what, module, t, at_limit & run.inside(t))
+        if found is not None:
+            yield found
+
+
+def _stops(run: RunData) -> Iterator[Violation]:
+    if run.robot is None:
+        return
+    limits = run.robot.joint_limits()
+    armed_s = run.armed_s()
+    for number, joint in enumerate(JOINTS):
+        module = MODULES[number // 2]
+        (q,) = run.columns(topics.JOINT_STATE, module, "q")
+        if not len(q):
+            continue
+        low, high = limits[number]
+        angle = q[:, number % 2]
+        t = run.times(topics.JOINT_STATE, module)
+        outside = (angle < low) | (angle > high)
+        found = first_violation(
+            "beyond a soft stop", joint, t, outside & (t >= armed_s) & run.inside(t)
+        )
+        if found is not None:
+            yield found
+
+
+def _margins(run: RunData) -> Iterator[Violation]:
+    if run.robot is None:
+        return
+    certificate = run.robot.certificate
+    mode, service, onboard = run.columns(
+        topics.PLANNER_STATUS, "", "mode", "margin", "margin_onboard"
+    )
+    t = run.times(topics.PLANNER_STATUS)
+    has_margin = ~np.isin(mode, (PlannerMode.WAITING, PlannerMode.MISPLACED)) & run.inside(t)
+    for name, values, least in (
+        ("margin of the joint services alone", service, certificate.margin_min),
+        ("margin of the drives alone", onboard, certificate.onboard_margin_min),
+    ):
+        below = (values < least) & has_margin
+        found = first_violation(f"under {least:g}", name, t, below)
+        if found is not None:
+            yield found._replace(least=float(values[below].min()))
+
+
+def _duration_min_s(found: Violation) -> float:
+    return TORQUE_DURATION_MIN_S if found.what.startswith(TORQUE) else 0.0
+
+
+def _together(found: Sequence[Violation]) -> list[list[Violation]]:
+    """Group violations of the modules or joints that began at about the same time."""
+    groups: list[list[Violation]] = []
+    for one in sorted(found, key=lambda violation: (violation.what, violation.t)):
+        before = groups[-1] if groups else []
+        many = one.name in (*MODULES, *JOINTS)
+        if many and before and before[0].what == one.what and one.t - before[0].t <= TOGETHER_S:
+            before.append(one)
+        else:
+            groups.append([one])
+    return groups
+
+
+def _event(group: Sequence[Violation]) -> TimelineEvent:
+    names = ", ".join(one.name for one in group)
+    longest = max(one.duration_s for one in group)
+    least = min(one.least for one in group)
+    down = f", down to {least:.3g}" if math.isfinite(least) else ""
+    text = f"{names}: {group[0].what}{down}, for the first time; {longest:.2f} s in total"
+    return TimelineEvent(group[0].t, "limit", text)

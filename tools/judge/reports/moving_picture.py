@@ -1,0 +1,243 @@
+"""The moving picture of a run: the robot from the side and from the front, as an animated GIF."""
+
+from __future__ import annotations
+
+import bisect
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageColor, ImageDraw
+
+from shared.atomic_file import atomic_file
+from shared.bus import topics
+from shared.bus.messages import Mode, RunEvent, RunEventKind
+from shared.clock import NS_PER_S
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import RunError
+from shared.joints import MODULES, SIDES
+from tools.judge.reports import scene
+from tools.judge.reports.canvas import SCALE, Canvas, Point
+from tools.judge.reports.moving_curves import WIDTH, Curves
+from tools.judge.reports.scene import RobotPose
+from tools.logs.run_log import RunLog
+
+Array = NDArray[np.float64]
+
+FRAMES_S: Final = 12.5
+"""Frames per second; a GIF counts in hundredths of a second."""
+SIZE: Final = (640, 400)
+COLOURS_MAX: Final = 64
+MIXTURES: Final = 4
+"""Shades of each ink, for smooth edges."""
+PX_PER_M: Final = 200.0
+GROUND_Y: Final = 365.0
+PX_PER_N: Final = 0.9
+VIEWS: Final = ((170.0, 0, 1.0), (465.0, 1, -1.0))
+"""Centre, px; which horizontal axis (0: x, from the side; 1: y, from the front); its sign."""
+BACKGROUND, INK, LINK, TORSO, COM_INK = "#ffffff", "#30363d", "#7b858f", "#c9d1d9", "#0d5ea6"
+HAND_INK, PUSH_INK = "#c44f1c", "#8c3399"
+MODE_INK: Final[dict[int, str]] = {
+    Mode.DISARMED: "#8a8f98",
+    Mode.HOLD: "#d98f1f",
+    Mode.TRACK: "#2e8a5c",
+    Mode.DAMP: "#8254b8",
+    Mode.FAULT: "#bf382b",
+}
+
+
+class Caption(NamedTuple):
+    """Caption of the picture from a time on."""
+
+    t_ns: int
+    text: str
+
+
+def write_gif(
+    log: RunLog,
+    robot: RobotConfig,
+    path: Path,
+    progress: Callable[[float], None],
+    *,
+    with_curves: bool = False,
+) -> int:
+    """Draw a run, from its scenario's begin, and return the number of frames.
+
+    Args:
+        log: the run; with the simulated world's truth, or as the legs know the torso.
+        robot: its robot.
+        path: the GIF; replaced if it exists.
+        progress: takes the share that is drawn, 0 .. 1.
+        with_curves: beside it COM, height and hand as they come.
+
+    Raises:
+        RunError: the log lacks states, or the file cannot be written.
+    """
+    began = _began_ns(log)
+    chosen = list(_thinned([pose for pose in scene.poses(log, robot) if pose.t_ns >= began]))
+    if not chosen:
+        raise RunError(f"{log.path}: the scenario never began; there is nothing to draw")
+    captions = _captions(log, began)
+    images = []
+    curves = None
+    if with_curves:
+        curves = Curves(chosen, began, SIZE[0], (HAND_INK, COM_INK), INK)
+    for number, pose in enumerate(chosen):
+        width = SIZE[0] + (WIDTH if curves is not None else 0)
+        image = Image.new("RGB", (width * SCALE, SIZE[1] * SCALE), BACKGROUND)
+        canvas = Canvas(ImageDraw.Draw(image))
+        _draw_frame(canvas, robot, pose, (pose.t_ns - began) / NS_PER_S, captions)
+        if curves is not None:
+            curves.draw(canvas, number)
+        images.append(image.resize((width, SIZE[1]), Image.Resampling.LANCZOS))
+        progress((number + 1) / len(chosen))
+    palette = _palette()
+    flat = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    try:
+        with atomic_file(path) as file:
+            flat[0].save(
+                file,
+                format="GIF",
+                save_all=True,
+                append_images=flat[1:],
+                duration=round(1000.0 / FRAMES_S),
+                loop=0,
+                optimize=True,
+            )
+    except OSError as error:
+        raise RunError(f"{path}: cannot be written: {error.strerror or error}") from None
+    return len(flat)
+
+
+def world_frames(robot: RobotConfig, pose: RobotPose) -> dict[str, tuple[Array, Array]]:
+    """Return each frame's origin (3,), m, and rotation (3, 3), in the world."""
+    placed = {"world": (np.zeros(3), np.eye(3))}
+    for frame in scene.frames(robot, pose):
+        origin, rotation = placed[frame.parent]
+        placed[frame.child] = (
+            origin + rotation @ np.array(frame.position),
+            rotation @ _matrix(frame.rotation),
+        )
+    return placed
+
+
+def _matrix(quaternion: Sequence[float]) -> Array:
+    """Return the rotation matrix (3, 3) of a quaternion (x, y, z, w)."""
+    x, y, z, w = quaternion
+    return np.array(
+        (
+            (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+            (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+            (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+        )
+    )
+
+
+def _palette() -> Image.Image:
+    """Return an image whose palette has every ink, and each mixed with the background."""
+    inks = (BACKGROUND, INK, LINK, TORSO, COM_INK, HAND_INK, PUSH_INK, *MODE_INK.values())
+    swatches = Image.new("RGB", (len(inks), MIXTURES), BACKGROUND)
+    for column, ink in enumerate(inks):
+        for row in range(MIXTURES):
+            mixed = Image.blend(
+                Image.new("RGB", (1, 1), BACKGROUND), Image.new("RGB", (1, 1), ink), row / MIXTURES
+            )
+            swatches.paste(mixed, (column, row))
+        swatches.putpixel((column, 0), ImageColor.getrgb(ink))
+    return swatches.quantize(COLOURS_MAX)
+
+
+def _began_ns(log: RunLog) -> int:
+    """Return when the scenario began; the log's begin if it has none."""
+    events: list[RunEvent] = log.messages(topics.RUN_EVENT)
+    started = [event.t_ns for event in events if event.kind == RunEventKind.STARTED]
+    return started[0] if started else 0
+
+
+def _captions(log: RunLog, began: int) -> list[Caption]:
+    captions = [Caption(began, "led by the hand")]
+    events: list[RunEvent] = log.messages(topics.RUN_EVENT)
+    for event in events:
+        if event.kind == RunEventKind.KILLED:
+            captions.append(Caption(event.t_ns, f"{event.subject} killed: it holds"))
+        elif event.kind == RunEventKind.RESTARTED:
+            captions.append(Caption(event.t_ns, f"{event.subject} started again"))
+    return captions
+
+
+def _thinned(poses: Sequence[RobotPose]) -> Iterator[RobotPose]:
+    """Yield poses at the picture's rate on average, so that it plays as fast as the run was."""
+    period_ns = round(NS_PER_S / FRAMES_S)
+    due_ns = poses[0].t_ns if poses else 0
+    for pose in poses:
+        if pose.t_ns >= due_ns:
+            due_ns += period_ns * (1 + (pose.t_ns - due_ns) // period_ns)
+            yield pose
+
+
+def _draw_frame(
+    canvas: Canvas,
+    robot: RobotConfig,
+    pose: RobotPose,
+    seconds: float,
+    captions: Sequence[Caption],
+) -> None:
+    frames = world_frames(robot, pose)
+    canvas.line([(20.0, GROUND_Y), (SIZE[0] - 20.0, GROUND_Y)], INK, 1.5)
+    for centre, axis, sign in VIEWS:
+        _draw_robot(canvas, robot, pose, frames, (centre, axis, sign))
+    caption = captions[max(0, bisect.bisect_right([c.t_ns for c in captions], pose.t_ns) - 1)]
+    lead = "   push" if any(pose.push) else ""
+    canvas.text((20.0, 14.0), f"{seconds:4.1f} s   {caption.text}{lead}", INK, 17)
+    canvas.text(
+        (20.0, 38.0), f"height {pose.torso[2]:.3f} m   hand {abs(pose.force[2]):3.0f} N", INK, 14
+    )
+    for number, mode in enumerate((Mode.TRACK, Mode.HOLD)):
+        canvas.disc((520.0, 24.0 + 22.0 * number), 6.0, MODE_INK[mode])
+        canvas.text((534.0, 15.0 + 22.0 * number), mode.name, INK, 14)
+
+
+def _draw_robot(
+    canvas: Canvas,
+    robot: RobotConfig,
+    pose: RobotPose,
+    frames: dict[str, tuple[Array, Array]],
+    view: tuple[float, int, float],
+) -> None:
+    centre, axis, sign = view
+
+    def at(point: Array) -> Point:
+        up = float(point[2]) + robot.geometry.foot_height
+        return (centre + sign * PX_PER_M * float(point[axis]), GROUND_Y - PX_PER_M * up)
+
+    def box(name: str, size: Sequence[float], middle: Sequence[float]) -> list[Point]:
+        origin, rotation = frames[name]
+        half = 0.5 * size[axis], 0.5 * size[2]
+        found = []
+        for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
+            corner = np.array(middle, dtype=float)
+            corner[axis] += a * half[0]
+            corner[2] += b * half[1]
+            found.append(at(origin + rotation @ corner))
+        return found
+
+    geometry = robot.geometry
+    canvas.polygon(box("torso", geometry.torso_size, (0.0, 0.0, 0.0)), TORSO)
+    hips = [at(frames[f"hip_{side}"][0]) for side in SIDES]
+    canvas.line(hips, LINK, 7.0)
+    foot = (geometry.l_foot, geometry.w_foot, geometry.foot_height)
+    for side in SIDES:
+        joints = [at(frames[f"{kind}_{side}"][0]) for kind in ("ankle", "knee", "hip")]
+        canvas.polygon(box(f"ankle_{side}", foot, (0.0, 0.0, -foot[2] / 2)), INK)
+        canvas.line(joints, LINK, 7.0)
+        for kind, joint in zip(("ankle", "knee", "hip"), joints, strict=True):
+            mode = pose.modes[MODULES.index(f"{kind}_{side}")]
+            canvas.disc(joint, 8.5, MODE_INK.get(mode, INK))
+    canvas.disc(at(np.array(pose.com)), 5.0, COM_INK)
+    harness = at(frames["harness"][0])
+    if abs(pose.force[2]) >= scene.FORCE_MIN_N:
+        canvas.arrow(harness, (0.0, -PX_PER_N * pose.force[2]), HAND_INK)
+    if pose.push[axis]:
+        canvas.arrow(at(np.array(pose.torso)), (sign * PX_PER_N * pose.push[axis], 0.0), PUSH_INK)

@@ -1,0 +1,268 @@
+"""3-D scene of the robot: a frame for each module, a body for each link, COM and forces.
+
+The frames are those of `shared.robot.frames`, and `com` with the axes of the world. The links are
+those of `shared.robot.robot_model`.
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+from collections.abc import Iterable, Iterator
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from services.planner.law.kinematics import Kinematics
+from shared.bus import topics
+from shared.bus.messages import JointState, Mode, PlannerStatus, SimTruth, Vector3, Wrench
+from shared.clock import NS_PER_S
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import RunError
+from shared.joints import MODULES, SIDES
+from shared.mcap_log.extended_copy import NewChannel, NewMessage
+from shared.robot.frames import (
+    ORIGIN,
+    UPRIGHT,
+    FramePose,
+    Quaternion,
+    body_frames,
+    torso_rotation,
+)
+from shared.robot.robot_model import MODULE_RADIUS
+from tools.judge.reports import foxglove, urdf
+from tools.judge.reports.foxglove import Arrow, Colour, Entity, Solid
+from tools.logs.run_log import RunLog
+
+RATE_HZ: Final = 30.0
+LINKS_PERIOD_S: Final = 1.0
+"""Links do not change; they are repeated for a viewer that starts in the middle."""
+METRES_PER_NEWTON: Final = 0.005
+FORCE_MIN_N: Final = 2.0
+"""Smaller forces have no arrow, since it would show the sensor's noise."""
+
+FRAMES, LINKS, STATE, MODEL = range(4)
+LINK: Final[Colour] = (0.62, 0.66, 0.70, 1.0)
+BODY: Final[Colour] = (0.45, 0.52, 0.60, 0.55)
+COM: Final[Colour] = (0.05, 0.37, 0.65, 1.0)
+HAND: Final[Colour] = (0.77, 0.31, 0.11, 1.0)
+PUSH: Final[Colour] = (0.55, 0.20, 0.60, 1.0)
+UNKNOWN: Final[Colour] = (0.4, 0.4, 0.4, 1.0)
+NO_MODE: Final = -1
+MODES: Final[dict[int, Colour]] = {
+    Mode.DISARMED: (0.70, 0.74, 0.77, 1.0),
+    Mode.HOLD: (0.85, 0.56, 0.12, 1.0),
+    Mode.TRACK: (0.18, 0.54, 0.36, 1.0),
+    Mode.DAMP: (0.51, 0.33, 0.72, 1.0),
+    Mode.FAULT: (0.75, 0.22, 0.17, 1.0),
+}
+
+
+class RobotPose(NamedTuple):
+    """Pose, modes and forces of the robot at one time."""
+
+    t_ns: int
+    """Monotonic clock."""
+    torso: Vector3
+    """Origin of the torso frame, m, world axes."""
+    angles: Vector3
+    """Roll, pitch, yaw (3-1-2), rad."""
+    com: Vector3
+    """m, world axes."""
+    q: tuple[float, ...]
+    """Joint angles (12,), rad."""
+    modes: tuple[int, ...]
+    force: Vector3
+    """Force of the operator on the torso, N, torso axes."""
+    push: Vector3
+    """N, world axes."""
+
+
+def channels(robot: str) -> list[NewChannel]:
+    """Return the channels of a scene: `FRAMES`, `LINKS`, `STATE` and, for Rerun, `MODEL`."""
+    rows = (
+        ("frames", foxglove.transforms_schema(), f"{RATE_HZ:g}", "pose of each module"),
+        ("links", foxglove.scene_schema(), f"{1.0 / LINKS_PERIOD_S:g}", "bodies of the robot"),
+        ("state", foxglove.scene_schema(), f"{RATE_HZ:g}", "modes by colour, COM, forces"),
+    )
+    found = [
+        NewChannel(
+            f"xrl/{robot}/scene/{name}",
+            schema.name,
+            schema.encoding,
+            schema.data,
+            foxglove.ENCODING,
+            {"rate_hz": rate, "why": why},
+        )
+        for name, schema, rate, why in rows
+    ]
+    model = NewChannel(
+        f"xrl/{robot}/robot_description",  # the name that Rerun expects
+        urdf.SCHEMA_NAME,
+        urdf.SCHEMA_ENCODING,
+        urdf.SCHEMA,
+        urdf.ENCODING,
+        {"why": "bodies of the robot as URDF, once"},
+    )
+    return [*found, model]
+
+
+def messages(logs: Iterable[RunLog], robot: RobotConfig) -> Iterator[NewMessage]:
+    """Yield the messages of a run's scene in the order of time.
+
+    Args:
+        logs: the run, or its parts one after the other.
+        robot: of the run.
+
+    Raises:
+        RunError: the log does not hold the states of all six modules.
+    """
+    links_ns: int | None = None
+    missing: RunError | None = None
+    for log in logs:
+        try:
+            for pose in poses(log, robot):
+                ns = pose.t_ns + log.offset_ns
+                if links_ns is None:
+                    yield NewMessage(MODEL, ns, urdf.message(model(log.robot, robot, pose)))
+                yield NewMessage(FRAMES, ns, foxglove.transforms(ns, frames(robot, pose)))
+                if links_ns is None or ns - links_ns >= LINKS_PERIOD_S * NS_PER_S:
+                    links_ns = ns
+                    yield NewMessage(LINKS, ns, foxglove.scene(ns, links(robot)))
+                yield NewMessage(STATE, ns, foxglove.scene(ns, state(pose)))
+        except RunError as error:  # a module was silent in this part
+            missing = missing or error
+    if links_ns is None and missing is not None:
+        raise missing
+
+
+def model(name: str, robot: RobotConfig, pose: RobotPose) -> str:
+    """Return all bodies of a robot as URDF; the modules have the colour of no mode."""
+    still = pose._replace(modes=(NO_MODE,) * len(MODULES))
+    return urdf.urdf(name, frames(robot, pose), [*links(robot), *state(still)])
+
+
+def poses(log: RunLog, robot: RobotConfig) -> Iterator[RobotPose]:
+    """Yield the poses of the robot at the scene's rate, from the newest messages at each time.
+
+    The pose of the torso comes from the simulated world. In a log without one it comes from the
+    legs' kinematics, with the planner's stance.
+
+    Raises:
+        RunError: the log does not hold the states of all six modules.
+    """
+    states: list[list[JointState]] = [log.messages(topics.JOINT_STATE, name) for name in MODULES]
+    if not all(states):
+        missing = ", ".join(name for name, rows in zip(MODULES, states, strict=True) if not rows)
+        raise RunError(f"{log.path}: no states of {missing}; a scene needs the states of all six")
+    truth: list[SimTruth] = log.messages(topics.SIM_TRUTH)
+    wrenches: list[Wrench] = log.messages(topics.WRENCH)
+    newest = [NewestAt(rows) for rows in states]
+    wrench = NewestAt(wrenches)
+    statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
+    status = NewestAt(statuses)
+    kinematics = None if truth else Kinematics(robot)
+    # a service without a sample from its drive yet publishes a stamp of 0
+    first_ns = max(next((row.t_ns for row in rows if row.t_ns > 0), 0) for rows in states)
+    if not log.is_first:
+        first_ns = max(first_ns, log.begin_ns)
+    for row in _thin(truth or states[0], first_ns):
+        if row.t_ns >= log.end_ns and not log.is_last:
+            break
+        states_now = [one.at(row.t_ns) for one in newest]
+        q = tuple(angle for state_now in states_now for angle in state_now.q)
+        sensed = wrench.at(row.t_ns) if wrenches and wrenches[0].t_ns <= row.t_ns else None
+        force = sensed.force if sensed is not None and sensed.valid else (0.0, 0.0, 0.0)
+        modes = tuple(state_now.mode for state_now in states_now)
+        if kinematics is None:
+            yield RobotPose(row.t_ns, row.torso, row.angles, row.com, q, modes, force, row.push)
+            continue
+        if statuses and statuses[0].t_ns <= row.t_ns:
+            kinematics.stance[:] = status.at(row.t_ns).stance
+        kinematics.update(np.array(q))
+        torso, com, angles = kinematics.r_torso, kinematics.p[:3], kinematics.p[3:]
+        yield RobotPose(
+            row.t_ns, _vector(torso), _vector(angles), _vector(com), q, modes, force,
+            ORIGIN,
+        )  # fmt: skip
+
+
+class NewestAt:
+    """Finds the newest message of a key at a time."""
+
+    def __init__(self, rows: list[Any]) -> None:
+        self._rows = rows
+        self._stamps = [row.t_ns for row in rows]
+
+    def at(self, t_ns: int) -> Any:
+        """Return the newest message at or before a time; there must be one."""
+        return self._rows[bisect.bisect_right(self._stamps, t_ns) - 1]
+
+
+def _thin(rows: list[Any], first_ns: int) -> Iterator[Any]:
+    """Yield rows at about the scene's rate, without changing their stamps."""
+    period_ns = round(NS_PER_S / RATE_HZ)
+    due_ns = first_ns
+    for row in rows:
+        if row.t_ns >= due_ns:
+            due_ns += period_ns * (1 + (row.t_ns - due_ns) // period_ns)
+            yield row
+
+
+def frames(robot: RobotConfig, pose: RobotPose) -> list[FramePose]:
+    """Return all frames of a pose."""
+    return [
+        FramePose("world", "torso", pose.torso, torso_rotation(pose.angles)),
+        FramePose("world", "com", pose.com, UPRIGHT),
+        *body_frames(robot.geometry, pose.q),
+    ]
+
+
+def rotation_to(direction: Vector3) -> Quaternion:
+    """Return the rotation that takes the x axis to a direction, which is not zero."""
+    x, y, z = (part / math.hypot(*direction) for part in direction)
+    across = y * y + z * z
+    beyond = across / (1.0 - x) if x < 0.0 else 1.0 + x  # 1 + x, precise near 0
+    if beyond < 1e-24:
+        return 0.0, 0.0, 1.0, 0.0
+    w = math.sqrt(beyond / 2)
+    return 0.0, -z / (2 * w), y / (2 * w), w
+
+
+def links(robot: RobotConfig) -> list[Entity]:
+    """Return the bodies, each in the frame of its module."""
+    geometry = robot.geometry
+    found = [Entity("torso", "torso", (Solid("cube", geometry.torso_size, BODY),))]
+    for side in SIDES:
+        for kind, name, length in (("hip", "thigh", geometry.l1), ("knee", "shin", geometry.l2)):
+            bone = Solid("cylinder", (0.06, 0.06, length), LINK, (0.0, 0.0, -length / 2))
+            found.append(Entity(f"{kind}_{side}", f"{name}_{side}", (bone,)))
+        size = (geometry.l_foot, geometry.w_foot, geometry.foot_height / 2)
+        sole = Solid("cube", size, LINK, (0.0, 0.0, -0.75 * geometry.foot_height))
+        found.append(Entity(f"ankle_{side}", f"sole_{side}", (sole,)))
+    return found
+
+
+def state(pose: RobotPose) -> list[Entity]:
+    """Return the changing parts: the modules in the colours of their modes, the COM, the forces."""
+    size = (MODULE_RADIUS,) * 3
+    found = []
+    for module, mode in zip(MODULES, pose.modes, strict=True):
+        ball = Solid("sphere", size, MODES.get(mode, UNKNOWN))
+        found.append(Entity(module, f"module_{module}", (ball,)))
+    ball = Solid("sphere", (0.06, 0.06, 0.06), COM)
+    found.append(Entity("com", "com", (ball,)))
+    found.append(Entity("harness", "operator", arrows=_arrows(pose.force, HAND)))
+    found.append(Entity("world", "push", arrows=_arrows(pose.push, PUSH, pose.torso)))
+    return found
+
+
+def _arrows(force: Vector3, colour: Colour, position: Vector3 = ORIGIN) -> tuple[Arrow, ...]:
+    size = math.hypot(*force)
+    if size < FORCE_MIN_N:
+        return ()
+    return (Arrow(position, rotation_to(force), METRES_PER_NEWTON * size, 0.02, colour),)
+
+
+def _vector(values: Any) -> Vector3:
+    return float(values[0]), float(values[1]), float(values[2])

@@ -1,0 +1,244 @@
+"""Head and foot of a page: verdict, facts about the run, lost messages, input files."""
+
+from __future__ import annotations
+
+import io
+import json
+import tomllib
+from collections.abc import Iterable
+from datetime import datetime
+from typing import Any, Final, NamedTuple
+
+from shared.bus import topics
+from shared.clock import NS_PER_S
+from shared.exceptions import XrlError
+from shared.mcap_log.recover import describe_lost
+from shared.mcap_log.sequence_stats import KeyCount
+from shared.text_file import decoded
+from tools.judge import verdict, verdict_table
+from tools.judge.reports.run_data import RunData
+from tools.judge.verdict import Summary
+from tools.judge.verdict_limits import LIMITS
+from tools.logs.run_log import RunLog
+from tools.terminal import Console
+
+REAL_TIME_ONLY: Final = ("pd_cycles_late_pct", "planner_tick_us")
+"""Figures without a meaning in virtual time."""
+
+MACHINE: Final = {
+    "python": "Python", "platform": "platform", "cpu_model": "CPU", "cpu_count": "CPUs",
+}  # fmt: skip
+
+
+class RunVerdict(NamedTuple):
+    """Verdict on a run."""
+
+    sentence: str
+    good: bool | None
+    """None: no verdict."""
+    rows: list[tuple[str, str, str, str]]
+    """(figure, measured, limit, `ok` or `over`, the latter possibly with the reason)."""
+    caution: str = ""
+    """Reason not to trust the figures."""
+
+
+class TopicLoss(NamedTuple):
+    """Recorded and lost messages of one topic."""
+
+    name: str
+    messages: int
+    rate_hz: float | None
+    """Mean rate from the first to the last message."""
+    nominal_hz: float
+    lost: int
+    gaps: int
+    restarts: int
+
+
+class Judge:
+    """Judges a run in the words of the command that made it, from its parts in their order."""
+
+    def __init__(self) -> None:
+        self._summaries: list[Summary] = []
+        self._why_not = ""
+
+    def take(self, run: RunData) -> None:
+        """Take a run, or the next part of it."""
+        if run.course is None:
+            self._why_not = self._why_not or run.without_course
+            return
+        try:
+            self._summaries.append(verdict.summarise(run.log, _duration_s(run)))
+        except XrlError as error:
+            self._why_not = str(error)
+
+    def verdict(self, log: RunLog, counts: Iterable[KeyCount], *, whole: bool = True) -> RunVerdict:
+        """Return the verdict.
+
+        Args:
+            log: the run, or any part of it.
+            counts: of every key, over the run.
+            whole: all of the run was taken; False gives the figures alone.
+        """
+        if not self._summaries:
+            return RunVerdict(f"No verdict: {self._why_not}", None, [])
+        summary = verdict.joined(self._summaries, counts)
+        if log.metadata["run"].get("lockstep"):
+            summary |= dict.fromkeys(REAL_TIME_ONLY) | {"in_real_time": True}
+        if not whole:
+            return RunVerdict("A part of a run, and its figures: no verdict", None, _rows(summary))
+        lines = _verdict_lines(summary)
+        cautions = verdict_table.stalls(summary)
+        cautions += [] if summary["in_real_time"] else [lines[-2]]
+        caution = " ".join(f"{line.rstrip('.')}." for line in cautions)
+        return RunVerdict(lines[-1], bool(summary["stood"]), _rows(summary), caution)
+
+
+def _duration_s(run: RunData) -> float:
+    """Return the planned duration of the scenario; without one, the duration of the run."""
+    raw = run.log.attachments.get("scenario.toml", b"")
+    try:
+        return float(tomllib.loads(decoded(raw))["duration"])
+    except (ValueError, KeyError, TypeError, RecursionError):  # not TOML, or without it
+        assert run.course is not None  # noqa: S101 - called with a course only
+        return float(run.course.t[-1])
+
+
+def _verdict_lines(summary: Summary) -> list[str]:
+    """Return the printed lines of the verdict; the last line is the verdict itself."""
+    text = io.StringIO()
+    console = Console(file=text, width=200, color_system=None, soft_wrap=True)
+    verdict_table.show(summary, console)
+    return [line.strip() for line in text.getvalue().strip().splitlines()]
+
+
+def _rows(summary: Summary) -> list[tuple[str, str, str, str]]:
+    rows = []
+    for limit in LIMITS:
+        value = summary.get(limit.key)
+        if value is None:
+            continue
+        unit = f" {limit.unit}" if limit.unit else ""
+        measured = f"{verdict_table.digits(value)}{unit}"
+        mark = verdict_table.mark(limit, summary)
+        rows.append((limit.what, measured, f"{limit.limit:g}{unit}", mark))
+    return rows
+
+
+def head(run: RunData) -> list[tuple[str, str]]:
+    """Return (name, value) of the facts that a reader needs first."""
+    log, about = run.log, run.log.metadata["run"]
+    begin, end = run.span
+    rows = [
+        ("scenario", _scenario(run)),
+        ("started", _date(about.get("started", ""))),
+        ("virtual time", about.get("lockstep", "")),
+        ("length", f"{end - begin:.1f} s"),
+        ("file", log.path.name),
+        (
+            "recording",
+            "complete" if log.complete else "incomplete: the recorder did not close the file",
+        ),
+        ("git commit", _commit(about)),
+        ("robot", log.robot),
+        ("xrl", log.metadata.get("packages", {}).get("xrl", "")),
+        ("log version", about.get("schema_version", "")),
+    ]
+    rows += [(name, about.get(key, "")) for key, name in MACHINE.items()]
+    rows.append(("threads", _threads(about.get("thread_env", ""))))
+    return [(name, value) for name, value in rows if value]
+
+
+def _threads(raw: str) -> str:
+    """Return the environment variables that limit threads; the raw text if it is not JSON."""
+    try:
+        found = json.loads(raw or "{}")
+        return ", ".join(f"{name}={value}" for name, value in sorted(found.items()))
+    except (ValueError, AttributeError, RecursionError):
+        return raw
+
+
+def _date(started: str) -> str:
+    """Return a readable date; the raw text if it is not in ISO format."""
+    try:
+        return f"{datetime.fromisoformat(started):%Y-%m-%d %H:%M:%S %Z}".strip()
+    except ValueError:
+        return started
+
+
+def _scenario(run: RunData) -> str:
+    name = run.log.metadata["run"].get("scenario", "")
+    raw = run.log.attachments.get("scenario.toml", b"")
+    try:
+        about = str(tomllib.loads(decoded(raw)).get("about", ""))
+    except (ValueError, RecursionError):
+        about = ""
+    return ": ".join(part for part in (name, about) if part)
+
+
+def _commit(about: dict[str, str]) -> str:
+    commit = about.get("git_commit", "")
+    return f"{commit} with changes" if about.get("git_dirty") == "true" else commit
+
+
+class MessageLosses:
+    """Recorded and lost messages of each topic, by sequence numbers."""
+
+    def __init__(self) -> None:
+        self.counts: dict[str, KeyCount] = {}
+        self._times_ns: dict[str, tuple[int, int]] = {}
+
+    def take(self, run: RunData) -> None:
+        """Take a run, or the next part of it."""
+        log = run.log
+        log.count_into(self.counts)
+        for key in log.keys():  # noqa: SIM118 - a log is no mapping
+            times = [t_ns for t_ns, _, _ in log.raw(key) if log.holds(t_ns)]
+            if not times:
+                continue
+            first_ns, last_ns = min(times), max(times)
+            self._times_ns[key] = (self._times_ns.get(key, (first_ns, 0))[0], last_ns)
+
+    def rows(self, robot: str) -> list[TopicLoss]:
+        """Return a row for each topic that has messages."""
+        known, rows = topics.all_keys(robot), []
+        for key, count in sorted((key, one) for key, one in self.counts.items() if one.count):
+            first_ns, last_ns = self._times_ns[key]
+            span_s = (last_ns - first_ns) / NS_PER_S
+            nominal_hz = known[key].rate_hz if key in known else 0.0
+            rate = (count.count - 1) / span_s if nominal_hz > 0.0 and span_s > 0.0 else None
+            name = key.removeprefix(f"xrl/{robot}/")
+            rows.append(
+                TopicLoss(
+                    name, count.count, rate, nominal_hz, count.missing, count.gaps, count.restarts
+                )
+            )
+        return rows
+
+
+def damage(run: RunData) -> list[str]:
+    """Return the unreadable parts of the file, one line each."""
+    log = run.log
+    if log.complete and not log.damage:
+        return []
+    return describe_lost(log.cut, log.damage, finished=log.complete)
+
+
+def files(run: RunData) -> list[tuple[str, str]]:
+    """Return (name, text) of the input files of the run, from its log."""
+    found = []
+    for name, raw in sorted(run.log.attachments.items(), key=lambda row: _order(row[0])):
+        if name.endswith((".toml", ".json")):
+            found.append((name, raw.decode(errors="replace")))
+    return found
+
+
+def _order(name: str) -> tuple[bool, str]:
+    """Sort files written by people before computed ones."""
+    return not name.endswith(".toml"), name
+
+
+def packages(run: RunData) -> list[tuple[str, str]]:
+    """Return (name, version) of all installed packages."""
+    found: dict[str, Any] = run.log.metadata.get("packages", {})
+    return sorted(found.items(), key=lambda row: row[0].lower())

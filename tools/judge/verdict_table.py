@@ -1,0 +1,149 @@
+"""The verdict for people: one table in the terminal."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from rich.table import Table
+from rich.text import Text
+
+from tools.judge.verdict import Summary
+from tools.judge.verdict_limits import LIMITS, SOUND, VerdictLimit
+from tools.terminal import Console, marked
+
+OK: Final = "ok"
+OVER: Final = "over"
+OF_THE_MACHINE: Final = ("pd_cycles_late_pct", "fleet_cpu_pct", "sequence_gaps")
+"""Figures that no impairment of a link explains."""
+STALLS_MAX: Final = 6
+"""Lines about single stalls."""
+NOTHING: Final = 5e-4
+"""Less than this is shown as 0.00: no limit is near it."""
+
+
+def show(summary: Summary, console: Console) -> None:
+    """Print the verdict table."""
+    table = Table(title="Verdict", title_justify="left")
+    table.add_column("what")
+    table.add_column("measured", justify="right")
+    table.add_column("limit", justify="right")
+    table.add_column("")
+    for row in LIMITS:
+        value = summary.get(row.key)
+        if value is None:
+            continue
+        word = mark(row, summary)
+        colour = "green" if word == OK else "yellow" if word.startswith(OVER) else "default"
+        unit = f" {row.unit}" if row.unit else ""
+        table.add_row(
+            row.what, f"{digits(value)}{unit}", f"{row.limit:g}{unit}", Text(word, colour)
+        )
+    console.print(table)
+    if summary["stood"] and any(_is_over(row, summary) for row in LIMITS):
+        decide = ", ".join(row.what for row in LIMITS if row.key in SOUND)
+        console.print(
+            "A figure over its limit is reported and does not decide: standing to the end does, "
+            f"and {decide}.",
+            style="dim",
+        )
+    for line in (*stalls(summary), *network(summary)):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    if summary.get("pace", 1.0) != 1.0:
+        console.print(
+            f"In slow motion: the fleet's clock went at {summary['pace']:g} of real time.",
+            style="dim",
+            highlight=False,
+        )
+    if not summary["in_real_time"]:
+        console.print(
+            marked(
+                "[yellow]The machine was too slow for real time: real-time factor "
+                "{:.3f}, {:.2f} s of world "
+                "time given up. The times above are not those of a robot.[/]",
+                summary["real_time_factor"],
+                summary["world_time_lost_s"],
+            )
+        )
+    console.print(_sentence(summary))
+
+
+def mark(row: VerdictLimit, summary: Summary) -> str:
+    """Return the verdict on a figure: `ok`, or `over` and perhaps why."""
+    if summary[row.key] <= row.limit:
+        return OK
+    if row.key == "sequence_gaps" and summary["stopped"]:
+        return "of a service that was stopped"
+    if row.key in summary["across_stalls"]:
+        return "in a stall"
+    if row.key in OF_THE_MACHINE:
+        return f"{OVER}, a busy machine" if row.key != "sequence_gaps" else OVER
+    return f"{OVER}, links impaired" if summary.get("links_impaired") else OVER
+
+
+def _is_over(row: VerdictLimit, summary: Summary) -> bool:
+    return summary.get(row.key) is not None and mark(row, summary).startswith(OVER)
+
+
+def stalls(summary: Summary) -> list[str]:
+    """Return a line for each stall that made something of the run, and one for the others.
+
+    After them each drop-out that no stall explains.
+    """
+    rows = summary["stalls"]
+    told = [row for row in rows if row["modules_held"] or row["messages_lost"]]
+    rest = [row["lasted_ms"] for row in rows if row not in told]
+    lines = [row["said"] for row in told[:STALLS_MAX]]
+    if len(told) > STALLS_MAX:
+        lines.append(f"{len(told) - STALLS_MAX} more stalls with consequences")
+    if rest:
+        stalls_are = "stall was" if len(rest) == 1 else "stalls were"
+        lines.append(f"{len(rest)} {'more ' if told else ''}{stalls_are} without consequence: "
+                     f"{max(rest):.0f} ms{' at most' if len(rest) > 1 else ''}")  # fmt: skip
+    if told:
+        lines.append("Figures marked led or held leave out what a stall made of the run.")
+    lines += summary["drop_outs"]
+    return lines
+
+
+def network(summary: Summary) -> list[str]:
+    """Return a line for each impairment: where, what, when, messages passed and lost.
+
+    If there is any, one more line compares the commands' ages during impairments and outside.
+    """
+    lines = [str(row["said"]) for row in summary.get("impairments", ())]
+    ages = [
+        f"{digits(found['median'])} ms, 99 % within {digits(found['p99'])} ms {word}"
+        for word, key in (("while impaired", "command_age_impaired_ms"),
+                          ("otherwise", "command_age_otherwise_ms"))
+        if (found := summary.get(key)) is not None
+    ]  # fmt: skip
+    if lines and ages:
+        lines.append(f"median age of commands in TRACK: {'; '.join(ages)}")
+    return lines
+
+
+def digits(value: float) -> str:
+    """Return a figure with three digits, or all before the point: 1540, not 1.54e+03.
+
+    Next to nothing is 0.00; none is 0.
+    """
+    if abs(value) < NOTHING:
+        return "0.00" if value else "0"
+    return f"{value:.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
+
+
+def _sentence(summary: Summary) -> Text:
+    if summary["stood"]:
+        return marked("[bold green]STOOD[/] for {:.1f} s", summary["duration_s"])
+    if not summary["began"]:
+        return marked(
+            "[bold red]FELL[/] {:.1f} s after the hoist let go, before the scenario began",
+            summary["fallen_at_s"],
+        )
+    if summary["fallen_at_s"] is not None:
+        return marked("[bold red]FELL[/] at {:.1f} s", summary["fallen_at_s"])
+    if summary["why_not"]:
+        return marked("[bold red]DOES NOT STAND[/] at the end: {}", summary["why_not"])
+    if summary["unsound"]:
+        return marked("[bold red]STOOD, BUT NOT SOUNDLY[/]: {}", summary["unsound"])
+    return marked("[bold red]NOT FINISHED[/]: the log ends at {:.1f} s", summary["duration_s"])

@@ -1,0 +1,1 @@
+"""The experiment on a fleet of processes: started, watched, impaired."""

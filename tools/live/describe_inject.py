@@ -1,0 +1,174 @@
+"""Impairments of the network as a person writes them: `LINK key=value ...`."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Iterable, Mapping
+from decimal import Decimal
+from difflib import get_close_matches
+from typing import Any, Final, NamedTuple, get_args
+
+import msgspec
+
+from shared.config.impairment import Distribution
+from shared.config.scenarios import Inject
+from shared.exceptions import ConfigError
+from shared.links import DIRECTIONS, GROUPS, directions_of
+from shared.toml_file import check_ranges
+
+
+class Number(NamedTuple):
+    """A word that takes a number."""
+
+    field: str
+    """Field of `Inject`."""
+    units: Mapping[str, str]
+    """Unit after a number, and the factor to SI."""
+    like: str
+    """What would be right."""
+
+
+_MS: Final = {"": "1", "us": "0.001", "ms": "1", "s": "1000"}
+_S: Final = {"": "1", "us": "0.000001", "ms": "0.001", "s": "1"}
+_SHARE: Final = {"": "1", "%": "0.01"}
+_PLAIN: Final = {"": "1"}
+_AS_MS: Final = "write 30 (ms), 0.03s or 500us"
+_AS_S: Final = "write 4 (s) or 500ms"
+_AS_SHARE: Final = "write 0.2 or 20%"
+_AS_RATE: Final = "write bytes a second, 10000 (tc-netem has bits)"
+
+NUMBERS: Final[Mapping[str, Number]] = {
+    "delay": Number("delay_ms", _MS, _AS_MS),
+    "jitter": Number("jitter_ms", _MS, _AS_MS),
+    "loss": Number("loss", _SHARE, _AS_SHARE),
+    "burst": Number("burst", _PLAIN, "write a number of messages, 5"),
+    "duplicate": Number("duplicate", _SHARE, _AS_SHARE),
+    "reorder": Number("reorder", _SHARE, _AS_SHARE),
+    "rate": Number("rate", _PLAIN, _AS_RATE),
+    "at": Number("at", _S, _AS_S),
+    "for": Number("duration", _S, _AS_S),
+}
+SWITCHES: Final = ("partition", "ordered")
+DISTRIBUTION: Final = "distribution"
+GRAMMAR: Final = (
+    "LINK KEY=VALUE ...; LINK is "
+    f"{', '.join(GROUPS)}, or one direction such as planner->knee_left; KEYs: delay, jitter (30, "
+    "30ms, 0.03s, 500us), distribution (uniform, normal, pareto), loss, duplicate, reorder (0.2, "
+    "20%), burst, rate (bytes/s), at, for (s); words: partition, ordered"
+)
+_FILE: Final = "--inject"
+
+
+def parse_inject(text: str) -> Inject:
+    """Parse `LINK key=value ...` for argparse; without `at` it starts with the scenario.
+
+    Raises:
+        argparse.ArgumentTypeError: the text is malformed; the message says what is right.
+    """
+    words = text.replace(",", " ").split()
+    link = words.pop(0) if words else ""
+    try:
+        return make(link, _split(words))
+    except ConfigError as error:
+        said = f"{text!r}: {error.key}: {error.found}; {error.expected}"
+        raise argparse.ArgumentTypeError(said) from None
+
+
+def make(link: str, words: Mapping[str, str], dash: str = "") -> Inject:
+    """Return an impairment from its words, checked.
+
+    Args:
+        link: of `shared.links`.
+        words: each with its value as written: times with us, ms or s behind them (alone: ms, of
+            `at` and `for` s), shares with % (alone: 0 to 1); of a switch it is not looked at.
+        dash: what stands before a word where it was written, for errors.
+
+    Raises:
+        ConfigError: a value is not understood or out of its range, or they do not go together;
+            the key is the word.
+    """
+    check_link(link, dash)
+    fields: dict[str, Any] = {"link": link, "at": 0.0}
+    for word, text in words.items():
+        if word in NUMBERS:
+            fields[NUMBERS[word].field] = _number(word, text, dash)
+        elif word == DISTRIBUTION:
+            fields[word] = _distribution(text, dash)
+        else:
+            fields[word] = True
+    inject = msgspec.convert(fields, Inject)
+    try:
+        check_ranges(_FILE, inject)
+    except ConfigError as error:
+        word = next(word for word, number in NUMBERS.items() if number.field == error.key)
+        found, right = f"{words[word]!r} is out of range", f"{error.expected}; {NUMBERS[word].like}"
+        raise ConfigError(_FILE, f"{dash}{word}", found, right) from None
+    problem = inject.fault()
+    if not problem and inject.describe() == "nothing":
+        problem = "nothing is done to it; give a delay, a loss or another word"
+    if problem:
+        found, _, right = problem.partition("; ")
+        raise ConfigError(_FILE, link, found, right)
+    return inject
+
+
+def check_link(link: str, dash: str = "") -> None:
+    """Refuse an unknown link, and name the closest one.
+
+    Raises:
+        ConfigError: there is no such link.
+    """
+    try:
+        directions_of(link, _FILE, f"{dash}link")
+    except ConfigError as error:
+        near = _near(link, (*GROUPS, *DIRECTIONS))
+        if link.endswith("-"):
+            near = "the shell took the rest for a file's name: put it in quotes; "
+        raise ConfigError(_FILE, error.key, error.found, near + error.expected) from None
+
+
+def _split(words: Iterable[str]) -> dict[str, str]:
+    """Return the keys of `--inject` with their values.
+
+    Raises:
+        ConfigError: a key is unknown or comes twice.
+    """
+    found: dict[str, str] = {}
+    for word in words:
+        key, equals, value = word.partition("=")
+        if key not in (SWITCHES if not equals else (*NUMBERS, DISTRIBUTION)):
+            near = _near(key, (*NUMBERS, DISTRIBUTION, *SWITCHES))
+            raise ConfigError(_FILE, word, "not understood", near + GRAMMAR)
+        if key in found:
+            raise ConfigError(_FILE, word, f"a second {key}", "leave one out")
+        found[key] = value
+    return found
+
+
+def _near(word: str, known: Iterable[str]) -> str:
+    """Return the beginning of a hint; empty if nothing is alike."""
+    near = get_close_matches(word, known, n=1)
+    return f"perhaps {near[0]!r}; " if near and near[0] != word else ""
+
+
+def _number(word: str, text: str, dash: str) -> float:
+    _, units, like = NUMBERS[word]
+    match = re.fullmatch(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d{1,3})?)([a-z%]*)", text)
+    if match is None or match[2] not in units:
+        raise ConfigError(_FILE, f"{dash}{word}", f"{text!r} is not understood", like)
+    return float(Decimal(match[1]) * Decimal(units[match[2]]))
+
+
+def _distribution(text: str, dash: str) -> str:
+    known = get_args(Distribution)
+    if text not in known:
+        right = f"{_near(text, known)}one of {', '.join(known)}"
+        raise ConfigError(_FILE, f"{dash}{DISTRIBUTION}", repr(text), right)
+    return text
+
+
+def in_words_of(inject: Inject) -> str:
+    """Return an impairment as text: what, on which link, when."""
+    lasts = "" if inject.duration is None else f" for {inject.duration:g} s"
+    return f"{inject.link} {inject.describe()} at {inject.at:g} s{lasts}"

@@ -1,0 +1,361 @@
+"""What an experiment is to be: scenario and robot file, with the flags laid over them.
+
+Shared by the verbs that run scenarios: the flags mean the same everywhere.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import time
+from pathlib import Path
+from typing import TypeVar, get_args, get_type_hints
+
+import msgspec
+
+from services.simulator.physics import plant
+from services.simulator.physics.plant import NAMED, PlantConfig
+from shared.atomic_file import replace_file
+from shared.config import checks as config_check
+from shared.config import files as config_file
+from shared.config import gain_schedule, scenarios
+from shared.config.robot_config import SERVICES, RobotConfig
+from shared.config.scenarios import (
+    FAULT_KINDS,
+    SIGNALS,
+    Fault,
+    Inject,
+    Kill,
+    Push,
+    Restart,
+    Scenario,
+)
+from shared.config.sections import LawConfig
+from shared.exceptions import FleetError, RunError
+from shared.joints import MODULES
+from shared.places import DEFAULT_CONFIG, SCENARIOS
+from tools.guarded_streams import printable
+from tools.live.describe_inject import in_words_of, parse_inject
+from tools.number_arguments import finite, natural
+from tools.terminal import Console, marked
+from tools.verb_table import add_config
+
+E = TypeVar("E", Kill, Restart, Push, Fault, Inject)
+
+PLANT_FILE = "plant.toml"
+"""Name of the plant among a run's results and in its log."""
+
+UNJUDGED = ("simulator", "recorder")
+"""A run cannot be judged without their part of it."""
+
+_NUMBER = r"\d+(?:\.\d*)?"
+
+
+def choices(field: str) -> tuple[str, ...]:
+    """Return the values of a `[law]` key, for the flag of the same name."""
+    return get_args(get_type_hints(LawConfig)[field])
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags that shape an experiment."""
+    add_config(parser)
+    parser.add_argument(
+        "--scenario",
+        default="squat",
+        metavar="NAME|FILE",
+        help="what happens: a name (of a file in scenarios/ beside the robot file, or one that is "
+        "shipped), or a file (default: squat, the paper's Fig. 7)",
+    )
+    parser.add_argument("--duration", type=finite, metavar="S", help="scenario time to run, s")
+    parser.add_argument(
+        "--kill",
+        action="append",
+        type=parse_kill,
+        metavar="SERVICE@T[:SIGNAL]",
+        help=f"send a signal ({', '.join(SIGNALS)}; default KILL) at scenario time T; "
+        "replaces the scenario's kills; may be repeated",
+    )
+    parser.add_argument(
+        "--restart",
+        action="append",
+        type=parse_restart,
+        metavar="SERVICE@T",
+        help="start a killed service again, or continue a stopped one; may be repeated",
+    )
+    parser.add_argument(
+        "--push",
+        action="append",
+        type=parse_push,
+        metavar="T:DUR:FX,FY,FZ",
+        help="push the torso by a force in N from T for DUR s; replaces the scenario's "
+        "pushes; may be repeated",
+    )
+    parser.add_argument(
+        "--fault",
+        action="append",
+        type=parse_fault,
+        metavar="MODULE:KIND@T",
+        help=f"a fault of a module's drive ({', '.join(FAULT_KINDS)}) at scenario time T; "
+        "MODULE.1 is its second axis, @T:DUR lasts DUR s; replaces the scenario's faults; "
+        "may be repeated",
+    )
+    parser.add_argument(
+        "--inject",
+        action="append",
+        type=parse_inject,
+        metavar="'LINK KEY=VALUE ...'",
+        help="what the network does to a link, such as 'planner->joints delay=30 jitter=10 at=3 "
+        "for=4' (ms and s), 'all loss=20%% burst=5', 'planner->left partition at=3'; at is "
+        "scenario time; `xrl inject --help` explains each word, and which of several counts; "
+        "replaces the scenario's; may be repeated",
+    )
+    add_plant(parser)
+    add_controller(parser)
+    add_imu(parser)
+    parser.add_argument("--split", choices=choices("split"), help="gain split of the law")
+    parser.add_argument(
+        "--jacobian",
+        choices=choices("jacobian"),
+        help="how the legs share the load; average comes with the diagonal split: no gains "
+        "certify it",
+    )
+    parser.add_argument(
+        "--seed",
+        type=natural,
+        default=0,
+        help="of the sensors' noise, and of what the network loses and how late it is",
+    )
+
+
+def add_imu(parser: argparse.ArgumentParser) -> None:
+    """Add the flag that fits an IMU."""
+    parser.add_argument(
+        "--imu",
+        action="store_true",
+        help="with an IMU on the torso, and its service: the robot stands on slopes "
+        "(imu.fitted of the robot file)",
+    )
+
+
+def add_controller(parser: argparse.ArgumentParser) -> None:
+    """Add the flag that puts a controller of somebody's own in the place of the law."""
+    parser.add_argument(
+        "--controller",
+        metavar="FILE.py[:NAME]",
+        help="a controller of your own in the place of the law, behind the same certificate, age "
+        "rule and limits (docs/own-controller.md, examples/lqr_controller.py)",
+    )
+
+
+def add_plant(parser: argparse.ArgumentParser) -> None:
+    """Add the flag that says how the simulated robot differs from its robot file."""
+    parser.add_argument(
+        "--plant",
+        action="append",
+        default=[],
+        metavar="NAME|FILE|KEY=VALUE",
+        help=f"the true robot: {', '.join(NAMED)} (default: realistic), a TOML file, or one value "
+        "such as drivetrain.stiffness=5000 or floor.slope=[0.03,0.0]; may be repeated, each laid "
+        "over those before; no controller sees it (deploy/plants/README.md)",
+    )
+
+
+def parse_kill(text: str) -> Kill:
+    """Read SERVICE@T[:SIGNAL]."""
+    match = re.fullmatch(rf"(\w+)@({_NUMBER})(?::(?:SIG)?(\w+))?", text)
+    if match is None or match[1] not in SERVICES or (match[3] or "KILL") not in SIGNALS:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}; write SERVICE@SECONDS or SERVICE@SECONDS:SIGNAL, for example "
+            f"planner@10:STOP; services: {', '.join(SERVICES)}; signals: {', '.join(SIGNALS)}"
+        )
+    if match[1] in UNJUDGED:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: without the {match[1]} there is nothing to judge the run by; "
+            "`xrl up` and `xrl kill` show what the fleet does then"
+        )
+    row = {"service": match[1], "at": float(match[2]), "signal": match[3] or "KILL"}
+    return msgspec.convert(row, Kill)
+
+
+def parse_restart(text: str) -> Restart:
+    """Read SERVICE@T."""
+    match = re.fullmatch(rf"(\w+)@({_NUMBER})", text)
+    if match is None or match[1] not in SERVICES:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}; write SERVICE@SECONDS, for example planner@9; "
+            f"services: {', '.join(SERVICES)}"
+        )
+    return Restart(service=match[1], at=float(match[2]))
+
+
+def parse_push(text: str) -> Push:
+    """Read T:DUR:FX,FY,FZ."""
+    signed = rf"(-?{_NUMBER})"
+    match = re.fullmatch(rf"({_NUMBER}):({_NUMBER}):{signed},{signed},{signed}", text)
+    if match is None:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}; write START:DURATION:FX,FY,FZ in s and N, for example 12:0.3:40,0,0"
+        )
+    t, duration, x, y, z = (float(number) for number in match.groups())
+    return Push(at=t, duration=duration, force=(x, y, z))
+
+
+def parse_fault(text: str) -> Fault:
+    """Read MODULE[.AXIS]:KIND@T[:DUR]."""
+    match = re.fullmatch(rf"(\w+)(?:\.([01]))?:(\w+)@({_NUMBER})(?::({_NUMBER}))?", text)
+    if match is None or match[1] not in MODULES or match[3] not in FAULT_KINDS:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}; write MODULE:KIND@SECONDS, for example knee_left:encoder@8, or "
+            f"knee_left.1:encoder@8:0.5; modules: {', '.join(MODULES)}; "
+            f"kinds: {', '.join(FAULT_KINDS)}"
+        )
+    row = {"module": match[1], "kind": match[3], "at": float(match[4])}
+    axis = int(match[2]) if match[2] else None
+    duration = float(match[5]) if match[5] else None
+    return msgspec.convert({**row, "axis": axis, "duration": duration}, Fault)
+
+
+def scenario_file(name: str, config: Path = DEFAULT_CONFIG) -> Path:
+    """Return the file of a scenario given by name or path, absolute.
+
+    Args:
+        name: a path that ends with .toml; or a name: first from the folder `scenarios` beside the
+            robot file, then from those that are shipped.
+        config: the robot file.
+
+    Raises:
+        FleetError: there is none; the message lists the names.
+    """
+    folders = (config.parent / SCENARIOS.name, SCENARIOS)
+    paths = [Path(name)] if name.endswith(".toml") else [at / f"{name}.toml" for at in folders]
+    for path in paths:
+        if path.is_file():
+            return path.absolute()
+    known = ", ".join(sorted({file.stem for at in folders for file in at.glob("*.toml")}))
+    raise FleetError(f"no scenario {name!r}; one of {known}, or the path of a .toml file")
+
+
+def make_scenario(args: argparse.Namespace) -> Scenario:
+    """Return the scenario with the flags applied.
+
+    A shorter duration drops the file's rows beyond it; a flag that names a time beyond it is
+    refused.
+
+    Raises:
+        ConfigError: file and flags make no valid scenario.
+    """
+    path = scenario_file(args.scenario, args.config)
+    scenario = scenarios.load(path)
+    duration = args.duration if args.duration is not None else scenario.duration
+    if duration <= 0.0:
+        raise RunError(f"--duration {duration:g}: must be more than 0 s")
+    kills = tuple(args.kill) if args.kill is not None else _inside(scenario.kill, duration)
+    restarts = tuple(args.restart or ()) if args.kill or args.restart else scenario.restart
+    pushes = tuple(args.push) if args.push is not None else _inside(scenario.push, duration)
+    faults = tuple(args.fault) if args.fault is not None else _inside(scenario.fault, duration)
+    injects = tuple(args.inject) if args.inject is not None else _inside(scenario.inject, duration)
+    scenario = msgspec.structs.replace(
+        scenario,
+        duration=duration,
+        fault=faults,
+        inject=injects,
+        kill=kills,
+        restart=_inside(restarts, duration) if not args.restart else restarts,
+        push=pushes,
+    )
+    flags = (args.kill, args.restart, args.push, args.fault, args.inject, args.duration)
+    by_flags = " with the flags of this command" if any(flag is not None for flag in flags) else ""
+    scenarios.check(f"{path}{by_flags}", scenario)
+    return scenario
+
+
+def _inside(rows: tuple[E, ...], duration: float) -> tuple[E, ...]:
+    return tuple(row for row in rows if row.at < duration)
+
+
+def describe(scenario: Scenario) -> str:
+    """Return kills, faults and impairments as a clause for the run's first line."""
+    done = [f"{row.service} {row.signal} at {row.at:g} s" for row in scenario.kill]
+    done += [f"{row.service} back at {row.at:g} s" for row in scenario.restart]
+    done += [f"{row.module} {row.kind} at {row.at:g} s" for row in scenario.fault]
+    done += [in_words_of(row) for row in scenario.inject]
+    done += ["push {:g},{:g},{:g} N at {:g} s".format(*row.force, row.at) for row in scenario.push]
+    return f"; {', '.join(done)}" if done else ""
+
+
+def introduce(scenario: Scenario, console: Console) -> None:
+    """Print what is about to happen."""
+    about = printable(f"{scenario.about}{describe(scenario)}")
+    console.print(marked("[bold]{}[/]: {}", scenario.name, about))
+
+
+def make_robot(args: argparse.Namespace) -> RobotConfig:
+    """Return the robot with the flags laid over it.
+
+    Raises:
+        ConfigError: the file cannot be used, or the gain split lacks its schedule.
+    """
+    changes = {
+        key: value
+        for key, value in (("split", args.split), ("jacobian", args.jacobian))
+        if value is not None
+    }
+    if changes.get("jacobian") == "average" and "split" not in changes:
+        changes["split"] = "diagonal"  # no local gains certify it, so there is no schedule
+    return load_robot(args.config, imu=args.imu, **changes)
+
+
+def load_robot(path: Path, *, imu: bool = False, **law: str) -> RobotConfig:
+    """Return the robot of a file, ready to run.
+
+    Args:
+        path: the robot file.
+        imu: fit one, whatever the file says.
+        law: keys of `[law]` to change, and their values.
+
+    Raises:
+        ConfigError: the file cannot be used, or the gain split lacks its schedule.
+    """
+    robot = config_file.load(path)
+    robot = msgspec.structs.replace(robot, law=msgspec.structs.replace(robot.law, **law))
+    if imu:
+        robot = msgspec.structs.replace(robot, imu=msgspec.structs.replace(robot.imu, fitted=True))
+        config_check.check(str(path), robot)
+    gain_schedule.require(robot, path)
+    return robot
+
+
+def make_out(out: Path | None, verb: str) -> Path:
+    """Make the directory of a run's results; without a name, one of this verb and time.
+
+    Raises:
+        RunError: it cannot be made, or holds a run already.
+    """
+    out = out if out is not None else Path("out") / time.strftime(f"{verb}-%Y%m%d-%H%M%S")
+    if (out / "run.mcap").exists():
+        raise RunError(f"{out}: holds a run already; choose another --out, or remove it")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunError(f"{out}: cannot be made: {error.strerror}; choose another --out") from None
+    return out
+
+
+def write_inputs(
+    out: Path, robot: RobotConfig, scenario: Scenario, true_plant: PlantConfig
+) -> tuple[Path, ...]:
+    """Write the run's inputs beside its results.
+
+    Returns:
+        The files: robot, scenario, plant and, if the robot has one, its gain schedule.
+    """
+    robot_path, scenario_path = out / "robot.toml", out / "scenario.toml"
+    plant_path = out / PLANT_FILE
+    replace_file(plant_path, plant.to_toml(true_plant).encode())
+    replace_file(robot_path, config_file.to_toml(robot).encode())
+    replace_file(scenario_path, scenarios.to_toml(scenario).encode())
+    if robot.gain_schedule is None:
+        return robot_path, scenario_path, plant_path
+    schedule_path = gain_schedule.path_beside(robot_path)
+    gain_schedule.write(schedule_path, robot.gain_schedule)
+    return robot_path, scenario_path, plant_path, schedule_path

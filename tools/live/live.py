@@ -1,0 +1,147 @@
+"""A live run: a fleet in a run directory of its own, led by a tool and then stopped."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
+from typing import TypeVar
+
+from services.planner.controller_file import ATTACHED, absolute, split_spec
+from services.simulator.physics.plant import PlantConfig
+from shared.atomic_file import replace_file
+from shared.bus.session import Session, open_session
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Scenario
+from shared.robot.robot_model import mjcf
+from tools.fleet.pace import run_at_fitting_pace
+from tools.fleet.supervise import SupervisedFleet
+from tools.live import experiment
+from tools.live.experiment import PLANT_FILE
+
+T = TypeVar("T")
+
+
+def run_live(
+    out: Path,
+    robot: RobotConfig,
+    scenario: Scenario,
+    lead: Callable[[SupervisedFleet, Session], T],
+    *,
+    verb: str,
+    seed: int,
+    true_plant: PlantConfig,
+    no_restart: Collection[str],
+    pace: float | None = None,
+    controller: str | None = None,
+    tell: Callable[[str], None] = lambda _text: None,
+) -> T:
+    """Start a fleet, call `lead`, stop the fleet; return what `lead` returns.
+
+    However it ends, no process and no run directory is left, and the logs are in `out`.
+
+    Args:
+        out: folder for the run's log, its inputs and the services' logs.
+        robot: the robot.
+        scenario: what the simulated operator and the drives do; kills are for `lead` to do.
+        lead: leads the run; it is given the fleet and a session on its bus.
+        verb: of the command line; names the run directory and the session.
+        seed: of the sensors' noise.
+        true_plant: how the simulated robot differs from `robot`.
+        no_restart: services that the supervisor leaves down when they end.
+        pace: clock rate of the fleet. None: the default, lowered step by step while the cores are
+            full; the pace found becomes the default of this process.
+        controller: of somebody's own, `FILE.py[:NAME]`, in the place of the law.
+        tell: takes a line of text each time the pace is lowered.
+
+    Raises:
+        CoresFullError: they do not carry it at any pace, or at the one asked for.
+        FleetError: the fleet cannot be started or stopped.
+    """
+
+    def at(pace: float) -> T:
+        return _run_once(
+            out, robot, scenario, lead,
+            verb=verb, seed=seed, true_plant=true_plant, no_restart=no_restart, pace=pace,
+            controller=controller,
+        )  # fmt: skip
+
+    def again(text: str) -> None:
+        for record in out.glob("run*.mcap"):
+            record.unlink()  # of a robot that stood and waited
+        tell(text)
+
+    return at(pace) if pace is not None else run_at_fitting_pace(at, again)
+
+
+def _run_once(
+    out: Path,
+    robot: RobotConfig,
+    scenario: Scenario,
+    lead: Callable[[SupervisedFleet, Session], T],
+    *,
+    verb: str,
+    seed: int,
+    true_plant: PlantConfig,
+    no_restart: Collection[str],
+    pace: float,
+    controller: str | None,
+) -> T:
+    """Run at one pace."""
+    robot_path, scenario_path, plant_path, *_ = experiment.write_inputs(
+        out, robot, scenario, true_plant
+    )
+    model_path = out / "model.xml"
+    replace_file(model_path, mjcf(robot).encode())
+    attached = {"model.xml": model_path, PLANT_FILE: plant_path}
+    if controller is not None:
+        attached[ATTACHED] = split_spec(controller)[0]
+    run_dir = Path(tempfile.mkdtemp(prefix=f"xrl-{verb}-", dir="/tmp"))
+    try:
+        fleet = SupervisedFleet.start(
+            robot_path.absolute(),
+            run_dir,
+            overrides={
+                "recorder": _recorder_arguments(out, scenario, scenario_path, attached),
+                **({"planner": ["--controller", absolute(controller)]} if controller else {}),
+                "simulator": [
+                    *("--scenario", str(scenario_path.absolute())),
+                    *("--plant", str(plant_path.absolute())),
+                    *("--seed", str(seed)),
+                ],
+                **({"network_proxy": ["--seed", str(seed)]} if scenario.inject else {}),
+            },
+            no_restart=frozenset(no_restart),
+            injected=bool(scenario.inject),
+            pace=pace,
+            leashed=True,
+        )
+        try:
+            with open_session(robot, verb, run_dir) as session:
+                return lead(fleet, session)
+        finally:
+            fleet.stop(keep_logs=True)
+            logs = out / "logs"
+            shutil.rmtree(logs, ignore_errors=True)
+            shutil.copytree(fleet.run.logs, logs, dirs_exist_ok=True)
+    finally:
+        shutil.rmtree(run_dir, ignore_errors=True)
+
+
+def _recorder_arguments(
+    out: Path, scenario: Scenario, scenario_path: Path, attached: Mapping[str, Path]
+) -> list[str]:
+    return [
+        "--out",
+        str(out.absolute()),
+        "--scenario",
+        str(scenario_path.absolute()),
+        "--scenario-text",
+        scenario.name,
+        *(
+            word
+            for name, path in attached.items()
+            for word in ("--attach", f"{name}={path.absolute()}")
+        ),
+    ]

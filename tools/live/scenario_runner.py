@@ -1,0 +1,404 @@
+"""Leads a live run through its scenario: start, kills, restarts, end.
+
+It watches the simulated truth on the bus and acts by scenario time. Each action is published as a
+run event, so that the log alone shows all of them.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import time
+from collections.abc import Callable, Iterable
+from typing import Final, NamedTuple
+
+from shared.bus import topics
+from shared.bus.code_names import name_of
+from shared.bus.messages import (
+    JointState,
+    Mode,
+    PlannerStatus,
+    RunEvent,
+    RunEventKind,
+    SimControl,
+    SimTruth,
+)
+from shared.bus.session import Latest, Session
+from shared.clock import NS_PER_S, machine_s, now_ns, pace
+from shared.config.scenarios import Fault, Inject, Kill, Push, Restart, Scenario
+from shared.exceptions import RunError
+from shared.joints import MODULES
+from tools.fleet import procfs
+from tools.fleet.pace import IDLE_LEAST, CoresFullError, IdleMeter, idle_and_total, idle_share
+from tools.fleet.proxy_client import ProxyClient
+from tools.fleet.supervise import SupervisedFleet
+from tools.judge.stalls import Stall
+from tools.live.live_stalls import LiveStalls
+
+READY_TIMEOUT_S: Final = 45.0
+"""Longer than all that a planner waits after the first five drop-outs: a machine may stall."""
+PATIENCE_S: Final = 10.0
+"""Start-up uses all cores, so the idle fraction is checked only after this time."""
+IDLE_EVERY_S: Final = 0.5
+SETTLE_S: Final = 2.0
+"""All six modules track for so long before the scenario starts."""
+AFTER_FALL_S: Final = 1.0
+"""A run is ended so long after a fall."""
+SILENT_S: Final = 3.0
+"""The simulated world says nothing for so long: the run is over."""
+LAST_WORDS_S: Final = 0.3
+"""s; the last messages reach the recorder in this time."""
+POLL_S: Final = 0.004
+UNHEARD_S: Final = 0.5
+"""A module that says nothing for so long is shown as silent."""
+PIDS_EVERY_S: Final = 1.0
+STALLS_FILE: Final = "stalls"
+"""In the run directory: what `StallWatch` finds."""
+ENDING_S: Final = 3.0
+"""s; a service that was told to end has done so by then, or was killed by its supervisor."""
+
+
+class LiveSnapshot(NamedTuple):
+    """Contents of the live display."""
+
+    truth: SimTruth | None
+    modes: tuple[str, ...]
+    """One letter for each module: D, H, T, damp, FAULT; `-` for one that never sent a state."""
+    note: str
+
+
+class EndOfRun(NamedTuple):
+    """How a run ended."""
+
+    cpu_pct: float | None
+    """CPU use of all processes together, %: 100 is one core; None: the robot fell before the
+    scenario could begin."""
+    scenario_s: float
+    """So long it was to stand."""
+
+
+class TriggeredKill(NamedTuple):
+    """A kill at no fixed time: when modules track again after a drop-out."""
+
+    service: str
+    modules: int
+    """So many track again,"""
+    after_s: float
+    """since so long."""
+
+
+class CpuMeter:
+    """CPU time of the fleet and of this process, summed over processes that come and go."""
+
+    def __init__(self) -> None:
+        self._last: dict[int, float] = {}
+        self._begin_s = self._end_s = time.monotonic()
+        self._spent_s = 0.0
+
+    def sample(self, pids: Iterable[int]) -> None:
+        """Add what each process has used since the sample before."""
+        self._end_s = time.monotonic()
+        for pid in (*pids, os.getpid()):
+            used = procfs.cpu_s(pid)
+            if used is not None:
+                self._spent_s += used - self._last.get(pid, used)
+                self._last[pid] = used
+
+    @property
+    def share_pct(self) -> float:
+        """Mean use from the first sample to the last: 100 is one core."""
+        return 100.0 * self._spent_s / max(1e-9, self._end_s - self._begin_s)
+
+
+class ScenarioRunner:
+    """One live run."""
+
+    def __init__(
+        self,
+        fleet: SupervisedFleet,
+        session: Session,
+        scenario: Scenario,
+        show: Callable[[LiveSnapshot], None],
+        triggered_kill: TriggeredKill | None = None,
+        tell: Callable[[str], None] = lambda _text: None,
+    ) -> None:
+        """Take the scenario's kills, and perhaps one that the modules' modes trigger.
+
+        Args:
+            fleet: that runs.
+            session: on its bus.
+            scenario: what is to be done.
+            show: shows how the run is.
+            triggered_kill: besides those of the scenario.
+            tell: takes what is to be known of the machine before the scenario starts.
+        """
+        self._fleet = fleet
+        self._scenario = scenario
+        self._show = show
+        self._tell = tell
+        self._triggered_kill = triggered_kill
+        self._dropped_out = False
+        self._triggered_kill_at_s = math.inf
+        self.said: list[RunEvent] = []
+        """Actions on the run so far."""
+        self._truths: Latest[SimTruth] = session.latest(topics.SIM_TRUTH, SimTruth)
+        self._states = {
+            module: session.latest(topics.JOINT_STATE, JointState, module) for module in MODULES
+        }
+        self._leads: Latest[PlannerStatus] = session.latest(topics.PLANNER_STATUS, PlannerStatus)
+        self._control = session.publisher(topics.SIM_CONTROL, SimControl)
+        self._events = session.publisher(topics.RUN_EVENT, RunEvent)
+        self._truth: SimTruth | None = None
+        self._truth_at_s = time.monotonic()
+        self._modes: dict[str, int] = {}
+        self._heard_s: dict[str, float] = {}
+        self._said = 0
+        self._start_ns = 0
+        self._note = ""
+        self._pids: dict[str, int] = {}
+        self._next_pids_s = 0.0
+        self._stalls = LiveStalls()
+        self._killed = False
+
+    def run(self, is_over: Callable[[], bool] = lambda: False) -> EndOfRun:
+        """Wait until the robot stands, run the scenario to its end.
+
+        Args:
+            is_over: returns True to end it sooner.
+
+        Raises:
+            CoresFullError: the cores do not carry the fleet at its pace, so it does not come to
+                stand.
+            RunError: the robot did not come to stand, or the simulated world went silent.
+            FleetError: a service that was to be restarted could not be.
+        """
+        with self._stalls.watched(self._fleet.run.path / STALLS_FILE):
+            return self._run(is_over)
+
+    def _run(self, is_over: Callable[[], bool]) -> EndOfRun:
+        if not self._wait_until_tracking(is_over):
+            self._say(RunEventKind.FINISHED, self._scenario.name, "fell before the start")
+            time.sleep(LAST_WORDS_S)
+            return EndOfRun(None, self._scenario.duration)
+        self._start()
+        todo: list[Kill | Restart | Push | Fault | Inject] = [
+            *self._scenario.kill,
+            *self._scenario.restart,
+            *self._scenario.push,
+            *self._scenario.fault,
+            *self._scenario.inject,
+        ]
+        todo.sort(key=lambda row: row.at)
+        fallen_at_s, ended_at_s = None, self._scenario.duration
+        meter = CpuMeter()
+        while True:
+            self._listen()
+            self._look_at_processes(meter)
+            truth = self._truth
+            if truth is not None and truth.scenario_s < 0.0:
+                raise RunError("the simulator was started again, and its scenario is gone")
+            if truth is not None:
+                # between two truths the scenario's clock runs on with ours
+                self._start_ns = truth.t_ns - round(truth.scenario_s * NS_PER_S)
+                if truth.fallen and fallen_at_s is None:
+                    fallen_at_s, self._note = truth.scenario_s, "FALLEN"
+                limit = self._scenario.duration
+                if fallen_at_s is not None:
+                    limit = min(limit, fallen_at_s + AFTER_FALL_S)
+                if truth.scenario_s >= limit:
+                    break
+                if is_over():
+                    ended_at_s = truth.scenario_s
+                    break
+            scenario_s = (now_ns() - self._start_ns) / NS_PER_S
+            while todo and scenario_s >= todo[0].at:
+                self._act(todo.pop(0))
+            self._follow(scenario_s)
+            time.sleep(POLL_S)
+        meter.sample(self._pids.values())
+        self._tell_stalls(self._stalls.rest())
+        self._say(RunEventKind.FINISHED, self._scenario.name, "")
+        time.sleep(LAST_WORDS_S)
+        return EndOfRun(meter.share_pct, ended_at_s)
+
+    def _look_at_processes(self, meter: CpuMeter) -> None:
+        """Once a second: a kill must not wait for the supervisor to tell the process."""
+        now_s = time.monotonic()
+        if now_s >= self._next_pids_s:
+            self._next_pids_s = now_s + PIDS_EVERY_S
+            self._pids = self._fleet.pids()
+            meter.sample(self._pids.values())
+
+    def _wait_until_tracking(self, is_over: Callable[[], bool]) -> bool:
+        """Wait until the hoist is down and all six modules have tracked for a while.
+
+        Returns False if the robot falls first: that is a finding, not an error.
+
+        Raises:
+            KeyboardInterrupt: it is over before that.
+        """
+        begin_s = time.monotonic()
+        deadline, next_look_s = begin_s + machine_s(READY_TIMEOUT_S), begin_s
+        meter, idle = IdleMeter(), None
+        since, before = None, idle_and_total()
+        self._note = "waiting for six modules to track"
+        while since is None or time.monotonic() - since < machine_s(SETTLE_S):
+            self._listen()
+            if is_over():
+                raise KeyboardInterrupt
+            if time.monotonic() >= next_look_s:
+                next_look_s += IDLE_EVERY_S
+                idle = meter.look()
+                late = time.monotonic() - begin_s >= PATIENCE_S
+                if late:
+                    self._check_cores(idle)
+            tracking = [self._modes.get(module) == Mode.TRACK for module in MODULES]
+            standing = self._truth is not None and self._truth.hoist == 0.0
+            if self._truth is not None and self._truth.fallen:
+                return False
+            if all(tracking) and standing:
+                self._stalls.begin()
+                if since is None:
+                    since, before = time.monotonic(), idle_and_total()
+                self._note = "standing, settling"
+            else:
+                since = None
+            if time.monotonic() > deadline:
+                lead = self._leads.take()
+                raise RunError(
+                    f"not all six modules track after {READY_TIMEOUT_S:.0f} s: "
+                    f"{(lead.why if lead else '') or self._describe_modes()}; "
+                    "the services' logs tell more"
+                )
+            time.sleep(POLL_S)
+        self._check_cores(idle)  # tracking for a moment is not being carried through a scenario
+        self._tell(self._stalls.describe_machine(idle_share(before), IDLE_LEAST))
+        self._note = ""
+        return True
+
+    def _check_cores(self, idle: float | None) -> None:
+        """Raise CoresFullError if the idle fraction of the cores is known and too small."""
+        if idle is not None and idle < IDLE_LEAST:
+            raise CoresFullError(
+                f"the cores do not carry the fleet at {pace():g} of real time: "
+                f"{100 * idle:.0f} % idle; modules: {self._describe_modes()}; "
+                f"`--pace {pace() / 2:g}` asks for half of it"
+            )
+
+    def _describe_modes(self) -> str:
+        return ", ".join(
+            f"{module} {name_of(Mode, self._modes[module]) if module in self._modes else 'silent'}"
+            for module in MODULES
+        )
+
+    def _start(self) -> None:
+        """Ask the world to start until it has."""
+        deadline = time.monotonic() + 5.0
+        while self._truth is None or self._truth.scenario_s < 0.0:
+            self._said += 1
+            self._control.put(SimControl(t_ns=now_ns(), seq=self._said, start=True))
+            time.sleep(0.05)
+            self._listen()
+            if time.monotonic() > deadline:
+                raise RunError("the simulator does not start the scenario; see its log")
+        self._start_ns = self._truth.t_ns - round(self._truth.scenario_s * NS_PER_S)
+        self._say(RunEventKind.STARTED, self._scenario.name, "")
+
+    def _tell_stalls(self, found: Iterable[Stall]) -> None:
+        for stall in found:
+            self._said += 1
+            event = stall.event(self._said, self._start_ns or stall.begin_ns + NS_PER_S)
+            self.said.append(event)
+            self._events.put(event)
+
+    def _listen(self) -> None:
+        """Receive new messages and show them."""
+        for module, latest in self._states.items():
+            state = latest.take()
+            if state is not None:
+                self._stalls.hear(module, state)
+                self._modes[module] = state.mode
+                self._heard_s[module] = time.monotonic()
+            elif time.monotonic() - self._heard_s.get(module, 0.0) > UNHEARD_S:
+                self._modes.pop(module, None)
+        truth = self._truths.take()
+        if truth is not None:
+            self._stalls.see(truth)
+            self._truth, self._truth_at_s = truth, time.monotonic()
+            modes = tuple(
+                name_of(Mode, self._modes[module])[0] if module in self._modes else "-"
+                for module in MODULES
+            )
+            held_by_it = [] if self._killed else list(self._modes.values())
+            words = (self._note, self._stalls.words(held_by_it))
+            note = "; ".join(word for word in words if word)
+            self._show(LiveSnapshot(truth, modes, note))
+        elif time.monotonic() - self._truth_at_s > SILENT_S and self._start_ns:
+            raise RunError(f"the simulator has said nothing for {SILENT_S:.0f} s; see its log")
+        self._tell_stalls(self._stalls.take())
+
+    def _act(self, row: Kill | Restart | Push | Fault | Inject) -> None:
+        """Do what is due; the simulator does pushes and faults, and they are only recorded here."""
+        if isinstance(row, Kill):
+            self._say(RunEventKind.KILLED, row.service, row.signal)
+            self._killed = True
+            number = signal.Signals[f"SIG{row.signal}"]
+            try:
+                os.kill(self._pids[row.service], number)
+            except (KeyError, ProcessLookupError):
+                words = f"kill {row.service}@{row.at:g}: it has no process then"
+                raise RunError(f"{words}; see logs/{row.service}.log") from None
+            self._note = f"{row.service} {'stopped' if row.signal == 'STOP' else 'killed'}"
+        elif isinstance(row, Restart):
+            self._wait_until_ended(row.service)
+            self._say(RunEventKind.RESTARTED, row.service, "")
+            self._fleet.start_service(row.service)
+            self._next_pids_s = 0.0
+            self._note = f"{row.service} back"
+        elif isinstance(row, Inject):
+            ProxyClient(self._fleet.run.path).begin(row)
+        elif isinstance(row, Fault):
+            self._say(RunEventKind.FAULTED, row.module, row.kind)
+            self._note = f"{row.module}: {row.kind}"
+        else:
+            x, y, z = row.force
+            self._say(RunEventKind.PUSHED, "torso", f"{x:g},{y:g},{z:g} N for {row.duration:g} s")
+
+    def _follow(self, scenario_s: float) -> None:
+        """Kill the triggered service when its time has come."""
+        if self._triggered_kill is None:
+            return
+        now_s = time.monotonic()
+        tracking = list(self._modes.values()).count(Mode.TRACK)
+        self._dropped_out |= tracking == 0
+        if self._dropped_out and tracking >= self._triggered_kill.modules:
+            self._triggered_kill_at_s = min(
+                self._triggered_kill_at_s, now_s + machine_s(self._triggered_kill.after_s)
+            )
+        if now_s >= self._triggered_kill_at_s:
+            service, self._triggered_kill = self._triggered_kill.service, None
+            self._act(Kill(service=service, at=scenario_s))
+
+    def _wait_until_ended(self, service: str) -> None:
+        """Wait for a service that is still leaving after TERM or INT; one that is stopped stays."""
+        pid = self._pids.get(service)
+        deadline = time.monotonic() + ENDING_S
+        while pid is not None and time.monotonic() < deadline:
+            if procfs.is_gone(pid) or procfs.is_suspended(pid):
+                return
+            time.sleep(POLL_S)
+
+    def _say(self, kind: RunEventKind, subject: str, detail: str) -> None:
+        now = now_ns()
+        self._said += 1
+        event = RunEvent(
+            t_ns=now,
+            seq=self._said,
+            kind=int(kind),
+            subject=subject,
+            detail=detail,
+            scenario_s=(now - self._start_ns) / NS_PER_S,
+        )
+        self.said.append(event)
+        self._events.put(event)

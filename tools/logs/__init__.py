@@ -1,0 +1,1 @@
+"""Records of runs: found, read, joined, played, executed again."""

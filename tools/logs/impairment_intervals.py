@@ -1,0 +1,135 @@
+"""Intervals in which a run's network was impaired, from the link events in its log."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.bus.traces import LinkEvent
+from shared.clock import NS_PER_S
+
+LAST_NS: Final = np.iinfo(np.int64).max
+
+
+class Impaired(NamedTuple):
+    """One impairment, over all its directions."""
+
+    link: str
+    """As requested: a direction, or a group of them."""
+    words: str
+    """The impairment, as `--inject` takes it."""
+    directions: frozenset[str]
+    """Directions, as named in `shared.links`."""
+    begin_ns: int
+    """Monotonic, as of messages."""
+    end_ns: int | None
+    """None: its end is not in the log."""
+    passed: int | None
+    """Messages that went through while it was in force, all directions; None without an end."""
+    lost: int | None
+    """Messages that it took away."""
+
+    @property
+    def title(self) -> str:
+        """Where, and what."""
+        return f"{self.link} {self.words}"
+
+    def begin_s(self, zero_ns: int) -> float:
+        """Return when it began, s after a stamp."""
+        return (self.begin_ns - zero_ns) / NS_PER_S
+
+    def end_s(self, zero_ns: int) -> float | None:
+        """Return when it ended, s after a stamp; None if that is not in the log."""
+        return None if self.end_ns is None else (self.end_ns - zero_ns) / NS_PER_S
+
+    def at(self, t_ns: int) -> bool:
+        """Return True if it was in force at a time."""
+        return self.begin_ns <= t_ns and (self.end_ns is None or t_ns < self.end_ns)
+
+    def when(self, zero_ns: int) -> str:
+        """Return for example `3.00 to 7.00 s`, in s after a stamp."""
+        begin, end = self.begin_s(zero_ns), self.end_s(zero_ns)
+        return f"from {begin:.2f} s on" if end is None else f"{begin:.2f} to {end:.2f} s"
+
+    def counts(self) -> str:
+        """Return the counts of passed and lost messages as text."""
+        if self.passed is None:
+            return "its end is not in the log"
+        return f"{self.passed} messages passed, {self.lost} lost"
+
+    def as_dict(self, zero_ns: int) -> dict[str, Any]:
+        """Return it as plain values, times in s after a stamp."""
+        return {
+            "link": self.link,
+            "words": self.words,
+            "begin_s": self.begin_s(zero_ns),
+            "end_s": self.end_s(zero_ns),
+            "passed": self.passed,
+            "lost": self.lost,
+            "said": f"{self.title}: {self.when(zero_ns)}; {self.counts()}",
+        }
+
+
+def impairments(events: Iterable[LinkEvent]) -> list[Impaired]:
+    """Return all impairments in the order of their start.
+
+    A network proxy that was killed records no end, and its successor counts from 1 again: a number
+    that starts again ends the earlier impairment of that number.
+
+    Args:
+        events: from the log.
+    """
+    found: list[list[LinkEvent]] = []
+    ends: list[list[LinkEvent]] = []
+    open_: dict[int, int] = {}
+    for event in events:
+        place = open_.get(event.number)
+        if event.active:
+            if place is None or found[place][0].t_ns != event.t_ns:
+                place = open_[event.number] = len(found)
+                found.append([])
+                ends.append([])
+            found[place].append(event)
+        elif place is not None:
+            ends[place].append(event)
+    return [_of(begun, ended, found) for begun, ended in zip(found, ends, strict=True)]
+
+
+def _of(
+    begun: Sequence[LinkEvent], ended: Sequence[LinkEvent], all_: Sequence[Sequence[LinkEvent]]
+) -> Impaired:
+    first = begun[0]
+    again = [row[0].t_ns for row in all_ if row[0].number == first.number]
+    end_ns = next((t_ns for t_ns in again if t_ns > first.t_ns), None)
+    if ended:
+        end_ns = ended[0].t_ns
+    return Impaired(
+        link=first.requested,
+        words=first.detail,
+        directions=frozenset(event.link for event in begun),
+        begin_ns=first.t_ns,
+        end_ns=end_ns,
+        passed=sum(event.passed for event in ended) if ended else None,
+        lost=sum(event.lost for event in ended) if ended else None,
+    )
+
+
+def touches(
+    rows: Iterable[Impaired], module: str, times_ns: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """Return, for each time, whether a link between the planner and a module was impaired.
+
+    Args:
+        rows: all impairments.
+        module: the module.
+        times_ns: monotonic, as of messages.
+    """
+    mask = np.zeros(len(times_ns), dtype=bool)
+    for row in rows:
+        if row.directions & {f"planner->{module}", f"{module}->planner"}:
+            end_ns = LAST_NS if row.end_ns is None else row.end_ns
+            mask |= (times_ns >= row.begin_ns) & (times_ns < end_ns)
+    return mask

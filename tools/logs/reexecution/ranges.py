@@ -1,0 +1,101 @@
+"""Executes a run again in ranges of its time, side by side on several processors.
+
+Each range begins a little before its begin, at the memory that the services recorded there, and
+what comes before its begin is not counted. So every tick is executed once, from a memory that the
+range before it is held to.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from tools.logs.recorded_robot import robot_of
+from tools.logs.reexecution.execution import Execution
+from tools.logs.reexecution.outcome import ReexecutionResult
+from tools.logs.run_index import RunIndex
+from tools.logs.run_log import MARGIN_S, NOTHING, RunLog, RunPart, parts_of
+
+RANGE_S: Final = 60.0
+"""Length of a range; shorter ones spend more on their lead-in and on starting."""
+LEAD_S: Final = 2.5
+"""Lead-in: memories are a second apart."""
+
+
+class RangeTask(NamedTuple):
+    """One range of a run."""
+
+    run: Path
+    part: RunPart
+    services: tuple[str, ...]
+    tolerance: float
+
+
+def ranges_of(
+    index: RunIndex,
+    part: RunPart,
+    services: tuple[str, ...],
+    tolerance: float,
+    *,
+    range_s: float = RANGE_S,
+    workers: int = 1,
+) -> list[RangeTask]:
+    """Return a part of a run in ranges, in their order.
+
+    Args:
+        index: of the run.
+        part: what of it to execute.
+        services: their names.
+        tolerance: largest accepted difference of numbers.
+        range_s: the longest that one may be.
+        workers: that share them: each is to have as many.
+    """
+    begin_s, end_s = max(part.begin_s, 0.0), min(part.end_s, index.length_s)
+    count = math.ceil((end_s - begin_s) / range_s)
+    count = workers * math.ceil(count / workers) if count > 1 else 1
+    edges = [begin_s + number * (end_s - begin_s) / count for number in range(count)]
+    parts = zip(edges, [*edges[1:], part.end_s], strict=True)
+    return [RangeTask(index.path, RunPart(*edge), services, tolerance) for edge in parts]
+
+
+def execute_range(task: RangeTask) -> list[ReexecutionResult]:
+    """Execute one range; return a result for each service, in the order of their names.
+
+    Raises:
+        RunError: the log cannot be read, or does not say what robot it is of.
+    """
+    index = _index_of(task.run)
+    robot = robot_of(RunLog(index, NOTHING, as_sent=True))
+    executions = [Execution(robot, name, task.tolerance) for name in task.services]
+    begin_s = task.part.begin_s
+    if begin_s > 0.0:
+        before = RunPart(max(0.0, begin_s - LEAD_S), begin_s)
+        _execute(executions, RunLog(index, before, MARGIN_S, as_sent=True))
+        for execution in executions:
+            execution.outcome.forget()
+    for log in parts_of(index, task.part, as_sent=True):
+        _execute(executions, log)
+    return [execution.outcome for execution in executions]
+
+
+def merged(results: Sequence[list[ReexecutionResult]]) -> list[ReexecutionResult]:
+    """Return one result for each service, from those of the ranges in their order."""
+    whole = results[0]
+    for later in results[1:]:
+        for mine, its in zip(whole, later, strict=True):
+            mine.add(its)
+    return whole
+
+
+@lru_cache(maxsize=1)
+def _index_of(run: Path) -> RunIndex:
+    return RunIndex(run)
+
+
+def _execute(executions: Sequence[Execution], log: RunLog) -> None:
+    for execution in executions:
+        for _ in execution.run(log):
+            pass

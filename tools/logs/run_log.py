@@ -1,0 +1,348 @@
+"""Reads a run's messages from its files, finished or killed: all of it, or a part of its time.
+
+A killed file has no summary, and may end in the middle of a record; the readers of the mcap package
+find nothing in the first and may stumble over the second (docs/logs.md). `shared.mcap_log.reader`
+walks the records from the start and keeps every whole one; here they are sorted by key.
+
+A whole run takes about 3 MB of memory for each of its seconds, and ten with its messages decoded.
+So what may be long is read by `parts_of`, one after the other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import lru_cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import msgspec
+
+from shared.bus import topics
+from shared.bus.topics import Topic
+from shared.clock import NS_PER_S
+from shared.exceptions import RunError
+from shared.mcap_log.sequence_stats import KeyCount
+from tools.logs.host_clocks import HostClocks
+from tools.logs.run_clocks import find_clocks
+from tools.logs.run_index import RunIndex
+
+PART_S: Final = 30.0
+"""Length of a part: its messages, decoded, fit into some 0.4 GB."""
+MARGIN_S: Final = 1.0
+"""Messages before and behind a part that are read with it: what a tick consumed or sent."""
+WHOLE_MAX_S: Final = 600.0
+"""Longest time that is read at once."""
+PICTURE_MAX_S: Final = 120.0
+"""Longest time in one picture of a run."""
+
+
+SEE_INFO: Final = "`xrl info` shows what the file holds"
+"""What to do about a part without messages."""
+
+
+class RunPart(NamedTuple):
+    """A part of a run's time, s since its first message."""
+
+    begin_s: float = 0.0
+    end_s: float = math.inf
+
+
+_EVER: Final = 1 << 62
+WHOLE: Final = RunPart()
+NOTHING: Final = RunPart(0.0, 0.0)
+"""Events alone."""
+
+
+class Series:
+    """The messages of one key, in the order in which they were recorded."""
+
+    def __init__(self) -> None:
+        self.payloads: list[bytes] = []
+        self.received_ns: list[int] = []
+        """Reception by the recorder, monotonic clock."""
+        self.seq: list[int] = []
+        self.decoded: list[Any] | None = None
+
+
+class RunLog:
+    """The messages of a run, or of a part of it, in memory.
+
+    Messages are decoded on request, once for each key. Topics of events, which have no rate, are
+    always of the whole run: a mode or a cut link that began before a part holds in it.
+
+    Where the services ran on several hosts, `t_ns` of a message is brought to the clock of the
+    recorder's (`tools/logs/host_clocks.py`), so that times can be compared; with `as_sent` it is
+    what the message says, as re-execution needs it. Other times in a message stay its sender's.
+    """
+
+    def __init__(
+        self,
+        index: RunIndex,
+        part: RunPart = WHOLE,
+        margin_s: float = 0.0,
+        *,
+        as_sent: bool = False,
+    ) -> None:
+        """Read the messages; `read_run` is the name to use.
+
+        Args:
+            index: of the run.
+            part: what of it to read.
+            margin_s: how much before and behind it is read as well.
+            as_sent: leave all times as they were sent.
+
+        Raises:
+            RunError: a file has gone, or is no log any more.
+        """
+        self.index = index
+        self.path, self.files = index.path, index.files
+        self.metadata, self.attachments = index.metadata, index.attachments
+        self.robot, self.offset_ns = index.robot, index.offset_ns
+        self.begin_ns = self.began_ns() + _ns(part.begin_s)
+        self.end_ns = min(self.began_ns() + _ns(part.end_s), self._ended_ns() + 1)
+        """The part, monotonic clock: from `begin_ns`, before `end_ns`."""
+        self.is_first = part.begin_s <= 0.0
+        self.is_last = self.end_ns > self._ended_ns()
+        self.is_whole = self.is_first and self.is_last
+        self._clocks = None if as_sent else clocks_of(index)
+        self._series: dict[str, Series] = {}
+        self._read(_ns(margin_s))
+        self.complete, self.damage, self.cut = index.complete, index.damage, index.cut
+
+    @property
+    def damaged(self) -> int:
+        """Number of places in the middle of the file that could not be read."""
+        return len(self.damage)
+
+    @property
+    def has_world(self) -> bool:
+        """True if a simulated world is in it."""
+        return bool(self.count(topics.SIM_TRUTH.key(self.robot)))
+
+    def keys(self) -> list[str]:
+        """Return every key that has at least one message."""
+        return [key for key, series in self._series.items() if series.payloads]
+
+    def count(self, key: str) -> int:
+        """Return the number of messages on a key; 0 for a key that is not in the file."""
+        return len(self._of(key).payloads)
+
+    def messages(self, topic: Topic, module: str = "") -> list[Any]:
+        """Return the messages of a topic as `topic.type`, in the order of the file.
+
+        Args:
+            topic: a row of `shared.bus.topics`.
+            module: for a topic with one key for each module.
+
+        Raises:
+            RunError: a message is not of that type: another version wrote the file;
+                or a module is needed and missing, or the other way round.
+        """
+        key = self._key(topic, module)
+        series = self._of(key)
+        if series.decoded is None:
+            decode = msgspec.json.Decoder(topic.type).decode
+            try:
+                decoded = [decode(payload) for payload in series.payloads]
+            except (msgspec.DecodeError, UnicodeDecodeError) as error:
+                version = self.metadata["run"].get("schema_version", "unknown")
+                raise RunError(
+                    f"{self.path}: {key}: a message is no {topic.type.__name__}: {error}; "
+                    f"the file has schema version {version}: read it with the code that wrote it"
+                ) from None
+            series.decoded = self._aligned(decoded, topic, module, series.received_ns)
+        return series.decoded
+
+    def raw(self, key: str) -> list[tuple[int, bytes, int]]:
+        """Return (monotonic reception, payload, number) of every message of a key."""
+        series = self._of(key)
+        return list(zip(series.received_ns, series.payloads, series.seq, strict=True))
+
+    def began_ns(self) -> int:
+        """Return when the run's first message reached the recorder, monotonic; 0 if none did."""
+        return self.index.began_ns - self.offset_ns
+
+    def _ended_ns(self) -> int:
+        return self.index.ended_ns - self.offset_ns
+
+    def received_ns(self, topic: Topic, module: str = "") -> list[int]:
+        """Return when each of `messages(topic, module)` reached the recorder.
+
+        Monotonic clock of the recorder's host: comparable with `t_ns` of senders there.
+        """
+        return self._of(self._key(topic, module)).received_ns
+
+    def holds(self, received_ns: int) -> bool:
+        """Return True for a message of this part, False for one of its margins."""
+        return (self.is_first or self.begin_ns <= received_ns) and (
+            self.is_last or received_ns < self.end_ns
+        )
+
+    def count_into(self, counts: dict[str, KeyCount]) -> None:
+        """Count the messages of this part, without its margins, after those of the parts before."""
+        for key in self.keys():
+            count = counts.setdefault(key, KeyCount(several=topics.several_may_write(key)))
+            for t_ns, _, seq in self.raw(key):
+                if self.holds(t_ns):
+                    count.feed(seq)
+
+    def gaps(self) -> dict[str, KeyCount]:
+        """Return counts, gaps and restarts of every key with messages, from the file itself."""
+        found = {}
+        for key in self.keys():
+            found[key] = KeyCount(several=topics.several_may_write(key))
+            for seq in self._of(key).seq:
+                found[key].feed(seq)
+        return found
+
+    def forget(self) -> None:
+        """Drop all messages; metadata and attachments stay."""
+        self._series = {}
+
+    def _aligned(
+        self, messages: list[Any], topic: Topic, module: str, received_ns: list[int]
+    ) -> list[Any]:
+        """Return the messages with `t_ns` on the recorder's clock."""
+        if self._clocks is None:
+            return messages
+        offset_ns = self._clocks.offset_ns
+        return [
+            msgspec.structs.replace(
+                message, t_ns=message.t_ns + offset_ns(topic, module, message.t_ns, at_ns)
+            )
+            for message, at_ns in zip(messages, received_ns, strict=True)
+        ]
+
+    def _key(self, topic: Topic, module: str) -> str:
+        if topic.per_module != bool(module):
+            right = "name a module" if topic.per_module else "name none"
+            raise RunError(f"{topic.name}: module {module!r} does not fit this topic; {right}")
+        return topic.key(self.robot, module)
+
+    def _of(self, key: str) -> Series:
+        return self._series.get(key) or Series()
+
+    def _read(self, margin_ns: int) -> None:
+        if self.is_whole:
+            self._take(0, _EVER)
+            return
+        known = topics.all_keys(self.robot).items()
+        events = frozenset(key for key, topic in known if not topic.rate_hz)
+        self._take(0, _EVER, events, others=False)
+        self._take(self.begin_ns - margin_ns, self.end_ns + margin_ns, events, others=True)
+
+    def _take(
+        self,
+        first_ns: int,
+        last_ns: int,
+        keys: frozenset[str] = frozenset(),
+        *,
+        others: bool = True,
+    ) -> None:
+        """Sort the messages of a time by key.
+
+        Args:
+            first_ns: monotonic clock, inclusive.
+            last_ns: the same, exclusive.
+            keys: full keys.
+            others: take the messages of all other keys; else of these.
+        """
+        offset_ns = self.offset_ns
+        first_ns, last_ns = first_ns + offset_ns, last_ns + offset_ns
+        for record, keys_by_channel in self.index.records(
+            first_ns, last_ns, None if others else keys
+        ):
+            body = record.body
+            by_channel = {
+                number: self._series.setdefault(key, Series())
+                for number, key in keys_by_channel.items()
+                if (key in keys) != others
+            }
+            for channel, seq, log_ns, _, start, end in record.rows:  # the hot loop of reading
+                series = by_channel.get(channel)
+                if series is not None and first_ns <= log_ns < last_ns:
+                    series.payloads.append(body[start:end])
+                    series.received_ns.append(log_ns - offset_ns)
+                    series.seq.append(seq)
+
+
+@lru_cache(maxsize=8)
+def clocks_of(index: RunIndex) -> HostClocks | None:
+    """Compare the clocks of a run's hosts; None if all its services ran on one.
+
+    Raises:
+        RunError: a message cannot be read.
+    """
+    return find_clocks(index, lambda *part: RunLog(index, RunPart(*part), as_sent=True))
+
+
+def read_run(path: Path, *, as_sent: bool = False) -> RunLog:
+    """Read a run, finished or killed.
+
+    Args:
+        path: a file; or a directory: all files of the run in it.
+        as_sent: leave all times as they were sent, see `RunLog`.
+
+    Raises:
+        RunError: a file is missing, empty, no MCAP file or no run; or the directory holds no
+            run, or several; or the run is longer than is read at once.
+    """
+    return read_part(RunIndex(path), WHOLE, as_sent=as_sent)
+
+
+def read_part(index: RunIndex, part: RunPart, *, as_sent: bool = False) -> RunLog:
+    """Read a part of a run at once.
+
+    Args:
+        index: of the run.
+        part: what of it to read.
+        as_sent: leave all times as they were sent, see `RunLog`.
+
+    Raises:
+        RunError: the part is empty, or longer than is read at once.
+    """
+    length_s = index.length_s
+    if part.begin_s > length_s:
+        raise RunError(f"{index.path}: --from {part.begin_s:g}: the run is {length_s:.1f} s long")
+    read_s = min(part.end_s, length_s) - max(part.begin_s, 0.0)
+    if read_s > WHOLE_MAX_S:
+        raise RunError(
+            f"{index.path}: {read_s:.0f} s are more than the {WHOLE_MAX_S:g} s that are read at "
+            "once; give --from and --to"
+        )
+    return RunLog(index, part, as_sent=as_sent)
+
+
+def parts_of(
+    index: RunIndex,
+    part: RunPart = WHOLE,
+    *,
+    part_s: float = PART_S,
+    margin_s: float = MARGIN_S,
+    as_sent: bool = False,
+) -> Iterator[RunLog]:
+    """Yield a run, or a part of it, in parts that follow each other: one in memory at a time.
+
+    Each forgets its messages when the next is asked for.
+
+    Args:
+        index: of the run.
+        part: what of it to read.
+        part_s: length of each part.
+        margin_s: how much before and behind each is read as well.
+        as_sent: leave all times as they were sent, see `RunLog`.
+    """
+    begin_s, end_s = max(part.begin_s, 0.0), min(part.end_s, index.length_s)
+    count = max(1, math.ceil((end_s - begin_s) / part_s))
+    step_s = (end_s - begin_s) / count
+    edges = [*(begin_s + number * step_s for number in range(count)), part.end_s]
+    for first_s, last_s in pairwise(edges):
+        log = RunLog(index, RunPart(first_s, last_s), margin_s, as_sent=as_sent)
+        yield log
+        log.forget()
+
+
+def _ns(seconds: float) -> int:
+    return round(min(seconds, 1e9) * NS_PER_S)

@@ -1,0 +1,249 @@
+"""Counts the contents of MCAP files: by file and by topic, finished or not, ours or foreign."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from shared.bus.topics import several_may_write
+from shared.clock import NS_PER_S
+from shared.mcap_log.files import in_use
+from shared.mcap_log.reader import ChunkPlace, LogReader, LogRecord, LostBytes, open_log
+from shared.mcap_log.records import Attachment, Channel, Header, McapRecord, Metadata, Schema
+from shared.mcap_log.sequence_stats import KeyCount
+from shared.mcap_log.writer import COUNTS, PROFILE
+from tools.logs.run_files import MetadataByName
+
+_NEVER: Final = -1
+
+
+class TopicFacts(msgspec.Struct, kw_only=True):
+    """One topic, over all files surveyed."""
+
+    schema: str
+    nominal_hz: float
+    """From the table of topics at the recording; 0: events, or unknown."""
+    bytes: int | None = 0
+    """Size of the payload before compression, bytes. None: not read."""
+    first_ns: int = _NEVER
+    last_ns: int = _NEVER
+    longest_gap_ns: int | None = 0
+    """Between two messages after each other; by the sender's clock in our logs. None: not read."""
+    sequence: KeyCount = msgspec.field(default_factory=KeyCount)
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Return the mean rate from the first to the last message."""
+        span_ns = self.last_ns - self.first_ns
+        return (self.sequence.count - 1) * NS_PER_S / span_ns if span_ns > 0 else None
+
+
+class FileFacts(msgspec.Struct, kw_only=True):
+    """One file."""
+
+    path: Path
+    size: int
+    finished: bool
+    in_use: bool
+    """A recorder is writing it."""
+    profile: str = ""
+    library: str = ""
+    messages: int = 0
+    first_ns: int = _NEVER
+    """Log times; -1 without messages."""
+    last_ns: int = _NEVER
+    orphans: int = 0
+    """Messages of channels that are nowhere described."""
+    passed_over: int = 0
+    """Records of kinds that the format does not define."""
+    attachments: dict[str, int] = msgspec.field(default_factory=dict)
+    """Sizes by name."""
+    metadata: MetadataByName = msgspec.field(default_factory=dict)
+    cut: LostBytes | None = None
+    damage: list[LostBytes] = msgspec.field(default_factory=list)
+
+    @property
+    def ours(self) -> bool:
+        """Return True for a log of this project, whatever its version."""
+        return self.profile == PROFILE
+
+
+class Survey:
+    """Files, and their topics taken together; feed it the files of a run in order."""
+
+    def __init__(self) -> None:
+        self.files: list[FileFacts] = []
+        self.topics: dict[str, TopicFacts] = {}
+
+    @property
+    def messages(self) -> int:
+        """Messages in all files."""
+        return sum(file.messages for file in self.files)
+
+    @property
+    def first_ns(self) -> int:
+        """Log time of the first message; -1 without any."""
+        return min((f.first_ns for f in self.files if f.messages), default=_NEVER)
+
+    @property
+    def last_ns(self) -> int:
+        """Log time of the last message; -1 without any."""
+        return max((f.last_ns for f in self.files if f.messages), default=_NEVER)
+
+    def add(self, path: Path, *, by_index: bool = False) -> FileFacts:
+        """Read a file.
+
+        Args:
+            path: the file.
+            by_index: of a finished file of ours take what its recorder counted, to within a
+                chunk, and do not look for damage; its messages are not read.
+
+        Raises:
+            RunError: it is missing, empty, or no MCAP file.
+        """
+        for take in (_Reading.skim, _Reading.read) if by_index else (_Reading.read,):
+            with open_log(path) as reader:
+                facts = FileFacts(
+                    path=path, size=reader.size, finished=reader.finished, in_use=_in_use(path)
+                )
+                taken = take(_Reading(facts, self.topics), reader)
+                facts.cut, facts.damage = reader.cut, reader.damage
+                facts.passed_over = reader.passed_over
+            if taken:
+                break
+        self.files.append(facts)
+        return facts
+
+
+class _Reading:
+    """One file being read."""
+
+    def __init__(self, facts: FileFacts, topics: dict[str, TopicFacts]) -> None:
+        self._facts, self._topics = facts, topics
+        self._schemas: dict[int, str] = {0: ""}
+        self._channels: dict[int, TopicFacts] = {}
+
+    def read(self, reader: LogReader) -> bool:
+        """Read every message; return True."""
+        for record in reader:
+            for value in record.values():
+                self._take(value)
+            if record.rows:
+                self._count(record)
+        return True
+
+    def skim(self, reader: LogReader) -> bool:
+        """Take the recorder's own counts; return False if there are none that fit."""
+        places: list[ChunkPlace] = []
+        others: list[McapRecord] = []
+        for found in reader.skim():
+            if isinstance(found, ChunkPlace):
+                places.append(found)
+            else:
+                others += found.values()
+        names = {value.topic: value.id for value in others if isinstance(value, Channel)}
+        counted = _counted(others, names, reader.message_count)
+        if (
+            not reader.finished
+            or counted is None
+            or any(place.channels is None for place in places)
+        ):
+            return False
+        for value in others:
+            self._take(value)
+        if places:
+            self._facts.first_ns = min(place.first_ns for place in places)
+            self._facts.last_ns = max(place.last_ns for place in places)
+        for key, count in counted.items():
+            topic = self._channels[names[key]]
+            within = [place for place in places if names[key] in (place.channels or ())]
+            self._facts.messages += count.count
+            topic.sequence.join(count)
+            topic.bytes = topic.longest_gap_ns = None
+            if within:
+                first_ns = min(place.first_ns for place in within)
+                topic.first_ns = first_ns if topic.first_ns == _NEVER else topic.first_ns
+                topic.last_ns = max(place.last_ns for place in within)
+        return True
+
+    def _take(self, value: McapRecord) -> None:
+        match value:
+            case Header(profile=profile, library=library):
+                self._facts.profile, self._facts.library = profile, library
+            case Schema(id=number, name=name):
+                self._schemas[number] = name
+            case Channel():
+                self._define(value)
+            case Metadata(name=name, metadata=entries):
+                self._facts.metadata[name] = entries
+            case Attachment(name=name, data=data):
+                self._facts.attachments[name] = len(data)
+
+    def _define(self, channel: Channel) -> None:
+        nominal_hz = 0.0
+        with contextlib.suppress(ValueError):
+            nominal_hz = float(channel.metadata.get("rate_hz", "0"))
+        facts = TopicFacts(
+            schema=self._schemas.get(channel.schema_id, ""),
+            nominal_hz=nominal_hz,
+            sequence=KeyCount(several=several_may_write(channel.topic)),
+        )
+        self._channels[channel.id] = self._topics.setdefault(channel.topic, facts)
+
+    def _count(self, record: LogRecord) -> None:
+        """Count the messages of a chunk; the hot loop."""
+        file, channels, ours = self._facts, self._channels, self._facts.ours
+        for channel, seq, log_ns, publish_ns, start, end in record.rows:
+            topic = channels.get(channel)
+            if topic is None:
+                file.orphans += 1
+                continue
+            if file.messages == 0:
+                file.first_ns = file.last_ns = log_ns
+            elif log_ns > file.last_ns:
+                file.last_ns = log_ns
+            elif log_ns < file.first_ns:
+                file.first_ns = log_ns
+            file.messages += 1
+            topic.bytes = (topic.bytes or 0) + end - start
+            topic.sequence.feed(seq)
+            time_ns = publish_ns if ours else log_ns
+            gap_ns = time_ns - topic.last_ns
+            if topic.last_ns == _NEVER:
+                topic.first_ns = time_ns
+            elif gap_ns > (topic.longest_gap_ns or 0):
+                topic.longest_gap_ns = gap_ns
+            topic.last_ns = time_ns
+
+
+def _counted(
+    records: list[McapRecord], names: Mapping[str, int], total: int | None
+) -> dict[str, KeyCount] | None:
+    """Return what the recorder counted, by key; None if it does not fit the file any more.
+
+    Another program may have left out messages, and copied the recorder's counts.
+
+    Args:
+        records: of the file.
+        names: of its channels.
+        total: messages, as the file's statistics say.
+    """
+    texts = next((m.metadata for m in records if isinstance(m, Metadata) and m.name == COUNTS), {})
+    try:
+        counts = {key: msgspec.json.decode(text, type=KeyCount) for key, text in texts.items()}
+    except msgspec.DecodeError:
+        return None
+    counted = {key: count for key, count in counts.items() if count.count or key in names}
+    fits = total is None or total == sum(count.count for count in counted.values())
+    return counted if counted and fits and counted.keys() <= names.keys() else None
+
+
+def _in_use(path: Path) -> bool:
+    try:
+        return in_use(path)
+    except OSError:
+        return False

@@ -1,1 +1,0 @@
-"""Generates the pages in docs/reference from the code: `python -m tools.reference`."""

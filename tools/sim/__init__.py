@@ -1,0 +1,1 @@
+"""The robot in virtual time: every service in one process, in lockstep."""

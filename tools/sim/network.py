@@ -1,0 +1,106 @@
+"""A modelled network link, seeded (docs/architecture.md). Pure.
+
+Its own impairment and those of `xrl sim --inject` are both `shared.config.impairment`: the network
+proxy of a live fleet uses the same class. A link here is never given up. There is neither lease nor
+dialling, and a stream delivers everything that a partition held back, however long it lasted.
+"""
+
+from __future__ import annotations
+
+import heapq
+from typing import Final, Generic, TypeVar
+
+from shared.bus.codec import encode
+from shared.bus.messages import Message
+from shared.config.impairment import HELD, Direction, Impairer, Impairment
+
+M = TypeVar("M", bound=Message)
+
+BASE: Final = Impairment(delay_ms=1.0)
+"""Impairment of every link, each way, by default."""
+OVERHEAD_BYTES: Final = 40
+"""Key and header that travel with a payload."""
+
+
+class VirtualLink(Generic[M]):
+    """One direction between two processes; the receiver keeps the newest arrival only.
+
+    What comes behind a message that was sent later is dropped, as Zenoh does by its own
+    sequence numbers.
+    """
+
+    def __init__(self, base: Impairment, name: str, seed: int) -> None:
+        """Prepare.
+
+        Args:
+            base: the link's own impairment.
+            name: of `shared.links`.
+            seed: of all random draws.
+        """
+        self.direction = Direction(name, seed)
+        self.overtaken = 0
+        """Messages that came too late, or twice, and were dropped."""
+        self._base = Impairer(base, f"{seed} {name} base")
+        self._queue: list[tuple[int, int, M]] = []  # by arrival
+        self._held: list[tuple[int, M]] = []
+        self._sent = self._newest = 0
+        self._stream_ns = 0
+        """When the last message of a stream has passed: until then all others wait for it."""
+
+    def put(self, now_ns: int, message: M) -> None:
+        """Send."""
+        self._sent += 1
+        if self.direction.active is None and now_ns >= self._stream_ns:  # the usual case
+            self._enter(now_ns, self._sent, message)
+            return
+        for release_ns in self.direction.passes(now_ns, self._size(message)):
+            if release_ns == HELD:
+                self._held.append((self._sent, message))
+            else:
+                self._enter(self._behind(now_ns, release_ns), self._sent, message)
+
+    def take(self, now_ns: int) -> M | None:
+        """Return the newest that has arrived, as a ring of depth 1 does; None if none has."""
+        newest = None
+        while self._queue and self._queue[0][0] <= now_ns:
+            _, number, message = heapq.heappop(self._queue)
+            if number > self._newest:
+                self._newest, newest = number, message
+            else:
+                self.overtaken += 1
+        return newest
+
+    def release(self, now_ns: int) -> None:
+        """Release what a partition held back, if it is over: in order, each with its delay."""
+        if not self._held:
+            return
+        impairer = self.direction.active
+        release_ns = now_ns if impairer is None else impairer.delays(now_ns)
+        if release_ns == HELD:
+            return
+        release_ns = self._stream_ns = max(release_ns, self._stream_ns)
+        held, self._held = self._held, []
+        for number, message in held:
+            self._enter(release_ns, number, message)
+
+    def _behind(self, now_ns: int, release_ns: int) -> int:
+        """Return when a message passes: not before what still waits on a stream.
+
+        Also where that was sent under another impairment than is in force now.
+        """
+        if now_ns < self._stream_ns:
+            release_ns = max(release_ns, self._stream_ns)
+        impairer = self.direction.active
+        if impairer is not None and impairer.what.ordered:
+            self._stream_ns = release_ns
+        return release_ns
+
+    def _enter(self, now_ns: int, number: int, message: M) -> None:
+        for arrival_ns in self._base.passes(now_ns, 0):
+            heapq.heappush(self._queue, (arrival_ns, number, message))
+
+    def _size(self, message: M) -> int:
+        impairer = self.direction.active
+        if impairer is None or not impairer.what.rate:
+            return 0
+        return len(encode(message)) + OVERHEAD_BYTES

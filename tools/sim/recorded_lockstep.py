@@ -1,0 +1,215 @@
+"""Runs in virtual time, recorded into `run.mcap` and judged by that log alone."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+from services.planner.controller_file import ATTACHED, controller_maker, split_spec
+from services.simulator.physics.plant import PlantConfig
+from shared import revision
+from shared.bus import topics
+from shared.bus.codec import encode
+from shared.bus.messages import Message, SimTruth
+from shared.bus.topics import Topic
+from shared.clock import NS_PER_S
+from shared.config.impairment import Impairment
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Scenario
+from shared.mcap_log import provenance
+from shared.mcap_log.writer import SCHEMA_VERSION, RunWriter
+from shared.robot.robot_model import mjcf
+from tools.judge.judgement import judge_run
+from tools.judge.verdict import Summary
+from tools.live import experiment
+from tools.logs.hand_path import HandRow
+from tools.sim.centralised.fleet import CONTROLS, SHIPPED
+from tools.sim.lockstep import Lockstep, Record, Watch
+
+Outcome = TypeVar("Outcome")
+AFTER_FALL_S: Final = 1.0
+"""A recorded run goes on this long after a fall, s, so that the log shows it."""
+DRAIN_EVERY: Final = 512
+"""Messages that wait before they are written."""
+REAL_TIME_ONLY: Final = (
+    "pd_cycles_late_pct",
+    "planner_tick_us",
+    "real_time_factor",
+    "world_time_lost_s",
+)
+"""Keys of the summary that only a live run has."""
+
+
+def _look_away(_truth: SimTruth) -> None:
+    """Watch nothing."""
+
+
+class Outbox:
+    """Messages on their way into the log."""
+
+    def __init__(self, robot: str) -> None:
+        self._robot = robot
+        self._queue: deque[tuple[str, bytes, int]] = deque()
+        self._newest_ns = 0
+
+    def __len__(self) -> int:
+        """Return how many wait."""
+        return len(self._queue)
+
+    def put(self, topic: Topic, module: str, message: Message) -> None:
+        """Take a message as the bus would.
+
+        Its arrival time is never before the previous message's. A joint service whose drive is
+        silent stamps its states with the last sample that it received.
+        """
+        self._newest_ns = max(self._newest_ns, message.t_ns)
+        self._queue.append((topic.key(self._robot, module), encode(message), self._newest_ns))
+
+    def take(self) -> tuple[str, bytes, int] | None:
+        """Return the oldest, or None."""
+        return self._queue.popleft() if self._queue else None
+
+
+def record_run(
+    scenario: Scenario,
+    robot: RobotConfig,
+    out: Path,
+    metadata: dict[str, str],
+    run: Callable[[Record, Watch], Outcome],
+    watch: Watch,
+    true_plant: PlantConfig,
+    attached: Sequence[tuple[str, Path]] = (),
+) -> Outcome:
+    """Record one run into `run.mcap` with its inputs beside it.
+
+    Args:
+        scenario: what happens.
+        robot: ready to run.
+        out: an empty folder.
+        metadata: added to the log's facts, at least `lockstep` with the command or the network.
+        run: runs it, given the function that records a message and the one that sees the world.
+        watch: sees the world at its rate.
+        true_plant: that `run` simulates.
+        attached: names and files that go into the log as well.
+
+    Returns:
+        What `run` returned.
+
+    Raises:
+        RunError: the log cannot be written.
+    """
+    inputs = experiment.write_inputs(out, robot, scenario, true_plant)
+    outbox = Outbox(robot.name)
+    recorded = {key: topic for key, topic in topics.all_keys(robot.name).items() if topic.recorded}
+    run_metadata = {
+        "schema_version": SCHEMA_VERSION,
+        "robot": robot.name,
+        "started": datetime.now(UTC).isoformat(timespec="milliseconds"),
+        "scenario": scenario.name,
+    }
+    with RunWriter(
+        out,
+        recorded,
+        offset_ns=0,
+        metadata={
+            "run": run_metadata | metadata | revision.code() | provenance.machine(),
+            "packages": provenance.packages(),
+        },
+        attachments={file.name: file.read_bytes() for file in inputs}
+        | {"model.xml": mjcf(robot).encode()}
+        | {name: file.read_bytes() for name, file in attached},
+        chunk_kib=robot.recorder.chunk_kib,
+    ) as writer:
+
+        def drain(truth: SimTruth) -> None:
+            if len(outbox) >= DRAIN_EVERY:
+                writer.take_from(outbox, len(outbox))
+            watch(truth)
+
+        outcome = run(outbox.put, drain)
+        writer.take_from(outbox, len(outbox))
+    return outcome
+
+
+def simulate(
+    robot: RobotConfig,
+    scenario: Scenario,
+    network: Impairment,
+    seed: int,
+    out: Path,
+    watch: Watch = _look_away,
+    control: str = SHIPPED,
+    true_plant: PlantConfig | None = None,
+    hand: Sequence[HandRow] = (),
+    controller: str | None = None,
+) -> float:
+    """Record a run of the fleet in virtual time, to its end or a second past a fall.
+
+    Args:
+        robot: ready to run.
+        scenario: what happens.
+        network: of every link, beside the scenario's own impairments.
+        seed: of the sensors' noise and of the network.
+        out: an empty folder.
+        watch: sees the world at its rate.
+        control: a name of `CONTROLS`.
+        true_plant: the simulated robot; None: the robot file's.
+        hand: how somebody leads the hand in place of the scenario.
+        controller: of somebody's own, `FILE.py[:NAME]`, in the place of the law.
+
+    Returns:
+        The simulated time, s.
+
+    Raises:
+        RunError: the log cannot be written.
+        ConfigError: the controller cannot be used.
+    """
+    true_plant = true_plant or PlantConfig()
+    make = controller_maker(controller, robot) if controller is not None else None
+    attached = [(ATTACHED, split_spec(controller)[0])] if controller is not None else []
+
+    def run(record: Record, drain: Watch) -> float:
+        inputs: dict[str, Any] = {
+            "seed": seed, "record": record, "plant": true_plant, "hand": hand,
+        }  # fmt: skip
+        if make is not None:
+            fleet = Lockstep(robot, scenario, network, controller=make, **inputs)
+        else:
+            fleet = CONTROLS[control](robot, scenario, network, **inputs)
+        end_s = math.inf
+        for truth in fleet.run():
+            drain(truth)
+            if truth.fallen:
+                end_s = min(end_s, truth.scenario_s + AFTER_FALL_S)
+            if truth.scenario_s > end_s:
+                break
+        fleet.network.end(fleet.now_ns)
+        return fleet.now_ns / NS_PER_S
+
+    lockstep = (
+        f"delay {network.delay_ms:g} ms, jitter {network.jitter_ms:g} ms, "
+        f"loss {network.loss:g}, seed {seed}"
+    )
+    metadata = {"lockstep": lockstep, "control": control}
+    if controller is not None:
+        metadata["controller"] = controller
+    return record_run(scenario, robot, out, metadata, run, watch, true_plant, attached)
+
+
+def judge_in_lockstep(scenario: Scenario, out: Path, **figures: Any) -> Summary:
+    """Judge a run in virtual time, which has no real time to keep.
+
+    Args:
+        scenario: what happened.
+        out: folder of `run.mcap`.
+        **figures: added to the summary.
+
+    Raises:
+        RunError: the log holds nothing to judge, or a file cannot be written.
+    """
+    figures |= dict.fromkeys(REAL_TIME_ONLY) | {"in_real_time": True}
+    return judge_run(out, f"{scenario.name} in lockstep", scenario.duration, figures)
