@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import difflib
-import importlib
 import importlib.metadata
 import os
 import signal
@@ -18,7 +17,7 @@ from typing import Any
 from shared import revision
 from shared.exceptions import BUG_EXIT_CODE, XrlError, os_error_in_words
 from tools.guarded_streams import guarded_streams
-from tools.verb_table import VERBS
+from tools.verb_table import NOUNS, RENAMED, VERBS, Subparsers, Verb, add_declared, sentence
 
 INTERRUPTED = 128 + signal.SIGINT
 
@@ -87,23 +86,48 @@ def _parser(arguments: Sequence[str], *, whole: bool = False) -> argparse.Argume
         epilog="`xrl help VERB` or `xrl VERB --help` shows a verb's arguments and examples.",
     )
     parser.add_argument("--version", action=_Version, help="print version and commit, and end")
-    subparsers = parser.add_subparsers(metavar="VERB", required=True)
-    wanted = next((word for word in arguments if not word.startswith("-")), "")
-    names = [verb.name for verb in VERBS]
-    if wanted and wanted not in names:
-        near = difflib.get_close_matches(wanted, names, n=3)
-        hint = f"did you mean {' or '.join(near)}? " if near else ""
-        if arguments[0].startswith("-"):
-            hint = f"{arguments[0]} comes after the verb; "
-        parser.error(f"no verb {wanted[:40]!r}; {hint}`xrl --help` lists them")
+    words = [word for word in arguments if not word.startswith("-")][:2]
+    _refuse_unknown(parser, words, arguments)
+    verbs = parser.add_subparsers(metavar="VERB", required=True)
+    nouns: dict[str, Subparsers] = {"": verbs}
     for verb in VERBS:
-        if whole or verb.name == wanted:
-            module = importlib.import_module(f"tools.verbs.{verb.name}")
-            module.add_parser(subparsers)
-            subparsers.choices[verb.name].set_defaults(run=module.run)
+        if verb.noun not in nouns:
+            text = NOUNS[verb.noun]
+            noun = verbs.add_parser(verb.noun, help=text, description=sentence(text))
+            nouns[verb.noun] = noun.add_subparsers(metavar="VERB", required=True)
+        among = nouns[verb.noun]
+        if whole or verb.name.split() == words[: len(verb.name.split())]:
+            _add(among, verb)
         else:
-            subparsers.add_parser(verb.name, help=verb.help)
+            among.add_parser(verb.word, help=verb.help)
     return parser
+
+
+def _add(among: Subparsers, verb: Verb) -> None:
+    if not hasattr(verb.module, "add_parser"):
+        add_declared(among, verb)
+        return
+    verb.module.add_parser(among)  # not declared yet
+    among.choices[verb.name].set_defaults(run=verb.module.run)
+
+
+def _refuse_unknown(
+    parser: argparse.ArgumentParser, words: Sequence[str], arguments: Sequence[str]
+) -> None:
+    """Refuse a verb that is none, and say which one may be meant."""
+    known = [verb.name for verb in VERBS]
+    asked = " ".join(words if words[:1] and words[0] in NOUNS else words[:1])
+    if not asked or asked in known or asked in NOUNS:
+        return
+    if asked in RENAMED:
+        parser.exit(XrlError.exit_code, f"xrl: `xrl {asked}` is `xrl {RENAMED[asked]}` now\n")
+    near = difflib.get_close_matches(asked, [*known, *NOUNS, *RENAMED], n=3)
+    names = list(dict.fromkeys(RENAMED.get(name, name) for name in near))
+    hint = f"did you mean {' or '.join(names)}? " if near else ""
+    if arguments[0].startswith("-"):
+        hint = f"{arguments[0]} comes after the verb; "
+    where = f"xrl {words[0]} --help" if words[0] in NOUNS else "xrl --help"
+    parser.error(f"no verb {asked[:40]!r}; {hint}`{where}` lists them")
 
 
 class _Version(argparse.Action):

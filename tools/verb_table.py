@@ -1,14 +1,17 @@
-"""The verbs of the command line: one table, and what their parsers have in common."""
+"""The verbs of the command line, by noun; and what their parsers have in common."""
 
 from __future__ import annotations
 
 import argparse
+import importlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final, NamedTuple, TypeAlias
+from types import ModuleType
+from typing import Final, NamedTuple, TypeAlias, get_type_hints
 
 from shared import places
 from shared.run_directory import RUN_DIR_VARIABLE, default_run_dir, own_directory
+from tools.flags import Flags, add_flags, read_flags
 
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # noqa: SLF001 - its only name
 """What `add_parser` is given."""
@@ -19,11 +22,52 @@ RUN_HELP: Final = "a run's record, finished or not; or its directory: all files 
 
 
 class Verb(NamedTuple):
-    """One row; `tools.verbs.NAME` has `add_parser(subparsers)` and `run(args) -> int`."""
+    """One row.
+
+    Its module has `EXAMPLES` and a function whose one parameter is the declaration of its flags
+    (`tools.flags`); it returns the exit code.
+    """
 
     name: str
+    """What is typed: `demo`, or a noun and a verb, `log info`."""
     help: str
+    at: str = ""
+    """MODULE:FUNCTION below `tools.verbs`; none: `run` in the module of the verb's name."""
 
+    @property
+    def noun(self) -> str:
+        """What it is about; "" at the top."""
+        return self.name.partition(" ")[0] if " " in self.name else ""
+
+    @property
+    def word(self) -> str:
+        """What comes after the noun."""
+        return self.name.rpartition(" ")[2]
+
+    @property
+    def module(self) -> ModuleType:
+        """Imported now."""
+        path = self.at.partition(":")[0] or self.name.replace(" ", ".")
+        return importlib.import_module(f"tools.verbs.{path}")
+
+    @property
+    def function(self) -> Callable[[Flags], int]:
+        """What does it."""
+        found: Callable[[Flags], int] = getattr(self.module, self.at.partition(":")[2] or "run")
+        return found
+
+    @property
+    def examples(self) -> str:
+        """Those of its module; of a module with several verbs, those that begin with this one."""
+        lines = [line.strip() for line in self.module.EXAMPLES.strip().splitlines()]
+        own = [line for line in lines if f"xrl {self.name}" in line]
+        return "\n".join(f"  {line}" for line in (own if self.at else lines))
+
+
+NOUNS: Final = {
+    "topic": "what is on the bus",
+}
+"""What the verbs of a noun are about."""
 
 VERBS: Final = (
     Verb("demo", "run the reference experiment, kill the planner, judge the outcome"),
@@ -34,7 +78,7 @@ VERBS: Final = (
     Verb("status", "show every service and every module"),
     Verb("top", "show processes and topics on one screen: CPU, rates, ages, bytes"),
     Verb("echo", "print the messages of a topic as they come"),
-    Verb("hz", "measure the rate, spacing, age and size of topics"),
+    Verb("topic hz", "measure the rate, spacing, age and size of topics"),
     Verb("faults", "list the faults: what the robot does then, and the way out"),
     Verb("kill", "send a signal to one service"),
     Verb("inject", "delay, drop or cut a live fleet's messages for a while"),
@@ -74,6 +118,31 @@ VERBS: Final = (
 """A verb's module is imported only when the verb is used."""
 
 HELP: Final = {verb.name: verb.help for verb in VERBS}
+
+RENAMED: Final = {
+    "hz": "topic hz",
+}
+"""Old names and what answers now."""
+
+
+def sentence(text: str) -> str:
+    """Return a line of the table as a description."""
+    return f"{text[0].upper()}{text[1:]}" + ("" if text.endswith("?") else ".")
+
+
+def add_declared(subparsers: Subparsers, verb: Verb) -> None:
+    """Add the parser of a verb whose flags are declared."""
+    parser = subparsers.add_parser(
+        verb.word,
+        help=verb.help,
+        description=sentence(verb.help),
+        epilog=f"examples:\n{verb.examples}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    function = verb.function
+    (declaration,) = (kind for name, kind in get_type_hints(function).items() if name != "return")
+    add_flags(parser, declaration)
+    parser.set_defaults(run=lambda found: function(read_flags(declaration, found)))
 
 
 def add_verb(subparsers: Subparsers, name: str, examples: str) -> argparse.ArgumentParser:

@@ -43,8 +43,7 @@ def test_help_lists_every_verb() -> None:
     done = xrl("--help")
     assert done.returncode == 0
     for verb in VERBS:
-        assert verb.name in done.stdout
-        assert verb.help.split()[0] in done.stdout
+        assert re.search(rf"^    {verb.name.split()[0]}\b", done.stdout, re.MULTILINE)
 
 
 def test_help_imports_no_verb() -> None:
@@ -178,7 +177,8 @@ def test_the_version_is_that_of_the_package_and_of_the_checkout(
 
 
 @pytest.mark.parametrize(
-    ("words", "same"), [(["help"], ["--help"]), (["help", "hz"], ["hz", "--help"])]
+    ("words", "same"),
+    [(["help"], ["--help"]), (["help", "topic", "hz"], ["topic", "hz", "--help"])],
 )
 def test_help_is_a_word_too(
     words: list[str], same: list[str], capsys: pytest.CaptureFixture[str]

@@ -7,7 +7,7 @@ from typing import Final
 
 from services.joint.failsafe import TRANSITIONS, Event
 from shared.bus.messages import Mode
-from tools.dev.reference.field_docs import field_docs
+from tools.field_docs import cell_docs
 
 _INTRODUCTION: Final = """\
 # Modes of a joint service
@@ -40,7 +40,7 @@ _COLOUR: Final = {
 
 def page() -> str:
     """Return the page in Markdown."""
-    docs = field_docs(Event)
+    docs = cell_docs(Event)
     lines = [_INTRODUCTION, "| event | " + " | ".join(f"in {mode.name}" for mode in Mode) + " |"]
     lines.append("|---" * (len(Mode) + 1) + "|")
     for event in Event:

@@ -13,7 +13,7 @@ from shared.config.gain_schedule import inputs_of
 from shared.config.robot_config import RobotConfig
 from shared.places import DEFAULT_CONFIG
 from shared.toml_file import Range
-from tools.dev.reference.field_docs import field_docs, one_line, summary
+from tools.field_docs import cell_docs, one_line, summary
 
 _INTRODUCTION: Final = """\
 # The robot file
@@ -135,7 +135,7 @@ def _same_as_sibling(section: type[msgspec.Struct], name: str) -> bool:
 
 
 def _table(section: type[msgspec.Struct], prefix: str, shipped: _Shipped) -> Iterator[str]:
-    docs = field_docs(section)
+    docs = cell_docs(section)
     hints = get_type_hints(section, include_extras=True)
     fields = {field.name: field for field in msgspec.structs.fields(section)}
     yield "| key | type | unit | range | default | shipped | meaning |"

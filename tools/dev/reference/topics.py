@@ -12,7 +12,7 @@ from shared.bus import messages, topics
 from shared.bus.topics import Topic
 from shared.joints import MODULES
 from shared.mcap_log.schema import ENUMERATIONS
-from tools.dev.reference.field_docs import field_docs, one_line, summary
+from tools.field_docs import cell_docs, one_line, summary
 
 ENUMS: Final[tuple[type[IntEnum], ...]] = tuple(
     sorted(set(ENUMERATIONS.values()), key=lambda enum: enum.__name__)
@@ -86,7 +86,7 @@ def _parts(kind: type[msgspec.Struct]) -> Iterator[type[msgspec.Struct]]:
 
 
 def _fields(kind: type[msgspec.Struct], *, own: bool = False) -> Iterator[str]:
-    docs, hints = field_docs(kind), get_type_hints(kind)
+    docs, hints = cell_docs(kind), get_type_hints(kind)
     base = () if own else messages.Message.__struct_fields__
     fields = [name for name in kind.__struct_fields__ if name not in base]
     if not fields:
@@ -111,7 +111,7 @@ def _type(hint: object) -> str:
 
 
 def _enumeration(enum: type[IntEnum]) -> Iterator[str]:
-    docs = field_docs(enum)
+    docs = cell_docs(enum)
     yield f"### {enum.__name__}\n"
     yield f"{summary(enum)}\n"
     yield "| value | name | meaning |"

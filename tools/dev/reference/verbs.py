@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import os
+from collections.abc import Iterator
 from typing import Any, Final
 
+from tools.cli import whole_parser
 from tools.verb_table import VERBS
 
 _WIDTH: Final = "96"
@@ -36,33 +37,26 @@ def page() -> str:
     before = os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = _WIDTH  # argparse wraps by it
     try:
-        parsers = _parsers()
+        helps = list(_helps(whole_parser()))
     finally:
         if before is None:
             del os.environ["COLUMNS"]
         else:
             os.environ["COLUMNS"] = before
     lines = [_INTRODUCTION, "| verb | what it does |", "|---|---|"]
-    lines += [f"| [`{verb.name}`](#xrl-{verb.name}) | {verb.help} |" for verb in VERBS]
-    for name, text in parsers:
+    lines += [
+        f"| [`{verb.name}`](#xrl-{verb.name.replace(' ', '-')}) | {verb.help} |" for verb in VERBS
+    ]
+    for name, text in helps:
         lines += ["", f"## xrl {name}", "", "```text", text.rstrip(), "```"]
     return "\n".join(lines) + "\n"
 
 
-def _parsers() -> list[tuple[str, str]]:
-    parser = argparse.ArgumentParser(prog="xrl")
-    subparsers = parser.add_subparsers()
-    for verb in VERBS:
-        importlib.import_module(f"tools.verbs.{verb.name}").add_parser(subparsers)
-    found = []
-    for verb in VERBS:
-        one = subparsers.choices[verb.name]
-        found.append((verb.name, one.format_help()))
-        found += [(f"{verb.name} {name}", sub.format_help()) for name, sub in _below(one)]
-    return found
-
-
-def _below(parser: argparse.ArgumentParser) -> list[tuple[str, argparse.ArgumentParser]]:
+def _helps(parser: argparse.ArgumentParser) -> Iterator[tuple[str, str]]:
+    """Yield name and help of every verb below a parser."""
     actions = parser._subparsers._group_actions if parser._subparsers else []  # noqa: SLF001
     choices: list[Any] = [action.choices for action in actions]  # of sub-parsers it is a dictionary
-    return [(name, sub) for found in choices for name, sub in found.items()]
+    for found in choices:
+        for below in found.values():
+            yield below.prog.removeprefix("xrl "), below.format_help()
+            yield from _helps(below)

@@ -3,21 +3,32 @@
 from __future__ import annotations
 
 import ast
+import functools
 import inspect
 import itertools
 import re
 import textwrap
+from typing import Final
+
+PACKAGES: Final = ("shared", "services", "tools", "tests")
+"""Whose sources are ours."""
 
 
 def field_docs(struct: type) -> dict[str, str]:
     """Return the docstring of each documented field, in one line, base classes included."""
     docs: dict[str, str] = {}
     for owner in reversed(struct.__mro__):
-        if owner.__module__.partition(".")[0] in ("shared", "services"):
+        if owner.__module__.partition(".")[0] in PACKAGES:
             docs |= _own_docs(owner)
     return docs
 
 
+def cell_docs(struct: type) -> dict[str, str]:
+    """Return the same for cells of a table (`one_line`)."""
+    return {name: one_line(text) for name, text in field_docs(struct).items()}
+
+
+@functools.cache
 def _own_docs(struct: type) -> dict[str, str]:
     tree = ast.parse(textwrap.dedent(inspect.getsource(struct)))
     (body,) = (node.body for node in tree.body if isinstance(node, ast.ClassDef))
@@ -31,7 +42,7 @@ def _own_docs(struct: type) -> dict[str, str]:
             continue
         if isinstance(target, ast.Name) and isinstance(below, ast.Expr):
             text = ast.literal_eval(below.value)
-            docs[target.id] = one_line(text)
+            docs[target.id] = " ".join(text.split())
     return docs
 
 

@@ -1,0 +1,298 @@
+"""A verb's flags as typed fields: parser, checks, help, completion and reference page follow.
+
+    class HzFlags(RunDirFlags):
+        topic: Annotated[tuple[str, ...], positional("TOPIC")] = ()
+        \"\"\"such as 'joint/*/state' (default: all)\"\"\"
+        for_s: Annotated[Seconds | None, option("--for")] = None
+        \"\"\"measure so long\"\"\"
+
+The type says what is read: `bool` is a switch, a `Literal` a choice, a tuple may be repeated, a
+number has a `Range` with its unit. The string below a field is its help; rules that cross fields
+are in `check`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import functools
+import math
+import types
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import (
+    Annotated,
+    Any,
+    Final,
+    Literal,
+    NamedTuple,
+    TypeVar,
+    Union,
+    dataclass_transform,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+from shared import places
+from shared.run_directory import default_run_dir, own_directory
+from shared.toml_file import Range
+from tools.field_docs import field_docs
+
+F = TypeVar("F", bound="Flags")
+
+FINITE_MAX: Final = 1e12
+
+Number = Annotated[float, Range(-FINITE_MAX, FINITE_MAX, "")]
+Seconds = Annotated[float, Range(0.0, FINITE_MAX, "s")]
+Duration = Annotated[float, Range(1e-3, FINITE_MAX, "s")]
+Count = Annotated[int, Range(1, 1_000_000, "")]
+Natural = Annotated[int, Range(0, 2**63 - 1, "")]
+"""A seed, a case."""
+Rate = Annotated[float, Range(1e-3, 1e4, "Hz")]
+Degrees = Annotated[int, Range(-360, 360, "degrees")]
+
+
+@dataclass_transform(kw_only_default=True, frozen_default=True)
+class Flags:
+    """Base of all declarations: each subclass is a frozen dataclass with keyword arguments only."""
+
+    def __init_subclass__(cls) -> None:  # noqa: D105 - the class says it
+        dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+
+    def check(self) -> None:
+        """Refuse flags that do not fit each other, by an `XrlError` that says what would be right.
+
+        Who overrides it calls `super().check()` first.
+        """
+
+
+class Arg(NamedTuple):
+    """What a field's type does not say about its flag."""
+
+    names: tuple[str, ...] = ()
+    """Of the flag; none: `--` and the field's name."""
+    metavar: str = ""
+    parse: Callable[[str], Any] | None = None
+    """Reads one value; raises ValueError or argparse.ArgumentTypeError that says what is right."""
+    is_positional: bool = False
+    takes_many: bool = False
+    """One flag takes several words, in place of a flag for each."""
+    exclusive: str = ""
+    """Flags of the same word here exclude each other; one that ends with `!` needs one of them."""
+    group: str = ""
+    """Heading in the help; further lines describe what follows."""
+    help: str = ""
+    """In place of the string below the field, where it has to be computed."""
+
+
+def option(*names: str, **more: Any) -> Arg:
+    """Return a flag of other names than the field's."""
+    return Arg(names, **more)
+
+
+def positional(metavar: str, **more: Any) -> Arg:
+    """Return an argument without a flag."""
+    return Arg(metavar=metavar, is_positional=True, **more)
+
+
+def parsed(parse: Callable[[str], Any], metavar: str, **more: Any) -> Arg:
+    """Return a flag whose value is read by a function."""
+    return Arg(metavar=metavar, parse=parse, **more)
+
+
+class _Field(NamedTuple):
+    name: str
+    kind: Any
+    """Type of one value, without None, notes and the tuple around it."""
+    limits: Range | None
+    arg: Arg
+    help: str
+    is_repeated: bool
+    is_required: bool
+
+
+def fields_of(declaration: type[Flags]) -> Iterator[_Field]:
+    """Yield the fields, a verb's own first."""
+    hints = get_type_hints(declaration, include_extras=True)
+    docs = field_docs(declaration)
+    by_name = {field.name: field for field in dataclasses.fields(declaration)}  # type: ignore[arg-type]
+    names = [
+        name for owner in declaration.__mro__ for name in vars(owner).get("__annotations__", ())
+    ]
+    for name in dict.fromkeys(names):
+        field = by_name[name]
+        kind, limits, arg, is_repeated = _taken_apart(hints[name])
+        is_required = (
+            field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+        )
+        text = arg.help or docs.get(name, "")
+        if _shows_default(field.default, text):
+            text += f" (default: {_in_words(field.default)})"
+        yield _Field(name, kind, limits, arg, text, is_repeated, is_required)
+
+
+def _taken_apart(hint: Any) -> tuple[Any, Range | None, Arg, bool]:
+    limits, arg, is_repeated = None, Arg(), False
+    while True:
+        origin, parts = get_origin(hint), get_args(hint)
+        if origin is Annotated:
+            hint = parts[0]
+            for note in parts[1:]:
+                limits = note if isinstance(note, Range) else limits
+                arg = note if isinstance(note, Arg) else arg
+        elif origin in (Union, types.UnionType):
+            (hint,) = (part for part in parts if part is not type(None))
+        elif origin is tuple and len(parts) == 2 and parts[1] is Ellipsis:
+            hint, is_repeated = parts[0], True
+        else:
+            return hint, limits, arg, is_repeated
+
+
+def _shows_default(default: object, text: str) -> bool:
+    is_nothing = default is dataclasses.MISSING or default is None or default in (False, "", ())
+    return "(default" not in text and (not is_nothing or type(default) in (int, float))
+
+
+def _in_words(value: object) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def add_flags(parser: argparse.ArgumentParser, declaration: type[Flags]) -> None:
+    """Add every field of a declaration to a parser."""
+    groups: dict[str, Any] = {"": parser}
+    exclusive: dict[str, Any] = {}
+    for field in fields_of(declaration):
+        arg = field.arg
+        if arg.group not in groups:
+            groups[arg.group] = parser.add_argument_group(*arg.group.split("\n", 1))
+        where = groups[arg.group]
+        if arg.exclusive:
+            if arg.exclusive not in exclusive:
+                needed = arg.exclusive.endswith("!")
+                exclusive[arg.exclusive] = where.add_mutually_exclusive_group(required=needed)
+            where = exclusive[arg.exclusive]
+        names = [field.name] if arg.is_positional else list(arg.names or [_flag(field.name)])
+        where.add_argument(*names, **_argument(field))
+
+
+def _flag(name: str) -> str:
+    return f"--{name.strip('_').replace('_', '-')}"
+
+
+def _argument(field: _Field) -> dict[str, Any]:
+    arg, kind = field.arg, field.kind
+    found: dict[str, Any] = {
+        "help": field.help.replace("%", "%%"),
+        "default": argparse.SUPPRESS,  # the declaration's own default holds then
+    }
+    if not arg.is_positional:
+        found |= {"dest": field.name, "required": field.is_required}
+    if kind is bool:
+        return found | {"action": "store_true"}
+    if get_origin(kind) is Literal and arg.parse is None:
+        found["choices"] = get_args(kind)
+    else:
+        found["type"] = arg.parse or _reader(kind, field.limits)
+    metavar = arg.metavar or (_unit(field) if "choices" not in found else "")
+    if metavar:
+        found["metavar"] = metavar
+    if field.is_repeated and (arg.is_positional or arg.takes_many):
+        found["nargs"] = "+" if field.is_required or arg.takes_many else "*"
+        if not arg.is_positional:
+            found["action"] = "extend"
+    elif field.is_repeated:
+        found["action"] = "append"
+    elif arg.is_positional and not field.is_required:
+        found["nargs"] = "?"
+    return found
+
+
+def _unit(field: _Field) -> str:
+    if field.kind is Path:
+        return "FILE"
+    if field.limits is not None:
+        return field.limits.unit.replace(" ", "").upper() or "N"
+    return field.name.upper()
+
+
+def _reader(kind: Any, limits: Range | None) -> Callable[[str], Any]:
+    if kind is int or kind is float:
+        if limits is None:
+            raise TypeError("a number needs a Range")
+        return functools.partial(_number, kind, limits)
+    reader: Callable[[str], Any] = kind
+    return reader
+
+
+def _number(kind: type[int] | type[float], limits: Range, text: str) -> float:
+    """Read a number.
+
+    Raises:
+        argparse.ArgumentTypeError: it is none, or out of range; says what is right.
+    """
+    try:
+        number = kind(text.strip()) if "_" not in text else math.nan
+    except ValueError:
+        number = math.nan
+    if not limits.low <= number <= limits.high:
+        raise argparse.ArgumentTypeError(f"{text[:40]!r}: {_right(kind, limits)} is right")
+    return number
+
+
+def _right(kind: type, limits: Range) -> str:
+    thing = "a whole number" if kind is int else "a number"
+    unit = f" {limits.unit}".rstrip()
+    if kind is float and limits.high >= FINITE_MAX:
+        least = "" if limits.low <= -FINITE_MAX else f" of at least {limits.low:g}{unit}"
+        return f"{thing}{least or unit}"
+    return f"{thing} from {limits.low:.12g} to {limits.high:.12g}{unit}"
+
+
+def read_flags(declaration: type[F], found: argparse.Namespace) -> F:
+    """Return what was given, with the declaration's defaults for the rest, checked.
+
+    Raises:
+        XrlError: flags do not fit each other, or a default cannot be had.
+    """
+    given = {
+        field.name: tuple(value) if field.is_repeated else value
+        for field in fields_of(declaration)
+        if (value := getattr(found, field.name, None)) is not None
+    }
+    flags = declaration(**given)
+    flags.check()
+    return flags
+
+
+class RunDirFlags(Flags):
+    """Which fleet is meant."""
+
+    run_dir: Annotated[Path, parsed(own_directory, "DIR")] = dataclasses.field(
+        default_factory=lambda: own_directory(str(default_run_dir()))
+    )
+    """directory of the fleet's sockets and logs (default: $XRL_RUN_DIR, else /tmp/xrl-UID of the
+    user); keep it short"""
+
+
+class ConfigFlags(Flags):
+    """Which robot is meant: its file, found in the working directory if it is not given."""
+
+    config: Annotated[Path, parsed(places.config_argument, "FILE", help=places.HELP)] = (
+        dataclasses.field(default_factory=places.robot_file)
+    )
+
+
+def robot_file_of(before: str) -> Arg:
+    """Return the flag of a verb that looks elsewhere for the robot file before it looks here.
+
+    The field is None if it is not given; the verb calls `places.robot_file` itself.
+    """
+    text = places.HELP.replace("(default: ", f"(default: {before}, else ")
+    return Arg(metavar="FILE", help=text)
+
+
+class FleetRobotFlags(RunDirFlags):
+    """Fleet and robot: the robot file is the fleet's, if there is a fleet."""
+
+    config: Annotated[Path | None, robot_file_of("that of the fleet in --run-dir")] = None

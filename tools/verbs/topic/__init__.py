@@ -1,0 +1,1 @@
+"""`xrl topic`: what is on the bus."""
