@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -15,17 +16,16 @@ from numpy.typing import NDArray
 
 from services.planner.controller import Controller, Observation
 from services.planner.intents import OperatorRequest
-from services.planner.law.assist import Overload, force_up
-from services.planner.law.hocca import Hocca, LawOutput
-from services.planner.snapshots import TickState
-from services.planner.state_phases import StatePhases
-from services.planner.watch.controller_guard import ControllerGuard
+from services.planner.law.assist import Overload, OverloadState, force_up
+from services.planner.law.hocca import Hocca, LawOutput, LawState
+from services.planner.state_phases import PhasesState, StatePhases
+from services.planner.watch.controller_guard import ControllerGuard, GuardState
 from services.planner.watch.engagement_fsm import Engagement
 from services.planner.watch.limp_leg_watch import LimpLegWatch
 from services.planner.watch.plausible import Plausible
 from services.planner.watch.rival_watch import RivalWatch
-from services.planner.watch.trips import PlannerTrips, values_of
-from services.planner.watch.unattended import Unattended
+from services.planner.watch.trips import PlannerTrips, TripsState, values_of
+from services.planner.watch.unattended import Unattended, UnattendedState
 from shared.bus.messages import (
     Attitude,
     JointCommand,
@@ -42,6 +42,7 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES, N_JOINTS, N_MODULES
 from shared.robot.limp_leg_support import Support
+from shared.state import copied
 
 Array = NDArray[np.float64]
 
@@ -56,6 +57,56 @@ _ALL_NEW = (1 << N_MODULES) - 1
 # Compared in each tick: docs/contributing.md, The control path.
 _CARRIES = (int(Mode.HOLD), int(Mode.TRACK))
 _WAITING, _UNCERTIFIED = PlannerMode.WAITING, SplitSource.UNCERTIFIED
+
+
+class PlannerState(msgspec.Struct, kw_only=True):
+    """State of `Planner` between two ticks; one of six entries for each module."""
+
+    states: list[JointState | None] = msgspec.field(default_factory=lambda: [None] * N_MODULES)
+    arrived_ns: list[int] = msgspec.field(default_factory=lambda: [0] * N_MODULES)
+    wrench: Wrench | None = None
+    wrench_ns: int = 0
+    wrench_seq: int = -1
+    last_ns: int = 0
+    """Time of the last tick."""
+    seq: int = 0
+    source: SplitSource | None = None
+    """Source of the gains of the last tick."""
+    engagement: Engagement = msgspec.field(default_factory=Engagement)
+    overload: OverloadState = msgspec.field(default_factory=OverloadState)
+    law: LawState = msgspec.field(default_factory=LawState)
+    limp_legs: LimpLegWatch = msgspec.field(default_factory=LimpLegWatch)
+    attitude: Attitude | None = None
+    attitude_ns: int = 0
+    attitude_seq: int = -1
+    trips: TripsState = msgspec.field(default_factory=TripsState)
+    request: OperatorRequest = OperatorRequest()
+    unattended: UnattendedState = msgspec.field(default_factory=UnattendedState)
+    phases: PhasesState = msgspec.field(default_factory=PhasesState)
+    rival: RivalWatch = msgspec.field(default_factory=RivalWatch)
+    guard: GuardState | None = None
+    """None without a controller of somebody's own."""
+    refused: int = 0
+    """Implausible measurements so far."""
+
+
+class _Ages(NamedTuple):
+    """Largest ages of what is used, ns."""
+
+    state: int
+    wrench: int
+    attitude: int
+    command: int
+
+    @classmethod
+    def of(cls, config: RobotConfig) -> _Ages:
+        rows = (
+            config.planner.state_stale_ms,
+            config.harness.stale_ms,
+            config.imu.stale_ms,
+            config.joint_service.max_command_age_ms,
+        )
+        return cls(*(round(row * NS_PER_MS) for row in rows))
 
 
 class Planner:
@@ -77,38 +128,26 @@ class Planner:
         if controller is not None:
             self._guard = ControllerGuard(controller, self._law, config.geometry)
         self._plausible = Plausible(config)
-        self._engagement = Engagement()
-        self._stale_ns = round(config.planner.state_stale_ms * NS_PER_MS)
-        self._period_s = 1.0 / config.planner.rate_hz
-        self._states: list[JointState | None] = [None] * N_MODULES
-        self._arrived_ns = [0] * N_MODULES
-        self._q: Array = np.zeros(N_JOINTS)
-        self._v: Array = np.zeros(N_JOINTS)
-        self._tau: Array = np.zeros(N_JOINTS)
-        self._request = OperatorRequest()
-        self._wrench: Wrench | None = None
-        self._wrench_ns = 0
-        self._wrench_stale_ns = round(config.harness.stale_ms * NS_PER_MS)
-        self._attitude: Attitude | None = None
-        self._attitude_ns = 0
-        self._attitude_seq = -1
-        self._attitude_stale_ns = round(config.imu.stale_ms * NS_PER_MS)
         self._overload = Overload.of(config.harness)
-        self._limp_legs = LimpLegWatch()
-        self._rival = RivalWatch()
-        self._command_age_ns = round(config.joint_service.max_command_age_ms * NS_PER_MS)
         self._trips = PlannerTrips(config)
         self._unattended = Unattended()
         service = config.joint_service
         self._phases = StatePhases(service.rate_hz, service.state_rate_hz)
-        self._support = Support.NONE
-        self._wrench_seq = -1
-        self._last_ns = 0
+        self._period_s = 1.0 / config.planner.rate_hz
+        self._ages = _Ages.of(config)
+        self._state = PlannerState(
+            overload=self._overload.state,
+            trips=self._trips.state,
+            unattended=self._unattended.state,
+            phases=self._phases.state,
+            guard=None if self._guard is None else self._guard.state,
+        )
+        self._q: Array = np.zeros(N_JOINTS)
+        self._v: Array = np.zeros(N_JOINTS)
+        self._tau: Array = np.zeros(N_JOINTS)
         self._new = 0  # bit i: module i has a state that no tick has used
-        self._seq = 0
+        self._support = Support.NONE
         self._output: LawOutput | None = None
-        self._source: SplitSource | None = None
-        """Source of the gains of the last tick."""
 
     @property
     def compares_arrivals(self) -> bool:
@@ -119,8 +158,8 @@ class Planner:
         """Store a module's newest state, if it is plausible."""
         if not self._plausible.is_state(module, state):
             return
-        self._states[module] = state
-        self._arrived_ns[module] = now_ns
+        self._state.states[module] = state
+        self._state.arrived_ns[module] = now_ns
         self._new |= 1 << module
         self._q[2 * module : 2 * module + 2] = state.q
         self._v[2 * module : 2 * module + 2] = state.v
@@ -130,20 +169,20 @@ class Planner:
         """Store the harness's newest wrench, if it is plausible."""
         if not self._plausible.is_wrench(wrench):
             return
-        self._wrench_seq = wrench.seq
-        self._wrench, self._wrench_ns = wrench, now_ns
+        self._state.wrench_seq = wrench.seq
+        self._state.wrench, self._state.wrench_ns = wrench, now_ns
         self._overload.receive(wrench, now_ns)
 
     def receive_attitude(self, attitude: Attitude, now_ns: int) -> None:
         """Store the IMU's newest attitude, if it is plausible."""
         if not self._plausible.is_attitude(attitude):
             return
-        self._attitude_seq = attitude.seq
-        self._attitude, self._attitude_ns = attitude, now_ns
+        self._state.attitude_seq = attitude.seq
+        self._state.attitude, self._state.attitude_ns = attitude, now_ns
 
     def receive_request(self, request: OperatorRequest) -> None:
         """Store the operator's current request (`services.planner.intents`)."""
-        self._request = request
+        self._state.request = request
 
     def is_due(self, now_ns: int) -> bool:
         """Return True if a tick is due: as soon as all six modules have a new state.
@@ -152,7 +191,7 @@ class Planner:
         gains. On its own timer the planner would let states age for up to a period. Waiting for
         them, it ticks at their rate, and it waits only briefly for late ones.
         """
-        since_s = (now_ns - self._last_ns) / NS_PER_S
+        since_s = (now_ns - self._state.last_ns) / NS_PER_S
         if self._new == _ALL_NEW:
             return since_s >= EARLY_FRACTION * self._period_s
         return since_s >= LATE_FRACTION * self._period_s
@@ -166,18 +205,18 @@ class Planner:
         Args:
             now_ns: the planner's monotonic clock.
         """
-        last_ns = self._last_ns
+        last_ns = self._state.last_ns
         dt = min((now_ns - last_ns) / NS_PER_S, TICK_GAP_MAX_S)
         if not last_ns:
             dt = self._period_s
-        self._last_ns = now_ns
+        self._state.last_ns = now_ns
         self._new = 0
-        states = [state for state in self._states if state is not None]
+        states = [state for state in self._state.states if state is not None]
         if len(states) < N_MODULES:
             return []
-        fresh = [now_ns - arrived <= self._stale_ns for arrived in self._arrived_ns]
+        fresh = [now_ns - arrived <= self._ages.state for arrived in self._state.arrived_ns]
         self._watch_rival([states[i] for i in range(N_MODULES) if fresh[i]])
-        engagement = self._engagement
+        engagement = self._state.engagement
         engagement.advance(
             now_ns,
             fresh,
@@ -185,24 +224,24 @@ class Planner:
             [state.mode for state in states],
             self._inhibit(),
         )
-        self._support = self._limp_legs.advance(now_ns, states)
-        self._phases.advance(states, self._arrived_ns, last_ns)
+        self._support = self._state.limp_legs.advance(now_ns, states)
+        self._phases.advance(states, self._state.arrived_ns, last_ns)
         # until all engage, the law restarts from the measured pose each tick: there is no
         # step
         self._output = self._law.tick(
             self._q,
             self._v,
-            self._request.assist_n,
+            self._state.request.assist_n,
             dt,
-            shift_requested=self._request.shift,
-            probe=(self._request.probe_row, self._request.probe),
+            shift_requested=self._state.request.shift,
+            probe=(self._state.request.probe_row, self._state.request.probe),
             align=engagement.hold,
             wrench=self._usable_wrench(now_ns),
             up_torso=self._usable_up(now_ns),
         )
         if self._guard is not None:
             self._output = self._controlled(self._guard, self._output, now_ns, dt)
-        self._source = self._output.local.source
+        self._state.source = self._output.local.source
         loads = self._law.leg_loads(self._tau)
         lifted, leads = self._lifted(now_ns), not engagement.hold
         all_carry = all(state.mode in _CARRIES for state in states)
@@ -216,72 +255,43 @@ class Planner:
         drift = self._drift(now_ns, lifted)
         values = values_of(self._output, self._q, loads, lifted, rate, drift, leads=leads)
         self._trips.advance(now_ns, values, leads=leads)
-        self._seq += 1
-        if self._rival.yields:
+        self._state.seq += 1
+        if self._state.rival.yields:
             return self._announcement(now_ns, states, self._output)
         return self._commands(now_ns, states, self._output)
 
-    def snapshot(self) -> TickState:
-        """Return the state between two ticks; `restore` continues from it."""
-        return TickState(
-            tuple(self._states),
-            tuple(self._arrived_ns),
-            self._wrench,
-            self._wrench_ns,
-            self._wrench_seq,
-            self._last_ns,
-            self._seq,
-            self._source,
-            self._engagement.copied(),
-            self._overload.snapshot(),
-            self._law.snapshot(),
-            msgspec.structs.replace(self._limp_legs),
-            self._attitude,
-            self._attitude_ns,
-            self._attitude_seq,
-            self._trips.snapshot(),
-            self._request,
-            self._unattended.snapshot(),
-            self._phases.snapshot(),
-            msgspec.structs.replace(self._rival),
-            self._guard.snapshot() if self._guard is not None else None,
-            refused=self._plausible.refused,
+    def snapshot(self) -> PlannerState:
+        """Return a copy of the state between two ticks; `restore` continues from it."""
+        refused = self._plausible.refused
+        return copied(
+            msgspec.structs.replace(self._state, law=self._law.snapshot(), refused=refused)
         )
 
-    def restore(self, snapshot: TickState) -> None:
-        """Continue from a state, bit for bit."""
-        m = snapshot
-        for module, (state, arrived_ns) in enumerate(zip(m.states, m.arrived_ns, strict=True)):
+    def restore(self, snapshot: PlannerState) -> None:
+        """Continue from a copy of a state, bit for bit."""
+        self._state = own = copied(snapshot)
+        for module, (state, arrived_ns) in enumerate(zip(own.states, own.arrived_ns, strict=True)):
             if state is not None:
                 self.receive_state(module, state, arrived_ns)
-        self._request, self._plausible.refused = m.request, m.refused
-        self._unattended.restore(m.unattended)
-        self._phases.restore(m.phases)
-        self._wrench, self._wrench_ns, self._wrench_seq = m.wrench, m.wrench_ns, m.wrench_seq
-        self._attitude, self._attitude_ns = m.attitude, m.attitude_ns
-        self._attitude_seq = m.attitude_seq
-        self._last_ns, self._seq, self._source = m.last_ns, m.seq, m.source
-        self._engagement = m.engagement.copied()
-        self._limp_legs = msgspec.structs.replace(m.limp_legs)
-        self._rival = msgspec.structs.replace(m.rival)
-        self._overload.restore(m.overload)
-        self._law.restore(m.law)
-        self._trips.restore(m.trips)
-        if self._guard is not None and m.guard is not None:
-            self._guard.restore(m.guard)
+        self._plausible.refused = own.refused
+        self._law.restore(own.law)
+        self._overload.state, self._trips.state = own.overload, own.trips
+        self._unattended.state, self._phases.state = own.unattended, own.phases
+        if self._guard is not None and own.guard is not None:
+            self._guard.state = own.guard
 
     def _watch_rival(self, states: Sequence[JointState]) -> None:
         """Find out if another planner leads, and if modules have retired this one's session."""
-        if self._rival.advance(self.session, states, self._command_age_ns):
+        if self._state.rival.advance(self.session, states, self._ages.command):
             self.session += 1
 
     def _announcement(
         self, now_ns: int, states: Sequence[JointState], output: LawOutput
     ) -> list[JointCommand]:
         """Return now and then commands that answer no state: too old, whatever the network does."""
-        if not self._rival.announces(now_ns):
+        if not self._state.rival.announces(now_ns):
             return []
-        earlier_ns = 2 * self._command_age_ns
+        earlier_ns = 2 * self._ages.command
         return [
             msgspec.structs.replace(command, hold=True, echo_t_ns=command.echo_t_ns - earlier_ns)
             for command in self._commands(now_ns, states, output)
@@ -290,12 +300,12 @@ class Planner:
     @property
     def yields(self) -> bool:
         """True while another planner leads, and this one waits."""
-        return self._rival.yields
+        return self._state.rival.yields
 
     @property
     def rival(self) -> str:
         """What there is to say of another planner that leads; empty if there is none."""
-        return self._rival.describe()
+        return self._state.rival.describe()
 
     def _commands(
         self, now_ns: int, states: Sequence[JointState], output: LawOutput
@@ -310,12 +320,12 @@ class Planner:
         pairs = [list(zip(row[::2], row[1::2], strict=True)) for row in map(_listed, arrays)]
         commands = []
         for module, state, phase, *row in zip(
-            MODULES, states, self._phases.phases, *pairs, strict=True
+            MODULES, states, self._state.phases.phases, *pairs, strict=True
         ):
             q_ref, v_ref, tau_ff, dtau_ff, tau_coupled, k_p, k_d = row
             command = JointCommand(
                 t_ns=now_ns,
-                seq=self._seq,
+                seq=self._state.seq,
                 session=self.session,
                 echo_t_ns=state.t_ns,
                 hold=hold,
@@ -339,15 +349,25 @@ class Planner:
     ) -> LawOutput:
         """Return the output of somebody's own controller in the place of the law's."""
         seen = Observation(
-            0.0, dt, self._q.copy(), self._v.copy(), self._tau.copy(), law.p, law.pdot,
-            self._law.J.copy(), self._law.T.copy(), self._usable_wrench(now_ns), self._request, law,
-        )  # fmt: skip
-        return guard.act(seen, leads=not self._engagement.hold)
+            time_s=0.0,
+            dt=dt,
+            q=self._q.copy(),
+            v=self._v.copy(),
+            tau=self._tau.copy(),
+            p=law.p,
+            pdot=law.pdot,
+            J=self._law.J.copy(),
+            T=self._law.T.copy(),
+            wrench=self._usable_wrench(now_ns),
+            request=self._state.request,
+            law=law,
+        )
+        return guard.act(seen, leads=not self._state.engagement.hold)
 
     def _usable_wrench(self, now_ns: int) -> Wrench | None:
         """Return the newest wrench, or None if it is invalid or too old."""
-        wrench = self._wrench
-        if wrench is None or not wrench.valid or now_ns - self._wrench_ns > self._wrench_stale_ns:
+        wrench = self._state.wrench
+        if wrench is None or not wrench.valid or now_ns - self._state.wrench_ns > self._ages.wrench:
             return None
         return wrench
 
@@ -370,14 +390,14 @@ class Planner:
 
     def _usable_up(self, now_ns: int) -> Vector3 | None:
         """Return the unit vector up, torso axes, or None if the newest is invalid or too old."""
-        attitude = self._attitude
+        attitude = self._state.attitude
         if attitude is None or not attitude.valid:
             return None
-        return attitude.up if now_ns - self._attitude_ns <= self._attitude_stale_ns else None
+        return attitude.up if now_ns - self._state.attitude_ns <= self._ages.attitude else None
 
     def _inhibit(self) -> PlannerMode | None:
         """Return why the planner may not engage, from the last tick's results; None if it may."""
-        if self._rival.yields:
+        if self._state.rival.yields:
             return PlannerMode.YIELDING
         if self._overload.hold:
             return PlannerMode.OVERLOADED
@@ -385,7 +405,7 @@ class Planner:
             return PlannerMode.MISPLACED
         if self._law.load_refused:
             return PlannerMode.MISLOADED
-        if self._source is _UNCERTIFIED:
+        if self._state.source is _UNCERTIFIED:
             return PlannerMode.UNCERTIFIED
         if self._trips.tripped:
             return PlannerMode.TRIPPED
@@ -396,27 +416,26 @@ class Planner:
 
         It uses this tick's results: without a certificate no gains go to modules in TRACK.
         """
-        return self._engagement.hold or self._inhibit() is not None
+        return self._state.engagement.hold or self._inhibit() is not None
 
     def status(self, now_ns: int, tick_us: float) -> PlannerStatus:
         """Return the inputs and decisions of the last tick."""
-        output = self._output
-        states = self._states
-        seqs = [state.seq if state is not None else -1 for state in states]
+        s, output = self._state, self._output
+        seqs = [state.seq if state is not None else -1 for state in s.states]
         ages = [
             now_ns - arrived if state is not None else -1
-            for state, arrived in zip(states, self._arrived_ns, strict=True)
+            for state, arrived in zip(s.states, s.arrived_ns, strict=True)
         ]
-        leads = not self._engagement.hold
+        leads = not s.engagement.hold
         p = pdot = p_ref = closure = stance = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         if output is not None:
             vectors = output.p, output.pdot, output.p_ref, output.closure, output.stance
             p, pdot, p_ref, closure, stance = map(_vector6, vectors)
         return PlannerStatus(
             t_ns=now_ns,
-            seq=self._seq,
+            seq=s.seq,
             session=self.session,
-            mode=int(self._engagement.mode) if output is not None else int(PlannerMode.WAITING),
+            mode=int(s.engagement.mode) if output is not None else int(PlannerMode.WAITING),
             hold=self._hold(),
             p=p,
             pdot=pdot,
@@ -430,19 +449,19 @@ class Planner:
             ik_residual=output.ik_residual if output is not None else 0.0,
             tick_us=tick_us,
             state_seq=(seqs[0], seqs[1], seqs[2], seqs[3], seqs[4], seqs[5]),
-            wrench_seq=self._wrench_seq,
-            assist_requested_n=self._request.assist_n,
+            wrench_seq=s.wrench_seq,
+            assist_requested_n=s.request.assist_n,
             state_age_ns=(ages[0], ages[1], ages[2], ages[3], ages[4], ages[5]),
-            wait_s=0.0 if leads else self._engagement.wait_ns(now_ns) / NS_PER_S,
-            attitude_seq=self._attitude_seq,
+            wait_s=0.0 if leads else s.engagement.wait_ns(now_ns) / NS_PER_S,
+            attitude_seq=s.attitude_seq,
             slope=output.slope if output is not None else (0.0, 0.0),
-            shift_requested=self._request.shift,
+            shift_requested=s.request.shift,
             load=self._law.load,
-            requested_by=self._request.source,
-            probe_row=self._request.probe_row,
-            probe=self._request.probe,
+            requested_by=s.request.source,
+            probe_row=s.request.probe_row,
+            probe=s.request.probe,
             stance=stance,
-            why=self._rival.describe()
+            why=s.rival.describe()
             or self._law.stance_refusal()
             or self._law.load_refusal()
             or self._trips.why

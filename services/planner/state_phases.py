@@ -17,7 +17,8 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-from services.planner.snapshots import PhasesState
+import msgspec
+
 from shared.bus.messages import JointState, Pair
 from shared.clock import NS_PER_S
 from shared.joints import N_MODULES
@@ -36,26 +37,34 @@ HYSTERESIS: Final = 0.15
 one another; without it a phase would change back and forth at the boundary."""
 
 
-class StatePhases:
-    """Phases of six modules.
+class PhasesState(msgspec.Struct):
+    """State of `StatePhases`."""
 
-    Attributes:
-        phases: of each module: it is to send its state in periods of this number modulo n.
-    """
+    phases: list[int] = []
+    """Each module sends its state in periods of this number modulo n; empty before the first."""
+    tick: int = 0
+    """Ticks since the last comparison began."""
+    every: int = SOON_TICKS
+    """Ticks from its begin to that of the next."""
+    sums: list[Pair] = msgspec.field(default_factory=lambda: [(0.0, 0.0)] * N_MODULES)
+    """Sum of (cos, sin) of 2 pi d / n for each module, whose states arrive d periods behind the
+    first module's."""
+
+
+class StatePhases:
+    """Phases of six modules."""
 
     def __init__(self, rate_hz: float, state_rate_hz: float) -> None:
         """Set the rates of the drives' samples and of the states, Hz."""
         self._n = round(rate_hz / state_rate_hz)
         self._radians_per_ns = 2.0 * math.pi * state_rate_hz / NS_PER_S
-        self._tick = 0
-        self._every = SOON_TICKS
-        self._sums: list[Pair] = [(0.0, 0.0)] * N_MODULES
-        self.phases: list[int] = []
+        self.state = PhasesState()
 
     @property
     def compares(self) -> bool:
         """True if the next tick's arrivals are compared: they must not be rounded up by a rest."""
-        return self._n > 1 and bool(self.phases) and self._tick < COMPARED_TICKS
+        state = self.state
+        return self._n > 1 and bool(state.phases) and state.tick < COMPARED_TICKS
 
     def advance(
         self, states: Sequence[JointState], arrived_ns: Sequence[int], last_tick_ns: int
@@ -67,41 +76,32 @@ class StatePhases:
             arrived_ns: their arrivals, by the planner's clock.
             last_tick_ns: time of the tick before.
         """
-        n, first_ns = self._n, arrived_ns[0]
-        if not self.phases:  # as the last planner left them
-            self.phases = [state.state_phase % n for state in states]
-        compares = self.compares and self._tick > 0  # before the first there was a rest
-        self._tick = (self._tick + 1) % self._every
+        state, n, first_ns = self.state, self._n, arrived_ns[0]
+        if not state.phases:  # as the last planner left them
+            state.phases = [one.state_phase % n for one in states]
+        compares = self.compares and state.tick > 0  # before the first there was a rest
+        state.tick = (state.tick + 1) % state.every
         if not compares:
             return
         if min(arrived_ns) > last_tick_ns:
-            for module, (x, y) in enumerate(self._sums):
+            for module, (x, y) in enumerate(state.sums):
                 angle = self._radians_per_ns * (arrived_ns[module] - first_ns)
-                self._sums[module] = (x + math.cos(angle), y + math.sin(angle))
+                state.sums[module] = (x + math.cos(angle), y + math.sin(angle))
         if not self.compares:
             self._decide(states)
 
     def _decide(self, states: Sequence[JointState]) -> None:
         """Choose the phases and when to compare next: soon if a module moved or was silent."""
-        n, count = self._n, COMPARED_TICKS - 1
+        own, n, count = self.state, self._n, COMPARED_TICKS - 1
         settled = True
-        for module, (state, (x, y)) in enumerate(zip(states, self._sums, strict=True)):
+        for module, (state, (x, y)) in enumerate(zip(states, own.sums, strict=True)):
             behind = n / (2.0 * math.pi) * math.atan2(y, x)
             # one that is in another phase than it was told has not heard yet
-            told = state.state_phase % n == self.phases[module]
+            told = state.state_phase % n == own.phases[module]
             sure = math.hypot(x, y) > SURE * count
             settled &= sure
             if told and sure and abs(behind) > 0.5 + HYSTERESIS:
-                self.phases[module] = (self.phases[module] - round(behind)) % n
+                own.phases[module] = (own.phases[module] - round(behind)) % n
                 settled = False
-        self._sums = [(0.0, 0.0)] * N_MODULES
-        self._every = min(EVERY_TICKS, 2 * self._every) if settled else SOON_TICKS
-
-    def snapshot(self) -> PhasesState:
-        """Return the state."""
-        return PhasesState(tuple(self.phases), self._tick, self._every, tuple(self._sums))
-
-    def restore(self, state: PhasesState) -> None:
-        """Continue from a state."""
-        self.phases, self._tick, self._every = list(state.phases), state.tick, state.every
-        self._sums = list(state.sums) or [(0.0, 0.0)] * N_MODULES
+        own.sums = [(0.0, 0.0)] * N_MODULES
+        own.every = min(EVERY_TICKS, 2 * own.every) if settled else SOON_TICKS

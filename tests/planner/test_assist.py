@@ -37,7 +37,7 @@ def make_law(wanted: float = 100.0) -> AssistLaw:
     """Return a law that has carried `wanted` for long enough to integrate."""
     law = AssistLaw(FORCE_MAX, RATE_MAX, INTEGRAL_MAX, INTEGRAL_S)
     run(law, SETTLE_S + 2 * DT, wanted, wanted)
-    assert (law.assist, law.integral) == (wanted, 0.0)
+    assert (law.assist, law.state.integral) == (wanted, 0.0)
     return law
 
 
@@ -71,7 +71,7 @@ def test_a_steady_error_is_integrated_beyond_what_friction_hides(error: float) -
     law = make_law()
     run(law, 1.5, 100.0, 100.0 - error)
     expected = math.copysign(abs(error) - ERROR_MIN, error) * 1.5 / INTEGRAL_S
-    assert law.integral == pytest.approx(expected)
+    assert law.state.integral == pytest.approx(expected)
     assert law.assist == pytest.approx(100.0 + expected)
 
 
@@ -79,16 +79,16 @@ def test_a_steady_error_is_integrated_beyond_what_friction_hides(error: float) -
 def test_an_error_within_friction_is_left_alone(share: float) -> None:
     law = make_law()
     run(law, 60.0, 100.0, 100.0 + share * ERROR_MIN)
-    assert law.integral == 0.0
+    assert law.state.integral == 0.0
 
 
 @pytest.mark.parametrize(("measured", "end"), [(-1e3, INTEGRAL_MAX), (1e3, -INTEGRAL_MAX)])
 def test_the_integral_stops_at_its_limit_and_turns_at_once(measured: float, end: float) -> None:
     law = make_law()
     run(law, 60.0, 100.0, measured)
-    assert law.integral == end
+    assert law.state.integral == end
     law.advance(100.0, 100.0 + math.copysign(50.0, end), DT, still=True)
-    assert abs(law.integral) < INTEGRAL_MAX
+    assert abs(law.state.integral) < INTEGRAL_MAX
 
 
 def test_the_robot_never_pulls_the_operator_down() -> None:
@@ -102,19 +102,19 @@ def test_the_robot_never_pulls_the_operator_down() -> None:
 def test_the_integral_freezes_without_a_reading() -> None:
     law = make_law()
     run(law, 1.0, 100.0, 70.0)
-    before = law.integral
+    before = law.state.integral
     assert before > 0.0
     run(law, 5.0, 100.0, None)
-    assert law.integral == before
+    assert law.state.integral == before
 
 
 def test_the_integral_freezes_while_the_operator_leads_and_a_little_longer() -> None:
     law = make_law()
     run(law, 5.0, 100.0, 60.0, still=False)
     run(law, SETTLE_S - DT, 100.0, 60.0)
-    assert law.integral == 0.0
+    assert law.state.integral == 0.0
     run(law, 3 * DT, 100.0, 60.0)
-    assert law.integral > 0.0
+    assert law.state.integral > 0.0
 
 
 def test_the_integral_freezes_while_the_wish_moves() -> None:
@@ -122,16 +122,16 @@ def test_the_integral_freezes_while_the_wish_moves() -> None:
     for _ in range(500):
         wanted += 0.1
         law.advance(wanted, 60.0, DT, still=True)
-    assert law.integral == 0.0
+    assert law.state.integral == 0.0
 
 
 def test_the_integral_leaks_away_when_nothing_is_wanted() -> None:
     law = make_law()
     run(law, 2.0, 100.0, 20.0)
-    before = law.integral
+    before = law.state.integral
     assert before > 20.0
     run(law, INTEGRAL_S, 0.0, 300.0)
-    assert law.integral == pytest.approx(before * math.exp(-1.0), rel=0.01)
+    assert law.state.integral == pytest.approx(before * math.exp(-1.0), rel=0.01)
     run(law, 10 * INTEGRAL_S, 0.0, 300.0)
     assert law.assist == pytest.approx(0.0, abs=0.01)
 

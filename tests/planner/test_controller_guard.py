@@ -21,6 +21,7 @@ from shared.config.robot_config import RobotConfig
 from shared.places import DEFAULT_CONFIG
 from shared.robot.capture_point import capture_point
 from shared.robot.robot_model import stand_pose
+from shared.state import copied
 
 GEOMETRY = load(DEFAULT_CONFIG).geometry
 
@@ -222,7 +223,7 @@ def test_its_state_goes_on_from_a_snapshot(hocca: Hocca, seen: Observation) -> N
     failed.act(seen, leads=True)
     mine = Scripted(changed())
     again = ControllerGuard(mine, hocca, GEOMETRY)
-    again.restore(failed.snapshot())
+    again.state = copied(failed.state)
     assert again.act(seen, leads=True).local.source is SplitSource.UNCERTIFIED
     assert again.why == failed.why
     assert mine.steps == 0

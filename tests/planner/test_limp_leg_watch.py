@@ -7,8 +7,7 @@ import itertools
 import msgspec
 import pytest
 
-from services.planner.planner import Planner
-from services.planner.snapshots import TickState
+from services.planner.planner import Planner, PlannerState
 from services.planner.watch.limp_leg_watch import DISARMED_NS, LimpLegWatch
 from shared.bus.messages import DriveStatus, JointState, Mode
 from shared.clock import NS_PER_MS
@@ -157,7 +156,7 @@ def test_a_planner_that_goes_on_from_its_memory_goes_on_counting(
         planner.tick(now_ns)
     text = msgspec.json.encode(planner.snapshot())
     twin = Planner(robot, SESSION)
-    twin.restore(msgspec.json.decode(text, type=TickState))
+    twin.restore(msgspec.json.decode(text, type=PlannerState))
     decided = []
     for tick in range(40, 60):
         now_ns += TICK_NS

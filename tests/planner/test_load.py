@@ -11,10 +11,10 @@ import pytest
 
 from services.planner.law.hocca import Hocca
 from services.planner.law.kinematics import Kinematics
-from services.planner.law.load import FRICTION_BAND, RESUME_FRACTION, WEIGHING_S, Load
-from services.planner.snapshots import LoadState
+from services.planner.law.load import FRICTION_BAND, RESUME_FRACTION, WEIGHING_S, Load, LoadState
 from shared.bus.messages import Pair, Tare, Wrench
 from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.state import copied
 from tests.planner.conftest import Closed
 
 LARGEST = (8.0, 20.0)
@@ -51,13 +51,13 @@ def load() -> Load:
 @pytest.mark.parametrize("moment", [-12.0, 0.0, 18.0])
 def test_what_rests_on_it_is_found(load: Load, kg: float, moment: float) -> None:
     found(load, kg, moment)
-    assert (load.kg, load.a) == pytest.approx((kg, moment), abs=0.05)
+    assert (load.state.kg, load.state.a) == pytest.approx((kg, moment), abs=0.05)
     assert not load.refused
 
 
 def test_how_high_it_lies_shows_as_the_torso_pitches(load: Load) -> None:
     found(load, 0.0, 10.0, -8.0, seconds=300.0, pitch=lambda t: 0.7 + 0.7 * math.sin(t))
-    assert (load.a, load.b) == pytest.approx((10.0, -8.0), abs=0.3)
+    assert (load.state.a, load.state.b) == pytest.approx((10.0, -8.0), abs=0.3)
 
 
 def test_a_robot_that_falls_freely_upwards_shows_it_too(load: Load) -> None:
@@ -66,7 +66,7 @@ def test_a_robot_that_falls_freely_upwards_shows_it_too(load: Load) -> None:
     for _ in range(500):
         load.advance(WEIGHT * STRAIGHT_UP, STRAIGHT_UP, 0.0, (v, 0.0), DT, led=False)
         v += DT * -kg * GRAVITY / MASS
-    assert load.kg == pytest.approx(kg, abs=0.1)
+    assert load.state.kg == pytest.approx(kg, abs=0.1)
 
 
 def test_a_person_who_presses_on_it_is_no_load(
@@ -114,7 +114,7 @@ def test_a_torso_that_turns_freely_shows_it_too(load: Load) -> None:
     for _ in range(500):
         load.advance(WEIGHT * STRAIGHT_UP, STRAIGHT_UP, 0.0, (0.0, rate), DT, led=False)
         rate += DT * -a / INERTIA
-    assert load.a == pytest.approx(a, abs=0.1)
+    assert load.state.a == pytest.approx(a, abs=0.1)
 
 
 def test_while_it_is_led_it_is_found_eight_times_as_slowly(load: Load) -> None:
@@ -124,13 +124,13 @@ def test_while_it_is_led_it_is_found_eight_times_as_slowly(load: Load) -> None:
             each.advance(
                 (WEIGHT + 50.0) * STRAIGHT_UP, STRAIGHT_UP, 0.0, (0.0, 0.0), DT, led=each is load
             )
-        assert each.kg == pytest.approx((1.0 - math.exp(-1.0)) * 50.0 / GRAVITY, rel=0.02)
+        assert each.state.kg == pytest.approx((1.0 - math.exp(-1.0)) * 50.0 / GRAVITY, rel=0.02)
 
 
 def test_after_a_long_gap_it_is_found_at_once_and_no_more(load: Load) -> None:
     for dt in (DT, 10.0):
         load.advance((WEIGHT + 50.0) * STRAIGHT_UP, STRAIGHT_UP, 0.0, (0.0, 0.0), dt, led=False)
-    assert load.kg == pytest.approx(50.0 / GRAVITY)
+    assert load.state.kg == pytest.approx(50.0 / GRAVITY)
 
 
 def bears(load: Load, share: float, seconds: float, *, led: bool = False) -> None:
@@ -143,7 +143,7 @@ def bears(load: Load, share: float, seconds: float, *, led: bool = False) -> Non
 def test_a_robot_that_is_led_and_falls_shows_nothing(load: Load) -> None:
     bears(load, 1.0, 1.0)
     bears(load, 0.2, 4.0, led=True)
-    assert (load.kg, load.a, load.b) == pytest.approx((0.0, 0.0, 0.0))
+    assert (load.state.kg, load.state.a, load.state.b) == pytest.approx((0.0, 0.0, 0.0))
     assert not load.refused
 
 
@@ -155,12 +155,12 @@ def test_one_that_hangs_is_refused_at_once_and_weighed_before_it_is_led(load: Lo
     assert load.refused, "its load is not known yet"
     bears(load, 1.0, 0.6 + WEIGHING_S)
     assert (load.refused, load.refusal()) == (False, "")
-    assert load.kg == pytest.approx(0.0, abs=0.5)
+    assert load.state.kg == pytest.approx(0.0, abs=0.5)
 
 
 def test_weighing_is_reported_while_it_lasts(load: Load) -> None:
     bears(load, 0.3, DT)
-    while load.kg < -RESUME_FRACTION * LARGEST[0]:
+    while load.state.kg < -RESUME_FRACTION * LARGEST[0]:
         bears(load, 1.0, DT)
     bears(load, 1.0, DT)
     assert load.refusal() == "its load is being weighed"
@@ -192,18 +192,20 @@ def test_without_a_harness_one_that_hangs_is_not_led_until_it_is_down(
     for _ in range(250):
         load.advance_without_harness(WEIGHT - 100.0, DT, led=led)
     assert not load.refused
-    assert (load.kg, load.a, load.b) == (0.0, 0.0, 0.0), "a hand may lift it: nothing is known"
+    assert (load.state.kg, load.state.a, load.state.b) == (0.0, 0.0, 0.0), (
+        "a hand may lift it: nothing is known"
+    )
 
 
 def test_a_memory_of_one_that_hangs_is_gone_on_with(load: Load) -> None:
     twin = Load(LARGEST, WEIGHT, MASS, INERTIA)
     bears(load, 0.3, 0.1)
-    text = msgspec.json.encode(load.snapshot())
-    twin.restore(msgspec.json.decode(text, type=LoadState))
+    text = msgspec.json.encode(load.state)
+    twin.state = msgspec.json.decode(text, type=LoadState)
     for each in (load, twin):
         bears(each, 1.0, 0.9)
         assert each.refused
-    assert twin.snapshot() == load.snapshot()
+    assert twin.state == load.state
 
 
 @pytest.mark.parametrize("rates", [(0.06, 0.0), (-0.06, 0.0), (0.0, 0.11), (0.0, -0.11)])
@@ -213,10 +215,10 @@ def test_in_motion_it_is_looked_for_only_while_the_robot_is_not_led(
     F = (WEIGHT + 50.0) * STRAIGHT_UP
     for _ in range(1000):
         load.advance(F, STRAIGHT_UP, 0.0, rates, DT, led=True)
-    assert load.kg == 0.0
+    assert load.state.kg == 0.0
     for _ in range(1000):
         load.advance(F, STRAIGHT_UP, 0.0, rates, DT, led=False)
-    assert load.kg == pytest.approx(50.0 / GRAVITY, abs=0.05)
+    assert load.state.kg == pytest.approx(50.0 / GRAVITY, abs=0.05)
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
@@ -260,11 +262,11 @@ def test_far_from_the_file_it_is_refused_until_it_is_well_within(
 def test_it_goes_on_from_a_memory(load: Load) -> None:
     twin = Load(LARGEST, WEIGHT, MASS, INERTIA)
     found(load, 9.0, 5.0, seconds=0.5)
-    text = msgspec.json.encode(load.snapshot())
-    twin.restore(msgspec.json.decode(text, type=LoadState))
+    text = msgspec.json.encode(load.state)
+    twin.state = msgspec.json.decode(text, type=LoadState)
     for each in (load, twin):
         found(each, -3.0, 2.0, seconds=0.5)
-    assert twin.snapshot() == load.snapshot()
+    assert twin.state == load.state
 
 
 @pytest.mark.parametrize(
@@ -281,7 +283,7 @@ def test_it_goes_on_from_a_memory(load: Load) -> None:
 def test_each_reason_is_reported_and_no_other(
     load: Load, kg: float, a: float, b: float, words: list[str]
 ) -> None:
-    load.restore(LoadState(kg, a, b, None, refused=True))
+    load.state = LoadState(kg, a, b, None, refused=True)
     reason = load.refusal()
     assert reason.count("carries") + reason.count("lies") == len(words)
     assert [reason.index(said) for said in words] == sorted(reason.index(said) for said in words)
@@ -291,6 +293,6 @@ def test_each_reason_is_reported_and_no_other(
 def test_what_was_refused_stays_refused_in_a_memory(load: Load) -> None:
     found(load, 9.0)
     twin = Load(LARGEST, WEIGHT, MASS, INERTIA)
-    twin.restore(load.snapshot())
+    twin.state = copied(load.state)
     assert twin.refused
     assert twin.refusal() == load.refusal()

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from services.planner.intents import OperatorRequest
-from services.planner.law.shift import ROWS, SHIFT_S, ShiftReference
+from services.planner.law.shift import ROWS, SHIFT_S, ShiftReference, ShiftState
 from services.planner.planner import Planner
-from services.planner.snapshots import ShiftState
 from shared.bus.messages import STRAIGHT, Vector4
 from shared.config.robot_config import RobotConfig
 
@@ -80,8 +79,8 @@ def test_a_follower_that_goes_on_from_its_memory_goes_on_bit_for_bit() -> None:
     follower, twin = ShiftReference(LARGEST), ShiftReference(LARGEST)
     for _ in range(40):
         follower.advance((0.03, -0.04, 0.0, 0.1), DT)
-    text = msgspec.json.encode(follower.snapshot())
-    twin.restore(msgspec.json.decode(text, type=ShiftState))
+    text = msgspec.json.encode(follower.state)
+    twin.state = msgspec.json.decode(text, type=ShiftState)
     for _ in range(40):
         for mine, other in zip(
             advanced(follower, STRAIGHT, DT), advanced(twin, STRAIGHT, DT), strict=True

@@ -21,6 +21,7 @@ from services.planner.state_phases import (
 from shared.bus.messages import JointState
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.joints import N_MODULES
+from shared.state import copied
 from tests.planner.test_planner import state
 
 RATE_HZ, STATE_HZ = 500.0, 250.0
@@ -66,7 +67,7 @@ def run(phases: StatePhases, modules: Modules, ticks: int, *, heard: bool = True
         arrived = [arrival for _, arrival in sent]
         phases.advance([state for state, _ in sent], arrived, min(arrived) - 1)
         if heard:
-            modules.phases = list(phases.phases)
+            modules.phases = list(phases.state.phases)
         period = modules.n * CYCLE_NS
         behind = [(a - arrived[0] + period / 2) % period - period / 2 for a in arrived]
         spreads.append((max(behind) - min(behind)) / CYCLE_NS)
@@ -93,7 +94,7 @@ def test_jitter_of_a_cycle_moves_no_module_to_and_fro() -> None:
     seen = set()
     for _ in range(2500):
         run(phases, modules, 1)
-        seen.add(tuple(phases.phases))
+        seen.add(tuple(phases.state.phases))
     assert seen == {(0,) * N_MODULES}
 
 
@@ -103,8 +104,8 @@ def test_drives_whose_clocks_drift_change_phase_once_for_each_cycle_they_drift()
     changes, last, spreads = 0, 0, []
     for _ in range(11_000):  # 44 s: 8.8 ms, four cycles and a bit
         spreads += run(phases, modules, 1)
-        changes += phases.phases[1] != last
-        last = phases.phases[1]
+        changes += phases.state.phases[1] != last
+        last = phases.state.phases[1]
     assert changes == 4
     assert max(spreads) < 0.5 + 0.15 + 200e-6 * 2 * EVERY_TICKS + 0.05
 
@@ -117,14 +118,14 @@ def test_one_late_state_moves_nothing() -> None:
     for late_ns in (1, CYCLE_NS, 100 * NS_PER_MS):
         phases.advance(states, [0, late_ns, 0, 0, 0, 0], -1)
     run(phases, modules, COMPARED_TICKS)
-    assert phases.phases == [0] * N_MODULES
+    assert phases.state.phases == [0] * N_MODULES
 
 
 def test_modules_that_do_not_hear_are_not_told_again_and_again() -> None:
     modules = Modules([0, CYCLE_NS, 0, 0, 0, 0], [0] * N_MODULES)
     phases = StatePhases(RATE_HZ, STATE_HZ)
     run(phases, modules, 3 * EVERY_TICKS, heard=False)
-    assert phases.phases == [0, 1, 0, 0, 0, 0]
+    assert phases.state.phases == [0, 1, 0, 0, 0, 0]
 
 
 def test_a_new_planner_adopts_the_phases_that_the_last_one_left() -> None:
@@ -133,13 +134,13 @@ def test_a_new_planner_adopts_the_phases_that_the_last_one_left() -> None:
     left = list(modules.phases)
     new = StatePhases(RATE_HZ, STATE_HZ)
     assert max(run(new, modules, 500)) < 0.5
-    assert new.phases == left == [0, 1, 0, 0, 0, 0]
+    assert new.state.phases == left == [0, 1, 0, 0, 0, 0]
 
 
 def test_where_every_cycle_sends_a_state_there_is_nothing_to_choose() -> None:
     phases = StatePhases(RATE_HZ, RATE_HZ)
     run(phases, Modules([0, 700_000, 0, 0, 0, 0], [0, 1, 2, 3, 4, 5], n=1), 500)
-    assert phases.phases == [0] * N_MODULES
+    assert phases.state.phases == [0] * N_MODULES
 
 
 @pytest.mark.parametrize("silent", [0, 3])
@@ -155,8 +156,8 @@ def test_while_a_module_is_silent_the_others_keep_their_phases(silent: int) -> N
         others = [arrival for module, (_, arrival) in enumerate(sent) if module != silent]
         compared += phases.compares
         phases.advance(*zip(*sent, strict=True), min(others) - 1)
-        modules.phases = list(phases.phases)
-    assert phases.phases == [0] * N_MODULES
+        modules.phases = list(phases.state.phases)
+    assert phases.state.phases == [0] * N_MODULES
     rounds = 20 * EVERY_TICKS // SOON_TICKS
     assert rounds - 1 <= compared / COMPARED_TICKS <= rounds, "between the comparisons it rests"
 
@@ -203,7 +204,7 @@ def test_a_module_moves_if_it_is_behind_by_more_than_half_a_period_and_a_bit(
     begin = [round(CYCLE_NS * (10.0 + behind * (module == 2))) for module in range(N_MODULES)]
     phases = StatePhases(RATE_HZ, STATE_HZ)
     run(phases, Modules(begin, [0] * N_MODULES), COMPARED_TICKS)
-    assert phases.phases == [0, 0, phase, 0, 0, 0]
+    assert phases.state.phases == [0, 0, phase, 0, 0, 0]
 
 
 def test_arrivals_in_all_phases_move_nothing_and_are_not_remembered() -> None:
@@ -214,8 +215,8 @@ def test_arrivals_in_all_phases_move_nothing_and_are_not_remembered() -> None:
         arrived = [arrival for _, arrival in sent]
         arrived[3] += tick % 8 * CYCLE_NS // 4
         phases.advance([state for state, _ in sent], arrived, min(arrived) - 1)
-    assert phases.phases == [0] * N_MODULES
-    assert phases.snapshot().sums == ((0.0, 0.0),) * N_MODULES
+    assert phases.state.phases == [0] * N_MODULES
+    assert phases.state.sums == [(0.0, 0.0)] * N_MODULES
 
 
 def test_before_there_are_six_modules_nothing_is_compared() -> None:
@@ -226,7 +227,7 @@ def test_before_there_are_six_modules_nothing_is_compared() -> None:
 def test_it_continues_from_a_state_bit_for_bit(ticks: int) -> None:
     one, other = StatePhases(RATE_HZ, STATE_HZ), StatePhases(RATE_HZ, STATE_HZ)
     run(one, Modules([0, 1_700_000, 300_000, 0, 0, 0], [0] * N_MODULES), ticks)
-    other.restore(one.snapshot())
+    other.state = copied(one.state)
     for phases in (one, other):
         run(phases, Modules([0, 1_700_000, 300_000, 0, 0, 0], [0] * N_MODULES), 60)
-    assert other.snapshot() == one.snapshot()
+    assert other.state == one.state

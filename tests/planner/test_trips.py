@@ -14,6 +14,7 @@ from shared.bus.messages import Trip
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 from shared.robot.trip_table import JOINT_TRIPS, PLANNER_TRIPS
+from shared.state import copied
 from tests.planner.conftest import Closed
 
 T0 = 5_000_000_000
@@ -126,11 +127,11 @@ def test_it_goes_on_from_a_memory(robot: RobotConfig) -> None:
     trips, other, values = PlannerTrips(robot), PlannerTrips(robot), beyond(robot, Trip.LEGS)
     for tick in range(11):
         trips.advance(T0 + tick * TICK_NS, values, leads=True)
-    other.restore(trips.snapshot())
+    other.state = copied(trips.state)
     for each in (trips, other):
         for tick in range(11, 14):
             each.advance(T0 + tick * TICK_NS, values, leads=True)
-    assert other.snapshot() == trips.snapshot()
+    assert other.state == trips.state
     assert other.tripped is Trip.LEGS
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from services.planner.watch.unattended import ARM, HAND_LOST_NS, HAND_MIN, Unattended
 from shared.bus.messages import Pair
+from shared.state import copied
 
 T0 = 5_000_000_000
 HERE: Pair = (0.8, 0.1)
@@ -60,7 +61,7 @@ def test_a_hand_that_is_not_felt_for_a_moment_has_not_let_go() -> None:
 
 def test_it_goes_on_from_a_memory() -> None:
     hand, twin = left(), Unattended()
-    twin.restore(hand.snapshot())
+    twin.state = copied(hand.state)
     for each in (hand, twin):
         each.drift(T0 + HAND_LOST_NS + 1, (0.9, 0.2), 0.0, 0.0)
-    assert twin.snapshot() == hand.snapshot()
+    assert twin.state == hand.state

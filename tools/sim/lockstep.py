@@ -17,8 +17,7 @@ from services.joint.drive_manager import DriveManager
 from services.joint.snapshots import DriveManagerState
 from services.planner.controller import Controller
 from services.planner.intents import OperatorRequest
-from services.planner.planner import Planner
-from services.planner.snapshots import TickState
+from services.planner.planner import Planner, PlannerState
 from services.simulator.drives.axis_bank import AxisBank
 from services.simulator.fault_injector import FaultInjector
 from services.simulator.physics.body import body_of
@@ -75,7 +74,7 @@ class FleetMoment(msgspec.Struct, frozen=True):
     """World and drives."""
     modules: Mapping[str, DriveManagerState]
     """State of each joint service; one that is not named is dead."""
-    planner: tuple[int, TickState] | None
+    planner: tuple[int, PlannerState] | None
     """Session and state of the planner; None: it is dead."""
 
 

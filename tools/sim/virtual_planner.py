@@ -6,8 +6,7 @@ from collections.abc import Callable
 
 from services.planner.checkpoint import Checkpoints
 from services.planner.intents import OperatorRequest
-from services.planner.planner import Planner
-from services.planner.snapshots import TickState
+from services.planner.planner import Planner, PlannerState
 from shared.bus import topics
 from shared.bus.messages import Message
 from shared.bus.topics import Topic
@@ -99,7 +98,7 @@ class VirtualPlanner:
             self.planner = self._make(self._session)
             self._checkpoints = Checkpoints(self._rate_hz)
 
-    def resume(self, start: tuple[int, TickState] | None) -> None:
+    def resume(self, start: tuple[int, PlannerState] | None) -> None:
         """Continue from another run's planner: its session and state; None: it is dead."""
         if start is None:
             self.planner = None

@@ -15,8 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.snapshots import AssistState, EasingState, OverloadState
-from shared.bus.messages import Vector3, Wrench
+from shared.bus.messages import Pair, Vector3, Wrench
 from shared.clamp import clamp
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import HarnessConfig
@@ -74,6 +73,17 @@ def is_still(rate_z: float, rate_pitch: float) -> bool:
     return abs(rate_z) <= STILL_RATE_Z and abs(rate_pitch) <= STILL_RATE_PITCH
 
 
+class AssistState(msgspec.Struct):
+    """State of `AssistLaw`."""
+
+    ramp: float | None = None
+    """N; None before the first tick."""
+    wanted: float = 0.0
+    still_s: float = 0.0
+    integral: float = 0.0
+    """N"""
+
+
 class AssistLaw:
     """Assist force: the rate-limited request plus a slow integral on its error.
 
@@ -107,27 +117,12 @@ class AssistLaw:
         self._rate_max = rate_max
         self._integral_max = integral_max
         self._integral_s = integral_s
-        self._ramp: float | None = None
-        self._wanted = 0.0
-        self._still_s = 0.0
-        self.integral = 0.0
-        """N"""
-
-    def snapshot(self) -> AssistState:
-        """Return the state."""
-        return AssistState(self._ramp, self._wanted, self._still_s, self.integral)
-
-    def restore(self, state: AssistState) -> None:
-        """Continue from a state."""
-        m = state
-        self._ramp, self._wanted, self._still_s, self.integral = (
-            m.ramp, m.wanted, m.still_s, m.integral
-        )  # fmt: skip
+        self.state = AssistState()
 
     @property
     def assist(self) -> float:
         """Assist force in the feedforward, N."""
-        return (self._ramp or 0.0) + self.integral
+        return (self.state.ramp or 0.0) + self.state.integral
 
     def advance(self, wanted: float, measured: float | None, dt: float, *, still: bool) -> float:
         """Advance by one tick; return the rate of `assist` in N/s.
@@ -138,25 +133,34 @@ class AssistLaw:
             dt: time since the last tick, s.
             still: False while the robot holds or the operator leads.
         """
-        wanted = clamp(wanted, 0.0, self._force_max)
-        if self._ramp is None:
+        s, wanted = self.state, clamp(wanted, 0.0, self._force_max)
+        if s.ramp is None:
             # a planner that takes over from HOLD finds the assist in HOLD's feedforward
-            self._ramp = wanted
-        before = self._ramp + self.integral
+            s.ramp = wanted
+        before = s.ramp + s.integral
         change_max = self._rate_max * dt
-        self._ramp += clamp(wanted - self._ramp, -change_max, change_max)
-        steady = still and wanted == self._wanted == self._ramp
-        self._wanted = wanted
-        self._still_s = self._still_s + dt if steady else 0.0
+        s.ramp += clamp(wanted - s.ramp, -change_max, change_max)
+        steady = still and wanted == s.wanted == s.ramp
+        s.wanted = wanted
+        s.still_s = s.still_s + dt if steady else 0.0
         if wanted == 0.0:
-            self.integral -= self.integral * min(1.0, dt / self._integral_s)
-        elif measured is not None and self._still_s > SETTLE_S:
+            s.integral -= s.integral * min(1.0, dt / self._integral_s)
+        elif measured is not None and s.still_s > SETTLE_S:
             error = wanted - measured
             error -= clamp(error, -ERROR_MIN, ERROR_MIN)
-            self.integral += error * dt / self._integral_s
-        low = max(-self._integral_max, -self._ramp)
-        self.integral = clamp(self.integral, low, self._integral_max)
-        return (self._ramp + self.integral - before) / dt if dt > 0.0 else 0.0
+            s.integral += error * dt / self._integral_s
+        low = max(-self._integral_max, -s.ramp)
+        s.integral = clamp(s.integral, low, self._integral_max)
+        return (s.ramp + s.integral - before) / dt if dt > 0.0 else 0.0
+
+
+class EasingState(msgspec.Struct):
+    """State of `LeadEasing`."""
+
+    lead: Pair = (0.0, 0.0)
+    """N and N m, within `LEAD_MAX`."""
+    left: float = 0.0
+    """Share of it that is used, 0 .. 1: it fades without a reading."""
 
 
 class LeadEasing:
@@ -174,16 +178,7 @@ class LeadEasing:
     def __init__(self, alpha: float) -> None:
         """Set alpha in [0, 1); 0 disables the easing."""
         self._alpha = alpha
-        self._lead = (0.0, 0.0)
-        self._left = 0.0
-
-    def snapshot(self) -> EasingState:
-        """Return the state."""
-        return EasingState(self._lead, self._left)
-
-    def restore(self, state: EasingState) -> None:
-        """Continue from a state."""
-        self._lead, self._left = state.lead, state.left
+        self.state = EasingState()
 
     def ease(
         self, up: float | None, moment_pitch: float, assist: float, dt: float
@@ -196,17 +191,27 @@ class LeadEasing:
             assist: assist force in the feedforward, N.
             dt: time since the last tick, s.
         """
+        s = self.state
         if up is None:
-            self._left = max(0.0, self._left - dt / LEAD_FADE_S)
+            s.left = max(0.0, s.left - dt / LEAD_FADE_S)
         else:
-            self._left = min(1.0, self._left + dt / LEAD_FADE_S)
+            s.left = min(1.0, s.left + dt / LEAD_FADE_S)
             force_max, moment_max = LEAD_MAX
-            self._lead = (
+            s.lead = (
                 clamp(up + assist, -force_max, force_max),
                 clamp(moment_pitch, -moment_max, moment_max),
             )
-        gain = self._alpha * self._left
-        return gain * self._lead[0], gain * self._lead[1]
+        gain = self._alpha * s.left
+        return gain * s.lead[0], gain * s.lead[1]
+
+
+class OverloadState(msgspec.Struct):
+    """State of `Overload`."""
+
+    beyond_since_ns: int | None = None
+    below_since_ns: int | None = None
+    hold: bool = False
+    """True during an overload."""
 
 
 class Overload:
@@ -224,10 +229,12 @@ class Overload:
         self._moment_max = moment_max
         self._after_ns = after_ns
         self._release_ns = release_ns
-        self._beyond_since_ns: int | None = None
-        self._below_since_ns: int | None = None
-        self.hold = False
+        self.state = OverloadState()
+
+    @property
+    def hold(self) -> bool:
         """True during an overload."""
+        return self.state.hold
 
     @classmethod
     def of(cls, harness: HarnessConfig) -> Overload:
@@ -236,18 +243,9 @@ class Overload:
         release_ns = round(harness.overload_release_s * NS_PER_S)
         return cls(harness.overload_force, harness.overload_moment, after_ns, release_ns)
 
-    def snapshot(self) -> OverloadState:
-        """Return the state."""
-        return OverloadState(self._beyond_since_ns, self._below_since_ns, self.hold)
-
-    def restore(self, state: OverloadState) -> None:
-        """Continue from a state."""
-        m = state
-        self._beyond_since_ns, self._below_since_ns = m.beyond_since_ns, m.below_since_ns
-        self.hold = m.hold
-
     def receive(self, wrench: Wrench, now_ns: int) -> None:
         """Update with a wrench that arrived now."""
+        s = self.state
         load_ratio = max(
             math.hypot(*wrench.force) / self._force_max,
             math.hypot(*wrench.moment) / self._moment_max,
@@ -255,12 +253,12 @@ class Overload:
         beyond = wrench.valid and load_ratio > 1.0
         below = wrench.valid and load_ratio < RELEASE_FRACTION
         if wrench.valid:
-            self._beyond_since_ns = _since(self._beyond_since_ns, now_ns, beyond)
-        self._below_since_ns = _since(self._below_since_ns, now_ns, below)
-        if wrench.saturated or _lasted(self._beyond_since_ns, now_ns, self._after_ns):
-            self.hold = True
-        elif _lasted(self._below_since_ns, now_ns, self._release_ns):
-            self.hold = False
+            s.beyond_since_ns = _since(s.beyond_since_ns, now_ns, beyond)
+        s.below_since_ns = _since(s.below_since_ns, now_ns, below)
+        if wrench.saturated or _lasted(s.beyond_since_ns, now_ns, self._after_ns):
+            s.hold = True
+        elif _lasted(s.below_since_ns, now_ns, self._release_ns):
+            s.hold = False
 
 
 def _since(since_ns: int | None, now_ns: int, condition: bool) -> int | None:

@@ -21,24 +21,34 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.law.assist import AssistLaw, LeadEasing, force_up, is_still, wrench_in_world
+from services.planner.law.assist import (
+    AssistLaw,
+    AssistState,
+    EasingState,
+    LeadEasing,
+    force_up,
+    is_still,
+    wrench_in_world,
+)
 from services.planner.law.coupling import CouplingFilter
 from services.planner.law.gains import GainLaw
 from services.planner.law.kinematics import Measured
 from services.planner.law.law_terms import LawAtReference
 from services.planner.law.levelling import Levelling
-from services.planner.law.load import Load
-from services.planner.law.probe import NO_ROW, ReferenceProbe
+from services.planner.law.load import Load, LoadState
+from services.planner.law.probe import NO_ROW, ProbeState, ReferenceProbe
 from services.planner.law.reference import Reference
-from services.planner.law.shift import ShiftReference
+from services.planner.law.shift import ShiftReference, ShiftState
 from services.planner.law.split import GainSplit, LocalGains
 from services.planner.law.stance import FOLLOW_S, Stance
-from services.planner.snapshots import LawState
-from shared.bus.messages import STRAIGHT, Pair, Vector3, Vector4, Wrench
+from shared.bus.messages import AS_CONFIGURED, STRAIGHT, Pair, Vector3, Vector4, Vector6, Wrench
 from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.joints import N_JOINTS
+from shared.state import copied
 
 Array = NDArray[np.float64]
 
@@ -79,6 +89,28 @@ class LawOutput(NamedTuple):
     ik_residual: float
 
 
+class LawState(msgspec.Struct):
+    """State of `Hocca`."""
+
+    p_C0: tuple[float, ...] = (0.0,) * 6
+    since_align_s: float = 0.0
+    aligned: bool = False
+    q: tuple[float, ...] = (0.0,) * N_JOINTS
+    """Start of the inverse kinematics, rad."""
+    assist: AssistState = msgspec.field(default_factory=AssistState)
+    easing: EasingState = msgspec.field(default_factory=EasingState)
+    has_led: bool = False
+    coupling: tuple[float, ...] = (0.0,) * (2 * N_JOINTS)
+    """State of `CouplingFilter`, N m."""
+    levelling: tuple[bool, float, float] = (False, 0.0, 0.0)
+    """State of `Levelling`: True if a slope is known, and the slope, rad."""
+    shift: ShiftState = msgspec.field(default_factory=ShiftState)
+    stance: tuple[Vector6, bool] = (AS_CONFIGURED, False)
+    """State of `Stance`: the adopted stance, m and rad, and True if it is refused."""
+    load: LoadState = msgspec.field(default_factory=LoadState)
+    probe: ProbeState = msgspec.field(default_factory=ProbeState)
+
+
 class Hocca:
     """The law and its state, such as the closed-loop reference p_C and the assist."""
 
@@ -86,12 +118,11 @@ class Hocca:
         """Build the law; the first tick starts from the measured pose."""
         self._measured = Measured(config)
         self._reference = Reference(config)
-        self._gains = GainLaw(config)
+        gains = GainLaw(config)
         self._split = GainSplit(config)
-        self._S = self._gains.S
-        coupling = self._split.coupling
-        self._terms = LawAtReference(self._gains, self._split)
-        self._coupling = CouplingFilter(coupling.bandwidth_hz)
+        self._S = gains.S
+        self._terms = LawAtReference(gains, self._split)
+        self._coupling = CouplingFilter(self._split.coupling.bandwidth_hz)
         self._S_perp = 1.0 - self._S
         self._levelling = Levelling(config.imu.levelling_s)
         self._shift = ShiftReference(config.law.shift_max)
@@ -112,9 +143,13 @@ class Hocca:
         self._easing = LeadEasing(config.law.lead_easing)
         self._recentre_s = config.law.recentre_s
         self._p_C0: Array = np.zeros(6)
-        self._since_align_s = 0.0
-        self._aligned = False
-        self._has_led = False
+        self._state = LawState(
+            assist=self._assist.state,
+            easing=self._easing.state,
+            shift=self._shift.state,
+            load=self._load.state,
+            probe=self._probe.state,
+        )
 
     @property
     def stance_refused(self) -> bool:
@@ -128,7 +163,8 @@ class Hocca:
     @property
     def load(self) -> Vector3:
         """Load beyond the robot file: kg, and moments a and b, N m."""
-        return self._load.kg, self._load.a, self._load.b
+        load = self._load.state
+        return load.kg, load.a, load.b
 
     @property
     def load_refused(self) -> bool:
@@ -174,21 +210,21 @@ class Hocca:
             up_torso: unit vector against gravity, torso axes, if the IMU knows it now.
         """
         measured, reference = self._measured, self._reference
-        if align or not self._aligned:
-            fraction = min(1.0, dt / FOLLOW_S) if self._has_led else 1.0
+        if align or not self._state.aligned:
+            fraction = min(1.0, dt / FOLLOW_S) if self._state.has_led else 1.0
             self._stance.take(measured.stance_at(q), fraction)
             self._apply_stance()
         measured.update(q, v)
-        self._levelling.advance(up_torso, measured.p[3:], dt, jump=align or not self._aligned)
+        self._levelling.advance(up_torso, measured.p[3:], dt, jump=align or not self._state.aligned)
         up = self._levelling.up
         self._F_O[:3] = self._weight * up
         self._F_O[4] = self._load.moment(float(measured.p[4]))
-        if align or not self._aligned:
+        if align or not self._state.aligned:
             self._align(q)
             self._shift.rest()
             self._probe.reset()
         else:
-            self._has_led = True
+            self._state.has_led = True
             self._probe.advance(*probe, measured.p, measured.pdot, dt)
             self._shift.advance(shift_requested, dt)
         pdot = measured.pdot
@@ -224,22 +260,22 @@ class Hocca:
         tau_coupled += ease_z * reference.J_harness[2] + ease_pitch * reference.J[4]
         reference.expect(dt)
         return LawOutput(
-            reference.q.copy(),
-            reference.v.copy(),
-            reference.gravity + reference.assist,
-            reference.dtau_ff.copy(),
-            tau_coupled,
-            terms.coupled,
-            terms.local,
-            measured.p.copy(),
-            pdot.copy(),
-            p_ref,
-            measured.closure.copy(),
-            self._assist.assist,
-            self._levelling.slope,
-            self._stance.taken,
-            result.iterations,
-            result.residual,
+            q_ref=reference.q.copy(),
+            v_ref=reference.v.copy(),
+            tau_ff=reference.gravity + reference.assist,
+            dtau_ff=reference.dtau_ff.copy(),
+            tau_coupled=tau_coupled,
+            tau_unfiltered=terms.coupled,
+            local=terms.local,
+            p=measured.p.copy(),
+            pdot=pdot.copy(),
+            p_ref=p_ref,
+            closure=measured.closure.copy(),
+            assist=self._assist.assist,
+            slope=self._levelling.slope,
+            stance=self._stance.taken,
+            ik_iterations=result.iterations,
+            ik_residual=result.residual,
         )
 
     @property
@@ -311,37 +347,31 @@ class Hocca:
         return float(self._measured.J_harness[2] @ v)
 
     def snapshot(self) -> LawState:
-        """Return the state."""
-        return LawState(
-            tuple(self._p_C0.tolist()),
-            self._since_align_s,
-            self._aligned,
-            tuple(self._reference.start.tolist()),
-            self._assist.snapshot(),
-            self._easing.snapshot(),
-            self._has_led,
-            self._coupling.snapshot(),
-            self._levelling.snapshot(),
-            self._shift.snapshot(),
-            self._stance.snapshot(),
-            self._load.snapshot(),
-            self._probe.snapshot(),
+        """Return a copy of the state; `restore` continues from it."""
+        state = msgspec.structs.replace(
+            self._state,
+            p_C0=tuple(self._p_C0.tolist()),
+            q=tuple(self._reference.start.tolist()),
+            coupling=self._coupling.snapshot(),
+            levelling=self._levelling.snapshot(),
+            stance=self._stance.snapshot(),
         )
+        return copied(state)
 
     def restore(self, state: LawState) -> None:
-        """Continue from a state."""
-        self._p_C0 = np.array(state.p_C0)
-        self._since_align_s, self._aligned = state.since_align_s, state.aligned
-        self._has_led = state.has_led
-        self._reference.start[:] = state.q
-        self._assist.restore(state.assist)
-        self._easing.restore(state.easing)
-        self._coupling.restore(state.coupling)
-        self._levelling.restore(state.levelling)
-        self._shift.restore(state.shift)
-        self._stance.restore(state.stance)
-        self._load.restore(state.load)
-        self._probe.restore(state.probe)
+        """Continue from a copy of a state."""
+        self._state = own = copied(state)
+        self._assist.state, self._easing.state, self._shift.state = (
+            own.assist,
+            own.easing,
+            own.shift,
+        )
+        self._load.state, self._probe.state = own.load, own.probe
+        self._p_C0 = np.array(own.p_C0)
+        self._reference.start[:] = own.q
+        self._coupling.restore(own.coupling)
+        self._levelling.restore(own.levelling)
+        self._stance.restore(own.stance)
         self._apply_stance()
 
     def _apply_stance(self) -> None:
@@ -349,13 +379,13 @@ class Hocca:
             stance[:] = self._stance.taken
 
     def _align(self, q: Array) -> None:
-        self._aligned = True
+        self._state.aligned = True
         self._coupling.reset()
-        kept_rows = np.where(RECENTRED & self._has_led, 0.0, self._S_perp)
+        kept_rows = np.where(RECENTRED & self._state.has_led, 0.0, self._S_perp)
         p = self._measured.p.copy()
         p[:2] -= self._levelling.up[:2] / self._levelling.up[2] * p[2]
         self._p_C0 = p * kept_rows
-        self._since_align_s = 0.0
+        self._state.since_align_s = 0.0
         self._reference.start[:] = q
 
     def _closed_loop_reference(self, dt: float) -> tuple[Array, Array]:
@@ -363,10 +393,10 @@ class Hocca:
 
         Height and pitch stay where they were found, if they are closed: at zero nothing stands.
         """
-        self._since_align_s += dt
-        if self._since_align_s >= self._recentre_s:
+        self._state.since_align_s += dt
+        if self._state.since_align_s >= self._recentre_s:
             return self._p_C0 * KEPT, np.zeros(6)
-        s = self._since_align_s / self._recentre_s
+        s = self._state.since_align_s / self._recentre_s
         remaining = 1.0 - s * s * s * (10.0 - 15.0 * s + 6.0 * s * s)
         rate = -30.0 * s * s * (1.0 - s) * (1.0 - s) / self._recentre_s
         return self._p_C0 * np.where(RECENTRED, remaining, 1.0), self._p_C0 * np.where(

@@ -26,10 +26,10 @@ from __future__ import annotations
 import math
 from typing import Final
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.snapshots import LoadState
 from shared.bus.messages import Pair
 from shared.config.robot_config import GRAVITY
 
@@ -53,14 +53,24 @@ HANGING_FRACTION: Final = 0.5
 """Fraction of the file's weight; with less on its feet, a robot in HOLD hangs on a hoist."""
 
 
-class Load:
-    """Low-passed surplus load.
+class LoadState(msgspec.Struct):
+    """State of `Load`."""
 
-    Attributes:
-        kg: surplus mass.
-        a: N m along pitch, for a load behind (+) or ahead of the file's centre.
-        b: N m along pitch, for a load below (+) or above it, with the torso at 90 degrees.
-    """
+    kg: float = 0.0
+    """Surplus mass."""
+    a: float = 0.0
+    """N m along pitch, for a load behind (+) or ahead of the file's centre."""
+    b: float = 0.0
+    """N m along pitch, for a load below (+) or above it, with the torso at 90 degrees."""
+    rates: Pair | None = None
+    refused: bool = False
+    weighing_s: float = 0.0
+    looked: bool = False
+    """It has looked whether the robot hangs, once."""
+
+
+class Load:
+    """Low-passed surplus load."""
 
     def __init__(self, correction_max: Pair, weight: float, mass: float, inertia: float) -> None:
         """Start with the robot file's load.
@@ -74,37 +84,35 @@ class Load:
         self._kg_max, self._moment_max = correction_max
         self.enabled = any(correction_max)
         self._weight, self._mass, self._inertia = weight, mass, inertia
-        self._rates: Pair | None = None
-        self._refused = False
-        self._weighing_s = 0.0
-        self._started = False
-        self.kg = self.a = self.b = 0.0
+        self.state = LoadState()
 
     @property
     def refused(self) -> bool:
         """True while the load differs too much from the file, or is not known yet."""
-        return self._refused or self._weighing_s > 0.0
+        s = self.state
+        return s.refused or s.weighing_s > 0.0
 
     def refusal(self) -> str:
         """Return why the load is refused and how to fix it, as text; "" if it is accepted."""
-        if not self._refused:
-            return "its load is being weighed" if self._weighing_s > 0.0 else ""
+        s = self.state
+        if not s.refused:
+            return "its load is being weighed" if s.weighing_s > 0.0 else ""
         if self._is_hung:
             return (
                 "it hangs: lower it until its feet bear its weight; or, on its feet, it carries "
-                f"{-self.kg:.0f} kg less than its file says: set mass.payload, then `xrl gains`"
+                f"{-s.kg:.0f} kg less than its file says: set mass.payload, then `xrl gains`"
             )
         reasons = []
-        if abs(self.kg) > RESUME_FRACTION * self._kg_max:
-            more = "more" if self.kg > 0.0 else "less"
-            held_up = "" if self.kg > 0.0 else "if nothing holds it up, "
+        if abs(s.kg) > RESUME_FRACTION * self._kg_max:
+            more = "more" if s.kg > 0.0 else "less"
+            held_up = "" if s.kg > 0.0 else "if nothing holds it up, "
             reasons.append(
-                f"the robot carries {abs(self.kg):.1f} kg {more} than its file says: at most "
+                f"the robot carries {abs(s.kg):.1f} kg {more} than its file says: at most "
                 f"{self._kg_max:g} kg are accepted "
                 f"({RESUME_FRACTION * self._kg_max:g} once refused); {held_up}set "
                 "mass.payload, then `xrl gains`"
             )
-        for moment, positive, negative in ((self.a, "behind", "ahead"), (self.b, "low", "high")):
+        for moment, positive, negative in ((s.a, "behind", "ahead"), (s.b, "low", "high")):
             if abs(moment) > RESUME_FRACTION * self._moment_max:
                 reasons.append(
                     f"the load lies too far {positive if moment > 0.0 else negative}, by "
@@ -115,7 +123,8 @@ class Load:
 
     def force(self) -> float:
         """Return the part of the weight beyond friction, N at the harness point; limited."""
-        return _deadband(GRAVITY * self.kg, FRICTION_BAND[0], GRAVITY * self._kg_max)
+        s = self.state
+        return _deadband(GRAVITY * s.kg, FRICTION_BAND[0], GRAVITY * self._kg_max)
 
     def moment(self, pitch: float) -> float:
         """Return the part of its pitch moment beyond friction, N m, within the limit."""
@@ -134,7 +143,8 @@ class Load:
             dt: time since the last call, s.
             led: the planner is engaged.
         """
-        before, self._rates = self._rates, rates
+        s = self.state
+        before, s.rates = s.rates, rates
         surplus = float(F[2]) - self._weight
         if self._hangs_at_start(surplus, led=led) or before is None:
             return
@@ -144,24 +154,25 @@ class Load:
             return
         pole_s = LEADING_S if led else HOLDING_S
         weight = surplus / float(n[2])
-        moment = float(F[4]) - float(n[4]) * GRAVITY * self.kg
-        self.kg += min(1.0, dt / pole_s) * (weight / GRAVITY - self.kg)
-        self.kg -= self._mass * (rates[0] - before[0]) / (GRAVITY * pole_s)
+        moment = float(F[4]) - float(n[4]) * GRAVITY * s.kg
+        s.kg += min(1.0, dt / pole_s) * (weight / GRAVITY - s.kg)
+        s.kg -= self._mass * (rates[0] - before[0]) / (GRAVITY * pole_s)
         error = dt * (moment - self._moment(pitch)) - self._inertia * (rates[1] - before[1])
         error /= pole_s
-        self.a += error * math.cos(pitch)
-        self.b += error * math.sin(pitch)
+        s.a += error * math.cos(pitch)
+        s.b += error * math.sin(pitch)
         if not led and self._is_hung:
-            self._weighing_s = WEIGHING_S
+            s.weighing_s = WEIGHING_S
         scale = RESUME_FRACTION if self.refused else 1.0
-        moment = max(abs(self.a), abs(self.b))
-        self._refused = abs(self.kg) > scale * self._kg_max or moment > scale * self._moment_max
-        if self._weighing_s > 0.0:
-            self._weighing_s = WEIGHING_S if self._refused else max(0.0, self._weighing_s - dt)
+        moment = max(abs(s.a), abs(s.b))
+        s.refused = abs(s.kg) > scale * self._kg_max or moment > scale * self._moment_max
+        if s.weighing_s > 0.0:
+            s.weighing_s = WEIGHING_S if s.refused else max(0.0, s.weighing_s - dt)
 
     def pause(self) -> None:
         """Pause the estimate, because nothing can be measured now; its value stays."""
-        self._rates = None
+        s = self.state
+        s.rates = None
 
     def advance_without_harness(self, F_z: float, dt: float, *, led: bool) -> None:
         """Update with the joints' force along z, N, without a harness; check only if it hangs.
@@ -169,17 +180,19 @@ class Load:
         Without a harness a load cannot be distinguished from a hand. Once the robot is lowered, the
         file's load is accepted.
         """
-        surplus, self._rates = F_z - self._weight, None
-        if self._hangs_at_start(surplus, led=led) or self._weighing_s == 0.0:
+        s = self.state
+        surplus, s.rates = F_z - self._weight, None
+        if self._hangs_at_start(surplus, led=led) or s.weighing_s == 0.0:
             return
-        self.kg += min(1.0, dt / HOLDING_S) * (surplus / GRAVITY - self.kg)
+        s.kg += min(1.0, dt / HOLDING_S) * (surplus / GRAVITY - s.kg)
         if not self._is_hung:
-            self._refused, self._weighing_s = False, 0.0
-            self.kg = self.a = self.b = 0.0
+            s.refused, s.weighing_s = False, 0.0
+            s.kg = s.a = s.b = 0.0
 
     @property
     def _is_hung(self) -> bool:
-        return GRAVITY * self.kg < (HANGING_FRACTION - 1.0) * self._weight
+        s = self.state
+        return GRAVITY * s.kg < (HANGING_FRACTION - 1.0) * self._weight
 
     def _hangs_at_start(self, surplus: float, *, led: bool) -> bool:
         """Return True at the first update of a robot that hangs.
@@ -190,26 +203,16 @@ class Load:
             surplus: force on the feet beyond the file's weight, N.
             led: the planner is engaged.
         """
-        first, self._started = not self._started, True
+        s = self.state
+        first, s.looked = not s.looked, True
         hangs = first and not led and surplus < (HANGING_FRACTION - 1.0) * self._weight
         if hangs:
-            self.kg, self._refused, self._weighing_s = surplus / GRAVITY, True, WEIGHING_S
+            s.kg, s.refused, s.weighing_s = surplus / GRAVITY, True, WEIGHING_S
         return hangs
 
-    def snapshot(self) -> LoadState:
-        """Return the state."""
-        return LoadState(
-            self.kg, self.a, self.b, self._rates, self._refused, self._weighing_s, self._started
-        )
-
-    def restore(self, state: LoadState) -> None:
-        """Continue from a state."""
-        self.kg, self.a, self.b = state.kg, state.a, state.b
-        self._rates, self._refused = state.rates, state.refused
-        self._weighing_s, self._started = state.weighing_s, state.looked
-
     def _moment(self, pitch: float) -> float:
-        return self.a * math.cos(pitch) + self.b * math.sin(pitch)
+        s = self.state
+        return s.a * math.cos(pitch) + s.b * math.sin(pitch)
 
 
 def _deadband(value: float, width: float, limit: float) -> float:

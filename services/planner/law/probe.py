@@ -16,8 +16,9 @@ only at rest, and fades in and out during `HOLD_S`: at once it would be a step i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,22 +36,21 @@ STILL: Final = 0.02
 """m/s or rad/s; a led row that moves faster is not taken from the person."""
 
 
-class ProbeState(NamedTuple):
+class ProbeState(msgspec.Struct, array_like=True):
     """State of `ReferenceProbe`."""
 
     row: int = NO_ROW
+    """Of p that is probed; `NO_ROW`: none."""
     offset: float = 0.0
+    """m or rad"""
     held: float = 0.0
+    """Where a led row is held, m or rad."""
     hold: float = 0.0
+    """How much it is, 0 .. 1."""
 
 
 class ReferenceProbe:
-    """Offset of one row.
-
-    Attributes:
-        row: of p that is probed; `NO_ROW`: none.
-        offset: m or rad.
-    """
+    """Offset of one row."""
 
     def __init__(self, probe_max: Sequence[float], led: Sequence[float]) -> None:
         """Set the limits.
@@ -60,8 +60,7 @@ class ReferenceProbe:
             led: `law.S`; 1 for a row that the person leads.
         """
         self._most, self._led = tuple(probe_max), tuple(bool(one) for one in led)
-        self.row, self.offset = NO_ROW, 0.0
-        self._held = self._hold = 0.0
+        self.state = ProbeState()
 
     def advance(self, row: int, wanted: float, p: Array, pdot: Array, dt: float) -> None:
         """Follow what is asked for; another row begins when this one is given back.
@@ -73,45 +72,38 @@ class ReferenceProbe:
             pdot: its rate (6,).
             dt: time since the last tick, s.
         """
-        if self.row == NO_ROW and row != NO_ROW and self._may_begin(row, float(pdot[row])):
-            self.row, self._held = row, float(p[row])
-        if self.row == NO_ROW:
+        s = self.state
+        if s.row == NO_ROW and row != NO_ROW and self._may_begin(row, float(pdot[row])):
+            s.row, s.held = row, float(p[row])
+        if s.row == NO_ROW:
             return
-        is_asked, led = row == self.row, self._led[self.row]
-        most = self._most[self.row]
+        is_asked, led, most = row == s.row, self._led[s.row], self._most[s.row]
         # a led row is held before it is offset, and offset no more before it is given back
-        ready = is_asked and (not led or self._hold == 1.0)
+        ready = is_asked and (not led or s.hold == 1.0)
         target = clamp(wanted, -most, most) if ready else 0.0
         step = dt * most / PROBE_S
-        self.offset += clamp(target - self.offset, -step, step)
+        s.offset += clamp(target - s.offset, -step, step)
         if led and is_asked:
-            self._hold = min(1.0, self._hold + dt / HOLD_S)
-        elif self.offset == 0.0:
-            self._hold = max(0.0, self._hold - dt / HOLD_S)
-        if not is_asked and self.offset == 0.0 and self._hold == 0.0:
-            self.row = NO_ROW
+            s.hold = min(1.0, s.hold + dt / HOLD_S)
+        elif s.offset == 0.0:
+            s.hold = max(0.0, s.hold - dt / HOLD_S)
+        if not is_asked and s.offset == 0.0 and s.hold == 0.0:
+            s.row = NO_ROW
 
     def apply(self, p_ref: Array, pdot_ref: Array, p: Array, pdot: Array) -> None:
         """Offset the row of a reference p_ref (6,) and hold it, if it is led; rates pdot_ref."""
-        row = self.row
+        s, row = self.state, self.state.row
         if row == NO_ROW:
             return
         if self._led[row]:
-            p_ref[row] = p[row] + self._hold * (self._held - p[row])
-            pdot_ref[row] = (1.0 - self._hold) * pdot[row]
-        p_ref[row] += self.offset
+            p_ref[row] = p[row] + s.hold * (s.held - p[row])
+            pdot_ref[row] = (1.0 - s.hold) * pdot[row]
+        p_ref[row] += s.offset
 
     def reset(self) -> None:
         """End at once: the planner does not lead."""
-        self.row, self.offset, self._hold = NO_ROW, 0.0, 0.0
-
-    def snapshot(self) -> ProbeState:
-        """Return the state."""
-        return ProbeState(self.row, self.offset, self._held, self._hold)
-
-    def restore(self, state: ProbeState) -> None:
-        """Continue from a state."""
-        self.row, self.offset, self._held, self._hold = state
+        s = self.state
+        s.row, s.offset, s.hold = NO_ROW, 0.0, 0.0
 
     def _may_begin(self, row: int, rate: float) -> bool:
         return self._most[row] > 0.0 and (not self._led[row] or abs(rate) < STILL)

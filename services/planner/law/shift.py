@@ -13,10 +13,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.snapshots import ShiftState
 from shared.bus.messages import Vector4
 from shared.clamp import clamp
 
@@ -30,6 +30,13 @@ OMEGA: Final = 6.0
 """w, rad/s; the follower is critically damped."""
 
 
+class ShiftState(msgspec.Struct):
+    """State of `ShiftReference`: x, y in m, roll, yaw in rad, and their rates."""
+
+    at: list[float] = msgspec.field(default_factory=lambda: [0.0] * len(ROWS))
+    rate: list[float] = msgspec.field(default_factory=lambda: [0.0] * len(ROWS))
+
+
 class ShiftReference:
     """Reference (x, y, roll, yaw) that follows the requested shift.
 
@@ -39,8 +46,7 @@ class ShiftReference:
     def __init__(self, shift_max: Sequence[float]) -> None:
         """Set the largest shift each way: m, m, rad, rad."""
         self._shift_max = tuple(shift_max)
-        self._at = [0.0] * len(ROWS)
-        self._rate = [0.0] * len(ROWS)
+        self.state = ShiftState()
 
     def advance(self, wanted: Vector4, dt: float) -> None:
         """Follow for dt seconds.
@@ -49,7 +55,7 @@ class ShiftReference:
             wanted: x, y in m, roll, yaw in rad; clipped to the limits.
             dt: time since the last tick, s.
         """
-        at, rate = self._at, self._rate
+        at, rate = self.state.at, self.state.rate
         for i, limit in enumerate(self._shift_max):
             target, rate_max = clamp(wanted[i], -limit, limit), limit / SHIFT_S
             rate_next = rate[i] + dt * OMEGA * (OMEGA * (target - at[i]) - 2.0 * rate[i])
@@ -58,23 +64,10 @@ class ShiftReference:
 
     def rest(self) -> None:
         """Stop at the current shift while the planner is not engaged."""
-        self._rate = [0.0] * len(ROWS)
+        self.state.rate = [0.0] * len(ROWS)
 
     def add_to(self, p: Array, pdot: Array) -> None:
         """Add the shift to a pose p (6,), m and rad, and its rate to pdot (6,), per s."""
-        for row, at, rate in zip(ROWS, self._at, self._rate, strict=True):
+        for row, at, rate in zip(ROWS, self.state.at, self.state.rate, strict=True):
             p[row] += at
             pdot[row] += rate
-
-    def snapshot(self) -> ShiftState:
-        """Return the state."""
-        return ShiftState(_vector4(self._at), _vector4(self._rate))
-
-    def restore(self, state: ShiftState) -> None:
-        """Continue from a state."""
-        self._at, self._rate = list(state.at), list(state.rate)
-
-
-def _vector4(values: Sequence[float]) -> Vector4:
-    a, b, c, d = values
-    return a, b, c, d

@@ -19,7 +19,6 @@ import numpy as np
 from services.planner.controller import Action, Controller, Observation
 from services.planner.law.hocca import Hocca, LawOutput
 from services.planner.law.split import LocalGains
-from services.planner.snapshots import GuardState
 from shared.bus.messages import SplitSource
 from shared.clamp import clamp
 from shared.config.sections import GeometryConfig
@@ -40,6 +39,21 @@ WORDS: Final = 200
 """Longest reason that goes into a status."""
 
 
+class GuardState(msgspec.Struct):
+    """State of `ControllerGuard`; a controller's is its own affair: it is reset first."""
+
+    failed: bool = False
+    """It is not asked again."""
+    why: str = ""
+    """Why its last action was not used."""
+    rest_s: float = 0.0
+    """Time for which all still hold."""
+    wait_s: float = 0.0
+    """The newest such time."""
+    time_s: float = 0.0
+    """Since it was last reset."""
+
+
 class ControllerGuard:
     """Asks a controller, and lets through what holds."""
 
@@ -53,13 +67,13 @@ class ControllerGuard:
         half = geometry.l_foot / 2, (geometry.w_base + geometry.w_foot) / 2
         self._room = SUPPORT * half[0], SUPPORT * half[1]
         self._controller, self._law = controller, law
-        self._state = GuardState()
+        self.state = GuardState()
         self._begun = False
 
     @property
     def why(self) -> str:
         """Why the controller's action was not used at the last tick; "": it was."""
-        return self._state.why
+        return self.state.why
 
     def act(self, seen: Observation, *, leads: bool) -> LawOutput:
         """Return the tick's output.
@@ -69,7 +83,7 @@ class ControllerGuard:
             leads: the planner leads; else the controller is reset, and the shipped law's output is
                 returned, which starts at the measured pose.
         """
-        law, state = seen.law, self._state
+        law, state = seen.law, self.state
         state.time_s = state.time_s + seen.dt if leads else 0.0
         if state.failed:
             return _uncertified(law)
@@ -106,7 +120,7 @@ class ControllerGuard:
 
     def _rested(self, seen: Observation) -> LawOutput:
         """Return the shipped law's output; after an objection all hold until it is calm."""
-        state = self._state
+        state = self.state
         if state.why:
             x, y = capture_point(seen.p.tolist(), seen.pdot.tolist(), seen.law.slope)
             calm = abs(x) <= CALM * self._room[0] and abs(y) <= CALM * self._room[1]
@@ -115,14 +129,6 @@ class ControllerGuard:
                 return _uncertified(seen.law)
             state.why = ""
         return seen.law
-
-    def snapshot(self) -> GuardState:
-        """Return the guard's own state; a controller's is its own affair."""
-        return msgspec.structs.replace(self._state)
-
-    def restore(self, state: GuardState) -> None:
-        """Continue from a state; the controller is reset first."""
-        self._state = msgspec.structs.replace(state)
 
     def _objection(self, seen: Observation, action: Action, local: LocalGains) -> str:
         """Return why an action must not be sent at this pose; "" if it may."""

@@ -84,10 +84,6 @@ class Engagement(msgspec.Struct):
             self.mode, self.since_ns = next_mode, now_ns
         return changed
 
-    def copied(self) -> Engagement:
-        """Return a copy that does not change with this one."""
-        return msgspec.structs.replace(self, dropouts=msgspec.structs.replace(self.dropouts))
-
     def wait_ns(self, now_ns: int) -> int:
         """Return the rest of the wait after drop-outs, ns; 0 if the planner may engage."""
         return max(0, self.dropouts.last_ns + WAITS_NS[self.dropouts.count] - now_ns)

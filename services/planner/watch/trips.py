@@ -28,11 +28,11 @@ from __future__ import annotations
 import math
 from typing import Final
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.law.hocca import LawOutput
-from services.planner.snapshots import TripsState
 from shared.bus.messages import Trip
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
@@ -56,6 +56,21 @@ _UNLOADED: Final = _TRIPS.index(Trip.UNLOADED)
 _SAGGING: Final = _TRIPS.index(Trip.SAGGING)
 
 
+class TripsState(msgspec.Struct):
+    """State of `PlannerTrips`."""
+
+    since_ns: tuple[int, ...] = (0,) * len(PLANNER_TRIPS)
+    """Time since which each value is beyond its limit; 0 if it is not."""
+    calm_ns: int = 0
+    """Time since which no value is beyond its limit."""
+    tripped: Trip = Trip.NONE
+    why: str = ""
+    stands: bool = False
+    """Both legs have carried the torso since the planner engaged."""
+    light: bool = False
+    """The person has stopped pressing on the robot since the planner engaged."""
+
+
 class PlannerTrips:
     """Checks the trips in each tick."""
 
@@ -66,25 +81,17 @@ class PlannerTrips:
         self._limits = [row.limit for row in rows]
         self._after_ns = [round(row.after_ms * NS_PER_MS) for row in rows]
         self._least = [PLANNER_TRIPS[trip].least for trip in _TRIPS]
-        self._state = TripsState()
+        self.state = TripsState()
 
     @property
     def tripped(self) -> Trip:
         """Active trip, which prevents the planner from engaging."""
-        return self._state.tripped
+        return self.state.tripped
 
     @property
     def why(self) -> str:
         """Active trip as text: value and limit at the time of the trip."""
-        return self._state.why
-
-    def snapshot(self) -> TripsState:
-        """Return the state."""
-        return self._state
-
-    def restore(self, state: TripsState) -> None:
-        """Continue from a state."""
-        self._state = state
+        return self.state.why
 
     def advance(self, now_ns: int, values: tuple[float, ...], *, leads: bool) -> None:
         """Advance by one tick.
@@ -94,34 +101,35 @@ class PlannerTrips:
             values: values that `values_of` measured; NaN is not known, and never trips.
             leads: the planner is engaged: it trips only then.
         """
-        state = self._state
+        state = self.state
         loaded = values[_UNLOADED] > LOADED_FACTOR * self._limits[_UNLOADED]
-        stands = (leads or state.tripped > 0) and (state.stands or loaded)
+        state.stands = (leads or state.tripped > 0) and (state.stands or loaded)
         beyond = [
             value < limit if least else value > limit
             for value, limit, least in zip(values, self._limits, self._least, strict=True)
         ]
-        beyond[_UNLOADED] &= stands
-        light = leads and (state.light or values[_SAGGING] == 0.0)
-        beyond[_SAGGING] &= light or not leads
-        since_ns = tuple(
+        beyond[_UNLOADED] &= state.stands
+        state.light = leads and (state.light or values[_SAGGING] == 0.0)
+        beyond[_SAGGING] &= state.light or not leads
+        state.since_ns = tuple(
             (since or now_ns) if is_beyond and leads else 0
             for since, is_beyond in zip(state.since_ns, beyond, strict=True)
         )
-        tripped, why = state.tripped, state.why
-        unknown = tripped > 0 and math.isnan(values[_TRIPS.index(tripped)])
-        calm_ns = 0 if unknown or any(beyond) else (state.calm_ns or now_ns)
-        if tripped and calm_ns and now_ns - calm_ns >= CALM_NS:
-            tripped, why = Trip.NONE, ""
-        if leads and not tripped:
-            for index, since in enumerate(since_ns):
+        unknown = state.tripped > 0 and math.isnan(values[_TRIPS.index(state.tripped)])
+        state.calm_ns = 0 if unknown or any(beyond) else (state.calm_ns or now_ns)
+        if state.tripped and state.calm_ns and now_ns - state.calm_ns >= CALM_NS:
+            state.tripped, state.why = Trip.NONE, ""
+        if leads and not state.tripped:
+            for index, since in enumerate(state.since_ns):
                 if since and now_ns - since >= self._after_ns[index]:
-                    tripped = _TRIPS[index]
-                    row = PLANNER_TRIPS[tripped]
-                    why = f"{row.measured}: {values[index]:.3g} {row.unit}"
-                    why += f" (limit {self._limits[index]:g})"
+                    self._trip(index, values[index])
                     break
-        self._state = TripsState(since_ns, calm_ns, tripped, why, stands, light)
+
+    def _trip(self, index: int, value: float) -> None:
+        row = PLANNER_TRIPS[_TRIPS[index]]
+        self.state.tripped = _TRIPS[index]
+        limit = f"(limit {self._limits[index]:g})"
+        self.state.why = f"{row.measured}: {value:.3g} {row.unit} {limit}"
 
 
 def values_of(

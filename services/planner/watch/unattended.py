@@ -11,7 +11,8 @@ from __future__ import annotations
 
 from typing import Final
 
-from services.planner.snapshots import UnattendedState
+import msgspec
+
 from shared.bus.messages import Pair
 from shared.clock import NS_PER_S
 
@@ -24,12 +25,21 @@ ARM: Final = 0.25
 """m per rad of the torso's pitch."""
 
 
+class UnattendedState(msgspec.Struct):
+    """State of `Unattended`."""
+
+    felt_ns: int = 0
+    """Time at which a hand was last felt."""
+    left: Pair | None = None
+    """Pose in which it left the robot: height of the COM, m, and the torso's pitch, rad."""
+
+
 class Unattended:
     """Keeps the pose at which a hand was last felt."""
 
     def __init__(self) -> None:
         """Start without a hand."""
-        self._state = UnattendedState()
+        self.state = UnattendedState()
 
     def drift(self, now_ns: int, pose: Pair, force: float, moment: float) -> float:
         """Return the drift, m.
@@ -40,17 +50,10 @@ class Unattended:
             force: upward, of the person on the robot, N; NaN if not known, which counts as a hand.
             moment: of the person about pitch, N m.
         """
-        state = self._state
+        state = self.state
         felt = not (abs(force) < HAND_MIN[0] and abs(moment) < HAND_MIN[1])
-        felt_ns = now_ns if felt else state.felt_ns
-        origin = state.left if state.left is not None and now_ns - felt_ns > HAND_LOST_NS else pose
-        self._state = UnattendedState(felt_ns, origin)
-        return max(abs(pose[0] - origin[0]), ARM * abs(pose[1] - origin[1]))
-
-    def snapshot(self) -> UnattendedState:
-        """Return the state."""
-        return self._state
-
-    def restore(self, state: UnattendedState) -> None:
-        """Continue from a state."""
-        self._state = state
+        if felt:
+            state.felt_ns = now_ns
+        if state.left is None or now_ns - state.felt_ns <= HAND_LOST_NS:
+            state.left = pose
+        return max(abs(pose[0] - state.left[0]), ARM * abs(pose[1] - state.left[1]))

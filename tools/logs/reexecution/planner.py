@@ -9,8 +9,7 @@ import msgspec
 
 from services.planner.controller import Controller
 from services.planner.intents import OperatorRequest
-from services.planner.planner import Planner
-from services.planner.snapshots import TickState
+from services.planner.planner import Planner, PlannerState
 from shared.bus import topics
 from shared.bus.messages import JointCommand, Message, PlannerStatus
 from shared.bus.traces import PlannerCheckpoint
@@ -76,7 +75,7 @@ class PlannerExecution:
             for command in log.messages(topics.JOINT_COMMAND, name)
         }
 
-    def snapshot(self) -> tuple[int, TickState] | None:
+    def snapshot(self) -> tuple[int, PlannerState] | None:
         """Return the planner's session and present state; None while it cannot be executed."""
         planner = self._planner
         return None if planner is None else (planner.session, planner.snapshot())
@@ -86,7 +85,7 @@ class PlannerExecution:
         snapshot = self._snapshots.get((status.session, status.t_ns))
         if snapshot is None:
             return
-        known = memory_of(snapshot.snapshot, TickState)
+        known = memory_of(snapshot.snapshot, PlannerState)
         controller = self._controller() if self._controller is not None else None
         self._planner = Planner(self._robot, status.session, controller)
         self._planner.restore(known)

@@ -9,7 +9,7 @@ from typing import Final, TypeVar
 import msgspec
 
 from services.joint.snapshots import DriveManagerState
-from services.planner.snapshots import TickState
+from services.planner.planner import PlannerState
 from shared.bus import topics
 from shared.bus.messages import PlannerStatus
 from shared.bus.traces import SimState
@@ -37,7 +37,7 @@ class Moment(msgspec.Struct):
     state: SimState
     modules: dict[str, DriveManagerState] = msgspec.field(default_factory=dict)
     """What each joint service that was alive knew."""
-    planner: tuple[int, TickState] | None = None
+    planner: tuple[int, PlannerState] | None = None
     """Session and state of the planner, if it was alive."""
     margin: float | None = None
     """Margin of the failsafe certificate, as last published."""

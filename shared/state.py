@@ -1,0 +1,28 @@
+"""State of a law as data: a mutable struct that holds all that changes, and nothing else.
+
+A law keeps its state in `state`, and continues bit for bit from a copy of it.
+"""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+import msgspec
+
+S = TypeVar("S")
+
+
+def copied(state: S) -> S:
+    """Return a copy that shares nothing that changes: structs and lists are copied, deeply."""
+    copy: Any = state
+    if isinstance(state, msgspec.Struct):
+        if type(state).__struct_config__.frozen:
+            return state
+        fields = type(state).__struct_fields__
+        copy = msgspec.structs.replace(
+            state, **{name: copied(getattr(state, name)) for name in fields}
+        )
+    elif isinstance(state, list):
+        copy = [copied(one) for one in state]
+    found: S = copy
+    return found
