@@ -18,13 +18,15 @@ from services.joint.failsafe import Event, Failsafe, timing_of
 from services.joint.joint_estimate import JointEstimate
 from services.joint.neighbours import UNKNOWN, NeighbourRow, NeighbourView
 from services.joint.pd_law import Setpoint
-from services.joint.setpoint_law import SetpointLaw
-from services.joint.snapshots import ControllerSnapshot, ControllerState
+from services.joint.sample_clock import SampleClock
+from services.joint.setpoint_law import SetpointLaw, SetpointState
 from services.joint.torque_limiter import limit_differential, limit_torque, limits_of
+from services.joint.trips import JointTrips
 from services.joint.trips import limits_of as trip_limits_of
 from shared.bus.messages import Cause, JointCommand, JointEvent, JointState, Mode, Outside, Pair
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
+from shared.state import copied
 
 # Compared in each cycle: docs/contributing.md, The control path.
 _DISARMED, _TRACK, _FAULT = Mode.DISARMED, Mode.TRACK, Mode.FAULT
@@ -38,6 +40,36 @@ class CycleResult(msgspec.Struct, gc=False, frozen=True):
     """Joint torque for the drive, N m, after the limiter."""
     event: JointEvent | None
     """The change of mode in this cycle, if there was one."""
+
+
+class ControllerState(msgspec.Struct, kw_only=True):
+    """What changes from cycle to cycle in `JointController`."""
+
+    estimate: JointEstimate
+    failsafe: Failsafe = msgspec.field(default_factory=Failsafe)
+    trips: JointTrips = msgspec.field(default_factory=JointTrips)
+    initial_torque: Pair | None = None
+    """Torque of a drive that was found armed, N m: it is taken over without a step."""
+    takeover_offset: Pair = (0.0, 0.0)
+    """Torque of the drive beyond the law's when the service resumed after a gap, N m."""
+    resumed_ns: int = 0
+    last_cycle_ns: int = 0
+    cause: int = 0
+    """`Cause` of the last change of mode."""
+    tau: Pair = (0.0, 0.0)
+    """Joint torque of the last cycle (phi, theta), N m."""
+    cycle: int = 0
+    late: int = 0
+    clock: SampleClock = msgspec.field(default_factory=SampleClock)
+    events: int = 0
+    states: int = 0
+
+
+class ControllerSnapshot(msgspec.Struct, kw_only=True):
+    """State of `JointController`, with its setpoint law's."""
+
+    state: ControllerState
+    law: SetpointState
 
 
 class JointController:
@@ -114,7 +146,7 @@ class JointController:
             carried: joint torques (phi, theta) of the drive now, N m.
         """
         s = self._state
-        wanted = pd_law.torque(self._law.current, s.estimate.q, s.estimate.v)
+        wanted = pd_law.torque(self._law.state.current, s.estimate.q, s.estimate.v)
         s.takeover_offset = (carried[0] - wanted[0], carried[1] - wanted[1])
         s.resumed_ns = now_ns
         s.tau = limit_differential(carried, self._limits.tau_module_max)
@@ -156,7 +188,7 @@ class JointController:
     @property
     def caught(self) -> bool:
         """True for a knee in DAMP that stopped sinking for the sake of the other modules."""
-        return self._law.sinking.caught
+        return self._law.state.sinking.caught
 
     @property
     def cause(self) -> Cause:
@@ -166,7 +198,7 @@ class JointController:
     @property
     def setpoint(self) -> Setpoint:
         """Setpoint of the last cycle."""
-        return self._law.current
+        return self._law.state.current
 
     @property
     def is_state_due(self) -> bool:
@@ -213,13 +245,13 @@ class JointController:
         )
 
     def snapshot(self) -> ControllerSnapshot:
-        """Return the state as a copy; `restore` continues from it."""
-        return ControllerSnapshot(state=self._state.copied(), law=self._law.snapshot())
+        """Return a copy of the state; `restore` continues from it."""
+        return ControllerSnapshot(state=copied(self._state), law=copied(self._law.state))
 
     def restore(self, snapshot: ControllerSnapshot) -> None:
-        """Continue from a state."""
-        self._state = snapshot.state.copied()
-        self._law.restore(snapshot.law)
+        """Continue from a copy of a state."""
+        self._state = copied(snapshot.state)
+        self._law.restore(copied(snapshot.law))
 
     def inside_limits(self) -> bool:
         """Return True if the joint was last measured inside its soft stops."""

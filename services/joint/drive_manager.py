@@ -12,14 +12,13 @@ from typing import Final
 
 import msgspec
 
-from services.joint.controller import CycleResult, JointController
+from services.joint.controller import ControllerSnapshot, CycleResult, JointController
 from services.joint.differential import motor_torque
 from services.joint.drive_fallback import DriveFallback
 from services.joint.drive_setpoint import DriveSetpointLaw
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.neighbours import UNKNOWN, NeighbourView
 from services.joint.rearm_guard import LastState
-from services.joint.snapshots import DriveManagerState
 from shared.bus.messages import Cause, JointCommand, JointEvent, Mode, Pair
 from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_MS
@@ -85,6 +84,30 @@ _NO_COMMAND, _TORQUE, _TARGET = DriveCommand.NOTHING, DriveCommand.TORQUE, Drive
 _NO_INHIBIT: Final = ArmingInhibit.NONE
 
 
+class DriveManagerState(msgspec.Struct, kw_only=True):
+    """State of `DriveManager`."""
+
+    controller: ControllerSnapshot
+    gains: Pair
+    """`DriveSetpointLaw.gains`."""
+    estop: bool = False
+    arm_at_ns: int = 0
+    idle_at_ns: int = 0
+    tries: int = 0
+    forgets: bool = False
+    """The drive's zero is to be forgotten when its position is lost."""
+    target: MotorTarget | None = None
+    """The last target sent to the drive."""
+    last_cycle_ns: int = 0
+    listen_until_ns: int = 0
+    """End of flushing the link after a gap; 0: no gap."""
+    last_state: LastState = LastState.NOTHING
+    """For the next service, in case this one dies now."""
+    holding: bool = False
+    """True while a drive that was found armed has not been taken over."""
+    gains_changed_ns: int = 0
+
+
 class DriveManager:
     """One module's service between its drive and the bus.
 
@@ -97,7 +120,6 @@ class DriveManager:
         self, config: RobotConfig, name: str, last_state: LastState = LastState.NOTHING
     ) -> None:
         """Take the last state of the service before this one; start DISARMED."""
-        self.last_state = last_state
         self.controller = JointController(config, name)
         self._fallback = DriveFallback(config, name)
         self.onboard = config.joint_service.loop == "onboard"
@@ -106,18 +128,18 @@ class DriveManager:
             config.joint.gear_ratio, drive.vel_limit, drive.current_lim * drive.torque_constant
         )
         self._gear_ratio = config.joint.gear_ratio
-        self._estop = last_state is LastState.DAMP
-        self._holding = False
-        """True while a drive that was found armed has not been taken over."""
-        self._arm_at_ns = 0
-        self._idle_at_ns = 0
-        self._tries = 0
-        self._forgets = config.drive.zero_mark_turns > 0.0
-        self._target: MotorTarget | None = None
-        """The last target sent to the drive."""
-        self._last_cycle_ns = 0
-        self._listen_until_ns = 0
-        """End of flushing the link after a gap; 0: no gap."""
+        self._state = DriveManagerState(
+            controller=self.controller.snapshot(),
+            gains=self._law.gains,
+            estop=last_state is LastState.DAMP,
+            forgets=drive.zero_mark_turns > 0.0,
+            last_state=last_state,
+        )
+
+    @property
+    def last_state(self) -> LastState:
+        """What the next service finds if this one dies now."""
+        return self._state.last_state
 
     @property
     def needs_neighbours(self) -> bool:
@@ -128,9 +150,10 @@ class DriveManager:
     @property
     def leaves_holding(self) -> bool:
         """True if the drive goes on holding by its own loop when the service ends now."""
+        s = self._state
         mode, lost = self.controller.failsafe.mode, self.controller.cause is Cause.DRIVE_LOST
         holds = mode in (Mode.HOLD, Mode.TRACK, Mode.DAMP) or (mode is Mode.FAULT and lost)
-        return self.onboard and (holds or self._holding)
+        return self.onboard and (holds or s.holding)
 
     def step(
         self,
@@ -141,29 +164,30 @@ class DriveManager:
         near: NeighbourView = UNKNOWN,
     ) -> DriveAction:
         """Run one cycle; arguments as for `JointController.step`; `estop` latches."""
-        self._estop = self._estop or estop
-        if self._tries == 0 and reading is not None and reading.status is _ARMED:
+        s = self._state
+        s.estop = s.estop or estop
+        if s.tries == 0 and reading is not None and reading.status is _ARMED:
             reading = self._found_armed(now_ns, reading)
-        if self._last_cycle_ns and now_ns - self._last_cycle_ns > GAP_NS:
-            self._listen_until_ns = now_ns + LISTEN_NS
-        self._last_cycle_ns = now_ns
+        if s.last_cycle_ns and now_ns - s.last_cycle_ns > GAP_NS:
+            s.listen_until_ns = now_ns + LISTEN_NS
+        s.last_cycle_ns = now_ns
         controller = self.controller
         tau_before = controller.tau
-        estop = self._estop and not self._is_to_be_taken_over(reading)
-        flushing = self._listen_until_ns > 0
+        estop = s.estop and not self._is_to_be_taken_over(reading)
+        flushing = s.listen_until_ns > 0
         result = controller.step(now_ns, reading, command, estop, flushing=flushing, near=near)
         mode = controller.failsafe.mode
         if result.event is not None:
-            self.last_state = self._new_last_state(mode)
-        if self._listen_until_ns:
+            s.last_state = self._new_last_state(mode)
+        if s.listen_until_ns:
             if mode in _UNCONTROLLED:
-                self._listen_until_ns = 0
+                s.listen_until_ns = 0
             else:
                 result = self._resumed(now_ns, result, tau_before)
-                if now_ns < self._listen_until_ns or reading is None:
+                if now_ns < s.listen_until_ns or reading is None:
                     return DriveAction(result.event, _NO_COMMAND, _NO_TORQUE, None, _NO_INHIBIT)
-                self._listen_until_ns = 0
-        if mode is _DISARMED and now_ns >= self._arm_at_ns:
+                s.listen_until_ns = 0
+        if mode is _DISARMED and now_ns >= s.arm_at_ns:
             inhibit = self._inhibit(now_ns, reading)
             if inhibit is not None:
                 command_out = DriveCommand.ARM if inhibit is _NO_INHIBIT else _NO_COMMAND
@@ -180,43 +204,30 @@ class DriveManager:
             target = self._law.target(
                 now_ns, fallback_setpoint, result.tau, samples.pos, samples.vel
             )
-            self._target = target
+            s.target = target
         return DriveAction(result.event, command_out, torque, target, _NO_INHIBIT)
 
     def snapshot(self) -> DriveManagerState:
-        """Return the state; `restore` continues from it."""
-        return DriveManagerState(
+        """Return a copy of the state; `restore` continues from it."""
+        return msgspec.structs.replace(
+            self._state,
             controller=self.controller.snapshot(),
             gains=self._law.gains,
-            estop=self._estop,
-            arm_at_ns=self._arm_at_ns,
-            idle_at_ns=self._idle_at_ns,
-            tries=self._tries,
-            forgets=self._forgets,
-            target=self._target,
-            last_cycle_ns=self._last_cycle_ns,
-            listen_until_ns=self._listen_until_ns,
-            last_state=self.last_state,
-            holding=self._holding,
             gains_changed_ns=self._law.changed_ns,
         )
 
     def restore(self, state: DriveManagerState) -> None:
-        """Continue from a state, bit for bit."""
-        m = state
-        self.controller.restore(m.controller)
-        self._law.gains, self._law.changed_ns = m.gains, m.gains_changed_ns
-        self._estop, self._arm_at_ns, self._idle_at_ns = m.estop, m.arm_at_ns, m.idle_at_ns
-        self._tries, self._forgets = m.tries, m.forgets
-        self._target, self._last_cycle_ns = m.target, m.last_cycle_ns
-        self._listen_until_ns = m.listen_until_ns
-        self.last_state, self._holding = m.last_state, m.holding
+        """Continue from a copy of a state, bit for bit."""
+        self._state = msgspec.structs.replace(state)
+        self.controller.restore(state.controller)
+        self._law.gains, self._law.changed_ns = state.gains, state.gains_changed_ns
 
     def _resumed(self, now_ns: int, result: CycleResult, tau_before: Pair) -> CycleResult:
         """Return the cycle's result with the torque that the drive carried without commands."""
+        s = self._state
         samples, carried = self.controller.samples, tau_before
-        if self._target is not None:
-            carried = self._law.carried(self._target, samples.pos, samples.vel)
+        if s.target is not None:
+            carried = self._law.carried(s.target, samples.pos, samples.vel)
         tau = self.controller.resume(now_ns, carried)
         event = result.event
         if event is not None:
@@ -231,15 +242,16 @@ class DriveManager:
         drive that lost its position also forgets its zero: a failed encoder that comes back may
         have missed turns.
         """
+        s = self._state
         samples, cause = self.controller.samples, self.controller.cause
         if cause is Cause.DRIVE_LOST and self.onboard and samples.status in _MAY_HOLD:
             return DriveCommand.NOTHING
-        if now_ns >= self._idle_at_ns:
-            self._idle_at_ns = now_ns + IDLE_EVERY_NS
+        if now_ns >= s.idle_at_ns:
+            s.idle_at_ns = now_ns + IDLE_EVERY_NS
             return DriveCommand.IDLE
         astray = cause is Cause.POSITION_LOST or samples.error & AxisError.ENCODER_FAILED
-        if self._forgets and astray:
-            self._forgets = False
+        if s.forgets and astray:
+            s.forgets = False
             return DriveCommand.CLEAR_ZERO
         return DriveCommand.NOTHING
 
@@ -252,14 +264,15 @@ class DriveManager:
         gains, rolled the torso, and the robot tipped while the hand led on. Without the onboard
         loop an armed drive is not ours.
         """
+        s = self._state
         if not self.onboard:
             return msgspec.structs.replace(reading, status=DriveStatus.IDLE)
         failsafe, timing = self.controller.failsafe, self.controller.timing
-        led = self._estop or failsafe.is_fresh(now_ns, timing)
-        self._holding = reading.torque is None or not led
-        if self._holding:
+        led = s.estop or failsafe.is_fresh(now_ns, timing)
+        s.holding = reading.torque is None or not led
+        if s.holding:
             return msgspec.structs.replace(reading, status=DriveStatus.HOLDING)
-        self._tries = 1
+        s.tries = 1
         return reading
 
     def _is_to_be_taken_over(self, reading: DriveReading | None) -> bool:
@@ -273,26 +286,28 @@ class DriveManager:
 
     def _new_last_state(self, mode: Mode) -> LastState:
         """Return the last state for the next service, in case this one dies now."""
+        s = self._state
         if mode is Mode.DISARMED:
-            return self.last_state
-        return LastState.DAMP if mode is Mode.DAMP or self._estop else LastState.HELD
+            return s.last_state
+        return LastState.DAMP if mode is Mode.DAMP or s.estop else LastState.HELD
 
     def _inhibit(self, now_ns: int, reading: DriveReading | None) -> ArmingInhibit | None:
         """Return what inhibits arming now; None if the drive is silent."""
+        s = self._state
         if reading is None or reading.status is DriveStatus.LOST:
             return None
-        self._arm_at_ns = now_ns + ARM_EVERY_NS
+        s.arm_at_ns = now_ns + ARM_EVERY_NS
         if reading.status is DriveStatus.HOLDING:
             return ArmingInhibit.WAITING if reading.torque is not None else None
-        self._holding = False
+        s.holding = False
         if reading.status is DriveStatus.UNZEROED:
-            self.last_state = LastState.NOTHING  # zeroing it is a request to arm it
+            s.last_state = LastState.NOTHING  # zeroing it is a request to arm it
             return ArmingInhibit.UNZEROED
-        if self.last_state is not LastState.NOTHING:
+        if s.last_state is not LastState.NOTHING:
             return ArmingInhibit.LOST_TORQUE
         if not self.controller.inside_limits():
             return ArmingInhibit.OUTSIDE_LIMITS
-        self._tries += 1
-        if self._tries <= ARM_TRIES:
+        s.tries += 1
+        if s.tries <= ARM_TRIES:
             return ArmingInhibit.NONE
-        return ArmingInhibit.REFUSED if self._tries == ARM_TRIES + 1 else None
+        return ArmingInhibit.REFUSED if s.tries == ARM_TRIES + 1 else None

@@ -196,10 +196,6 @@ class Failsafe(msgspec.Struct):
         self.refused += count
         self.refusal, self.refused_session, self.refused_ns = refusal, session, now_ns
 
-    def copied(self) -> Failsafe:
-        """Return a copy that does not change with this one."""
-        return msgspec.structs.replace(self, dropouts=msgspec.structs.replace(self.dropouts))
-
     @property
     def stiffen_requested(self) -> bool:
         """True in HOLD if the newest accepted command says that another module may be limp."""

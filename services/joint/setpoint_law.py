@@ -21,13 +21,17 @@ from shared.config.robot_config import RobotConfig
 _HOLD, _TRACK, _DAMP = Mode.HOLD, Mode.TRACK, Mode.DAMP
 
 
-class SetpointState(msgspec.Struct, frozen=True, kw_only=True):
+class SetpointState(msgspec.Struct, kw_only=True):
     """State of `SetpointLaw`."""
 
     frozen: Setpoint
+    """The setpoint at the last change of mode: HOLD keeps it, TRACK blends from it."""
     current: Setpoint
-    changed_ns: int
-    stiffened_ns: int
+    """Of the last cycle."""
+    changed_ns: int = 0
+    """Time of the last change of mode."""
+    stiffened_ns: int = 0
+    """When it began to stiffen because another module may be limp; 0: it does not."""
     sinking: SinkingState
 
 
@@ -45,17 +49,16 @@ class SetpointLaw:
         self._coupled_ramp_ns = service.coupled_ramp_ms * NS_PER_MS
         self._blend_ns = service.blend_ms * NS_PER_MS
         self.sinking = Sinking(config, module)
-        self._frozen = pd_law.stand(pd_law.ZERO, self.stand_k_p, self.stand_k_d)
-        """The setpoint at the last change of mode: HOLD keeps it, TRACK blends from it."""
-        self.current: Setpoint = self._frozen
-        self._changed_ns = 0
-        self._stiffened_ns = 0
-        """When it began to stiffen because another module may be limp; 0: it does not."""
+        stand_here = pd_law.stand(pd_law.ZERO, self.stand_k_p, self.stand_k_d)
+        self.state = SetpointState(
+            frozen=stand_here, current=stand_here, sinking=self.sinking.state
+        )
 
     @property
     def stiffened(self) -> bool:
         """True while it holds with all of its support gains."""
-        return self._stiffened_ns > 0
+        s = self.state
+        return s.stiffened_ns > 0
 
     def age_s(self, command: JointCommand, now_ns: int) -> float:
         """Return a command's age, s, as far as it is extrapolated: docs/law.md (22)."""
@@ -63,12 +66,14 @@ class SetpointLaw:
 
     def is_settled(self, now_ns: int) -> bool:
         """Return True if the blend after the last change of mode is over."""
-        return now_ns - self._changed_ns >= self._blend_ns
+        s = self.state
+        return now_ns - s.changed_ns >= self._blend_ns
 
     def start(self, mode: Mode, now_ns: int, setpoint: Setpoint) -> None:
         """Start a mode from a given setpoint: until now the module was DISARMED."""
+        s = self.state
         self._note_change(mode, now_ns)
-        self._frozen = self.current = setpoint
+        s.frozen = s.current = setpoint
 
     def change(self, mode: Mode, now_ns: int, q: Pair) -> None:
         """Freeze the setpoint in force for a new mode.
@@ -78,15 +83,14 @@ class SetpointLaw:
             now_ns: this module's monotonic clock.
             q: joint angles (phi, theta), rad.
         """
+        s = self.state
         self._note_change(mode, now_ns)
         if mode is Mode.DAMP:
-            self._frozen = self.sinking.begin(self.current, q)
+            s.frozen = self.sinking.begin(s.current, q)
         elif mode is Mode.HOLD:
-            self._frozen = pd_law.limit_stiffening(
-                self.current, q, self._hold_k_p, self._hold_torque
-            )
+            s.frozen = pd_law.limit_stiffening(s.current, q, self._hold_k_p, self._hold_torque)
         else:
-            self._frozen = self.current
+            s.frozen = s.current
 
     def evaluate(
         self, now_ns: int, failsafe: Failsafe, q: Pair, near: NeighbourView = UNKNOWN
@@ -99,47 +103,37 @@ class SetpointLaw:
             q: joint angles (phi, theta), rad.
             near: what is known of the other modules on this host.
         """
+        s = self.state
         mode = failsafe.mode
         limp = near.stiffen and (mode is _HOLD or mode is _DAMP)
-        if not self._stiffened_ns and (limp or failsafe.stiffen_requested):
-            self._stiffened_ns = now_ns
+        if not s.stiffened_ns and (limp or failsafe.stiffen_requested):
+            s.stiffened_ns = now_ns
             if mode is _HOLD:
                 self._bound_stiffening(now_ns, q)
-        since_ns = now_ns - self._changed_ns
+        since_ns = now_ns - s.changed_ns
         if mode is _TRACK:
-            self.current = self._tracked(now_ns, failsafe.command, since_ns)
+            s.current = self._tracked(now_ns, failsafe.command, since_ns)
         elif mode is _DAMP:
-            near = near._replace(stiffen=self._stiffened_ns > 0)
-            self.current = self.sinking.law(self._frozen, self.current, since_ns, q, near)
+            near = near._replace(stiffen=s.stiffened_ns > 0)
+            s.current = self.sinking.law(s.frozen, s.current, since_ns, q, near)
         else:
-            self.current = self._held(since_ns)
-            if self._stiffened_ns:
-                risen = min(1.0, (now_ns - self._stiffened_ns) / self._blend_ns)
-                self.current = pd_law.raise_gains(
-                    self.current, self._support_k_p, self._support_k_d, risen
+            s.current = self._held(since_ns)
+            if s.stiffened_ns:
+                risen = min(1.0, (now_ns - s.stiffened_ns) / self._blend_ns)
+                s.current = pd_law.raise_gains(
+                    s.current, self._support_k_p, self._support_k_d, risen
                 )
-        return self.current
-
-    def snapshot(self) -> SetpointState:
-        """Return the state; `restore` continues from it."""
-        return SetpointState(
-            frozen=self._frozen,
-            current=self.current,
-            changed_ns=self._changed_ns,
-            stiffened_ns=self._stiffened_ns,
-            sinking=self.sinking.snapshot(),
-        )
+        return s.current
 
     def restore(self, state: SetpointState) -> None:
-        """Continue from a state."""
-        self._frozen, self.current = state.frozen, state.current
-        self._changed_ns, self._stiffened_ns = state.changed_ns, state.stiffened_ns
-        self.sinking.restore(state.sinking)
+        """Continue from a state, which is this law's from now on."""
+        self.state, self.sinking.state = state, state.sinking
 
     def _note_change(self, mode: Mode, now_ns: int) -> None:
-        self._changed_ns = now_ns
+        s = self.state
+        s.changed_ns = now_ns
         if mode is not Mode.DAMP:
-            self._stiffened_ns = 0
+            s.stiffened_ns = 0
 
     def _tracked(self, now_ns: int, command: JointCommand | None, since_ns: int) -> Setpoint:
         """Return the planner's setpoint now, blended in from HOLD's."""
@@ -154,14 +148,16 @@ class SetpointLaw:
 
         A hip whose theta is soft may be far from its reference: a hand has turned the torso.
         """
-        held = self._held(now_ns - self._changed_ns)
+        s = self.state
+        held = self._held(now_ns - s.changed_ns)
         near = pd_law.limit_stiffening(held, q, self._support_k_p, self._hold_torque)
         if near is not held:
-            self._frozen, self._changed_ns = near, now_ns
+            s.frozen, s.changed_ns = near, now_ns
 
     def _held(self, since_ns: int) -> Setpoint:
         """Return HOLD's setpoint: frozen, and some gains rise to the stand gains."""
+        s = self.state
         moving = max(0.0, 1.0 - since_ns / self._coupled_ramp_ns)
         risen = min(1.0, since_ns / self._blend_ns)
-        frozen = pd_law.freeze(self._frozen, moving)
+        frozen = pd_law.freeze(s.frozen, moving)
         return pd_law.raise_gains(frozen, self._hold_k_p, self._hold_k_d, risen)

@@ -43,36 +43,32 @@ LEVEL_MAX: Final = 0.1
 """rad; a torso that is farther off is brought back no harder than that."""
 
 
-class SinkingState(msgspec.Struct, frozen=True):
+class SinkingState(msgspec.Struct):
     """State of `Sinking`."""
 
     stop: float | None = None
-    """None: there is no stop (JSON has no infinity)."""
+    """Where a knee is caught, rad; None: nowhere."""
     upright: float | None = None
+    """How the torso stood as it began, the leg's thetas together, rad; None: not known."""
     held: Setpoint | None = None
+    """The setpoint from which it stiffens for a limp module, at the angles that it had then, its
+    load as feedforward; None: it does not."""
     below: float | None = None
+    """`NeighbourView.leg`'s angle when that was known last, rad; None: never."""
     caught: bool = False
+    """True if a knee does not sink any more for the others' sake."""
     doubt_ns: int = -1
+    """Since when there is reason to, from the beginning on; -1: there is none."""
     held_ns: int = -1
+    """When `held` was taken, from the beginning on; -1: it was not."""
     ahead: float | None = None
+    """How far ahead of an ankle its hip joint is to stay, m; None: not known."""
     start: float = 0.0
+    """The ankle's theta when that was found, rad."""
 
 
 class Sinking:
-    """One module's way down.
-
-    Attributes:
-        stop: where a knee is caught, rad; -inf: nowhere.
-        upright: how the torso stood as it began, the leg's thetas together, rad; None: not known.
-        held: the setpoint from which it stiffens for a limp module, at the angles that it had then,
-            its load as feedforward; None: it does not.
-        held_ns: when it did, from the beginning on; -1: it has not.
-        leg: `NeighbourView.leg`'s angle when that was known last, rad; None: never.
-        ahead: how far ahead of an ankle its hip joint is to stay, m; None: not known.
-        start: the ankle's theta when that was found, rad.
-        caught: True if a knee does not sink any more for the others' sake.
-        doubt_ns: since when there is reason to, from the beginning on; -1: there is none.
-    """
+    """One module's way down."""
 
     def __init__(self, config: RobotConfig, module: str) -> None:
         """Take times and gains."""
@@ -89,21 +85,15 @@ class Sinking:
         self._fade_ns = service.damp_fade_s * NS_PER_S
         self._blend_ns = service.blend_ms * NS_PER_MS
         self._coupled_ramp_ns = service.coupled_ramp_ms * NS_PER_MS
-        self._stops = kind == "knee"
-        self.stop = service.damp_knee_stop if kind == "knee" else -math.inf
-        self.upright: float | None = None
-        self.held: Setpoint | None = None
-        self.leg: float | None = None
-        self.ahead: float | None = None
-        self.start = 0.0
-        self.caught = False
-        self.doubt_ns = self.held_ns = -1
+        self.state = SinkingState(stop=service.damp_knee_stop if kind == "knee" else None)
 
     def begin(self, setpoint: Setpoint, q: Pair) -> Setpoint:
         """Return the setpoint that sinking starts from, at joint angles q (rad)."""
-        self.stop = min(self.stop, q[1])
-        self.upright = self.held = self.leg = self.ahead = None
-        self.caught, self.doubt_ns, self.held_ns = False, -1, -1
+        s = self.state
+        if s.stop is not None:
+            s.stop = min(s.stop, q[1])
+        s.upright = s.held = s.below = s.ahead = None
+        s.caught, s.doubt_ns, s.held_ns = False, -1, -1
         return pd_law.load_to_feedforward(setpoint, self._sinks, q)
 
     def law(
@@ -123,20 +113,23 @@ class Sinking:
             q: joint angles, rad.
             near: view of the other modules.
         """
-        if near.stiffen and self.held is None:
-            self.held, self.held_ns = self._carried(current, q), since_ns
-        if self.held is not None:
-            return self._stiffened(self.held, since_ns - self.held_ns)
+        s = self.state
+        if near.stiffen and s.held is None:
+            s.held, s.held_ns = self._carried(current, q), since_ns
+        if s.held is not None:
+            return self._stiffened(s.held, since_ns - s.held_ns)
         holds = self._is_to_hold(since_ns, near)
         sunk = self._sunk(frozen_setpoint, since_ns)
         if self._levels:
             return self._levelled(sunk, q[1], near, min(1.0, since_ns / self._blend_ns))
         if self._places:
             return self._placed(sunk, q[1], near)
-        if holds and self._stops and not self.caught:
-            self.caught, self.stop = True, max(self.stop, q[1])
-        if q[1] < self.stop:
-            return pd_law.add_stop(sunk, self.stop, self._k_p[1], self._k_d[1])
+        if s.stop is None:
+            return sunk
+        if holds and not s.caught:
+            s.caught, s.stop = True, max(s.stop, q[1])
+        if q[1] < s.stop:
+            return pd_law.add_stop(sunk, s.stop, self._k_p[1], self._k_d[1])
         return sunk
 
     def _sunk(self, frozen_setpoint: Setpoint, since_ns: int) -> Setpoint:
@@ -160,64 +153,50 @@ class Sinking:
         stands = msgspec.structs.replace(stands, tau_ff=held.tau_ff)
         return pd_law.blend(start, stands, min(1.0, after_ns / self._blend_ns))
 
-    def snapshot(self) -> SinkingState:
-        """Return the state."""
-        stop = self.stop if math.isfinite(self.stop) else None
-        return SinkingState(
-            stop, self.upright, self.held, self.leg, self.caught, self.doubt_ns, self.held_ns,
-            self.ahead, self.start,
-        )  # fmt: skip
-
-    def restore(self, state: SinkingState) -> None:
-        """Continue from a state."""
-        self.stop = -math.inf if state.stop is None else state.stop
-        self.upright, self.held, self.leg = state.upright, state.held, state.below
-        self.caught, self.doubt_ns = state.caught, state.doubt_ns
-        self.held_ns, self.ahead, self.start = state.held_ns, state.ahead, state.start
-
     def _is_to_hold(self, since_ns: int, near: NeighbourView) -> bool:
+        s = self.state
         if near.sinks:
-            self.doubt_ns = -1
+            s.doubt_ns = -1
             return False
-        if self.doubt_ns < 0:
-            self.doubt_ns = since_ns
-        return since_ns - self.doubt_ns >= DOUBT_NS
+        if s.doubt_ns < 0:
+            s.doubt_ns = since_ns
+        return since_ns - s.doubt_ns >= DOUBT_NS
 
     def _levelled(
         self, sunk: Setpoint, theta: float, near: NeighbourView, risen: float
     ) -> Setpoint:
         """Return the law of a hip; if its leg is no longer seen, the leg's last angle holds."""
-        rate = 0.0
+        s, rate = self.state, 0.0
         if near.leg is not None:
-            self.leg, rate = near.leg
-        if self.leg is None:
+            s.below, rate = near.leg
+        if s.below is None:
             return sunk
-        if self.upright is None:
-            self.upright = self.leg + theta
-        wanted = self.upright - self.leg
+        if s.upright is None:
+            s.upright = s.below + theta
+        wanted = s.upright - s.below
         wanted = clamp(wanted, theta - LEVEL_MAX, theta + LEVEL_MAX)
         return pd_law.hold_theta(sunk, wanted, -rate, risen * self._k_p[1])
 
     def _placed(self, sunk: Setpoint, theta: float, near: NeighbourView) -> Setpoint:
         """Return the law of an ankle; if its knee is no longer seen, its last angle holds."""
-        rate = 0.0
+        s, rate = self.state, 0.0
         if near.leg is not None:
             knee, rate = near.leg
-            self.leg = clamp(knee, -math.pi, math.pi)  # the cosine of an infinity would raise
-        if self.leg is None:
+            s.below = clamp(knee, -math.pi, math.pi)  # the cosine of an infinity would raise
+        if s.below is None:
             return sunk
-        if self.ahead is None:
-            self.start = theta
-            self.ahead = self._shank * math.sin(theta) + self._thigh * math.sin(theta + self.leg)
+        if s.ahead is None:
+            s.start = theta
+            s.ahead = self._shank * math.sin(theta) + self._thigh * math.sin(theta + s.below)
         # from ankle to hip joint: a link of this length, at this angle from the shank
-        along = self._shank + self._thigh * math.cos(self.leg)
-        across = self._thigh * math.sin(self.leg)
-        length = max(math.hypot(along, across), abs(self.ahead), LEAST_M)
-        place = math.asin(self.ahead / length) - math.atan2(across, along)
+        along = self._shank + self._thigh * math.cos(s.below)
+        across = self._thigh * math.sin(s.below)
+        length = max(math.hypot(along, across), abs(s.ahead), LEAST_M)
+        place = math.asin(s.ahead / length) - math.atan2(across, along)
         low, high = self._limits
-        place = clamp(place, min(low, self.start), max(high, self.start))
-        wanted = sunk.q_ref[1] + place - self.start  # its spring goes on carrying its load
-        up = self._thigh * math.cos(place + self.leg)
+        place = clamp(place, min(low, s.start), max(high, s.start))
+        wanted = sunk.q_ref[1] + place - s.start  # its spring goes on carrying its load
+        up = self._thigh * math.cos(place + s.below)
         height = self._shank * math.cos(place) + up
         v_ref = -rate * up / height if height > LOW_M else 0.0
         return pd_law.hold_theta(sunk, wanted, v_ref, sunk.k_p[1])

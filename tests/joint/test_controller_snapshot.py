@@ -5,10 +5,9 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from services.joint.controller import JointController, row_of
+from services.joint.controller import ControllerSnapshot, JointController, row_of
 from services.joint.neighbours import NeighbourRow, NeighbourView
 from services.joint.sinking import SinkingState
-from services.joint.snapshots import ControllerSnapshot
 from services.joint.torque_limiter import limits_of
 from services.joint.trips import JointTrips
 from shared.bus.messages import Cause, Mode

@@ -35,7 +35,7 @@ def test_a_hip_holds_the_torso_as_it_stood_while_its_leg_folds(
 ) -> None:
     sinking, frozen = begun(robot, "hip_right")
     sinking.law(frozen, frozen, 0, Q, NeighbourView((0.3, 0.05)))
-    assert sinking.upright == pytest.approx(0.3 - 0.4)
+    assert sinking.state.upright == pytest.approx(0.3 - 0.4)
     found = sinking.law(frozen, frozen, LONG_NS, (0.02, theta), NeighbourView((0.32, 0.07)))
     assert found.q_ref == pytest.approx((0.1, -0.42)), "0.02 rad farther back than it stood"
     assert found.v_ref == pytest.approx((0.0, -0.07))
@@ -68,7 +68,7 @@ def test_a_hip_that_never_received_its_legs_states_damps(robot: RobotConfig) -> 
     assert found.k_p[1] == 0.0
     assert found.k_d[1] == robot.joint_service.damp_k_d
     assert found.tau_ff[1] == 0.0
-    assert sinking.upright is None
+    assert sinking.state.upright is None
 
 
 def test_a_leg_without_fresh_states_is_taken_to_stay(robot: RobotConfig) -> None:
@@ -209,12 +209,12 @@ def test_a_reason_that_passes_is_none(robot: RobotConfig) -> None:
     sinking, frozen = begun(robot, "knee_right")
     sinking.law(frozen, frozen, 0, Q, UNHEARD)
     sinking.law(frozen, frozen, DOUBT_NS - 1, Q, UNKNOWN)
-    assert sinking.doubt_ns == -1
+    assert sinking.state.doubt_ns == -1
     sinking.law(frozen, frozen, DOUBT_NS, Q, UNHEARD)
     sinking.law(frozen, frozen, 2 * DOUBT_NS - 1, Q, UNHEARD)
-    assert not sinking.caught
+    assert not sinking.state.caught
     sinking.law(frozen, frozen, 2 * DOUBT_NS, Q, UNHEARD)
-    assert sinking.caught
+    assert sinking.state.caught
 
 
 def test_a_knee_beside_one_that_does_not_sink_is_caught_where_it_is(robot: RobotConfig) -> None:
@@ -222,48 +222,39 @@ def test_a_knee_beside_one_that_does_not_sink_is_caught_where_it_is(robot: Robot
     stand = robot.stand_gains("knee_left")
     assert sinking.law(frozen, frozen, 0, (0.02, -1.1), UNHEARD).k_p[1] == 0.0
     found = sinking.law(frozen, frozen, DOUBT_NS, (0.02, -1.2), UNHEARD)
-    assert sinking.stop == -1.2
+    assert sinking.state.stop == -1.2
     assert found.k_p[1] == 0.0, "at its stop nothing is sprung yet"
     found = sinking.law(frozen, frozen, LONG_NS, (0.02, -1.25), UNHEARD)
     assert (found.q_ref[1], found.k_p[1], found.k_d[1]) == (-1.2, stand.k_p[1], stand.k_d[1])
-    assert sinking.stop == -1.2, "where it was caught it stays"
+    assert sinking.state.stop == -1.2, "where it was caught it stays"
     below_its_stop = robot.joint_service.damp_knee_stop - 0.1
     sinking, frozen = begun(robot, "knee_left", (0.02, -1.0))
     sinking.law(frozen, frozen, 0, (0.02, below_its_stop), UNHEARD)
     sinking.law(frozen, frozen, DOUBT_NS, (0.02, below_its_stop), UNHEARD)
-    assert sinking.stop == robot.joint_service.damp_knee_stop
+    assert sinking.state.stop == robot.joint_service.damp_knee_stop
 
 
 @pytest.mark.parametrize("module", ["ankle_right", "hip_right"])
 def test_only_knees_are_caught(robot: RobotConfig, module: str) -> None:
     sinking, frozen = begun(robot, module)
-    assert sinking.stop == -math.inf
+    assert sinking.state.stop is None
     sinking.law(frozen, frozen, 0, Q, UNHEARD)
     sinking.law(frozen, frozen, DOUBT_NS, Q, UNHEARD)
-    assert not sinking.caught
-    assert sinking.stop == -math.inf
+    assert not sinking.state.caught
+    assert sinking.state.stop is None
 
 
 def test_a_second_stop_begins_anew(robot: RobotConfig) -> None:
     sinking, frozen = begun(robot, "hip_right")
     sinking.law(frozen, frozen, DOUBT_NS, Q, NeighbourView((0.3, 0.2), stiffen=True))
-    assert sinking.snapshot().held_ns == DOUBT_NS
+    assert sinking.state.held_ns == DOUBT_NS
     sinking.begin(FULL, Q)
-    assert sinking.snapshot() == SinkingState(doubt_ns=-1)
+    assert sinking.state == SinkingState(doubt_ns=-1)
     knee, frozen = begun(robot, "knee_right", (0.0, -1.0))
     knee.law(frozen, frozen, 0, Q, UNHEARD)
     knee.law(frozen, frozen, DOUBT_NS, Q, UNHEARD)
     knee.begin(FULL, (0.0, -1.0))
-    assert (knee.caught, knee.doubt_ns) == (False, -1)
-
-
-@pytest.mark.parametrize("stop", [None, -2.2])
-def test_it_goes_on_from_its_memory(robot: RobotConfig, stop: float | None) -> None:
-    memory = SinkingState(stop, 0.1, FULL, 0.4, caught=True, doubt_ns=7, held_ns=9)
-    sinking = Sinking(robot, "hip_right")
-    sinking.restore(memory)
-    assert sinking.stop == (-math.inf if stop is None else stop)
-    assert sinking.snapshot() == memory
+    assert (knee.state.caught, knee.state.doubt_ns) == (False, -1)
 
 
 def test_what_sinks_lets_go_of_its_feedforward_and_holds_the_rest(robot: RobotConfig) -> None:

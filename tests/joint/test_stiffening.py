@@ -8,11 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from services.joint import pd_law
-from services.joint.controller import JointController
+from services.joint.controller import ControllerSnapshot, JointController
 from services.joint.failsafe import Failsafe
 from services.joint.neighbours import NeighbourView
 from services.joint.setpoint_law import SetpointLaw
-from services.joint.snapshots import ControllerSnapshot
 from shared.bus.messages import Mode, Pair
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig

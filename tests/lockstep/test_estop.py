@@ -230,5 +230,5 @@ def test_a_stop_that_not_all_hear_tips_nothing(robot: RobotConfig) -> None:
         if truth.scenario_s >= 4.0:
             fleet.world.let_go()
             for joint in fleet.joints:
-                joint.manager._estop = joint.name != "knee_left"
+                joint.manager._state.estop = joint.name != "knee_left"
         assert not truth.fallen

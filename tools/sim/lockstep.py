@@ -13,8 +13,7 @@ from typing import ClassVar
 import msgspec
 
 from services.joint.controller import JointController
-from services.joint.drive_manager import DriveManager
-from services.joint.snapshots import DriveManagerState
+from services.joint.drive_manager import DriveManager, DriveManagerState
 from services.planner.controller import Controller
 from services.planner.intents import OperatorRequest
 from services.planner.planner import Planner, PlannerState

@@ -7,10 +7,9 @@ from typing import Final
 
 import msgspec
 
-from services.joint.drive_manager import DriveManager
+from services.joint.drive_manager import DriveManager, DriveManagerState
 from services.joint.drivers.base import DriveReading
 from services.joint.neighbours import NeighbourView
-from services.joint.snapshots import DriveManagerState
 from shared.bus import topics
 from shared.bus.messages import DriveStatus, JointCommand, JointState, Message
 from shared.bus.traces import CycleTrace, JointTrace

@@ -8,7 +8,7 @@ from typing import Final, TypeVar
 
 import msgspec
 
-from services.joint.snapshots import DriveManagerState
+from services.joint.drive_manager import DriveManagerState
 from services.planner.planner import PlannerState
 from shared.bus import topics
 from shared.bus.messages import PlannerStatus
