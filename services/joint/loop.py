@@ -1,9 +1,13 @@
-"""The joint service's loop, clocked by the drive's encoder frames."""
+"""The joint service's loop, clocked by the drive's encoder frames.
+
+Live, lockstep and re-execution run this loop over ports, a drive and a clock of their own.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
-from typing import Final
+from typing import Final, Protocol
 
 import msgspec
 
@@ -16,13 +20,13 @@ from services.joint.drive_manager import (
     DriveManager,
 )
 from services.joint.drivers.base import Drive
-from services.joint.neighbours import UNKNOWN, Neighbours
+from services.joint.neighbours import UNKNOWN, NeighbourRow, NeighbourView
 from services.joint.pendant import PendantWatch
 from services.joint.rearm_guard import PENDANT, LastState, RearmGuard
 from services.joint.tracer import Tracer
 from shared import log
 from shared.bus.messages import Cause, Estop, JointCommand, JointEvent, JointState, Mode
-from shared.bus.session import Latest, Publisher
+from shared.bus.ports import CountingInbox, Inbox, Outbox
 from shared.bus.traces import JointTrace
 from shared.clock import NS_PER_S, now_ns
 from shared.config.robot_config import RobotConfig
@@ -48,14 +52,25 @@ _WHY_NOT: Final = {
 }
 
 
-class JointPorts(msgspec.Struct, frozen=True):
-    """The bus ends of one joint service."""
+class OtherModules(Protocol):
+    """What the joint services of a host know of each other, without a bus."""
 
-    commands: Latest[JointCommand]
-    estops: Latest[Estop]
-    states: Publisher[JointState]
-    events: Publisher[JointEvent]
-    traces: Publisher[JointTrace]
+    def view(self, now_ns: int, /) -> NeighbourView:
+        """Return what this module knows of the others."""
+
+    def write(self, row: NeighbourRow, /) -> None:
+        """Write down where this module is."""
+
+
+class JointPorts(msgspec.Struct, frozen=True):
+    """What one joint service takes and sends."""
+
+    commands: CountingInbox[JointCommand]
+    estops: Inbox[Estop]
+    states: Outbox[JointState]
+    events: Outbox[JointEvent]
+    traces: Outbox[JointTrace] | None
+    """None: nothing is recorded for re-execution."""
 
 
 class JointLoop:
@@ -68,7 +83,8 @@ class JointLoop:
         drive: Drive,
         ports: JointPorts,
         rearm_guard: RearmGuard | None = None,
-        neighbours: Neighbours | None = None,
+        neighbours: OtherModules | None = None,
+        clock: Callable[[], int] | None = None,
     ) -> None:
         """Take the parts of the service.
 
@@ -78,15 +94,14 @@ class JointLoop:
             drive: the module's drive.
             ports: publishers and subscribers.
             rearm_guard: shared memory for the next service of this module, and for a local stop.
-            neighbours: shared memory of the six services on this host.
+            neighbours: the six services on this host.
+            clock: in place of this host's monotonic one, ns.
         """
-        service = config.joint_service
+        self.module = module
         self._rearm_guard, self._neighbours = rearm_guard, neighbours
-        self._pendant = PendantWatch(service.pendant_ms)
-        self._module = module
-        self._drive = drive
-        self._ports = ports
-        self._tracer = Tracer(module)
+        self._pendant = PendantWatch(config.joint_service.pendant_ms)
+        self._drive, self._ports, self._clock = drive, ports, clock or now_ns
+        self._tracer = None if ports.traces is None else Tracer(module)
         self._reported = ArmingInhibit.NONE
         self._report_at_ns = 0
         self._malformed = 0
@@ -100,20 +115,21 @@ class JointLoop:
         drive is left idle.
         """
         while not stop:
-            self.cycle()
-        rest = self._tracer.take()
-        if rest is not None:
-            self._ports.traces.put(rest)
-        if stop.interrupted or not self._module.leaves_holding:
+            self.report(self.cycle())
+        if self._tracer is not None and self._ports.traces is not None:
+            rest = self._tracer.take()
+            if rest is not None:
+                self._ports.traces.put(rest)
+        if stop.interrupted or not self.module.leaves_holding:
             self._drive.idle()
         if stop.interrupted and self._rearm_guard is not None:
             self._rearm_guard.write(LastState.NOTHING)
 
-    def cycle(self) -> None:
-        """Run one cycle."""
-        module, ports, tracer = self._module, self._ports, self._tracer
+    def cycle(self) -> DriveAction:
+        """Run one cycle; return what was decided, and done."""
+        module, ports, tracer = self.module, self._ports, self._tracer
         reading = self._drive.read(READ_TIMEOUT_S)
-        now = now_ns()
+        now = self._clock()
         estop = self._is_stopped(now)
         command = ports.commands.take()
         malformed = ports.commands.refused - self._malformed
@@ -128,17 +144,17 @@ class JointLoop:
         controller = module.controller
         if self._neighbours is not None:
             self._neighbours.write(row_of(controller))
-        if controller.is_state_due:
-            ports.states.put(controller.state(now))
         if step.event is not None:
             ports.events.put(step.event)
+        if controller.is_state_due:
+            ports.states.put(controller.state(now))
         if self._rearm_guard is not None:
             self._rearm_guard.write(module.last_state)
-        trace = tracer.after(now, reading, command, estop, step, near, malformed)
-        if trace is not None:
-            ports.traces.put(trace)
-        if step.event is not None or step.inhibit is not ArmingInhibit.NONE:
-            self._report(now, step)
+        if tracer is not None and ports.traces is not None:
+            trace = tracer.after(now, reading, command, estop, step, near, malformed)
+            if trace is not None:
+                ports.traces.put(trace)
+        return step
 
     def _is_stopped(self, now: int) -> bool:
         """Return True if an emergency stop has come or is set here, or the pendant is silent."""
@@ -158,16 +174,18 @@ class JointLoop:
         elif order is DriveCommand.TORQUE:
             drive.write_torque(step.torque)
         elif order is DriveCommand.ARM:
-            drive.arm(onboard=self._module.onboard)
+            drive.arm(onboard=self.module.onboard)
         elif order is DriveCommand.IDLE:
             drive.idle()
         elif order is DriveCommand.CLEAR_ZERO:
             with suppress(DriveError):  # the drive is gone, and its zero with it
                 drive.set_position(self._nowhere)
 
-    def _report(self, now: int, step: DriveAction) -> None:
+    def report(self, step: DriveAction) -> None:
         """Log what a person must know; the module is not controlled then, so a log line is safe."""
-        samples = self._module.controller.samples
+        if step.event is None and step.inhibit is ArmingInhibit.NONE:
+            return
+        now, samples = self._clock(), self.module.controller.samples
         if step.event is not None and step.event.cause == Cause.ESTOP and self._pendant.lost:
             log.get("xrl").error("emergency stop: the pendant is silent")
         if step.event is not None and step.event.mode_after == Mode.FAULT:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import secrets
 
 from services.planner.controller_file import controller_maker
-from services.planner.loop import PlannerLoop, PlannerPorts
+from services.planner.loop import PlannerLoop, PlannerPorts, requests_of
 from services.planner.planner import Planner
 from shared import log, scheduling
 from shared.bus import topics
@@ -56,7 +56,7 @@ def main() -> int:
             states=[session.latest(topics.JOINT_STATE, JointState, m) for m in MODULES],
             wrench=session.latest(topics.WRENCH, Wrench),
             attitude=session.latest(topics.ATTITUDE, Attitude),
-            intent=session.latest(topics.OPERATOR_INTENT, OperatorIntent),
+            request=requests_of(robot, session.latest(topics.OPERATOR_INTENT, OperatorIntent)),
             commands=[session.publisher(topics.JOINT_COMMAND, JointCommand, m) for m in MODULES],
             status=session.publisher(topics.PLANNER_STATUS, PlannerStatus),
             checkpoint=session.publisher(topics.PLANNER_CHECKPOINT, PlannerCheckpoint),

@@ -1,13 +1,16 @@
-"""Runs the planner's loop: read six states, compute, publish six commands and a status."""
+"""Runs the planner's loop: read six states, compute, publish six commands and a status.
+
+Live, lockstep and re-execution run this loop over ports and a clock of their own.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import msgspec
 
 from services.planner.checkpoint import Checkpoints
-from services.planner.intents import Intents
+from services.planner.intents import Intents, OperatorRequest
 from services.planner.planner import EARLY_FRACTION, Planner
 from shared import log
 from shared.bus.messages import (
@@ -18,7 +21,7 @@ from shared.bus.messages import (
     PlannerStatus,
     Wrench,
 )
-from shared.bus.session import Latest, Publisher
+from shared.bus.ports import Inbox, Outbox
 from shared.bus.traces import PlannerCheckpoint
 from shared.clock import NS_PER_S, NS_PER_US, now_ns, sleep_until
 from shared.config.robot_config import RobotConfig
@@ -26,15 +29,32 @@ from shared.process import StopFlag
 
 
 class PlannerPorts(msgspec.Struct, frozen=True):
-    """The planner's subscribers and publishers; one per module in `MODULES` order."""
+    """What the planner takes and sends; one of each sequence for a module, in `MODULES` order."""
 
-    states: Sequence[Latest[JointState]]
-    wrench: Latest[Wrench]
-    attitude: Latest[Attitude]
-    intent: Latest[OperatorIntent]
-    commands: Sequence[Publisher[JointCommand]]
-    status: Publisher[PlannerStatus]
-    checkpoint: Publisher[PlannerCheckpoint]
+    states: Sequence[Inbox[JointState]]
+    wrench: Inbox[Wrench]
+    attitude: Inbox[Attitude]
+    request: Callable[[int], OperatorRequest]
+    """Returns what the operator requests at a time of the planner's clock."""
+    commands: Sequence[Outbox[JointCommand]]
+    status: Outbox[PlannerStatus]
+    checkpoint: Outbox[PlannerCheckpoint] | None
+    """None: nothing is recorded for re-execution."""
+
+
+def requests_of(
+    config: RobotConfig, intents: Inbox[OperatorIntent]
+) -> Callable[[int], OperatorRequest]:
+    """Return what the operator requests, by the intents that come."""
+    kept = Intents(config.assist)
+
+    def request(now_ns: int) -> OperatorRequest:
+        intent = intents.take()
+        if intent is not None:
+            kept.receive(intent, now_ns)
+        return kept.request(now_ns)
+
+    return request
 
 
 POLL_NS = 200 * NS_PER_US
@@ -49,22 +69,29 @@ held up makes none of the following late."""
 class PlannerLoop:
     """Ticks the planner when its six states have arrived, at their rate."""
 
-    def __init__(self, config: RobotConfig, planner: Planner, ports: PlannerPorts) -> None:
-        self._planner = planner
-        self._ports = ports
+    def __init__(
+        self,
+        config: RobotConfig,
+        planner: Planner,
+        ports: PlannerPorts,
+        clock: Callable[[], int] | None = None,
+    ) -> None:
+        self.planner = planner
+        self._ports, self._clock = ports, clock or now_ns
         self._period_ns = round(NS_PER_S / config.planner.rate_hz)
         self._due_ns = 0
-        self._intents = Intents(config.assist)
         self._checkpoints = Checkpoints(config.planner.rate_hz)
         self._yielded = False
 
     def run(self, stop: StopFlag) -> None:
         """Run until `stop` is set."""
         while not stop:
-            now = now_ns()
+            now = self._clock()
             due = self.receive_states(now)
             if due:
                 self.tick(now)
+                if self.planner.yields != self._yielded:
+                    self._report()
             sleep_until(self._next_look(now, ticked=due))
 
     def _next_look(self, now: int, *, ticked: bool) -> int:
@@ -78,7 +105,7 @@ class PlannerLoop:
         if ticked:
             expected = self._due_ns + period + FOLLOW_NS
             self._due_ns = now if now - expected > period else min(now, expected)
-        if self._planner.compares_arrivals:
+        if self.planner.compares_arrivals:
             return now + POLL_NS
         if ticked:
             return now + round(EARLY_FRACTION * period)
@@ -86,7 +113,7 @@ class PlannerLoop:
 
     def receive_states(self, now: int) -> bool:
         """Receive new states; return True if a tick is due."""
-        planner = self._planner
+        planner = self.planner
         for module, latest in enumerate(self._ports.states):
             state = latest.take()
             if state is not None:
@@ -95,27 +122,23 @@ class PlannerLoop:
 
     def tick(self, now: int) -> None:
         """Receive the other inputs, run one tick and publish its results."""
-        planner, ports = self._planner, self._ports
+        planner, ports = self.planner, self._ports
         wrench = ports.wrench.take()
         if wrench is not None:
             planner.receive_wrench(wrench, now)
         attitude = ports.attitude.take()
         if attitude is not None:
             planner.receive_attitude(attitude, now)
-        intent = ports.intent.take()
-        if intent is not None:
-            self._intents.receive(intent, now)
-        planner.receive_request(self._intents.request(now))
+        planner.receive_request(ports.request(now))
         for publisher, command in zip(ports.commands, planner.tick(now), strict=False):
             publisher.put(command)
-        ports.status.put(planner.status(now, (now_ns() - now) / NS_PER_US))
-        checkpoint = self._checkpoints.after(planner, now)
-        if checkpoint is not None:
-            ports.checkpoint.put(checkpoint)
-        if planner.yields != self._yielded:
-            self._report()
+        ports.status.put(planner.status(now, (self._clock() - now) / NS_PER_US))
+        if ports.checkpoint is not None:
+            checkpoint = self._checkpoints.after(planner, now)
+            if checkpoint is not None:
+                ports.checkpoint.put(checkpoint)
 
     def _report(self) -> None:
         """Log that it yields to another planner, or goes on; it leads nobody then."""
-        self._yielded = self._planner.yields
-        log.get("xrl").warning("%s", self._planner.rival or "no other planner leads: going on")
+        self._yielded = self.planner.yields
+        log.get("xrl").warning("%s", self.planner.rival or "no other planner leads: going on")

@@ -118,7 +118,7 @@ class Rig:
     def run(self, cycles: int) -> None:
         for _ in range(cycles):
             self.now_ns += self.period_ns
-            self.loop.cycle()
+            self.loop.report(self.loop.cycle())
 
     @property
     def mode(self) -> Mode:

@@ -22,8 +22,8 @@ from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
 from tests.lockstep import partial
 from tests.lockstep.partial import PartialCase
-from tools.sim.host_clock import HostClock
 from tools.sim.lockstep import FleetMoment, Lockstep
+from tools.sim.virtual_time import HostClock
 
 HOUR_NS = 3600 * NS_PER_S
 HOSTS = ("planner", "harness", *MODULES)

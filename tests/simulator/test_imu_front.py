@@ -16,7 +16,7 @@ from shared.can.imu_can import ImuAssembler
 from shared.config.robot_config import RobotConfig
 from tests.imu.robots import with_imu
 from tests.lockstep.runs import still
-from tools.sim.virtual_can import VirtualCan
+from tools.sim.virtual_services import VirtualCan
 
 EXACT = ImuErrors(tilt=(0.0, 0.0), noise=0.0)
 

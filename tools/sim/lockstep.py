@@ -7,8 +7,9 @@ process, clock or bus: two runs with one seed are equal to the last bit.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import msgspec
 
@@ -42,22 +43,23 @@ from shared.config.scenarios import SCENARIO, Kill, Push, Restart, Scenario
 from shared.exceptions import RunError
 from shared.joints import MODULE_INDEX, MODULES
 from tools.logs.hand_path import HandRow
-from tools.sim.host_clock import HostClock
-from tools.sim.network import BASE
-from tools.sim.virtual_drive import VirtualDrive
-from tools.sim.virtual_harness import VirtualHarness
-from tools.sim.virtual_imu import VirtualImu
-from tools.sim.virtual_joint import NeighbourRows, VirtualJoint
-from tools.sim.virtual_network import VirtualNetwork
-from tools.sim.virtual_planner import VirtualPlanner
+from tools.sim.network import BASE, VirtualNetwork
+from tools.sim.virtual_services import (
+    SharedMemory,
+    VirtualHarness,
+    VirtualImu,
+    VirtualJoint,
+    VirtualPlanner,
+)
+from tools.sim.virtual_time import HostClock, Record, VirtualTime
 
 SETTLE_NS = NS_PER_S
 """The scenario starts this long after all six modules track, ns."""
 READY_NS = 20 * NS_PER_S
 """Virtual time by which the scenario must have started, ns. It starts at 1 s: 19 s of a run."""
 
-Record = Callable[[Topic, str, Message], None]
-"""Takes what live would be on the bus: topic, module or "", message."""
+Happening = Kill | Restart | Push | HandRow
+"""What a scenario, or somebody who looks on, makes happen."""
 Watch = Callable[[SimTruth], None]
 """Sees the simulated world at its rate."""
 
@@ -77,14 +79,43 @@ class FleetMoment(msgspec.Struct, frozen=True):
     """Session and state of the planner; None: it is dead."""
 
 
+class _Periods(NamedTuple):
+    """Of what comes at a rate, ns."""
+
+    cycle: int
+    step: int
+    truth: int
+    sim_state: int
+
+    @classmethod
+    def of(cls, config: RobotConfig) -> _Periods:
+        rates_hz = (
+            config.joint_service.rate_hz,
+            1.0 / config.simulation.timestep,
+            config.simulation.truth_rate_hz,
+            topics.SIM_STATE.rate_hz,
+        )
+        return cls(*(round(NS_PER_S / rate_hz) for rate_hz in rates_hz))
+
+
+class _Progress(msgspec.Struct):
+    """How far the run is."""
+
+    todo: list[Happening]
+    """What the scenario still has, in its order."""
+    tracked_since_ns: int = 0
+    sim_states: int = 0
+    led: int = 0
+    run_events: int = 0
+
+
 class Lockstep:
     """A whole fleet in virtual time; a subclass may use other planners or joint services.
 
     Attributes:
         joints: the six joint services, in the order of `MODULES`.
         events: each change of mode, with its module.
-        estop: set it to stop every module.
-        now_ns: virtual time.
+        time: virtual time.
     """
 
     planner_type: ClassVar[type[Planner]] = Planner
@@ -127,12 +158,11 @@ class Lockstep:
         self.plant = plant or PlantConfig()
         self.world = World(body_of(config, self.plant), scenario)
         self.events: list[tuple[str, JointEvent]] = []
-        self.estop = False
-        self.now_ns = NS_PER_S
+        self.time = time = VirtualTime(NS_PER_S)
         self._record = record
-        self._traces = self.traced and record is not forget
+        self._traces = traced = self.traced and record is not forget
         self._controller = controller
-        self.network = VirtualNetwork(
+        self.network = network_ = VirtualNetwork(
             network or BASE,
             scenario.inject,
             seed,
@@ -141,19 +171,15 @@ class Lockstep:
         clock_of = {name: HostClock() for name in ("planner", "harness", "imu", *MODULES)}
         clock_of |= clocks or {}
         self.harness = VirtualHarness(
-            config, self.network.wrenches(), record, seed, clock_of["harness"]
+            config, network_, record, seed, time=time, clock=clock_of["harness"]
         )
         self._imu = VirtualImu(
-            config, self.plant.imu, self.network.attitudes(), record, seed, clock_of["imu"]
+            config, self.plant.imu, network_, record, seed, time=time, clock=clock_of["imu"]
         )
         self._planner = VirtualPlanner(
-            self._new_planner,
-            self.network,
-            record,
-            rate_hz=config.planner.rate_hz,
-            clock=clock_of["planner"],
-            traced=self._traces,
-        )
+            config, self._new_planner, self._request, network_, record,
+            time=time, clock=clock_of["planner"], traced=traced,
+        )  # fmt: skip
         self.bank = AxisBank(
             config.drive,
             encoder_counts_per_turn=config.joint.encoder_counts_per_turn,
@@ -161,24 +187,36 @@ class Lockstep:
         )
         self._torque = self.bank.torque
         self._faults = FaultInjector(scenario.fault, self.bank)
-        self._drives = [
-            VirtualDrive(
-                self.bank, index, config.drive, config.module_named(name).motor_signs, self.now_ns
+        self._memory = SharedMemory()
+        self.joints = [
+            VirtualJoint(
+                config, index, functools.partial(self.module_type, config, name), self.bank,
+                self._memory, network_, record, time=time, clock=clock_of[name], traced=traced,
             )
             for index, name in enumerate(MODULES)
+        ]  # fmt: skip
+        self._periods = _Periods.of(config)
+        happens: list[Kill | Restart | Push | HandRow] = [
+            *scenario.kill,
+            *scenario.restart,
+            *scenario.push,
+            *hand,
         ]
-        self.joints = [self._joint(index, clock_of[name]) for index, name in enumerate(MODULES)]
-        self._cycle_ns = round(NS_PER_S / config.joint_service.rate_hz)
-        self._step_ns = round(config.simulation.timestep * NS_PER_S)
-        self._truth_ns = round(NS_PER_S / config.simulation.truth_rate_hz)
-        self._sim_state_ns = round(NS_PER_S / topics.SIM_STATE.rate_hz)
-        self._sim_states = 0
-        self._tracked_since_ns = 0
-        self._todo: list[Kill | Restart | Push | HandRow] = sorted(
-            (*scenario.kill, *scenario.restart, *scenario.push, *hand), key=lambda row: row.at
-        )
-        self._led = 0
-        self._run_events = 0
+        self._progress = _Progress(sorted(happens, key=lambda row: row.at))
+
+    @property
+    def now_ns(self) -> int:
+        """Virtual time."""
+        return self.time.now_ns
+
+    @property
+    def estop(self) -> bool:
+        """Set it to stop every module."""
+        return self._memory.estop
+
+    @estop.setter
+    def estop(self, estop: bool) -> None:
+        self._memory.estop = estop
 
     @property
     def planner(self) -> Planner | None:
@@ -206,18 +244,16 @@ class Lockstep:
     def resume(self, moment: FleetMoment) -> None:
         """Continue from a moment of another run, before the first step; links are empty then."""
         state, modules = moment.state, moment.modules
-        self.now_ns = -(-state.t_ns // self._step_ns) * self._step_ns
+        step_ns = self._periods.step
+        self.time.now_ns = -(-state.t_ns // step_ns) * step_ns
         restored(self.world, self.bank, state)
         for joint in self.joints:
-            if joint.name in modules:
-                joint.manager.restore(modules[joint.name])
-            else:
-                joint.kill(for_good=True)
+            joint.resume(modules.get(joint.name))
         self._planner.resume(moment.planner)
-        for drive in self._drives:
-            drive.assume_heard(self.now_ns)
         self.harness.assume_tared()
-        self._todo = [row for row in self._todo if row.at >= self.world.scenario_s]
+        self._progress.todo = [
+            row for row in self._progress.todo if row.at >= self.world.scenario_s
+        ]
 
     def run(self) -> Iterator[SimTruth]:
         """Run to the scenario's end; yield the truth at its rate.
@@ -226,14 +262,14 @@ class Lockstep:
         or if the scenario has not started when virtual time is past `READY_NS`.
         """
         while self.world.scenario_s < self.scenario.duration:
-            while self._todo and self.world.scenario_s >= self._todo[0].at:
-                self.act(self._todo.pop(0))
+            while self._progress.todo and self.world.scenario_s >= self._progress.todo[0].at:
+                self.act(self._progress.todo.pop(0))
             self.advance()
-            if self._traces and self.now_ns % self._sim_state_ns == 0:
-                self._sim_states += 1
-                state = taken(self.world, self.bank, self.now_ns, self._sim_states)
+            if self._traces and self.now_ns % self._periods.sim_state == 0:
+                self._progress.sim_states += 1
+                state = taken(self.world, self.bank, self.now_ns, self._progress.sim_states)
                 self._record(topics.SIM_STATE, "", state)
-            if self.now_ns % self._truth_ns == 0:
+            if self.now_ns % self._periods.truth == 0:
                 truth = self.world.truth(self.now_ns, 1.0, 0.0)
                 self._record(topics.SIM_TRUTH, "", truth)
                 yield truth
@@ -244,19 +280,19 @@ class Lockstep:
         """Advance virtual time by one step of the world."""
         now = self.now_ns
         self.network.advance(self.world.scenario_s, now)
-        if now % self._cycle_ns == 0:
+        if now % self._periods.cycle == 0:
             for fault in self._faults.advance(self.world.scenario_s):
                 self._put_event(RunEventKind.FAULTED, fault.module, fault.kind)
             self._torque = self.bank.step(self.world.time, *self.world.motor_turns())
-            self._cycle_joints(now)
+            self._cycle_joints()
         elif self.bank.regulates:
             self._torque = self.bank.step(self.world.time, *self.world.motor_turns())
-        self.harness.advance(self.world, now)
-        self._imu.advance(self.world, now)
-        self._planner.advance(now, self._request)
+        self.harness.advance(self.world)
+        self._imu.advance(self.world)
+        self._planner.advance()
         self._start_when_tracking(now)
         self.world.step(self._torque)
-        self.now_ns += self._step_ns
+        self.time.now_ns += self._periods.step
 
     def _new_planner(self, session: int) -> Planner:
         if self._controller is None:
@@ -267,24 +303,21 @@ class Lockstep:
         wanted = self.world.lead()
         return OperatorRequest(wanted.assist, wanted.shift, SCENARIO)
 
-    def _cycle_joints(self, now: int) -> None:
-        rows = NeighbourRows(self.joints, now)
-        for index, joint in enumerate(self.joints):
-            if joint.frozen:
-                continue
-            event = joint.cycle(now, estop=self.estop, near=rows.view(index))
-            rows.write(index)
-            if event is not None:
-                self.events.append((joint.name, event))
+    def _cycle_joints(self) -> None:
+        for joint in self.joints:
+            if not joint.frozen:
+                event = joint.cycle().event
+                if event is not None:
+                    self.events.append((joint.name, event))
 
     def lead(self, hand: HandLead) -> None:
         """Let somebody lead the hand in place of the scenario, and record it."""
-        self._led += 1
-        hand = msgspec.structs.replace(hand, t_ns=self.now_ns, seq=self._led)
+        self._progress.led += 1
+        hand = msgspec.structs.replace(hand, t_ns=self.now_ns, seq=self._progress.led)
         self.world.take_hand(hand)
         self._record(topics.OPERATOR_HAND, "", hand)
 
-    def act(self, row: Kill | Restart | Push | HandRow) -> None:
+    def act(self, row: Happening) -> None:
         """Carry out a row of the scenario, or of somebody who looks on, and record it."""
         if isinstance(row, HandRow):
             self.lead(row.hand)
@@ -309,35 +342,22 @@ class Lockstep:
         if Mode.DISARMED not in modes:
             self.world.release_hoist()
         if self.world.hoist > 0.0 or any(mode is not Mode.TRACK for mode in modes):
-            self._tracked_since_ns = now
-        elif now - self._tracked_since_ns >= SETTLE_NS:
+            self._progress.tracked_since_ns = now
+        elif now - self._progress.tracked_since_ns >= SETTLE_NS:
             self.world.start()
             self._put_event(RunEventKind.STARTED, self.scenario.name, "")
 
     def _put_event(self, kind: RunEventKind, subject: str, detail: str) -> None:
-        self._run_events += 1
+        self._progress.run_events += 1
         event = RunEvent(
             t_ns=self.now_ns,
-            seq=self._run_events,
+            seq=self._progress.run_events,
             kind=int(kind),
             subject=subject,
             detail=detail,
             scenario_s=self.world.scenario_s,
         )
         self._record(topics.RUN_EVENT, "", event)
-
-    def _joint(self, index: int, clock: HostClock) -> VirtualJoint:
-        name = MODULES[index]
-        return VirtualJoint(
-            name,
-            lambda: self.module_type(self.config, name),
-            self._drives[index],
-            self.network.commands()[index],
-            self.network.states()[index],
-            self._record,
-            clock=clock,
-            traced=self._traces,
-        )
 
     def _joint_named(self, name: str) -> VirtualJoint:
         return self.joints[MODULE_INDEX[name]]

@@ -28,7 +28,8 @@ from tools.judge.verdict import Summary
 from tools.live import experiment
 from tools.logs.hand_path import HandRow
 from tools.sim.centralised.fleet import CONTROLS, SHIPPED
-from tools.sim.lockstep import Lockstep, Record, Watch
+from tools.sim.lockstep import Lockstep, Watch
+from tools.sim.virtual_time import Record
 
 Outcome = TypeVar("Outcome")
 AFTER_FALL_S: Final = 1.0
@@ -48,7 +49,7 @@ def _look_away(_truth: SimTruth) -> None:
     """Watch nothing."""
 
 
-class Outbox:
+class RecordedMessages:
     """Messages on their way into the log."""
 
     def __init__(self, robot: str) -> None:
@@ -103,7 +104,7 @@ def record_run(
         RunError: the log cannot be written.
     """
     inputs = experiment.write_inputs(out, robot, scenario, true_plant)
-    outbox = Outbox(robot.name)
+    messages = RecordedMessages(robot.name)
     recorded = {key: topic for key, topic in topics.all_keys(robot.name).items() if topic.recorded}
     run_metadata = {
         "schema_version": SCHEMA_VERSION,
@@ -126,12 +127,12 @@ def record_run(
     ) as writer:
 
         def drain(truth: SimTruth) -> None:
-            if len(outbox) >= DRAIN_EVERY:
-                writer.take_from(outbox, len(outbox))
+            if len(messages) >= DRAIN_EVERY:
+                writer.take_from(messages, len(messages))
             watch(truth)
 
-        outcome = run(outbox.put, drain)
-        writer.take_from(outbox, len(outbox))
+        outcome = run(messages.put, drain)
+        writer.take_from(messages, len(messages))
     return outcome
 
 

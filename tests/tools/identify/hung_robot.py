@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from services.joint.drive_manager import ArmingInhibit, DriveAction, DriveCommand
-from services.joint.drivers.base import DriveReading, MotorTarget
+from services.joint.drivers.base import DriveReading
+from services.joint.drivers.wired_drive import MotorFrame, WiredDrive
 from services.simulator.drives.axis_bank import AxisBank
 from services.simulator.physics.body import body_of
 from services.simulator.physics.plant import PlantConfig
@@ -30,12 +30,15 @@ class HungRobot:
             encoder_counts_per_turn=robot.joint.encoder_counts_per_turn,
             motor_signs=robot.motor_signs(),
         )
+        counts = robot.joint.encoder_counts_per_turn
         self.drives = {
-            name: HungDrive(self, VirtualDrive(
-                self.bank, index, robot.drive, robot.module_named(name).motor_signs, self.now_ns
-            ))
+            name: HungDrive(
+                self,
+                VirtualDrive(self.bank, index, robot.drive, self.clock, counts_per_turn=counts),
+                MotorFrame(robot.drive.zero_mark_turns, robot.module_named(name).motor_signs),
+            )
             for index, name in enumerate(MODULES)
-        }  # fmt: skip
+        }
         for _ in range(1500):
             self.step()
 
@@ -49,39 +52,30 @@ class HungRobot:
         return self.now_ns
 
 
-class HungDrive:
+class HungDrive(WiredDrive):
     """One drive of it (`services.joint.drivers.base.Drive`)."""
 
-    def __init__(self, robot: HungRobot, drive: VirtualDrive) -> None:
-        self._robot, self._drive = robot, drive
+    def __init__(self, robot: HungRobot, drive: VirtualDrive, frame: MotorFrame) -> None:
+        super().__init__(drive, frame)
+        self._robot = robot
         self.never_arms = self.deaf = False
 
     def read(self, timeout_s: float) -> DriveReading | None:
         for _ in range(2 if timeout_s > 0.0 else 0):
             self._robot.step()
-        return self._drive.read(self._robot.now_ns)
-
-    def write(self, target: MotorTarget) -> None:
-        self._do(DriveCommand.TARGET, target)
+        return super().read(timeout_s)
 
     def arm(self, *, onboard: bool) -> None:
         assert onboard
         if not self.never_arms:
-            self._do(DriveCommand.ARM)
+            super().arm(onboard=True)
 
     def idle(self) -> None:
         if not self.deaf:
-            self._do(DriveCommand.IDLE)
+            super().idle()
 
     def write_torque(self, torque: Pair) -> None:
         raise AssertionError(torque)
 
     def set_position(self, turns: Pair) -> None:
         raise AssertionError(turns)
-
-    def close(self) -> None:
-        pass
-
-    def _do(self, command: DriveCommand, target: MotorTarget | None = None) -> None:
-        action = DriveAction(None, command, (0.0, 0.0), target, ArmingInhibit.NONE)
-        self._drive.carry_out(action, onboard=True)

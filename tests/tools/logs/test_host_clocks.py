@@ -39,7 +39,7 @@ from tests.tools.logs.three_hosts import (
 from tools.logs.clock_offsets import ClockOffsets, OffsetBounds
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import clocks_of, read_run
-from tools.sim.host_clock import HostClock
+from tools.sim.virtual_time import HostClock
 
 # ---- bounds
 

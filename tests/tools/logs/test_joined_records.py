@@ -27,7 +27,7 @@ from tools.hosts.records import fleets_run, join_fetched
 from tools.logs.joined_records import in_order
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import parts_of, read_run
-from tools.sim.host_clock import HostClock
+from tools.sim.virtual_time import HostClock
 
 
 @pytest.fixture(scope="module")

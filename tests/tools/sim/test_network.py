@@ -11,8 +11,7 @@ from shared.bus.traces import LinkEvent
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.impairment import Impairment
 from shared.config.scenarios import Inject
-from tools.sim.network import BASE, VirtualLink
-from tools.sim.virtual_network import VirtualNetwork
+from tools.sim.network import BASE, VirtualLink, VirtualNetwork
 
 
 def message(number: int) -> SimControl:

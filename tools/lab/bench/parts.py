@@ -30,7 +30,7 @@ from shared.joints import MODULES
 from shared.mcap_log.writer import RunWriter
 from tools.lab.bench.timing import Repeated
 from tools.sim.lockstep import Lockstep, forget
-from tools.sim.recorded_lockstep import DRAIN_EVERY, Outbox
+from tools.sim.recorded_lockstep import DRAIN_EVERY, RecordedMessages
 from tools.sim.standing_start import begin_standing
 
 SECONDS: Final = 3.0
@@ -193,7 +193,7 @@ def simulator_step(recorded: Recorded, _stack: ExitStack) -> Repeated:
 def recorder_batch(recorded: Recorded, stack: ExitStack) -> Repeated:
     """`BATCH` messages from the bus to the file."""
     writer = _writer(recorded.robot, stack)
-    outbox, messages = Outbox(recorded.robot.name), itertools.cycle(recorded.messages)
+    outbox, messages = RecordedMessages(recorded.robot.name), itertools.cycle(recorded.messages)
 
     def before() -> None:
         for topic, module, message in itertools.islice(messages, BATCH):
@@ -254,7 +254,7 @@ class LockstepRun:
         return (self._fleet.now_ns - started_ns) / NS_PER_S / (time.process_time() - begin)
 
     def _begin(self) -> None:
-        self._outbox = Outbox(self._robot.name)
+        self._outbox = RecordedMessages(self._robot.name)
         record = self._outbox.put if self._recorded else forget
         self._fleet = Lockstep(self._robot, self._scenario, record=record)
         begin_standing(self._fleet)

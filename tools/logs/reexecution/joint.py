@@ -1,4 +1,4 @@
-"""Executes a joint service again, cycle by cycle."""
+"""Executes a joint service again, cycle by cycle: its own loop, over what the log has."""
 
 from __future__ import annotations
 
@@ -9,9 +9,17 @@ import msgspec
 
 from services.joint.drive_manager import DriveManager, DriveManagerState
 from services.joint.drivers.base import DriveReading
+from services.joint.loop import JointLoop, JointPorts
 from services.joint.neighbours import NeighbourView
 from shared.bus import topics
-from shared.bus.messages import DriveStatus, JointCommand, JointState, Message
+from shared.bus.messages import (
+    DriveStatus,
+    Estop,
+    JointCommand,
+    JointEvent,
+    JointState,
+    Message,
+)
 from shared.bus.traces import CycleTrace, JointTrace
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
@@ -24,13 +32,68 @@ _encode: Final = msgspec.json.Encoder().encode
 _STATUS: Final = {int(status): status for status in DriveStatus}
 
 
+class _Cycle:
+    """What one cycle takes, and what came out: drive, ports, neighbours and clock of the loop."""
+
+    def __init__(self) -> None:
+        self.trace: CycleTrace | None = None
+        self.command: JointCommand | None = None
+        self.refused = 0
+        self.sent: list[JointState | JointEvent] = []
+
+    def now(self) -> CycleTrace:
+        assert self.trace is not None  # noqa: S101 - set before each cycle
+        return self.trace
+
+    def clock(self) -> int:
+        return self.now().now_ns
+
+    def read(self, timeout_s: float) -> DriveReading | None:  # noqa: ARG002
+        return _reading(self.now())
+
+    def take(self) -> JointCommand | None:
+        return self.command
+
+    def view(self, now_ns: int) -> NeighbourView:  # noqa: ARG002
+        c = self.now()
+        return NeighbourView(c.below if c.knows_below else None, c.sinks, c.stiffen)
+
+    def put(self, message: JointState | JointEvent, /) -> bool:
+        self.sent.append(message)
+        return True
+
+    def write(self, _: object) -> None:
+        """Do nothing: the drive and the neighbours have what they got."""
+
+    write_torque = set_position = write
+
+    def arm(self, *, onboard: bool) -> None:
+        """Do nothing."""
+
+    def idle(self) -> None:
+        """Do nothing."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+class _Stops:
+    def __init__(self, cycle: _Cycle) -> None:
+        self._cycle = cycle
+
+    def take(self) -> Estop | None:
+        c = self._cycle.now()
+        return Estop(t_ns=c.now_ns, seq=0, source="") if c.estop else None
+
+
 class JointExecution:
     """One module's service, from its traces."""
 
     def __init__(self, robot: RobotConfig, name: str, outcome: ReexecutionResult) -> None:
         """Take the robot to execute with, the module's name and what to fill in."""
         self._robot, self._name, self._outcome = robot, name, outcome
-        self._module: DriveManager | None = None
+        self._cycle = _Cycle()
+        self._loop: JointLoop | None = None
         self._expected = 0
 
     def run(self, log: RunLog) -> Iterator[Message]:
@@ -46,15 +109,16 @@ class JointExecution:
             if not log.begin_ns <= received_ns < log.end_ns:
                 continue
             if trace.seq != self._expected:
-                self._module = None  # the log lacks traces in between, or the service restarted
+                self._loop = None  # the log lacks traces in between, or the service restarted
             self._expected = trace.seq + 1
             if trace.snapshot:
                 self._remember(trace)
             for cycle in trace.cycles:
-                if self._module is None:
+                if self._loop is None or not self._receive(cycle):
+                    self._loop = None
                     self._outcome.skipped += 1
                 else:
-                    yield from self._cycle(self._module, cycle)
+                    yield from self._execute(self._loop, cycle)
 
     def _load(self, log: RunLog) -> None:
         """Look up what the cycles of a part took and sent."""
@@ -67,52 +131,60 @@ class JointExecution:
 
     def snapshot(self) -> DriveManagerState | None:
         """Return the service's present state; None while it cannot be executed."""
-        return None if self._module is None else self._module.snapshot()
+        return None if self._loop is None else self._loop.module.snapshot()
 
     def _remember(self, trace: JointTrace) -> None:
         """Go on from a recorded memory, or hold ours to it."""
-        if self._module is None:
-            self._module = DriveManager(self._robot, self._name)
-            self._module.restore(memory_of(trace.snapshot, DriveManagerState))
+        if self._loop is None:
+            module = DriveManager(self._robot, self._name)
+            module.restore(memory_of(trace.snapshot, DriveManagerState))
+            self._loop = self._loop_of(module)
             self._outcome.starts += 1
             return
         if self._outcome.exact:
             computed = msgspec.structs.replace(
-                trace, snapshot=_encode(self._module.snapshot()).decode()
+                trace, snapshot=_encode(self._loop.module.snapshot()).decode()
             )
-            self._compare("trace", self._module.controller.cycle, trace, computed)
+            self._compare("trace", self._loop.module.controller.cycle, trace, computed)
 
-    def _cycle(self, module: DriveManager, cycle: CycleTrace) -> Iterator[Message]:
-        c, outcome = cycle, self._outcome
-        command = None
-        if c.command_seq >= 0:
-            command = self._commands.get((c.session, c.command_seq))
-            if command is None:
-                outcome.lost_inputs += 1
-                outcome.skipped += 1
-                self._module = None
-                return
-        if c.malformed:
-            module.controller.count_malformed(c.malformed, c.now_ns)
-        near = NeighbourView(c.below if c.knows_below else None, c.sinks, c.stiffen)
-        step = module.step(c.now_ns, _reading(c), command, c.estop, near)
-        controller = module.controller
-        outcome.ticks += 1
+    def _loop_of(self, module: DriveManager) -> JointLoop:
+        self._cycle = cycle = _Cycle()
+        ports = JointPorts(
+            commands=cycle, estops=_Stops(cycle), states=cycle, events=cycle, traces=None
+        )
+        return JointLoop(self._robot, module, cycle, ports, neighbours=cycle, clock=cycle.clock)
+
+    def _receive(self, trace: CycleTrace) -> bool:
+        """Set what a cycle takes; False if the log lacks its command."""
+        cycle = self._cycle
+        cycle.trace, cycle.command = trace, None
+        cycle.refused += trace.malformed
+        if trace.command_seq >= 0:
+            cycle.command = self._commands.get((trace.session, trace.command_seq))
+            if cycle.command is None:
+                self._outcome.lost_inputs += 1
+                return False
+        return True
+
+    def _execute(self, loop: JointLoop, trace: CycleTrace) -> Iterator[Message]:
+        step, controller, sent = loop.cycle(), loop.module.controller, self._cycle.sent
+        self._outcome.ticks += 1
         drive_command, tau = step.command.value, controller.tau
-        if drive_command != cycle.drive_command or tau != cycle.tau:
-            computed = msgspec.structs.replace(cycle, drive_command=drive_command, tau=tau)
-            self._compare("trace", controller.cycle, _single(cycle), _single(computed))
-        if controller.is_state_due:
-            state = controller.state(c.now_ns)
-            recorded = self._states.get((state.t_ns, state.cycle))
+        if drive_command != trace.drive_command or tau != trace.tau:
+            computed = msgspec.structs.replace(trace, drive_command=drive_command, tau=tau)
+            self._compare("trace", controller.cycle, _single(trace), _single(computed))
+        for message in sent:
+            is_state = isinstance(message, JointState)
+            recorded = (
+                self._states.get((message.t_ns, message.cycle))
+                if isinstance(message, JointState)
+                else self._events.get(message.t_ns)
+            )
             if recorded is not None:
-                self._compare("state", controller.cycle, recorded, state)
-                yield state
-        if step.event is not None:
-            logged = self._events.get(step.event.t_ns)
-            if logged is not None:
-                self._compare("event", controller.cycle, logged, step.event)
-                yield step.event
+                what = "state" if is_state else "event"
+                self._compare(what, controller.cycle, recorded, message)
+                yield message
+        sent.clear()
 
     def _compare(self, what: str, tick: int, recorded: Message, recomputed: Message) -> None:
         comparison: Comparison = self._outcome.comparison

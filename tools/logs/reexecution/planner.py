@@ -1,17 +1,18 @@
-"""Executes the planner again, tick by tick."""
+"""Executes the planner again, tick by tick: its own loop, over what the log has."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Final
+from typing import Final, Generic, TypeVar
 
 import msgspec
 
 from services.planner.controller import Controller
 from services.planner.intents import OperatorRequest
+from services.planner.loop import PlannerLoop, PlannerPorts
 from services.planner.planner import Planner, PlannerState
 from shared.bus import topics
-from shared.bus.messages import JointCommand, Message, PlannerStatus
+from shared.bus.messages import Attitude, JointCommand, Message, PlannerStatus, Wrench
 from shared.bus.traces import PlannerCheckpoint
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
@@ -20,7 +21,51 @@ from tools.logs.reexecution.memory import memory_of
 from tools.logs.reexecution.outcome import ReexecutionResult
 from tools.logs.run_log import RunLog
 
+M = TypeVar("M", bound=Message)
 _encode: Final = msgspec.json.Encoder().encode
+
+
+class _LoggedInbox(Generic[M]):
+    """An inbox that holds what the log says was taken at this tick."""
+
+    def __init__(self) -> None:
+        self.message: M | None = None
+
+    def take(self) -> M | None:
+        message, self.message = self.message, None
+        return message
+
+
+class _KeptOutbox(Generic[M]):
+    """An outbox that keeps what came out of this tick."""
+
+    def __init__(self) -> None:
+        self.messages: list[M] = []
+
+    def put(self, message: M, /) -> bool:
+        self.messages.append(message)
+        return True
+
+
+class _Tick:
+    """What one tick takes and sends."""
+
+    def __init__(self) -> None:
+        self.t_ns = 0
+        self.wrench = _LoggedInbox[Wrench]()
+        self.attitude = _LoggedInbox[Attitude]()
+        self.request = OperatorRequest()
+        self.commands = _KeptOutbox[JointCommand]()
+        self.status = _KeptOutbox[PlannerStatus]()
+        self.ports = PlannerPorts(
+            states=(),  # each is received with the time at which it arrived
+            wrench=self.wrench,
+            attitude=self.attitude,
+            request=lambda _now_ns: self.request,
+            commands=[self.commands] * len(MODULES),
+            status=self.status,
+            checkpoint=None,
+        )
 
 
 class PlannerExecution:
@@ -34,11 +79,9 @@ class PlannerExecution:
     ) -> None:
         """Take the robot to execute with, what to fill in, and somebody's own controller."""
         self._robot, self._outcome, self._controller = robot, outcome, controller
-        self._planner: Planner | None = None
+        self._tick = _Tick()
+        self._loop: PlannerLoop | None = None
         self._last: PlannerStatus | None = None
-        self._state_seq: list[int] = []
-        self._wrench_seq = -1
-        self._attitude_seq = -1
 
     def run(self, log: RunLog) -> Iterator[tuple[str, Message]]:
         """Execute every tick that can be; yield module (or "") and what comes out.
@@ -54,13 +97,13 @@ class PlannerExecution:
                 continue
             last, self._last = self._last, status
             if last is not None and not _follows(status, last):
-                self._planner = None  # another planner, or ticks that the log lacks
-            if self._planner is None or not self._receive(self._planner, status):
-                self._planner = None
+                self._loop = None  # another planner, or ticks that the log lacks
+            if self._loop is None or not self._receive(self._loop.planner, status):
+                self._loop = None
                 self._outcome.skipped += 1
                 self._begin(status)
                 continue
-            yield from self._tick(self._planner, status)
+            yield from self._execute(self._loop, status)
 
     def _load(self, log: RunLog) -> None:
         """Look up what the ticks of a part took and sent."""
@@ -77,8 +120,9 @@ class PlannerExecution:
 
     def snapshot(self) -> tuple[int, PlannerState] | None:
         """Return the planner's session and present state; None while it cannot be executed."""
-        planner = self._planner
-        return None if planner is None else (planner.session, planner.snapshot())
+        if self._loop is None:
+            return None
+        return self._loop.planner.session, self._loop.planner.snapshot()
 
     def _begin(self, status: PlannerStatus) -> None:
         """Go on from the memory after this tick, if the log has it."""
@@ -87,69 +131,70 @@ class PlannerExecution:
             return
         known = memory_of(snapshot.snapshot, PlannerState)
         controller = self._controller() if self._controller is not None else None
-        self._planner = Planner(self._robot, status.session, controller)
-        self._planner.restore(known)
-        self._state_seq = [-1 if state is None else state.seq for state in known.states]
-        self._wrench_seq = known.wrench_seq
-        self._attitude_seq = known.attitude_seq
+        planner = Planner(self._robot, status.session, controller)
+        planner.restore(known)
+        self._tick = tick = _Tick()
+        self._loop = PlannerLoop(self._robot, planner, tick.ports, lambda: tick.t_ns)
+        self._taken = (
+            [-1 if state is None else state.seq for state in known.states],
+            known.wrench_seq,
+            known.attitude_seq,
+        )
         self._outcome.starts += 1
 
     def _receive(self, planner: Planner, status: PlannerStatus) -> bool:
         """Give the planner what this tick took; False if the log lacks something of it."""
-        for module, seq in enumerate(status.state_seq):
-            arrived_ns = status.t_ns - status.state_age_ns[module]
-            if seq == self._state_seq[module]:
+        tick, (state_seq, wrench_seq, attitude_seq) = self._tick, self._taken
+        given = True
+        for module, (seq, age_ns) in enumerate(
+            zip(status.state_seq, status.state_age_ns, strict=True)
+        ):
+            if seq == state_seq[module]:
                 continue
-            state = self._states[module].at(seq, arrived_ns)
+            state = self._states[module].at(seq, status.t_ns - age_ns)
             if state is None:
-                self._outcome.lost_inputs += 1
-                return False
-            planner.receive_state(module, state, arrived_ns)
-            self._state_seq[module] = seq
-        if status.wrench_seq != self._wrench_seq:
-            wrench = self._wrenches.at(status.wrench_seq, status.t_ns)
-            if wrench is None:
-                self._outcome.lost_inputs += 1
-                return False
-            planner.receive_wrench(wrench, status.t_ns)
-            self._wrench_seq = status.wrench_seq
-        if status.attitude_seq != self._attitude_seq:
-            attitude = self._attitudes.at(status.attitude_seq, status.t_ns)
-            if attitude is None:
-                self._outcome.lost_inputs += 1
-                return False
-            planner.receive_attitude(attitude, status.t_ns)
-            self._attitude_seq = status.attitude_seq
-        request = OperatorRequest(
-            status.assist_requested_n,
-            status.shift_requested,
-            status.requested_by,
-            status.probe_row,
-            status.probe,
+                given = False
+                break
+            planner.receive_state(module, state, status.t_ns - age_ns)
+        if given and status.wrench_seq != wrench_seq:
+            tick.wrench.message = self._wrenches.at(status.wrench_seq, status.t_ns)
+            given = tick.wrench.message is not None
+        if given and status.attitude_seq != attitude_seq:
+            tick.attitude.message = self._attitudes.at(status.attitude_seq, status.t_ns)
+            given = tick.attitude.message is not None
+        self._taken = list(status.state_seq), status.wrench_seq, status.attitude_seq
+        self._outcome.lost_inputs += not given
+        tick.t_ns = status.t_ns
+        tick.request = OperatorRequest(
+            assist_n=status.assist_requested_n,
+            shift=status.shift_requested,
+            source=status.requested_by,
+            probe_row=status.probe_row,
+            probe=status.probe,
         )
-        planner.receive_request(request)
-        return True
+        return given
 
-    def _tick(self, planner: Planner, status: PlannerStatus) -> Iterator[tuple[str, Message]]:
-        outcome, compare = self._outcome, self._outcome.comparison.take
-        commands = planner.tick(status.t_ns)
+    def _execute(self, loop: PlannerLoop, status: PlannerStatus) -> Iterator[tuple[str, Message]]:
+        outcome, compare, tick = self._outcome, self._outcome.comparison.take, self._tick
+        loop.tick(status.t_ns)
         outcome.ticks += 1
-        tick = status.seq
-        for name, command in zip(MODULES, commands, strict=False):
+        for name, command in zip(MODULES, tick.commands.messages, strict=False):
             recorded = self._commands.get((name, status.session, command.seq))
             if recorded is not None:
-                compare(f"joint/{name}/command", tick, recorded, command)
+                compare(f"joint/{name}/command", status.seq, recorded, command)
                 yield name, command
-        computed = planner.status(
-            status.t_ns, status.tick_us
-        )  # tick_us is a time that was measured
-        compare("planner/status", tick, status, computed)
+        (computed,) = tick.status.messages
+        tick.commands.messages.clear()
+        tick.status.messages.clear()
+        # tick_us is a time that was measured
+        computed = msgspec.structs.replace(computed, tick_us=status.tick_us)
+        compare("planner/status", status.seq, status, computed)
         yield "", computed
         snapshot = self._snapshots.get((status.session, status.t_ns))
         if snapshot is not None and outcome.exact:
-            text = _encode(planner.snapshot()).decode()
+            text = _encode(loop.planner.snapshot()).decode()
             mine_then = msgspec.structs.replace(snapshot, snapshot=text)
-            compare("planner/checkpoint", tick, snapshot, mine_then)
+            compare("planner/checkpoint", status.seq, snapshot, mine_then)
 
 
 def _follows(status: PlannerStatus, last: PlannerStatus) -> bool:

@@ -15,7 +15,8 @@ from shared.config.scenarios import Scenario
 from shared.robot.trip_table import untripped
 from tools.logs.hand_path import HandRow
 from tools.sim.centralised.control import CentralPlanner, PassThrough
-from tools.sim.lockstep import Lockstep, Record, forget
+from tools.sim.lockstep import Lockstep, forget
+from tools.sim.virtual_time import Record
 
 
 def torques_only(config: RobotConfig) -> RobotConfig:

@@ -47,7 +47,8 @@ from tools.lab.studies.sweeps.figures import (
 )
 from tools.lab.studies.sweeps.push_range import SHARE, PushRange
 from tools.sim.centralised.fleet import CentralisedLockstep
-from tools.sim.lockstep import Lockstep, Record, Watch
+from tools.sim.lockstep import Lockstep, Watch
+from tools.sim.virtual_time import Record
 
 SQUATS: Final = ((0.5, 0.0), (3.0, 0.24), (5.5, 0.0), (8.0, 0.24))
 """s, and m below the stand: as in the paper's Fig. 7, at its pace."""

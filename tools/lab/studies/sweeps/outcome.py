@@ -31,7 +31,8 @@ from tools.lab.studies.sweeps.figures import (
     sole_tilt_max_rad,
     that_count,
 )
-from tools.sim.lockstep import Lockstep, Record, Watch
+from tools.sim.lockstep import Lockstep, Watch
+from tools.sim.virtual_time import Record
 
 
 class KillResult(Ended, frozen=True, kw_only=True):

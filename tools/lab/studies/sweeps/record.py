@@ -14,8 +14,9 @@ from shared.config.scenarios import Scenario
 from tools.lab.studies.sweeps import study
 from tools.lab.studies.sweeps.figures import Ended, exit_code
 from tools.live import experiment
-from tools.sim.lockstep import Record, Watch
+from tools.sim.lockstep import Watch
 from tools.sim.recorded_lockstep import AFTER_FALL_S, judge_in_lockstep, record_run
+from tools.sim.virtual_time import Record
 from tools.terminal import Console, marked
 
 Outcome_co = TypeVar("Outcome_co", bound=Ended, covariant=True)

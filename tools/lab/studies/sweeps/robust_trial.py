@@ -26,7 +26,8 @@ from tools.lab.studies.sweeps.figures import (
     that_count,
 )
 from tools.lab.studies.sweeps.push_range import PushRange
-from tools.sim.lockstep import Lockstep, Record, Watch, forget
+from tools.sim.lockstep import Lockstep, Watch, forget
+from tools.sim.virtual_time import Record
 
 KINDS: Final = ("squat", "crawl", "lean")
 DELAY_MAX_MS: Final = 10.0

@@ -1,0 +1,386 @@
+"""The services in virtual time: their own loops, over modelled links and clocks.
+
+Nothing of a service is written again here. What is added is how one is killed and started again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+from services.harness.filter import WrenchFilter, tared_state
+from services.harness.loop import HarnessLoop
+from services.imu.attitude import AttitudeLaw
+from services.imu.loop import ImuLoop
+from services.joint.controller import row_of
+from services.joint.drive_manager import DriveAction, DriveManager, DriveManagerState
+from services.joint.drivers.wired_drive import MotorFrame, WiredDrive
+from services.joint.loop import JointLoop, JointPorts
+from services.joint.neighbours import NeighbourRow, NeighbourView, view_of
+from services.planner.intents import OperatorRequest
+from services.planner.loop import PlannerLoop, PlannerPorts
+from services.planner.planner import Planner, PlannerState
+from services.simulator.drives.axis_bank import AxisBank
+from services.simulator.fronts.harness_front import HarnessFront
+from services.simulator.fronts.imu_front import ImuFront
+from services.simulator.physics.plant import ImuErrors
+from services.simulator.physics.world import World
+from shared.bus import topics
+from shared.bus.messages import Estop, TareRequest, Vector6
+from shared.bus.traces import PlannerCheckpoint
+from shared.can.can_sensor import Assembler
+from shared.can.imu_can import ImuAssembler
+from shared.can.loadcell_can import LegSample, SampleAssembler
+from shared.clock import NS_PER_S
+from shared.config.robot_config import RobotConfig
+from shared.joints import MODULES
+from tools.sim.network import VirtualNetwork
+from tools.sim.virtual_drive import VirtualDrive
+from tools.sim.virtual_time import HostClock, LinkInbox, Record, RecordOutbox, VirtualTime
+
+S = TypeVar("S")
+
+
+class SharedMemory:
+    """What the six joint services of a host know of each other, and the emergency stop.
+
+    Attributes:
+        estop: set it to stop every module.
+        rows: as each service wrote its own last, in virtual time.
+    """
+
+    def __init__(self) -> None:
+        self.estop = False
+        self.rows: list[NeighbourRow | None] = [None] * len(MODULES)
+
+
+class Neighbourhood:
+    """One module's place in the shared memory: `OtherModules`, and the inbox of its stops."""
+
+    def __init__(
+        self, memory: SharedMemory, index: int, time: VirtualTime, clock: Callable[[], int]
+    ) -> None:
+        self._memory, self._index = memory, index
+        self._time, self._clock = time, clock
+
+    def view(self, _host_ns: int) -> NeighbourView:
+        """Return what this module knows of the others; all rows are in virtual time."""
+        return view_of(MODULES[self._index], self._memory.rows, self._time.now_ns)
+
+    def write(self, row: NeighbourRow, *, is_dead: bool = False) -> None:
+        """Write down where this module is; a dead one that never had a sample was there once."""
+        offset_ns = self._clock() - self._time.now_ns
+        if not row.t_ns:
+            row = row._replace(t_ns=int(is_dead))
+        elif offset_ns:
+            row = row._replace(t_ns=row.t_ns - offset_ns)
+        self._memory.rows[self._index] = row
+
+    def take(self) -> Estop | None:
+        """Return the emergency stop while it is set."""
+        return Estop(t_ns=0, seq=0, source="lockstep") if self._memory.estop else None
+
+
+class VirtualJoint:
+    """A joint service.
+
+    Attributes:
+        frozen: stopped or dead; it runs no cycle, and its drive keeps what it has.
+    """
+
+    def __init__(
+        self,
+        config: RobotConfig,
+        index: int,
+        make: Callable[[], DriveManager],
+        bank: AxisBank,
+        memory: SharedMemory,
+        network: VirtualNetwork,
+        record: Record,
+        *,
+        time: VirtualTime,
+        clock: HostClock,
+        traced: bool,
+    ) -> None:
+        """Start the service.
+
+        Args:
+            config: the robot.
+            index: of the module in `MODULES`.
+            make: makes the service's decisions, now and at each restart.
+            bank: the drives.
+            memory: of the host.
+            network: its links.
+            record: takes every message.
+            time: virtual time.
+            clock: of the service's host.
+            traced: record what re-execution needs.
+        """
+        self.name = name = MODULES[index]
+        self.frozen = self._is_dead = False
+        self._config, self._make, self._clock = config, make, time.on(clock)
+        self.drive = VirtualDrive(
+            bank,
+            index,
+            config.drive,
+            self._clock,
+            counts_per_turn=config.joint.encoder_counts_per_turn,
+        )
+        frame = MotorFrame(config.drive.zero_mark_turns, config.module_named(name).motor_signs)
+        self._wired = WiredDrive(self.drive, frame)
+        self._place = Neighbourhood(memory, index, time, self._clock)
+        self._ports = JointPorts(
+            commands=LinkInbox(network.commands()[index], time),
+            estops=self._place,
+            states=RecordOutbox(record, topics.JOINT_STATE, name, network.states()[index], time),
+            events=RecordOutbox(record, topics.JOINT_EVENT, name),
+            traces=RecordOutbox(record, topics.JOINT_TRACE, name) if traced else None,
+        )
+        self._start()
+
+    def _start(self) -> None:
+        self.manager = self._make()
+        self._loop = JointLoop(
+            self._config,
+            self.manager,
+            self._wired,
+            self._ports,
+            neighbours=self._place,
+            clock=self._clock,
+        )
+        self._place.write(row_of(self.manager.controller))
+
+    def cycle(self) -> DriveAction:
+        """Run one cycle."""
+        return self._loop.cycle()
+
+    def kill(self, *, for_good: bool) -> None:
+        """Freeze the service; `for_good`: it is dead, and a restart makes a new one."""
+        self.frozen, self._is_dead = True, self._is_dead or for_good
+        self._place.write(row_of(self.manager.controller), is_dead=self._is_dead)
+
+    def restart(self) -> None:
+        """Continue a frozen service; a dead one is replaced, and takes over its armed drive."""
+        self.frozen = False
+        if self._is_dead:
+            self._is_dead = False
+            self._start()
+            self.drive.start_service()
+
+    def resume(self, state: DriveManagerState | None) -> None:
+        """Continue from another run's service; None: it is dead."""
+        if state is None:
+            self.kill(for_good=True)
+        else:
+            self.manager.restore(state)
+            self._place.write(row_of(self.manager.controller))
+        self.drive.assume_heard()
+
+
+class VirtualPlanner:
+    """The planner's process.
+
+    Attributes:
+        loop: its loop; None: there is no planner.
+        frozen: stopped or dead.
+    """
+
+    def __init__(
+        self,
+        config: RobotConfig,
+        make: Callable[[int], Planner],
+        request: Callable[[], OperatorRequest],
+        network: VirtualNetwork,
+        record: Record,
+        *,
+        time: VirtualTime,
+        clock: HostClock,
+        traced: bool,
+    ) -> None:
+        """Start the service.
+
+        Args:
+            config: the robot.
+            make: makes a planner with a session, now and at each restart.
+            request: returns what the operator requests.
+            network: its links.
+            record: takes every message.
+            time: virtual time.
+            clock: of the service's host.
+            traced: record what re-execution needs.
+        """
+        self.frozen = self._is_dead = False
+        self._config, self._make, self._clock = config, make, time.on(clock)
+        commands = zip(MODULES, network.commands(), strict=True)
+        checkpoints = RecordOutbox[PlannerCheckpoint](record, topics.PLANNER_CHECKPOINT)
+        self._ports = PlannerPorts(
+            states=[LinkInbox(link, time) for link in network.states()],
+            wrench=LinkInbox(network.wrenches(), time),
+            attitude=LinkInbox(network.attitudes(), time),
+            request=lambda _host_ns: request(),
+            commands=[
+                RecordOutbox(record, topics.JOINT_COMMAND, name, link, time)
+                for name, link in commands
+            ],
+            status=RecordOutbox(record, topics.PLANNER_STATUS),
+            checkpoint=checkpoints if traced else None,
+        )
+        self._session = 1
+        self.loop: PlannerLoop | None = self._loop_of(make(1))
+
+    def _loop_of(self, planner: Planner) -> PlannerLoop:
+        return PlannerLoop(self._config, planner, self._ports, self._clock)
+
+    @property
+    def planner(self) -> Planner | None:
+        """The planner; set it to None for a robot without one."""
+        return None if self.loop is None else self.loop.planner
+
+    @planner.setter
+    def planner(self, planner: Planner | None) -> None:
+        self.loop = None if planner is None else self._loop_of(planner)
+
+    def advance(self) -> None:
+        """Receive what has arrived, and tick if a tick is due."""
+        if self.loop is None or self.frozen:
+            return
+        host_ns = self._clock()
+        if self.loop.receive_states(host_ns):
+            self.loop.tick(host_ns)
+
+    def kill(self, *, for_good: bool) -> None:
+        """Freeze the service; `for_good`: it is dead, and a restart makes a new one."""
+        self.frozen, self._is_dead = True, self._is_dead or for_good
+
+    def restart(self) -> None:
+        """Continue a frozen planner; a dead one is replaced under the next session."""
+        self.frozen = False
+        if self._is_dead:
+            self._is_dead = False
+            self._session += 1
+            self.planner = self._make(self._session)
+
+    def resume(self, start: tuple[int, PlannerState] | None) -> None:
+        """Continue from another run's planner: its session and state; None: it is dead."""
+        if start is None:
+            self.planner = None
+            return
+        self._session, state = start
+        planner = self._make(self._session)
+        planner.restore(state)
+        self.planner = planner
+
+
+class VirtualCan(Generic[S]):
+    """A sensor's CAN bus: a frame is received as soon as it is sent."""
+
+    def __init__(self, assembler: Assembler[S]) -> None:
+        """Take what makes samples of the sensor's frames."""
+        self._assembler = assembler
+        self._newest: S | None = None
+
+    def poll(self) -> None:
+        """Do nothing: nobody has to be let in."""
+
+    def broadcast(self, frames: list[tuple[int, bytes]]) -> None:
+        """Take the frames of one sample."""
+        for can_id, data in frames:
+            self._newest = self._assembler.add(can_id, data) or self._newest
+
+    def newest(self, _now_ns: int) -> S | None:
+        """Return the newest sample since the last call, or None."""
+        sample, self._newest = self._newest, None
+        return sample
+
+
+class Cells(VirtualCan[Vector6]):
+    """The load cells as the live loop has them."""
+
+    def __init__(self) -> None:
+        super().__init__(SampleAssembler())
+
+    def read(self, now_ns: int) -> LegSample | None:
+        """Return the newest sample since the last read, or None."""
+        forces = self.newest(now_ns)
+        return None if forces is None else LegSample(now_ns, forces)
+
+    def close(self) -> None:
+        """Do nothing: there is no link."""
+
+
+def whole_steps_ns(config: RobotConfig, rate_hz: float) -> int:
+    """Return a sensor's period in whole steps of the world, ns, as the live simulator has it."""
+    step_ns = round(config.simulation.timestep * NS_PER_S)
+    return step_ns * max(1, round(NS_PER_S / (rate_hz * step_ns)))
+
+
+class VirtualHarness:
+    """Sensor and service in one; both begin with a tare, while the hoist holds."""
+
+    def __init__(
+        self,
+        config: RobotConfig,
+        network: VirtualNetwork,
+        record: Record,
+        seed: int,
+        *,
+        time: VirtualTime,
+        clock: HostClock,
+    ) -> None:
+        """Draw the cells' zero offsets from `seed`, and their noise."""
+        cells = Cells()
+        self._front = HarnessFront(config, cells, seed)
+        wrenches = RecordOutbox(record, topics.WRENCH, "", network.wrenches(), time)
+        self._loop = HarnessLoop(cells, WrenchFilter(config.harness), wrenches, self)
+        self._period_ns = whole_steps_ns(config, config.harness.rate_hz)
+        self._time, self._clock = time, time.on(clock)
+        self._request: TareRequest | None = None
+
+    def advance(self, world: World) -> None:
+        """If it is time, sample what acts on the torso, and run one cycle of the service."""
+        if not self._time.now_ns % self._period_ns:
+            self._front.send(world.harness_force, world.harness_moment)
+            self._loop.cycle(self._clock())
+
+    def assume_tared(self) -> None:
+        """Set the tare as done: in the middle of a run the operator's load is on the cells."""
+        self._loop.state = tared_state(self._front.bias)
+
+    def tare(self, request: TareRequest) -> None:
+        """Ask for a new zero, from the next cycle on."""
+        self._request = request
+
+    def take(self) -> TareRequest | None:
+        """Return the request that has come, or None."""
+        request, self._request = self._request, None
+        return request
+
+
+class VirtualImu:
+    """Sensor and service in one."""
+
+    def __init__(
+        self,
+        config: RobotConfig,
+        errors: ImuErrors,
+        network: VirtualNetwork,
+        record: Record,
+        seed: int,
+        *,
+        time: VirtualTime,
+        clock: HostClock,
+    ) -> None:
+        """Mount the sensor with the plant's errors, if one is fitted; `seed` is its noise's."""
+        frames = VirtualCan(ImuAssembler())
+        self._fitted = config.imu.fitted
+        self._period_ns = whole_steps_ns(config, config.imu.rate_hz)
+        self._time, self._clock = time, time.on(clock)
+        self._front = ImuFront(config.imu, errors, frames, seed)
+        attitudes = RecordOutbox(record, topics.ATTITUDE, "", network.attitudes(), time)
+        self._loop = ImuLoop(frames, AttitudeLaw(config.imu), attitudes)
+
+    def advance(self, world: World) -> None:
+        """If it is time, sample how the torso stands, and run one cycle of the service."""
+        if self._fitted and not self._time.now_ns % self._period_ns:
+            self._front.send(world)
+            self._loop.cycle(self._clock())
