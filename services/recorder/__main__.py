@@ -30,9 +30,9 @@ from services.recorder.roster import Roster
 from services.recorder.snapshot import SnapshotRing
 from shared import log, revision, scheduling
 from shared.bus import topics
-from shared.bus.arrivals import Arrivals
-from shared.bus.same_host import ports_here
+from shared.bus.security import ports_here
 from shared.bus.session import open_session
+from shared.bus.sockets import Arrivals
 from shared.clock import keep_pace, now_ns, pace
 from shared.config import gain_schedule
 from shared.config.files import load

@@ -11,7 +11,7 @@ from typing import Final
 
 from services.recorder.disk_guard import MIB, DiskChange, SpaceGuard
 from services.recorder.loop import Deadline, free_bytes_at
-from shared.bus.arrivals import Arrivals
+from shared.bus.sockets import Arrivals
 from shared.clock import NS_PER_S
 
 RUN_DIR_MIN_MIB: Final = 16

@@ -26,13 +26,12 @@ from typing import Final, Generic, Self, TypeAlias, TypeVar
 import zenoh
 
 from shared import log
-from shared.bus import same_host, security, socket_linger, tls_probe
-from shared.bus.access import alive_prefix, token_key, tools_prefix
-from shared.bus.allow_list import resolved
+from shared.bus import security, sockets, tls_probe
 from shared.bus.codec import Decoder, encode
 from shared.bus.credentials import Credentials, read_credentials
 from shared.bus.messages import Message
-from shared.bus.socket_linger import Address
+from shared.bus.security import alive_prefix, token_key, tools_prefix
+from shared.bus.sockets import Address
 from shared.bus.tls_probe import LinkWatch
 from shared.bus.topics import Priority, Topic
 from shared.clock import keep_pace, now_ns
@@ -266,13 +265,8 @@ class Session:
     def publisher(self, topic: Topic, message_type: type[M], module: str = "") -> Publisher[M]:
         """Declare a publisher; do it at the start, not in a loop.
 
-        Args:
-            topic: a row of `shared.bus.topics`.
-            message_type: its type, for the type checker and checked here.
-            module: the module, for a topic with one key per module.
-
-        Raises:
-            BusError: the type or the module does not fit the topic.
+        `module` is for a topic with one key per module. Raises BusError if the type or the module
+        does not fit the topic.
         """
         key = self._key(topic, message_type, module)
         publisher = self._session.declare_publisher(
@@ -284,18 +278,11 @@ class Session:
         return Publisher(publisher)
 
     def raw_publisher(self, key: str, *, patient: bool) -> RawPublisher:
-        """Declare a publisher of encoded payloads on any key.
+        """Declare a publisher of encoded payloads on any full key; BusError if it is malformed.
 
         All such publishers have one priority: payloads arrive in the order of `put`, over all keys.
-
-        Args:
-            key: a full key, without wildcards.
-            patient: `put` waits for a slow subscriber, up to `wait_before_close` (5 s) and then
-                drops the link, instead of dropping the message. Only for a caller that nothing
-                waits for.
-
-        Raises:
-            BusError: the key is malformed.
+        With `patient` the `put` waits for a slow subscriber, up to `wait_before_close` (5 s), and
+        then drops the link instead of the message: only for a caller that nothing waits for.
         """
         control = zenoh.CongestionControl.BLOCK if patient else zenoh.CongestionControl.DROP
         try:
@@ -307,24 +294,15 @@ class Session:
         return RawPublisher(publisher)
 
     def latest(self, topic: Topic, message_type: type[M], module: str = "") -> Latest[M]:
-        """Declare a subscriber that keeps the newest message only; arguments as `publisher`.
-
-        Raises:
-            BusError: the type or the module does not fit the topic.
-        """
+        """Declare a subscriber that keeps the newest message only; as `publisher`."""
         key = self._key(topic, message_type, module)
         return Latest(_ring(self._session, key, 1), message_type)
 
     def stream(self, key_expressions: Sequence[str], capacity: int = 65536) -> Stream:
         """Declare a subscriber that keeps every sample, up to `capacity` per expression.
 
-        Args:
-            key_expressions: full keys, or with wildcards such as `xrl/lab/joint/*/state`;
-                a key that fits two of them comes twice.
-            capacity: samples that are kept until they are taken.
-
-        Raises:
-            BusError: an expression is not one.
+        Expressions are full keys, or with wildcards such as `xrl/lab/joint/*/state`; a key that
+        fits two of them comes twice. Raises BusError for one that is none.
         """
         try:
             return Stream([_ring(self._session, key, capacity) for key in key_expressions])
@@ -354,19 +332,14 @@ class Session:
         )
 
     def watch_links(self, own: Credentials, dialled: Mapping[str, str]) -> None:
-        """Log from now on why TLS links to these peers do not come (`shared.bus.tls_probe`).
-
-        Args:
-            own: with which they are dialled.
-            dialled: endpoint of each peer.
-        """
+        """Log from now on why TLS links to these peers do not come (`shared.bus.tls_probe`)."""
         if dialled:
             self._link_watch = LinkWatch(own, dialled, self.is_linked)
 
     def is_linked(self, endpoint: str) -> bool:
         """Return True if there is a link with tls/HOST:PORT."""
         host, port = host_and_port(endpoint)
-        addresses, _ = resolved([host])
+        addresses, _ = sockets.resolved([host])
         return any((str(address), port) in self._linked for address in addresses)
 
     def _meet(self, event: zenoh.LinkEvent) -> None:
@@ -405,7 +378,8 @@ def open_session(
 
     Use it as `with open_session(config, "planner", run_dir) as session:`. Raise the priority of the
     process before: Zenoh's thread inherits it. From then on the process uses the clock of the fleet
-    in `run_dir` (`shared.clock.keep_pace`).
+    in `run_dir` (`shared.clock.keep_pace`). The socket that a killed process left behind is no
+    obstacle.
 
     Args:
         config: the robot; `config.bus` holds the endpoints and the lease.
@@ -419,19 +393,18 @@ def open_session(
             (`shared.links.PAIRS`).
 
     Raises:
-        BusError: the name cannot be used, or the endpoint is taken, too long or not
-            possible. The socket that a killed process left behind is no obstacle.
+        BusError: the name cannot be used, or the endpoint is taken, too long or not possible.
     """
     keep_pace(run_dir)
     if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
         raise BusError(f"{name!r} is no name for a process; use letters, digits, _ and - only")
-    here = same_host.services_here(config)
-    own = same_host.listening(config, name, here) if name in SERVICES else ()
+    here = security.services_here(config)
+    own = security.listening(config, name, here) if name in SERVICES else ()
     peers = [peer for peer in peers_of(name, config.services) if only is None or peer in only]
     endpoints = [
         endpoint_through(Pair(name, peer))
         if injected and Pair(name, peer) in PAIRS
-        else same_host.endpoint_here(config, peer, here)
+        else security.endpoint_here(config, peer, here)
         for peer in peers
     ]
     listening = [_endpoint(text, run_dir) for text in (*own, *listen)]
@@ -490,7 +463,7 @@ def _close_at_once(link: zenoh.Link) -> None:
     than the lease, all links of the process stalled for up to 10 s for each lost link.
     """
     ends = host_and_port(link.src), host_and_port(link.dst)
-    socket_linger.reset_on_close(*ends)
+    sockets.reset_on_close(*ends)
 
 
 def _ring(session: zenoh.Session, key: str, capacity: int) -> _Subscriber:

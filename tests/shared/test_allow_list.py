@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shared.bus.allow_list import (
+from shared.bus.sockets import (
     ADDRESSES_MAX,
     Instruction,
     IpAddress,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from shared.bus.arrivals import Arrivals, established
+from shared.bus.sockets import Arrivals, established
 from shared.clock import NS_PER_S
 
 HEAD = "  sl  local_address rem_address   st tx_queue rx_queue tr tm->when retrnsmt   uid  inode\n"

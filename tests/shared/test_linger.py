@@ -7,7 +7,7 @@ import struct
 import time
 from pathlib import Path
 
-from shared.bus import socket_linger
+from shared.bus import sockets
 from shared.bus.session import open_session
 from shared.config import files as config_file
 from shared.places import DEFAULT_CONFIG
@@ -57,10 +57,10 @@ def test_only_the_connection_between_the_two_addresses_is_changed() -> None:
         ):
             for connection in (one, other):
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, ON_FOR_10_S)
-            assert socket_linger.reset_on_close(one.getsockname(), one.getpeername())
+            assert sockets.reset_on_close(one.getsockname(), one.getpeername())
             assert resets(one)
             assert not resets(other)
-        assert not socket_linger.reset_on_close(("127.0.0.1", 1), ("127.0.0.1", 2))
+        assert not sockets.reset_on_close(("127.0.0.1", 1), ("127.0.0.1", 2))
 
 
 def test_no_tcp_link_of_the_bus_lingers_when_it_is_given_up(tmp_path: Path) -> None:

@@ -20,11 +20,10 @@ import pytest
 import zenoh
 
 from shared.bus import credentials, topics
-from shared.bus.access import PRINCIPALS, access_control, token_key
 from shared.bus.messages import Estop
-from shared.bus.same_host import services_here
+from shared.bus.security import access_control, services_here, token_key
 from shared.bus.session import open_session
-from shared.bus.topics import all_keys
+from shared.bus.topics import PRINCIPALS, all_keys
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import BusSecurityConfig

@@ -11,7 +11,6 @@ import msgspec
 
 from services.joint.rearm_guard import stop_source
 from shared import scheduling
-from shared.bus.code_names import name_of
 from shared.bus.messages import (
     Cause,
     DriveStatus,
@@ -24,6 +23,7 @@ from shared.bus.messages import (
     PlannerStatus,
     Refusal,
     ToolRoster,
+    name_of,
 )
 from shared.bus.session import Latest, Session, place_of_tool
 from shared.bus.topics import JOINT_STATE, PLANNER_STATUS, TOOLS, TOPICS

@@ -11,7 +11,6 @@ import numpy as np
 from services.planner.law.kinematics import Kinematics
 from services.simulator.physics.soles import SoleLoad
 from shared.bus import topics
-from shared.bus.code_names import name_of
 from shared.bus.messages import (
     JointCommand,
     JointState,
@@ -23,6 +22,7 @@ from shared.bus.messages import (
     SimTruth,
     Vector3,
     Wrench,
+    name_of,
 )
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS, NS_PER_S
