@@ -135,7 +135,6 @@ EDGES = [
 
 TOOL_LAWS = [
     "shared/can/cansimple*.py",
-    "shared/mcap_log/encoding.py",
     "shared/mcap_log/records.py",
     "shared/mcap_log/sequence_stats.py",
     "tools/bringup/jogging.py",

@@ -8,7 +8,7 @@ import pytest
 from mcap.reader import make_reader
 
 from shared.exceptions import RunError
-from shared.mcap_log.extended_copy import NOTE, NewChannel, NewMessage, write_extended
+from shared.mcap_log.log_copy import NOTE, NewChannel, NewMessage, write_extended
 from tests.shared.mcap_log import runs
 from tests.shared.mcap_log.runs import ATTACHMENTS, OFFSET_NS, STATE_KEY, item
 from tools.logs.run_log import read_run

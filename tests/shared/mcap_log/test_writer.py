@@ -200,6 +200,6 @@ def test_a_sync_that_fails_is_one_run_error(
     def fail(_descriptor: int) -> None:
         raise OSError(5, "Input/output error")
 
-    monkeypatch.setattr("shared.mcap_log.fsync_thread.os.fsync", fail)
+    monkeypatch.setattr("shared.mcap_log.files.os.fsync", fail)
     with pytest.raises(RunError, match=r"run\.mcap: cannot be .*Input/output error"):
         runs.write(tmp_path, [item(0)])
