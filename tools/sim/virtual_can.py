@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Generic, TypeVar
 
-from shared.can.can_sensor import Assembler
+from shared.can.frame_group import FrameGroup
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 
@@ -20,7 +20,7 @@ def whole_steps_ns(config: RobotConfig, rate_hz: float) -> int:
 class VirtualCan(Generic[S]):
     """The bus, and on its other end the newest sample."""
 
-    def __init__(self, assembler: Assembler[S]) -> None:
+    def __init__(self, assembler: FrameGroup[S]) -> None:
         """Take what makes samples of the sensor's frames."""
         self._assembler = assembler
         self._newest: S | None = None

@@ -12,28 +12,13 @@ from services.harness.filter import WrenchFilter, tared_state
 from services.harness.loop import HarnessLoop
 from services.simulator.fronts.harness_front import HarnessFront
 from services.simulator.physics.world import World
-from shared.bus.messages import Message, TareRequest, Vector6, Wrench
+from shared.bus.messages import Message, TareRequest, Wrench
 from shared.bus.topics import WRENCH, Topic
-from shared.can.loadcell_can import LegSample, SampleAssembler
+from shared.can.loadcell_can import SampleAssembler
 from shared.config.robot_config import RobotConfig
 from tools.sim.host_clock import HostClock, HostLink
 from tools.sim.network import VirtualLink
 from tools.sim.virtual_can import VirtualCan, whole_steps_ns
-
-
-class Cells(VirtualCan[Vector6]):
-    """The sensor as the live loop has it."""
-
-    def __init__(self) -> None:
-        super().__init__(SampleAssembler())
-
-    def read(self, now_ns: int) -> LegSample | None:
-        """Return the newest sample since the last read, or None."""
-        forces = self.newest(now_ns)
-        return None if forces is None else LegSample(now_ns, forces)
-
-    def close(self) -> None:
-        """Do nothing: there is no link."""
 
 
 class VirtualHarness:
@@ -56,7 +41,7 @@ class VirtualHarness:
             seed: of the cells' offsets and noise.
             clock: of the service's host.
         """
-        cells = Cells()
+        cells = VirtualCan(SampleAssembler())
         self._front = HarnessFront(config, cells, seed)
         self._loop = HarnessLoop(cells, WrenchFilter(config.harness), self, self)
         self._link, self._record = HostLink(wrenches), record
