@@ -45,12 +45,7 @@ ON_ROBOTS: Final = frozenset({"ros2", "usb"})
 def require(extra: str, otherwise: str = "") -> None:
     """Make sure that the packages of an extra are installed; imports none of them.
 
-    Args:
-        extra: its name in `EXTRAS`.
-        otherwise: what serves without them.
-
-    Raises:
-        MissingPackageError: one is not.
+    `otherwise` is what serves without them. Raises MissingPackageError if one is not.
     """
     missing = [name for name in EXTRAS[extra] if not _is_there(name)]
     if missing:
@@ -89,12 +84,9 @@ def missing_package(extra: str, missing: list[str], otherwise: str = "") -> Miss
 
 
 def late(module: str) -> Any:
-    """Return a stand-in for a module of an optional package, imported when it is first used.
+    """Return a stand-in for a module such as `matplotlib.patches`, imported when it is first used.
 
-    That use raises `MissingPackageError` where the package is not installed.
-
-    Args:
-        module: such as `matplotlib.patches`.
+    That use raises MissingPackageError where the package is not installed.
     """
     return _LateModule(module)
 

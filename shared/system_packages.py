@@ -6,12 +6,7 @@ import shutil
 
 
 def how_to_install(debian: str, fedora: str) -> str:
-    """Return the command that brings a package of the system, as deploy/lib.sh names it.
-
-    Args:
-        debian: its name there and on Ubuntu.
-        fedora: its name there.
-    """
+    """Return the command that brings a package of the system, as deploy/lib.sh names it."""
     if shutil.which("apt-get"):
         return f"`sudo apt-get install {debian}`"
     if shutil.which("dnf"):

@@ -145,11 +145,7 @@ def _record(
     roster: Roster | None,
     host: HostWatch,
 ) -> None:
-    """Record until `stop`, then the queued rest.
-
-    Raises:
-        RunError: the file cannot be written.
-    """
+    """Record until `stop`, then the queued rest."""
     while not stop:
         if asked.take():
             recording.trigger("requested by SIGUSR1", now_ns())

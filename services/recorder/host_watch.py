@@ -31,7 +31,6 @@ class HostWatch:
     def __init__(
         self, arrivals: Arrivals, run_dir: Path, logger: logging.Logger, now_ns: int
     ) -> None:
-        """Take where to look and where to say it."""
         self._arrivals, self._run_dir, self._logger = arrivals, run_dir, logger
         self._guard = SpaceGuard(RUN_DIR_MIN_MIB)
         self._look = Deadline(_EVERY_NS, now_ns)

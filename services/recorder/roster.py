@@ -20,7 +20,6 @@ class Roster:
     """Every tool dials the recorder, so the recorder knows all that are linked."""
 
     def __init__(self, session: Session) -> None:
-        """Begin to watch."""
         self._watch = session.linked_tools()
         self._publisher = session.publisher(topics.TOOLS, ToolRoster)
         self._told: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())

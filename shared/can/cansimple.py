@@ -259,9 +259,8 @@ def pack_motor_error(error: int) -> bytes:
 def pack_two_floats(first: float, second: float) -> bytes:
     """Pack two numbers.
 
-    0x009 position and velocity; 0x00D velocity and torque; 0x00F velocity limit and
-    current limit; 0x014 Iq set and measured; 0x017 bus voltage and current; 0x01B
-    velocity gain and integrator gain.
+    0x009 position and velocity; 0x00D velocity and torque; 0x00F velocity limit and current limit;
+    0x014 Iq set and measured; 0x017 bus voltage, current; 0x01B velocity and integrator gain.
     """
     return _TWO_F32.pack(first, second)
 

@@ -40,12 +40,7 @@ _POWER_UP_TURNS: Final = 1.0
 def check(file: str, config: RobotConfig) -> None:
     """Check what no single number shows: duplicates, crossings, dangling names.
 
-    Args:
-        file: for the error.
-        config: the robot, each of its values in range.
-
-    Raises:
-        ConfigError: naming the file, the key, what stands there and what would be right.
+    Each value of the robot is in its range; `file` names it in the ConfigError.
     """
     _check_names(file, config)
     _check_interfaces(file, config)
@@ -58,8 +53,7 @@ def check(file: str, config: RobotConfig) -> None:
 def check_security(file: str, config: RobotConfig) -> None:
     """Check that the endpoints are those of `bus.security.mode`; not done for a robot of a log.
 
-    Raises:
-        ConfigError: a port would be open to anyone, and the file does not say so.
+    Raises ConfigError if a port would be open to anyone, and the file does not say so.
     """
     security = config.bus.security
     if not re.match(r"[~/]", security.keys):

@@ -91,11 +91,7 @@ def path_beside(robot_file: Path) -> Path:
 
 
 def read(path: Path) -> GainSchedule | None:
-    """Read a schedule; return None if there is no such file.
-
-    Raises:
-        ConfigError: the file cannot be read, or its tables do not fit together.
-    """
+    """Read a schedule; None if there is no such file, ConfigError if it is not as it should be."""
     again = "make it again: `xrl gains`"
     try:
         schedule = msgspec.json.decode(read_text(path), type=GainSchedule)
@@ -182,11 +178,7 @@ def believing(config: RobotConfig) -> RobotConfig:
 
 
 def require(config: RobotConfig, robot_file: Path) -> None:
-    """Refuse a robot whose gain split needs a schedule that it has not.
-
-    Raises:
-        ConfigError: naming the difference and the command to run.
-    """
+    """Refuse a robot whose gain split needs a schedule that it has not, by a ConfigError."""
     if config.law.split != "certified":
         return
     stale = why_stale(config)

@@ -166,8 +166,7 @@ class RobotConfig(Section, frozen=True):
 def expand(text: str, run_dir: Path) -> str:
     """Return a path or endpoint with `{run}` replaced by the run directory.
 
-    Raises:
-        BusError: something else stands in braces; it would be taken as it is.
+    Raises BusError if something else stands in braces; it would be taken as it is.
     """
     stray = stray_braces(text, [RUN])
     if stray:

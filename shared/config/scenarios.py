@@ -210,11 +210,7 @@ def push_at(scenario: Scenario, t: float) -> tuple[float, float, float]:
 
 
 def load(path: Path) -> Scenario:
-    """Read and check a scenario file.
-
-    Raises:
-        ConfigError: naming the file, the key, what stands there and what would be right.
-    """
+    """Read and check a scenario file, or ConfigError."""
     scenario = read_toml(path, Scenario)
     check(str(path), scenario)
     return scenario

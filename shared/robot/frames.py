@@ -33,12 +33,7 @@ class FramePose(NamedTuple):
 
 
 def body_frames(geometry: GeometryConfig, q: Sequence[float]) -> list[FramePose]:
-    """Return the frames on the torso and below it.
-
-    Args:
-        geometry: of the robot.
-        q: joint angles (12,), rad.
-    """
+    """Return the frames on the torso and below it, at joint angles (12,), rad."""
     found = [FramePose("torso", "harness", geometry.harness_point, UPRIGHT)]
     for side in SIDES:
         parent = "torso"
@@ -71,11 +66,7 @@ def torso_pose(
     """Return the torso's pose in the world, m: the mean of what the two legs say.
 
     The world is midway between the feet, at the height of the ankles; both feet lie on the floor.
-
-    Args:
-        geometry: of the robot.
-        q: joint angles (12,), rad.
-        stance: place of the right foot relative to the left, as in `PlannerStatus`.
+    Joint angles are (12,), rad; `stance` is the place of the right foot, as in `PlannerStatus`.
     """
     positions, rotations = [], []
     for side in SIDES:

@@ -12,9 +12,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from services.network_proxy.commands import ASKED_MAX, CommandHandler
-from services.network_proxy.control import ASKERS_MAX, ControlSocket
-from services.network_proxy.event_loop import SocketWatch
+from services.network_proxy.control import ASKED_MAX, ASKERS_MAX, CommandHandler, ControlSocket
+from services.network_proxy.sockets import SocketWatch
 from shared.bus.traces import LinkEvent
 from shared.config.impairment import Direction
 from shared.config.scenarios import Inject

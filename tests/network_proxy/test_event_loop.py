@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from services.network_proxy.event_loop import READ, WRITE, SocketWatch
+from services.network_proxy.sockets import READ, WRITE, SocketWatch
 
 
 @pytest.fixture

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from services.network_proxy.listener import SocketListener
-from services.network_proxy.proxy_endpoint import Address, ProxyEndpoint, address_of
+from services.network_proxy.sockets import Address, ProxyEndpoint, SocketListener, address_of
 from shared.exceptions import BusError
 from tests.network_proxy.rig import MESSAGE, PAIR, WAIT_S, Rig, batch, heard, listening
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from services.network_proxy.direction import PENDING_MAX, WAITING_MAX
+from services.network_proxy.connection import PENDING_MAX, WAITING_MAX
 from shared.config.impairment import Impairment
 from tests.network_proxy.rig import DECLARE, MESSAGE, Rig, batch, heard, numbers
 
