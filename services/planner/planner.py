@@ -41,7 +41,7 @@ from shared.bus.messages import (
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES, N_JOINTS, N_MODULES
-from shared.robot.limp_leg_support import Support
+from shared.robot.hold_rules import Support
 
 Array = NDArray[np.float64]
 

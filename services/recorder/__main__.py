@@ -24,9 +24,8 @@ from typing import Final
 
 from services.recorder.auto_recover import AutoRecovery
 from services.recorder.disk_guard import MIB
-from services.recorder.host_watch import HostWatch
+from services.recorder.host_watch import HostWatch, Roster
 from services.recorder.loop import CAPACITY, Recorder, free_bytes_at, summary
-from services.recorder.roster import Roster
 from services.recorder.snapshot import SnapshotRing
 from shared import log, revision, scheduling
 from shared.bus import topics
@@ -41,7 +40,7 @@ from shared.config.sections import RecorderConfig
 from shared.exceptions import ConfigError, RunError
 from shared.mcap_log import provenance
 from shared.mcap_log.files import FIRST
-from shared.mcap_log.writer import SCHEMA_VERSION, MessageSource, RunWriter
+from shared.mcap_log.writer import SCHEMA_VERSION, RunWriter
 from shared.process import StopFlag, run_service, service_parser
 
 DRAIN_PERIOD_S: Final = 0.02
@@ -97,9 +96,11 @@ def main() -> int:
                 chunk_kib=config.recorder.chunk_kib,
                 begin=False,
             ) as writer:
-                recording = _recording(
-                    stream, writer, config.recorder, logger, arguments.out, snapshot
-                )
+                recording = Recorder(
+                    stream, writer, config.recorder, logger,
+                    free_bytes=lambda: free_bytes_at(arguments.out), now_ns=now_ns(),
+                    snapshot=snapshot,
+                )  # fmt: skip
                 logger.info("%s, priority %s", _about(writer, snapshot, len(recorded)), granted)
                 auto_recovery.start()
                 roster = None if arguments.of else Roster(session)
@@ -158,25 +159,6 @@ def _record(
     recording.close()
     time.sleep(LAST_WORDS_S)
     recording.close()
-
-
-def _recording(
-    source: MessageSource,
-    writer: RunWriter,
-    config: RecorderConfig,
-    logger: logging.Logger,
-    out: Path,
-    snapshot: SnapshotRing | None,
-) -> Recorder:
-    return Recorder(
-        source,
-        writer,
-        config,
-        logger,
-        free_bytes=lambda: free_bytes_at(out),
-        now_ns=now_ns(),
-        snapshot=snapshot,
-    )
 
 
 def _about(writer: RunWriter, snapshot: SnapshotRing | None, keys: int) -> str:

@@ -29,8 +29,8 @@ from shared.robot.frames import (
     rotation_about,
     torso_pose,
 )
-from shared.robot.remedies import reason_of, remedy_of
 from shared.robot.robot_urdf import cross_of
+from shared.robot.trip_table import reason_of, remedy_of
 
 JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"

@@ -20,7 +20,6 @@ import socket
 from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Final, Generic, Self, TypeAlias, TypeVar
 
 import zenoh
@@ -243,12 +242,7 @@ class Session:
         """Return the session itself."""
         return self
 
-    def __exit__(
-        self,
-        error_type: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         """Close the session."""
         self.close()
 

@@ -25,7 +25,6 @@ import secrets
 from collections.abc import Callable, Iterator, Mapping
 from enum import Enum
 from pathlib import Path
-from types import TracebackType
 from typing import Annotated, BinaryIO, Final, Protocol
 
 import msgspec
@@ -137,12 +136,7 @@ class RunWriter:
         """Return the writer itself."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_error: object) -> None:
         """Finish the file; after an error only close it."""
         try:
             if kind is None:

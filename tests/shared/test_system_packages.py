@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from shared.system_packages import libusb_fix
+from shared.extras import libusb_fix
 
 
 @pytest.mark.parametrize(

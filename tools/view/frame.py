@@ -28,7 +28,7 @@ from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULE_INDEX, MODULES
-from shared.robot.capture_point import capture_point
+from shared.robot.frames import capture_point
 from tools.fleet.fleet_status import module_status
 from tools.judge.stalls import STALL_SHOWN_NS, stalls_of
 from tools.view.sole_estimate import SoleEstimate
