@@ -154,11 +154,7 @@ class WrenchFilter:
         if np.max(squares / count - mean * mean) > TARE_DEVIATION_MAX**2:
             return _begin_tare(state, Tare.UNSTEADY)
         return msgspec.structs.replace(
-            state,
-            tare=Tare.DONE,
-            offset=state.tare_first + mean,
-            wrench=_ZERO,
-            wrench_t_ns=t_ns,
+            state, tare=Tare.DONE, offset=state.tare_first + mean, wrench=_ZERO, wrench_t_ns=t_ns
         )
 
     def _measure(self, state: FilterState, t_ns: int, forces: Array) -> FilterState:

@@ -21,14 +21,7 @@ from shared.bus.messages import (
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.joints import AXES, MODULES, SIDES
-from shared.robot.frames import (
-    ORIGIN,
-    UPRIGHT,
-    FramePose,
-    leg_offsets,
-    rotation_about,
-    torso_pose,
-)
+from shared.robot.frames import ORIGIN, UPRIGHT, FramePose, leg_offsets, rotation_about, torso_pose
 from shared.robot.robot_urdf import cross_of
 from shared.robot.trip_table import reason_of, remedy_of
 

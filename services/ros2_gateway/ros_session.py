@@ -26,11 +26,7 @@ _SETTINGS: Final[dict[str, object]] = {
     "scouting/multicast/enabled": False,
     "connect/timeout_ms": 1000,
     "connect/exit_on_failure": True,
-    "connect/retry": {
-        "period_init_ms": 200,
-        "period_max_ms": 2000,
-        "period_increase_factor": 2.0,
-    },
+    "connect/retry": {"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 2.0},
     "timestamping/enabled": True,  # the cache of a transient-local publisher asks for it
 }
 _QUEUE: Final = 64
@@ -43,13 +39,7 @@ class RosSession:
     """A node with publishers and subscriptions. Use it in a `with` statement."""
 
     def __init__(
-        self,
-        router: str,
-        domain: int,
-        types: RosTypes,
-        *,
-        namespace: str = "",
-        name: str = NODE,
+        self, router: str, domain: int, types: RosTypes, *, namespace: str = "", name: str = NODE
     ) -> None:
         """Open the session by the router's endpoint; takes up to a second.
 

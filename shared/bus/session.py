@@ -55,11 +55,7 @@ _SETTINGS: Final[dict[str, object]] = {
     "connect/timeout_ms": -1,
     "connect/exit_on_failure": False,
     # One object: Zenoh knows no key for its parts.
-    "connect/retry": {
-        "period_init_ms": 20,
-        "period_max_ms": 200,
-        "period_increase_factor": 2.0,
-    },
+    "connect/retry": {"period_init_ms": 20, "period_max_ms": 200, "period_increase_factor": 2.0},
     # Else open() waits half a second for peers that are not up.
     "open/return_conditions/connect_scouted": False,
     "transport/link/tx/keep_alive": 4,

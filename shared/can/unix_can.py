@@ -60,10 +60,7 @@ class UnixCanBus(can.BusABC):
     """
 
     def __init__(
-        self,
-        channel: str,
-        can_filters: can.typechecking.CanFilters | None = None,
-        **kwargs: object,
+        self, channel: str, can_filters: can.typechecking.CanFilters | None = None, **kwargs: object
     ) -> None:
         """Connect to the hub that listens on path `channel`, or can.CanInitializationError."""
         self.dropped = 0

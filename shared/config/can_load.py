@@ -78,11 +78,7 @@ def frame_bits(data_bytes: int) -> float:
 
 
 def bus_load(
-    axes: int,
-    *,
-    onboard: bool,
-    heartbeat_period_ms: float,
-    loadcell_rate_hz: float = 0.0,
+    axes: int, *, onboard: bool, heartbeat_period_ms: float, loadcell_rate_hz: float = 0.0
 ) -> BusLoad:
     """Return the load of a bus: per cycle, an estimate from each axis and a target to it.
 

@@ -11,15 +11,7 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from shared.bus.messages import (
-    Cause,
-    DriveStatus,
-    JointState,
-    Mode,
-    Outside,
-    PlannerStatus,
-    Trip,
-)
+from shared.bus.messages import Cause, DriveStatus, JointState, Mode, Outside, PlannerStatus, Trip
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import TripLimit, TripsConfig
 from shared.robot.fault_table import recovery_of

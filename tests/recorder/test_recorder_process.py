@@ -154,9 +154,7 @@ def test_sigkill_loses_nothing_that_was_flushed(rig: Rig) -> None:
     assert log.gaps()[KEY].missing == 0
 
 
-def test_sigkill_loses_less_than_a_second_and_the_next_recorder_recovers_the_rest(
-    rig: Rig,
-) -> None:
+def test_sigkill_loses_less_than_a_second_and_the_next_recorder_recovers_the_rest(rig: Rig) -> None:
     """docs/results.md#targets: 0.3 s; a busy machine is given a second."""
     end = time.monotonic() + 2.5
     while time.monotonic() < end:

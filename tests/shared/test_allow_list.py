@@ -10,14 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shared.bus.sockets import (
-    ADDRESSES_MAX,
-    Instruction,
-    IpAddress,
-    program,
-    resolved,
-    restrict,
-)
+from shared.bus.sockets import ADDRESSES_MAX, Instruction, IpAddress, program, resolved, restrict
 from shared.exceptions import BusError
 
 FOURS = st.ip_addresses(v=4)

@@ -40,8 +40,7 @@ def messages_of(message_type: type[msgspec.Struct]) -> st.SearchStrategy[Any]:
     """Return a strategy for messages whose numbers are all finite."""
     hints = get_type_hints(message_type)
     return st.builds(
-        message_type,
-        **{name: strategy(hints[name]) for name in message_type.__struct_fields__},
+        message_type, **{name: strategy(hints[name]) for name in message_type.__struct_fields__}
     )
 
 

@@ -435,10 +435,7 @@ SPOILT: dict[str, tuple[Callable[[Path], object], str]] = {
     "no certificate": (_remove("planner.pem"), "planner.pem: missing"),
     "no key": (_remove("planner.key"), "planner.key: missing"),
     "no authority": (_remove("authority.pem"), "authority.pem: missing"),
-    "a key that others can read": (
-        lambda keys: (keys / "planner.key").chmod(0o640),
-        "chmod 600",
-    ),
+    "a key that others can read": (lambda keys: (keys / "planner.key").chmod(0o640), "chmod 600"),
     "a key that is none": (lambda keys: (keys / "planner.key").write_bytes(b"x"), "planner"),
 }
 

@@ -90,11 +90,7 @@ class Killed(NamedTuple):
 
 
 def killed_file(
-    directory: Path,
-    batches: int = 12,
-    size: int = 100,
-    *,
-    keys: Mapping[str, Topic] | None = None,
+    directory: Path, batches: int = 12, size: int = 100, *, keys: Mapping[str, Topic] | None = None
 ) -> Killed:
     """Write messages in batches, each flushed, and keep the file as it is before its end."""
     path = directory / "killed.mcap"
