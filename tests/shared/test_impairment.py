@@ -225,9 +225,7 @@ def test_an_ineffective_impairment_is_reported_with_what_it_lacks(
     assert not msgspec.structs.replace(idle, **{cure: 10.0}).fault()
 
 
-def test_links_have_their_directions_but_a_sensor_receives_nothing_and_others_are_refused() -> (
-    None
-):
+def test_links_have_their_directions_but_a_sensor_receives_nothing_and_others_are_refused() -> None:
     named = {name for pair in PAIRS for name in (pair.there, pair.back)}
     assert named - set(DIRECTIONS) == {"planner->harness", "planner->imu"}
     assert all(set(names) <= set(DIRECTIONS) for names in GROUPS.values())
