@@ -76,6 +76,12 @@ class Rig:
     def link(self) -> tuple[socket.socket, socket.socket]:
         return self.dial(), self.answer()
 
+    def ended(self, number: int = 1) -> tuple[int, int]:
+        """End an impairment there; return how many passed and were lost."""
+        ended = self.there.end(number)
+        assert ended is not None
+        return ended.passed, ended.lost
+
     def turn(self) -> None:
         """Let out what is due, and take in what is there, until nothing more comes."""
         while True:
@@ -110,6 +116,15 @@ class Rig:
                     taken = end.send(data)
             data = data[taken:]
         return data
+
+    def rest_of(self, end: socket.socket, other: socket.socket, rest: bytes, size: int) -> bytes:
+        """Send what was not taken, and return all that comes, of a size."""
+        got = b""
+        while len(got) < size:
+            rest = self.push(end, rest)
+            self.turn()
+            got += heard(other) or b""
+        return got
 
     def release(self) -> None:
         """Go on after a change, as the loop does."""
