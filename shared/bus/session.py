@@ -18,7 +18,7 @@ import os
 import re
 import socket
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final, Generic, Self, TypeAlias, TypeVar
 
@@ -43,6 +43,7 @@ from shared.process import SOCKET_PATH_MAX
 from shared.run_directory import private_files
 
 M = TypeVar("M", bound=Message)
+T = TypeVar("T")
 _Subscriber: TypeAlias = "zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]"
 
 _SETTINGS: Final[dict[str, object]] = {
@@ -99,35 +100,33 @@ def peers_of(name: str, services: Sequence[str] = SERVICES) -> tuple[str, ...]:
     return (*MODULES, *central[: central.index(name)])
 
 
-class Publisher(Generic[M]):
+class Publisher(Generic[T]):
     """Puts the messages of one key on the bus."""
 
-    def __init__(self, publisher: zenoh.Publisher) -> None:
-        self._put = publisher.put
+    def __init__(self, publisher: zenoh.Publisher, encoded: Callable[[T], bytes]) -> None:
+        self._publisher, self._put, self._encoded = publisher, publisher.put, encoded
         self.failed = 0
         """Messages that were not sent: not finite, or the session is closed."""
 
-    def put(self, message: M) -> bool:
+    def put(self, message: T) -> bool:
         """Send a message; return False and count it if it cannot be sent.
 
         Never blocks and never raises. Where a subscriber's queue is full the message is
         dropped for that subscriber only, and that is not counted.
         """
         try:
-            self._put(encode(message))
+            self._put(self._encoded(message))
         except (NonFiniteError, zenoh.ZError):
             self.failed += 1
             return False
         return True
 
 
-class RawPublisher:
+class RawPublisher(Publisher[bytes]):
     """Puts payloads on one key as they are: for a player of logs, never for a service."""
 
     def __init__(self, publisher: zenoh.Publisher) -> None:
-        self._publisher = publisher
-        self.failed = 0
-        """Payloads that were not sent: the session is closed."""
+        super().__init__(publisher, bytes)
 
     @property
     def matched(self) -> bool:
@@ -136,15 +135,6 @@ class RawPublisher:
             return bool(self._publisher.matching_status.matching)  # type: ignore[attr-defined]  # zenoh's stub
         except zenoh.ZError:
             return False
-
-    def put(self, payload: bytes) -> bool:
-        """Send a payload; return False and count it if it cannot be sent; never raises."""
-        try:
-            self._publisher.put(payload)
-        except zenoh.ZError:
-            self.failed += 1
-            return False
-        return True
 
 
 class Latest(Generic[M]):
@@ -265,7 +255,7 @@ class Session:
             priority=_PRIORITIES[topic.priority],
             express=False,
         )
-        return Publisher(publisher)
+        return Publisher(publisher, encode)
 
     def raw_publisher(self, key: str, *, patient: bool) -> RawPublisher:
         """Declare a publisher of encoded payloads on any full key; BusError if it is malformed.
@@ -338,7 +328,9 @@ class Session:
         there = host_and_port(event.link.dst)
         if event.kind == zenoh.SampleKind.PUT:
             self._linked.add(there)
-            _close_at_once(event.link)
+            # Zenoh sets SO_LINGER to 10 s and closes from its only thread. After a cable was cut
+            # for longer than the lease, all links stalled for up to 10 s for each lost link.
+            sockets.reset_on_close(host_and_port(event.link.src), there)
         else:
             self._linked.discard(there)
 
@@ -444,16 +436,6 @@ def _look_after_links(
     if name in SERVICES:
         over_tls = {peer: at for peer, at in dialled.items() if at.startswith(security.TCP)}
         session.watch_links(own, over_tls)
-
-
-def _close_at_once(link: zenoh.Link) -> None:
-    """Make the socket of a new TCP link close at once when the link is given up.
-
-    Zenoh sets SO_LINGER to 10 s and closes from its only thread. After a cable was cut for longer
-    than the lease, all links of the process stalled for up to 10 s for each lost link.
-    """
-    ends = host_and_port(link.src), host_and_port(link.dst)
-    sockets.reset_on_close(*ends)
 
 
 def _ring(session: zenoh.Session, key: str, capacity: int) -> _Subscriber:
