@@ -17,16 +17,9 @@ def atomic_file(
     """Yield a file beside a path, which takes its place when the block ends well.
 
     Otherwise it is removed and what was there stays. A kill leaves `.NAME.part`, which the next try
-    replaces.
-
-    Args:
-        path: of the file.
-        private: for this user alone.
-        exclusive: refuse to replace a file.
-        lasting: return when it is on the disk.
-
-    Raises:
-        OSError: it cannot be written, or exists; `filename` is the path.
+    replaces. `private`: for this user alone; `exclusive`: replace no file; `lasting`: return when
+    it is on the disk. Raises OSError, whose `filename` is the path, if it cannot be written or
+    exists.
     """
     part = path.with_name(f".{path.name}.part")
     try:
@@ -51,16 +44,7 @@ def atomic_file(
 
 
 def replace_file(path: Path, content: bytes, *, private: bool = False) -> None:
-    """Write a file whole or not at all.
-
-    Args:
-        path: the file.
-        content: of it.
-        private: for this user alone.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write a file whole or not at all, as `atomic_file`."""
     with atomic_file(path, private=private) as file:
         file.write(content)
 

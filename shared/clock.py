@@ -49,8 +49,7 @@ def pace() -> float:
 def keep_pace(run_dir: Path) -> None:
     """Use the clock of the fleet in a run directory from now on; call it before any time is read.
 
-    Raises:
-        FleetError: the file with its pace is malformed.
+    Raises FleetError if the file with its pace is malformed.
     """
     global _pace  # noqa: PLW0603 - a process has one clock, as it has one CLOCK_MONOTONIC
     path = run_dir / PACE_FILE

@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import platform
+import shutil
 import sys
 from pathlib import Path
 from typing import Any, Final
@@ -45,12 +46,7 @@ ON_ROBOTS: Final = frozenset({"ros2", "usb"})
 def require(extra: str, otherwise: str = "") -> None:
     """Make sure that the packages of an extra are installed; imports none of them.
 
-    Args:
-        extra: its name in `EXTRAS`.
-        otherwise: what serves without them.
-
-    Raises:
-        MissingPackageError: one is not.
+    `otherwise` is what serves without them. Raises MissingPackageError if one is not.
     """
     missing = [name for name in EXTRAS[extra] if not _is_there(name)]
     if missing:
@@ -89,12 +85,9 @@ def missing_package(extra: str, missing: list[str], otherwise: str = "") -> Miss
 
 
 def late(module: str) -> Any:
-    """Return a stand-in for a module of an optional package, imported when it is first used.
+    """Return a stand-in for a module such as `matplotlib.patches`, imported when it is first used.
 
-    That use raises `MissingPackageError` where the package is not installed.
-
-    Args:
-        module: such as `matplotlib.patches`.
+    That use raises MissingPackageError where the package is not installed.
     """
     return _LateModule(module)
 
@@ -116,3 +109,17 @@ class _LateModule:
             raise missing_package(extra, [package]) from None
         setattr(self, name, found)
         return found
+
+
+def how_to_install(debian: str, fedora: str) -> str:
+    """Return the command that brings a package of the system, as deploy/lib.sh names it."""
+    if shutil.which("apt-get"):
+        return f"`sudo apt-get install {debian}`"
+    if shutil.which("dnf"):
+        return f"`sudo dnf install {fedora}`"
+    return f"your package manager (Debian: {debian}, Fedora: {fedora})"
+
+
+def libusb_fix() -> str:
+    """Return the command that brings libusb-1.0.so.0, which the `odrive` package loads."""
+    return how_to_install("libusb-1.0-0", "libusb1")

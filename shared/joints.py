@@ -8,14 +8,7 @@ from __future__ import annotations
 
 from typing import Final
 
-MODULES: Final = (
-    "ankle_right",
-    "knee_right",
-    "hip_right",
-    "ankle_left",
-    "knee_left",
-    "hip_left",
-)
+MODULES: Final = ("ankle_right", "knee_right", "hip_right", "ankle_left", "knee_left", "hip_left")
 """Module names in the order of q, v and tau."""
 
 SIDES: Final = ("right", "left")

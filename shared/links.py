@@ -61,15 +61,9 @@ def endpoint_through(pair: Pair) -> str:
 
 
 def directions_of(link: str, file: str = "--link", key: str = "link") -> tuple[str, ...]:
-    """Return the directions that a name stands for.
+    """Return the directions that a name of `DIRECTIONS` or `GROUPS` stands for.
 
-    Args:
-        link: of `DIRECTIONS` or `GROUPS`.
-        file: where it stands, for the error.
-        key: under which key.
-
-    Raises:
-        ConfigError: there is none of that name.
+    `file` and `key` say where it stands in the ConfigError for a name of none.
     """
     if link in GROUPS:
         return GROUPS[link]

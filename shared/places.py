@@ -32,11 +32,7 @@ HELP: Final = f"robot file (default: {ROBOT_FILE} of the working directory, else
 
 
 def need_checkout(what: str) -> None:
-    """Refuse what cannot do without the source tree or git where there are none.
-
-    Raises:
-        RunError: XRL runs from an installed wheel; `what` needs more.
-    """
+    """Refuse what needs the source tree or git: RunError where XRL runs from an installed wheel."""
     if not IS_CHECKOUT:
         raise RunError(
             f"{what} needs a checkout of XRL, and this is a wheel installed in {CHECKOUT}; "
@@ -45,11 +41,7 @@ def need_checkout(what: str) -> None:
 
 
 def refuse_shipped(path: Path) -> None:
-    """Refuse to write into the files of an installed wheel: the next install would replace them.
-
-    Raises:
-        RunError: the path lies in them.
-    """
+    """Refuse to write into the files of an installed wheel: the next install would replace them."""
     if not IS_CHECKOUT and path.resolve().is_relative_to(FILES):
         raise RunError(
             f"{path}: is the robot as shipped, and stays so; `xrl new DIR` makes one to be changed"
@@ -59,14 +51,8 @@ def refuse_shipped(path: Path) -> None:
 def robot_file(given: Path | None = None) -> Path:
     """Return which robot file is meant; says on stderr which one it found.
 
-    Args:
-        given: by `--config`; it is returned as it is.
-
-    Returns:
-        What was given, else `robot.toml` of the working directory (absolute), else the shipped one.
-
-    Raises:
-        ConfigError: `robot.toml` of the working directory belongs to another user.
+    What `--config` gave as it is, else `robot.toml` of the working directory (absolute), else the
+    shipped one. Raises ConfigError as `robot_file_here`.
     """
     found = given or robot_file_here()
     if found is None:
@@ -80,9 +66,8 @@ def robot_file_here() -> Path | None:
     """Return `robot.toml` of the working directory, absolute; None if it is not there or shipped.
 
     A link that leads nowhere counts: the shipped robot must not stand in for a file that is lost.
-
-    Raises:
-        ConfigError: it belongs to another user, who could choose the robot for whoever works here.
+    Raises ConfigError if it belongs to another user, who could choose the robot for whoever works
+    here.
     """
     if not os.path.lexists(ROBOT_FILE):
         return None

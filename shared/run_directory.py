@@ -36,14 +36,9 @@ def default_run_dir() -> Path:
 def check_own(path: Path, *, alone: bool = True) -> None:
     """Refuse a directory that is not this user's; one that is not there is no fault.
 
-    Args:
-        path: the directory.
-        alone: refuse one that others may write to, too. A fleet is not started or acted on in
-            such a one; it can be stopped, for it may have become one while the fleet was up.
-
-    Raises:
-        FleetError: it is somebody else's, others may write to it or to a directory above it, or it
-            is no directory.
+    `alone`: refuse one that others may write to, too, itself or a directory above it. A fleet is
+    not started or acted on in such a one; it can be stopped, for it may have become one while the
+    fleet was up. Raises FleetError.
     """
     try:
         found = path.lstat()
@@ -106,10 +101,8 @@ def _is_own_group(gid: int) -> bool:
 def open_private(path: Path) -> BinaryIO:
     """Open a file of this user alone to read and write, or make it, whatever the umask.
 
-    One that others could read or write, left by an older version, is taken from them.
-
-    Raises:
-        OSError: it cannot be opened, is a link or somebody else's.
+    One that others could read or write, left by an older version, is taken from them. Raises
+    OSError if it is a link or somebody else's.
     """
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, PRIVATE)
     os.fchmod(descriptor, PRIVATE)
@@ -130,10 +123,8 @@ def service_directory(text: str) -> Path:
     """Return the run directory of a service, which somebody may have started by hand.
 
     Under a supervisor it was looked at when the fleet started; a successor of a service that
-    crashed begins whatever has become of it, for its module is to be held.
-
-    Raises:
-        argparse.ArgumentTypeError: it is somebody else's, or others may write to it.
+    crashed begins whatever has become of it, because its module is to be held. Raises
+    argparse.ArgumentTypeError as `check_own`.
     """
     path = Path(text)
     if FLEET_VARIABLE not in os.environ:
@@ -145,11 +136,7 @@ def service_directory(text: str) -> Path:
 
 
 def own_directory(text: str) -> Path:
-    """Return a run directory named on a command line.
-
-    Raises:
-        argparse.ArgumentTypeError: it is somebody else's.
-    """
+    """Return a run directory named on a command line; ArgumentTypeError for somebody else's."""
     path = Path(text)
     try:
         check_own(path, alone=False)

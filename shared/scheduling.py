@@ -54,11 +54,9 @@ _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
 
 def apply(kind: str, module: str = "") -> str:
-    """Give this process its priority, processors and locked memory; return what was granted.
+    """Give this process, of a kind in `TABLE`, its priority, processors and locked memory.
 
-    Args:
-        kind: of process, in `TABLE`.
-        module: of a joint service.
+    Returns what was granted.
     """
     granted = [raise_priority(TABLE[kind].fifo)]
     if os.environ.get(PINNED_VARIABLE) == "1":

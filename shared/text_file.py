@@ -18,11 +18,7 @@ _OTHERS: Final = (
 
 
 def decoded(content: bytes) -> str:
-    """Return the text of a file's content.
-
-    Raises:
-        UnicodeError: it is no UTF-8; says what it is, or where it is none.
-    """
+    """Return the text of a file's content; UnicodeError says what it is instead of UTF-8."""
     for name, mark in _OTHERS:
         if content.startswith(mark):
             raise UnicodeError(f"is {name}; save it as UTF-8")
@@ -36,10 +32,5 @@ def decoded(content: bytes) -> str:
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file.
-
-    Raises:
-        OSError: it cannot be read.
-        UnicodeError: it is no UTF-8.
-    """
+    """Return the text of a file; OSError if it cannot be read, UnicodeError if it is no UTF-8."""
     return decoded(path.read_bytes())

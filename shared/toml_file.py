@@ -48,11 +48,7 @@ class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 
 
 def read_toml(path: Path, into: type[S]) -> S:
-    """Read a TOML file into a struct, with every number inside its `Range`.
-
-    Raises:
-        ConfigError: naming the file, the key, what stands there and what would be right.
-    """
+    """Read a TOML file into a struct, with every number inside its `Range`, or ConfigError."""
     file = str(path)
     try:
         found = path.stat()
@@ -69,11 +65,7 @@ def read_toml(path: Path, into: type[S]) -> S:
 
 
 def parse_toml(text: str, file: str, into: type[S]) -> S:
-    """Read TOML text into a struct, as `read_toml` does; `file` names it in errors.
-
-    Raises:
-        ConfigError: naming the file, the key, what stands there and what would be right.
-    """
+    """Read TOML text into a struct, as `read_toml` does; `file` names it in errors."""
     try:
         raw = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -140,11 +132,7 @@ def _fits(value: Any, hint: Any) -> bool:
 
 
 def check_ranges(file: str, config: msgspec.Struct) -> None:
-    """Check each number of a struct against the `Range` of its type hint.
-
-    Raises:
-        ConfigError: names the file, the key, the value and the range.
-    """
+    """Check each number of a struct against the `Range` of its type hint, or ConfigError."""
     _check_ranges(file, "", config, type(config))
 
 

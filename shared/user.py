@@ -20,11 +20,7 @@ def user_name() -> str:
 
 
 def in_home(path: str | Path) -> Path:
-    """Return a path with its `~` replaced by a home.
-
-    Raises:
-        XrlError: it begins with `~`, and this user has no home, or that user is unknown.
-    """
+    """Return a path with its `~` replaced by a home; XrlError if there is no such home."""
     try:
         return Path(path).expanduser()
     except RuntimeError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import socket
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -11,9 +12,9 @@ import msgspec
 
 from shared.config.robot_config import SERVICES, RobotConfig
 from shared.config.sections import BusSecurityConfig
-from tools.keys import authority, bundle
+from tools.keys import authority, bundle, certificates
 from tools.keys.authority import Authority
-from tools.keys.certificates import CERTIFICATE_DAYS
+from tools.keys.certificates import CERTIFICATE_DAYS, Issued
 
 
 def tls_endpoints(host: str = "127.0.0.1") -> dict[str, str]:
@@ -55,3 +56,30 @@ def opened(robot: RobotConfig, endpoints: Mapping[str, str]) -> RobotConfig:
     security = BusSecurityConfig(mode="open")
     bus = msgspec.structs.replace(robot.bus, endpoints=dict(endpoints), security=security)
     return msgspec.structs.replace(robot, bus=bus)
+
+
+def with_keys(robot: RobotConfig, folder: Path) -> RobotConfig:
+    """Return the robot with another folder of keys."""
+    security = msgspec.structs.replace(robot.bus.security, keys=str(folder))
+    return msgspec.structs.replace(robot, bus=msgspec.structs.replace(robot.bus, security=security))
+
+
+def signer_of(made: Authority) -> Issued:
+    return Issued(made.certificate, (made.folder / "authority.key").read_bytes())
+
+
+def give(
+    signer: Issued,
+    folder: Path,
+    name: str,
+    *,
+    from_day: int = 0,
+    days: int = 90,
+    host: str = "127.0.0.1",
+) -> None:
+    """Write a certificate and its key, whose time begins a day before `from_day` from today."""
+    then = dt.datetime.now(dt.UTC) + dt.timedelta(days=from_day)
+    issued = certificates.issue(signer, f"{name}.1", (host,), then, days)
+    folder.mkdir(exist_ok=True)
+    (folder / f"{name}.pem").write_bytes(issued.certificate)
+    (folder / f"{name}.key").write_bytes(issued.key)

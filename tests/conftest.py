@@ -41,10 +41,16 @@ ROBOT_FILE = Path(__file__).parents[1] / "deploy" / "robot.toml"
 
 
 @pytest.fixture
-def run_dir() -> Iterator[Path]:
-    """Return where a fleet may run; the path is short, for sockets are in it."""
+def short_dir() -> Iterator[Path]:
+    """Return a folder whose path is short: sockets are in it."""
     with tempfile.TemporaryDirectory(dir="/tmp", prefix="xrl-t-") as path:
-        yield Path(path) / "r"
+        yield Path(path)
+
+
+@pytest.fixture
+def run_dir(short_dir: Path) -> Path:
+    """Return where a fleet may run."""
+    return short_dir / "r"
 
 
 @pytest.hookimpl(tryfirst=True)  # before `-m` chooses

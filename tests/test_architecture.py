@@ -126,7 +126,6 @@ EDGES = [
     "services/planner/controller_file.py",
     "services/recorder/auto_recover.py",
     "services/recorder/host_watch.py",
-    "services/recorder/roster.py",
     "services/ros2_gateway/ros_session.py",
     "services/simulator/fronts/*.py",
     "shared/robot/compiled_graph.py",
@@ -135,7 +134,6 @@ EDGES = [
 
 TOOL_LAWS = [
     "shared/can/cansimple*.py",
-    "shared/mcap_log/encoding.py",
     "shared/mcap_log/records.py",
     "shared/mcap_log/sequence_stats.py",
     "tools/bringup/jogging.py",

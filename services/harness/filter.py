@@ -21,8 +21,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from shared.bus.messages import Tare
-from shared.can.loadcell_can import LegSample, as_sent
+from shared.bus.messages import Tare, Vector6
+from shared.can.loadcell_can import as_sent
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import HarnessConfig
 from shared.robot.stewart import N_LEGS, geometry_matrix
@@ -43,27 +43,27 @@ less than a hand on the harness makes, or a robot that sways."""
 class FilterState(msgspec.Struct, frozen=True, gc=False, kw_only=True):
     """All that the filter remembers; its arrays are never written to."""
 
-    tare: Tare
-    tare_start_ns: int
+    tare: Tare = Tare.RUNNING
+    tare_start_ns: int = NEVER_NS
     """Time of the first sample of the tare; `NEVER_NS` before it."""
-    tare_count: int
-    tare_first: Array
+    tare_count: int = 0
+    tare_first: Array = _ZERO
     """(6,) raw leg forces of that sample, N: near the mean, so that squares stay small."""
-    tare_sum: Array
+    tare_sum: Array = _ZERO
     """(6,) sum of the raw leg forces since then, less those of the first, N."""
-    tare_squares: Array
+    tare_squares: Array = _ZERO
     """(6,) sum of the squares of the same, N^2."""
-    offset: Array
+    offset: Array = _ZERO
     """(6,) leg forces that count as zero, N."""
-    wrench: Array
+    wrench: Array = _ZERO
     """(6,) last good wrench after the low-pass, [N; N m]."""
-    wrench_t_ns: int
+    wrench_t_ns: int = NEVER_NS
     """Time of the last sample that went into it."""
-    sample_t_ns: int
+    sample_t_ns: int = NEVER_NS
     """Time of the newest finite sample; `NEVER_NS` before the first."""
-    saturated: bool
+    saturated: bool = False
     """True if a leg of that sample was saturated."""
-    refused: int
+    refused: int = 0
     """Samples that were not finite."""
 
 
@@ -81,25 +81,12 @@ class FilteredWrench(msgspec.Struct, frozen=True, gc=False, kw_only=True):
 
 def initial_state() -> FilterState:
     """Return the state at power-up: waiting for the first sample of the tare."""
-    return FilterState(
-        tare=Tare.RUNNING,
-        tare_start_ns=NEVER_NS,
-        tare_count=0,
-        tare_first=_ZERO,
-        tare_sum=_ZERO,
-        tare_squares=_ZERO,
-        offset=_ZERO,
-        wrench=np.zeros(6),
-        wrench_t_ns=NEVER_NS,
-        sample_t_ns=NEVER_NS,
-        saturated=False,
-        refused=0,
-    )
+    return FilterState()
 
 
 def tared_state(offset: Array) -> FilterState:
     """Return the state of a sensor whose tare found these leg forces (6,), N, as zero."""
-    return msgspec.structs.replace(initial_state(), tare=Tare.DONE, offset=offset)
+    return FilterState(tare=Tare.DONE, offset=offset)
 
 
 def start_tare(state: FilterState) -> FilterState:
@@ -111,11 +98,7 @@ class WrenchFilter:
     """The constants of the filter and its one step."""
 
     def __init__(self, config: HarnessConfig) -> None:
-        """Derive the constants.
-
-        Raises:
-            ConfigError: the sensor's geometry is singular.
-        """
+        """Derive the constants; ConfigError if the sensor's geometry is singular."""
         self._G = geometry_matrix(config.base_radius, config.platform_radius, config.height)
         self._cutoff = 2.0 * math.pi * config.low_pass_hz  # rad/s
         # A cell at the end of its range reads this after its trip through float32.
@@ -124,11 +107,11 @@ class WrenchFilter:
         self._tare_ns = round(config.tare_s * NS_PER_S)
 
     def step(
-        self, state: FilterState, now_ns: int, sample: LegSample | None
+        self, state: FilterState, now_ns: int, forces: Vector6 | None
     ) -> tuple[FilterState, FilteredWrench]:
-        """Take the newest sample, or None if there is none, and say what holds now."""
-        if sample is not None:
-            state = self._take(state, sample)
+        """Take the newest leg forces, N, or None if there are none, and say what holds now."""
+        if forces is not None:
+            state = self._add(state, now_ns, forces)
         seen = state.sample_t_ns != NEVER_NS
         age_ns = now_ns - state.sample_t_ns if seen else -1
         fresh = 0 <= age_ns <= self._stale_ns
@@ -140,16 +123,16 @@ class WrenchFilter:
         )
         return state, reading
 
-    def _take(self, state: FilterState, sample: LegSample) -> FilterState:
-        if not all(map(math.isfinite, sample.forces)):
+    def _add(self, state: FilterState, t_ns: int, sample: Vector6) -> FilterState:
+        if not all(map(math.isfinite, sample)):
             return msgspec.structs.replace(state, refused=state.refused + 1)
-        saturated = max(map(abs, sample.forces)) >= self._force_limit
-        forces = np.array(sample.forces)
+        saturated = max(map(abs, sample)) >= self._force_limit
+        forces = np.array(sample)
         if state.tare is not Tare.DONE:
-            state = self._tare(state, sample.t_ns, forces, saturated)
+            state = self._tare(state, t_ns, forces, saturated)
         elif not saturated:
-            state = self._measure(state, sample.t_ns, forces)
-        return msgspec.structs.replace(state, sample_t_ns=sample.t_ns, saturated=saturated)
+            state = self._measure(state, t_ns, forces)
+        return msgspec.structs.replace(state, sample_t_ns=t_ns, saturated=saturated)
 
     def _tare(self, state: FilterState, t_ns: int, forces: Array, saturated: bool) -> FilterState:
         gap = t_ns - state.sample_t_ns > self._stale_ns
@@ -171,11 +154,7 @@ class WrenchFilter:
         if np.max(squares / count - mean * mean) > TARE_DEVIATION_MAX**2:
             return _begin_tare(state, Tare.UNSTEADY)
         return msgspec.structs.replace(
-            state,
-            tare=Tare.DONE,
-            offset=state.tare_first + mean,
-            wrench=np.zeros(6),
-            wrench_t_ns=t_ns,
+            state, tare=Tare.DONE, offset=state.tare_first + mean, wrench=_ZERO, wrench_t_ns=t_ns
         )
 
     def _measure(self, state: FilterState, t_ns: int, forces: Array) -> FilterState:

@@ -6,8 +6,17 @@ from typing import Protocol
 
 from services.harness import filter as wrench_filter
 from services.harness.filter import FilterState, WrenchFilter
-from services.harness.sensor import HarnessSensor
-from shared.bus.messages import TareRequest, Wrench
+from shared.bus.messages import TareRequest, Vector6, Wrench
+
+
+class HarnessSensor(Protocol):
+    """Six load cells."""
+
+    def newest(self, now_ns: int, /) -> Vector6 | None:
+        """Return the leg forces that came since the last call, N, or None; never blocks.
+
+        Never raises for a lost link: that is None until it is back.
+        """
 
 
 class WrenchPublisher(Protocol):
@@ -25,7 +34,7 @@ class TareRequests(Protocol):
 
 
 class HarnessLoop:
-    """One cycle of the service, on whatever clock it is called with."""
+    """One cycle of the service, on whatever clock it is called with; begins with a tare."""
 
     def __init__(
         self,
@@ -34,26 +43,28 @@ class HarnessLoop:
         publisher: WrenchPublisher,
         requests: TareRequests,
     ) -> None:
-        """Begin with a tare."""
         self.state: FilterState = wrench_filter.initial_state()
         self.cycles = 0
         self.skipped = 0
         """Deadlines that were missed and not made up for."""
         self.unsent = 0
-        self._sensor = sensor
-        self._law = law
-        self._publisher = publisher
-        self._requests = requests
+        self._sensor, self._law = sensor, law
+        self._publisher, self._requests = publisher, requests
+
+    @property
+    def refused(self) -> int:
+        """Samples that were not finite."""
+        return self.state.refused
 
     def cycle(self, now_ns: int) -> Wrench:
         """Read, tare on request, filter, publish; return the published message.
 
         The wrench is in torso axes: the sensor is fixed to the torso.
         """
-        sample = self._sensor.read(now_ns)
+        forces = self._sensor.newest(now_ns)
         if self._requests.take() is not None:
             self.state = wrench_filter.start_tare(self.state)
-        self.state, reading = self._law.step(self.state, now_ns, sample)
+        self.state, reading = self._law.step(self.state, now_ns, forces)
         fx, fy, fz, mx, my, mz = reading.wrench.tolist()
         message = Wrench(
             t_ns=now_ns,

@@ -43,7 +43,6 @@ class AttitudeLaw:
     """The mounting, the last good sample and its age."""
 
     def __init__(self, config: ImuConfig) -> None:
-        """Take how the sensor is mounted and how old a sample may be."""
         self.refused = 0
         """Samples whose quaternion was not of unit length."""
         self._mounting = rotation(*config.mounting)

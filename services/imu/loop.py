@@ -36,6 +36,11 @@ class ImuLoop:
         self.unsent = 0
         self._sensor, self._law, self._publisher = sensor, law, publisher
 
+    @property
+    def refused(self) -> int:
+        """Samples whose quaternion was not of unit length."""
+        return self._law.refused
+
     def cycle(self, now_ns: int) -> Attitude:
         """Read, publish the vector up; return the published message."""
         reading = self._law.step(now_ns, self._sensor.newest(now_ns))

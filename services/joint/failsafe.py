@@ -18,7 +18,7 @@ import msgspec
 from shared.bus.messages import Cause, JointCommand, Mode, Outside, Refusal
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
-from shared.robot.dropouts import Dropouts
+from shared.robot.hold_rules import Dropouts
 
 
 class Event(IntEnum):

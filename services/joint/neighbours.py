@@ -7,7 +7,7 @@ torso turned back by 1.5 rad, and with its COM 5 cm back and 10 cm up the robot 
 that knows the angles of its ankle and knee holds the torso's attitude. A knee that sinks beside a
 knee whose service is dead tips the robot sideways: it fell within 4 s. So each knee must know
 whether the other one sinks. A limp module makes the others stiffen, in HOLD and in DAMP
-(`shared.robot.limp_leg_support`). Without that the robot fell within 1.3 s of a knee that went limp
+(`shared.robot.hold_rules`). Without that the robot fell within 1.3 s of a knee that went limp
 with the planner dead, and within 2 s of a stop beside a limp knee.
 
 All this must work with planner and bus dead. So each service writes its row into a file that all
@@ -28,7 +28,7 @@ from shared.bus.messages import Mode, Pair
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import LOST_S
 from shared.joints import MODULE_INDEX, MODULES, N_MODULES, kind_of
-from shared.robot.limp_leg_support import SUPPORT_FOR
+from shared.robot.hold_rules import SUPPORT_FOR
 
 STALE_NS: Final = 20 * NS_PER_MS
 """An older angle says nothing of where the joint is now."""

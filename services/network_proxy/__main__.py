@@ -7,13 +7,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from services.network_proxy.commands import CommandHandler
-from services.network_proxy.control import ControlSocket
-from services.network_proxy.event_loop import SocketWatch
-from services.network_proxy.listener import SocketListener
+from services.network_proxy.control import CommandHandler, ControlSocket
 from services.network_proxy.loop import run
-from services.network_proxy.proxy_endpoint import ProxyEndpoint, address_of
 from services.network_proxy.relay import Relay
+from services.network_proxy.sockets import ProxyEndpoint, SocketListener, SocketWatch, address_of
 from shared import log, process, scheduling
 from shared.bus import session as bus
 from shared.bus import topics
@@ -66,11 +63,7 @@ def main() -> int:
 
 
 def _proxy_endpoint(pair: Pair, config: RobotConfig, run_dir: Path) -> ProxyEndpoint:
-    """Stand between two processes.
-
-    Raises:
-        BusError: it is not possible there.
-    """
+    """Stand between two processes; BusError if that is not possible there."""
     path = Path(expand(endpoint_through(pair), run_dir).removeprefix(_UNIX))
     beyond = address_of(expand(config.bus.endpoints[pair.listens], run_dir))
     return ProxyEndpoint(pair, SocketListener(path), beyond)

@@ -1,18 +1,227 @@
-"""One connection of a pair: two ends, and a flow each way."""
+"""One connection of a pair: two ends, and each way what came in, when it goes out."""
 
 from __future__ import annotations
 
 import socket
+from collections import deque
 from collections.abc import Callable
 from functools import partial
+from typing import Final, NamedTuple
 
-from services.network_proxy.direction import Flow, Waiting
-from services.network_proxy.event_loop import READ, WRITE, Ready, SocketWatch
-from shared.config.impairment import Direction
+from services.network_proxy.sockets import READ, WRITE, Ready, SocketWatch
+from services.network_proxy.wire import Splitter, carries_messages
+from shared.config.impairment import HELD, Direction, Impairer
+
+PENDING_MAX: Final = 262_144
+"""Due bytes that wait for a slow receiver. Above it the sender is no longer read, as on a direct
+link.
+"""
+WAITING_MAX: Final = 4_194_304
+"""Bytes that are not due yet: then, too, the sender is read no more. Ten seconds of states."""
+_READ: Final = 65_536
+
+
+class Waiting(NamedTuple):
+    """A batch on its way."""
+
+    release_ns: int
+    batch: bytes
+    """Empty: the end, seen on the other side as late as all else."""
+    counted: Impairer | None = None
+    """Who said that it passes; None: nobody, or it is the second of two."""
+
+    def count_lost(self) -> None:
+        """It never comes out, for its connection is gone: it is lost, and has not passed."""
+        if self.counted is not None:
+            self.counted.drop()
+
+
+class Flow:
+    """Reads batches from one end, and writes each to the other when it is due; neither blocks."""
+
+    def __init__(self, source: socket.socket, sink: socket.socket, direction: Direction) -> None:
+        self.source, self.sink, self.direction = source, sink, direction
+        self.ended = False
+        """The source has nothing more to say."""
+        self.broken = False
+        """The sink takes nothing any more. What comes is still read, to see its end."""
+        self._closing = False
+        self._splitter = Splitter()
+        self._held: list[Waiting] = []
+        self._waits = 0
+        self._pending = bytearray()
+        self._unsent: deque[tuple[int, Waiting]] = deque()
+        self._sent = 0
+        self._since_ns: int | None = None
+        self._own_ns = 0
+        """Release time of the newest batch of the link's own traffic."""
+        self._stream_ns = 0
+        """When the last comes out that nothing may overtake."""
+
+    @property
+    def writes(self) -> bool:
+        """True while bytes wait for the sink."""
+        return bool(self._pending)
+
+    @property
+    def reads(self) -> bool:
+        """True while the source is to be read: not while too much waits for the sink."""
+        return not self.ended and len(self._pending) < PENDING_MAX and self._waits < WAITING_MAX
+
+    @property
+    def over(self) -> bool:
+        """True once the sink has all, and the end is due."""
+        return self._closing and not self._pending
+
+    def read(self, now_ns: int) -> list[Waiting]:
+        """Read what there is; return what waits now, in the order in which it came."""
+        found = self.release(now_ns)
+        try:
+            data = self.source.recv(_READ)
+        except BlockingIOError:
+            return found
+        except OSError:
+            data = b""
+        if not data:
+            self.ended = True
+            return found + self._keep([Waiting(self._later(now_ns), b"")])
+        rows = []
+        for batch in self._splitter.feed(data):
+            if carries_messages(batch):
+                rows += self._message(now_ns, batch)
+            else:
+                rows.append(Waiting(self._later(now_ns), batch))
+        return found + self._keep(rows)
+
+    def release(self, now_ns: int) -> list[Waiting]:
+        """Release what a partition that is over has held back; it comes out like new batches."""
+        impairer = self.direction.active
+        if not self._held or (impairer is not None and impairer.what.partition):
+            return []
+        found, self._held = self._held, []
+        return [self._resumed(row, now_ns) for row in found]
+
+    def put(self, row: Waiting) -> None:
+        """Write a due batch, and keep the part that the sink does not take."""
+        self._waits -= len(row.batch)
+        if self.broken:
+            row.count_lost()
+        if not row.batch:
+            self._closing = True
+        elif self._pending:
+            self._queue(row, row.batch)
+        elif not self.broken:
+            self._send(row)
+
+    def flush(self) -> None:
+        """Write as much as the sink takes."""
+        try:
+            sent = self.sink.send(self._pending)
+        except BlockingIOError:
+            return
+        except OSError:
+            self._break()
+            return
+        del self._pending[:sent]
+        self._sent += sent
+        self._since_ns = None
+        while self._unsent and self._unsent[0][0] <= self._sent:
+            self._unsent.popleft()
+
+    def stuck_ns(self, now_ns: int) -> int:
+        """Return for how long the sink has taken nothing of what waits for it.
+
+        Tried with each call: a UNIX socket is not called ready before most of it is read.
+        Measured from one call to the next.
+        """
+        if self._pending:
+            self.flush()
+        if not self._pending:
+            self._since_ns = None
+        elif self._since_ns is None:
+            self._since_ns = now_ns
+        return 0 if self._since_ns is None else now_ns - self._since_ns
+
+    def drop(self) -> None:
+        """Count held and unwritten messages as lost: the connection is gone."""
+        self._break()
+        for row in self._held:
+            row.count_lost()
+        self._held.clear()
+
+    def _break(self) -> None:
+        self.broken = True
+        for _, row in self._unsent:
+            row.count_lost()
+        self._unsent.clear()
+        self._pending.clear()
+
+    def _queue(self, row: Waiting, rest: bytes) -> None:
+        self._pending += rest
+        self._unsent.append((self._sent + len(self._pending), row))
+
+    def _send(self, row: Waiting) -> None:
+        try:
+            sent = self.sink.send(row.batch)
+        except BlockingIOError:
+            sent = 0
+        except OSError:
+            self._break()
+            row.count_lost()
+            return
+        if sent < len(row.batch):
+            self._queue(row, row.batch[sent:])
+
+    def _keep(self, rows: list[Waiting]) -> list[Waiting]:
+        """Hold back the messages of a partition; return the rest."""
+        found: list[Waiting] = []
+        for row in rows:
+            self._waits += len(row.batch)
+            (self._held if row.release_ns == HELD else found).append(row)
+        return found
+
+    def _message(self, now_ns: int, batch: bytes) -> list[Waiting]:
+        """Return a message as often as it comes out; the first time is the one that counts."""
+        impairer = self.direction.active
+        times = sorted(self._not_before(t) for t in self.direction.passes(now_ns, len(batch)))
+        return [Waiting(t, batch, None if n else impairer) for n, t in enumerate(times)]
+
+    def _resumed(self, row: Waiting, now_ns: int) -> Waiting:
+        release_ns = self._later(now_ns)
+        if row.counted is not None:  # a message that was held: it is on a stream
+            self._stream_ns = release_ns
+        return row._replace(release_ns=release_ns)
+
+    def _later(self, now_ns: int) -> int:
+        """Return when what must not be lost comes out; in order with all that must not be."""
+        impairer = self.direction.active
+        release_ns = now_ns if impairer is None else impairer.delays(now_ns)
+        if release_ns != HELD:
+            release_ns = self._own_ns = max(release_ns, self._own_ns, self._stream_ns)
+            if impairer is not None and impairer.what.ordered:
+                self._stream_ns = release_ns
+        return release_ns
+
+    def _not_before(self, release_ns: int) -> int:
+        """Return a message's release time, never before an earlier message on the same stream.
+
+        This holds after an impairment has ended too: messages that it delayed still come first.
+        """
+        if release_ns == HELD:
+            return HELD
+        release_ns = max(release_ns, self._stream_ns)
+        impairer = self.direction.active
+        if impairer is not None and impairer.what.ordered:
+            release_ns = self._stream_ns = max(release_ns, self._own_ns)
+        return release_ns
 
 
 class Connection:
-    """Both flows, and when there is nobody left for them."""
+    """Both flows, and when there is nobody left for them.
+
+    `ends` are those of the dialling side and of the other, `directions` the impairments there and
+    back; `taken` is called with what a flow has read, and the time, ns.
+    """
 
     def __init__(
         self,
@@ -21,14 +230,6 @@ class Connection:
         watch: SocketWatch,
         taken: Callable[[Connection, Flow, list[Waiting], int], None],
     ) -> None:
-        """Start to watch both ends.
-
-        Args:
-            ends: sockets of the dialling side and of the other; they do not block.
-            directions: from the first to the second, and back.
-            watch: of the loop.
-            taken: called with what a flow has read, and the time, ns.
-        """
         first, second = ends
         there, back = Flow(first, second, directions[0]), Flow(second, first, directions[1])
         self.flows = (there, back)
@@ -40,7 +241,7 @@ class Connection:
             partial(self._is_ready, back, there),
         )
         self._wanted = (0, 0)
-        self.look()
+        self.watch_ends()
 
     @property
     def left(self) -> bool:
@@ -56,7 +257,7 @@ class Connection:
         there, back = self.flows
         return there.over or back.over or (there.ended and back.ended)
 
-    def look(self) -> None:
+    def watch_ends(self) -> None:
         """Watch the ends for the events that the flows need now."""
         there, back = self.flows
         wanted = (
@@ -83,4 +284,4 @@ class Connection:
             return  # in this same turn
         if events & WRITE:
             sink.flush()
-        self._taken(self, source, source.take(now_ns) if events & READ else [], now_ns)
+        self._taken(self, source, source.read(now_ns) if events & READ else [], now_ns)

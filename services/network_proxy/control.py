@@ -1,7 +1,8 @@
-"""The network proxy's socket: requests in, answers out. Never waits for anybody."""
+"""What is asked of the network proxy: requests in, carried out, answers out. Waits for nobody."""
 
 from __future__ import annotations
 
+import math
 import socket
 from collections.abc import Callable
 from functools import partial
@@ -10,9 +11,80 @@ from typing import Final
 
 import msgspec
 
-from services.network_proxy.event_loop import READ, WRITE, SocketWatch
-from services.network_proxy.listener import SocketListener
-from shared.network.proxy_protocol import LINE_MAX, Reply, Request
+from services.network_proxy.sockets import READ, WRITE, SocketListener, SocketWatch
+from shared.clock import NS_PER_S, now_ns
+from shared.exceptions import ConfigError
+from shared.network.impairment_schedule import ImpairmentSchedule
+from shared.network.proxy_protocol import (
+    LINE_MAX,
+    Begin,
+    Clear,
+    Reply,
+    Request,
+    RequestedImpairment,
+)
+from shared.toml_file import check_ranges
+
+ASKED_MAX: Final = 64
+"""Impairments at once: each costs a little with every message, and a line in every answer."""
+WAIT_MAX_S: Final = 86_400.0
+"""Latest begin, from now."""
+
+
+class CommandHandler:
+    """Obeys, or says why not."""
+
+    def __init__(self, impairments: ImpairmentSchedule) -> None:
+        self._injections = impairments
+        self.changed = False
+        """An impairment has started or ended; the loop clears it."""
+
+    def obey(self, request: Request) -> Reply:
+        """Carry a request out and reply with the impairments."""
+        at_ns = now_ns()
+        try:
+            if isinstance(request, Begin):
+                if problem := self._problem(request):
+                    return Reply(error=problem)
+                self._begin(request, at_ns)
+            elif isinstance(request, Clear):
+                self._injections.clear(request.link, at_ns)
+        except ConfigError as error:
+            return Reply(error=f"{error.key}: {error.found}; {error.expected}")
+        self.changed = True
+        return Reply(requested=tuple(self._asked(at_ns)))
+
+    def _problem(self, request: Begin) -> str:
+        """Return why not, empty if it can be done; ConfigError for a number out of its range."""
+        check_ranges("inject", request.inject)
+        if not 0.0 <= request.in_s <= WAIT_MAX_S:
+            return f"in {request.in_s:g} s; from now to {WAIT_MAX_S:g} s on"
+        if len(self._injections.requested) >= ASKED_MAX:
+            return f"{ASKED_MAX} impairments are active or planned already; clear some first"
+        return request.inject.fault()
+
+    def _begin(self, request: Begin, at_ns: int) -> None:
+        inject, begins_ns = request.inject, at_ns + request.in_s * NS_PER_S
+        lasts_s = math.inf if inject.duration is None else inject.duration
+        until_ns = begins_ns + lasts_s * NS_PER_S
+        if request.in_s > 0.0:
+            self._injections.plan(inject.link, inject, begins_ns, until_ns)
+        else:
+            self._injections.begin(inject.link, inject, until_ns, at_ns)
+
+    def _asked(self, at_ns: int) -> list[RequestedImpairment]:
+        rows = []
+        for number, row in self._injections.requested.items():
+            passed, lost = self._injections.counts(number)
+            left_s = None if math.isinf(row.until) else (row.until - at_ns) / NS_PER_S
+            in_s = max(0.0, (row.begins - at_ns) / NS_PER_S)
+            hidden = self._injections.hidden(number)
+            words = row.what.describe()
+            rows.append(
+                RequestedImpairment(number, row.link, words, left_s, passed, lost, in_s, hidden)
+            )
+        return rows
+
 
 ASKERS_MAX: Final = 16
 """Who asks at once; one more, and the one that came first has to go."""
@@ -64,16 +136,7 @@ class ControlSocket:
     """A UNIX socket that takes one request a line."""
 
     def __init__(self, path: Path, obey: Callable[[Request], Reply], watch: SocketWatch) -> None:
-        """Listen.
-
-        Args:
-            path: of the socket; the file of a killed network proxy is removed.
-            obey: carries a request out.
-            watch: of the loop.
-
-        Raises:
-            BusError: no socket can be made there.
-        """
+        """Listen; BusError if no socket can be made there."""
         self._obey, self._watch = obey, watch
         self._askers: list[_Asker] = []
         self._listener = SocketListener(path)

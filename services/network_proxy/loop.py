@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Final
 
-from services.network_proxy.commands import CommandHandler
-from services.network_proxy.event_loop import SocketWatch
+from services.network_proxy.control import CommandHandler
 from services.network_proxy.relay import Relay
+from services.network_proxy.sockets import SocketWatch
 from shared.clock import NS_PER_S, machine_s, now_ns
 from shared.network.impairment_schedule import ImpairmentSchedule
 from shared.process import StopFlag
@@ -28,13 +28,13 @@ def run(
     while not stop:
         ready = watch.wait(_patience_s(relay, impairments))
         at_ns = now_ns()
-        relay.let_out_due(at_ns)
+        relay.release_due(at_ns)
         for call, events in ready:
             call(events, at_ns)
-        relay.give_up(at_ns)
+        relay.part_stuck(at_ns)
         if impairments.advance(at_ns, at_ns) or commands.changed:
             commands.changed = False
-            relay.release(at_ns)
+            relay.release_held(at_ns)
 
 
 def _patience_s(relay: Relay, impairments: ImpairmentSchedule) -> float:

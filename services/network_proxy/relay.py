@@ -8,10 +8,8 @@ from functools import partial
 from itertools import count
 from typing import Final, NamedTuple
 
-from services.network_proxy.connection import Connection
-from services.network_proxy.direction import Flow, Waiting
-from services.network_proxy.event_loop import READ, SocketWatch
-from services.network_proxy.proxy_endpoint import ProxyEndpoint
+from services.network_proxy.connection import Connection, Flow, Waiting
+from services.network_proxy.sockets import READ, ProxyEndpoint, SocketWatch
 from shared.config.impairment import Direction
 
 LINKS_MAX: Final = 16
@@ -41,11 +39,8 @@ class Relay:
     ) -> None:
         """Start to listen.
 
-        Args:
-            endpoints: one for each pair.
-            directions: impairments by the direction's name; others forward at once.
-            watch: of the loop.
-            lease_ns: time after which Zenoh gives up a silent link.
+        `directions` have the impairments by name, others forward at once; after `lease_ns` Zenoh
+        gives up a silent link.
         """
         self._directions, self._watch, self._lease_ns = directions, watch, lease_ns
         self._links: dict[ProxyEndpoint, list[Connection]] = {
@@ -73,21 +68,21 @@ class Relay:
         """Return when the next batch is due; None: none waits."""
         return self._due[0].release_ns if self._due else None
 
-    def let_out_due(self, now_ns: int) -> None:
-        """Let out every batch whose time has come."""
+    def release_due(self, now_ns: int) -> None:
+        """Release every batch whose time has come."""
         while self._due and self._due[0].release_ns <= now_ns:
             due = heapq.heappop(self._due)
             due.flow.put(due.row)
             self._settle(due.connection)
 
-    def release(self, now_ns: int) -> None:
+    def release_held(self, now_ns: int) -> None:
         """Send on what partitions that are over have held back."""
         for links in list(self._links.values()):
             for connection in list(links):
                 for flow in connection.flows:
                     self._pass_on(connection, flow, flow.release(now_ns), now_ns)
 
-    def give_up(self, now_ns: int) -> None:
+    def part_stuck(self, now_ns: int) -> None:
         """Part what stands still: an end that has taken nothing for a lease has left its link.
 
         Zenoh may have given it up without closing it, at both ends: each waits for room to say
@@ -141,7 +136,7 @@ class Relay:
         if connection.over:
             self._part(connection)
         elif not connection.parted:
-            connection.look()
+            connection.watch_ends()
 
     def _part(self, connection: Connection) -> None:
         """Close a connection; what waits for it is lost."""
@@ -153,6 +148,6 @@ class Relay:
                 links.remove(connection)
         for due in self._due:
             if due.connection is connection:
-                due.row.lose()
+                due.row.count_lost()
         self._due = [due for due in self._due if due.connection is not connection]
         heapq.heapify(self._due)

@@ -24,15 +24,14 @@ from typing import Final
 
 from services.recorder.auto_recover import AutoRecovery
 from services.recorder.disk_guard import MIB
-from services.recorder.host_watch import HostWatch
+from services.recorder.host_watch import HostWatch, Roster
 from services.recorder.loop import CAPACITY, Recorder, free_bytes_at, summary
-from services.recorder.roster import Roster
 from services.recorder.snapshot import SnapshotRing
 from shared import log, revision, scheduling
 from shared.bus import topics
-from shared.bus.arrivals import Arrivals
-from shared.bus.same_host import ports_here
+from shared.bus.security import ports_here
 from shared.bus.session import open_session
+from shared.bus.sockets import Arrivals
 from shared.clock import keep_pace, now_ns, pace
 from shared.config import gain_schedule
 from shared.config.files import load
@@ -41,7 +40,7 @@ from shared.config.sections import RecorderConfig
 from shared.exceptions import ConfigError, RunError
 from shared.mcap_log import provenance
 from shared.mcap_log.files import FIRST
-from shared.mcap_log.writer import SCHEMA_VERSION, MessageSource, RunWriter
+from shared.mcap_log.writer import SCHEMA_VERSION, RunWriter
 from shared.process import StopFlag, run_service, service_parser
 
 DRAIN_PERIOD_S: Final = 0.02
@@ -97,9 +96,11 @@ def main() -> int:
                 chunk_kib=config.recorder.chunk_kib,
                 begin=False,
             ) as writer:
-                recording = _recording(
-                    stream, writer, config.recorder, logger, arguments.out, snapshot
-                )
+                recording = Recorder(
+                    stream, writer, config.recorder, logger,
+                    free_bytes=lambda: free_bytes_at(arguments.out), now_ns=now_ns(),
+                    snapshot=snapshot,
+                )  # fmt: skip
                 logger.info("%s, priority %s", _about(writer, snapshot, len(recorded)), granted)
                 auto_recovery.start()
                 roster = None if arguments.of else Roster(session)
@@ -145,11 +146,7 @@ def _record(
     roster: Roster | None,
     host: HostWatch,
 ) -> None:
-    """Record until `stop`, then the queued rest.
-
-    Raises:
-        RunError: the file cannot be written.
-    """
+    """Record until `stop`, then the queued rest."""
     while not stop:
         if asked.take():
             recording.trigger("requested by SIGUSR1", now_ns())
@@ -162,25 +159,6 @@ def _record(
     recording.close()
     time.sleep(LAST_WORDS_S)
     recording.close()
-
-
-def _recording(
-    source: MessageSource,
-    writer: RunWriter,
-    config: RecorderConfig,
-    logger: logging.Logger,
-    out: Path,
-    snapshot: SnapshotRing | None,
-) -> Recorder:
-    return Recorder(
-        source,
-        writer,
-        config,
-        logger,
-        free_bytes=lambda: free_bytes_at(out),
-        now_ns=now_ns(),
-        snapshot=snapshot,
-    )
 
 
 def _about(writer: RunWriter, snapshot: SnapshotRing | None, keys: int) -> str:

@@ -19,16 +19,9 @@ from shared.mcap_log.recover import Interrupted
 
 
 class AutoRecovery(threading.Thread):
-    """Looks through a directory once, and ends."""
+    """Looks through a directory once, and ends; leaves `keep_free` bytes free beside a copy."""
 
     def __init__(self, directory: Path, keep_free: int, logger: logging.Logger) -> None:
-        """Recover the unfinished files of a directory.
-
-        Args:
-            directory: of the runs.
-            keep_free: bytes to leave free beside a copy.
-            logger: for the outcomes.
-        """
         super().__init__(name="auto_recovery", daemon=True)
         self._directory, self._keep_free = directory, keep_free
         self._logger = logger
@@ -69,12 +62,9 @@ def recover_in_place(
     """Recover one file, if it is unfinished and nobody writes it.
 
     A file that was only cut off is replaced by its recovered copy once that is on the disk. If
-    there is damage in the middle as well, the original stays and the copy goes beside it.
-
-    Raises:
-        RunError: it cannot be read, or the copy cannot be written.
-        Interrupted: `stop` returned True.
-        OSError: it cannot be opened.
+    there is damage in the middle as well, the original stays and the copy goes beside it. Raises
+    RunError or OSError if the file cannot be read or the copy not written; Interrupted if `stop`
+    returned True.
     """
     beside = recovered_name(path)
     with locked(path) as free:

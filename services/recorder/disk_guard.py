@@ -30,10 +30,9 @@ class DiskChange(Enum):
 
 
 class SpaceGuard:
-    """Feed it the free space once in a while."""
+    """Feed it the free space once in a while; a least free space of 0 switches it off."""
 
     def __init__(self, least_mib: float) -> None:
-        """Take the least free space; 0 switches the guard off."""
         self.enough = True
         """Recording may go on."""
         self._least = least_mib * MIB

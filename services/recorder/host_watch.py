@@ -1,6 +1,6 @@
-"""What goes wrong on this host beside the record: floods of the bus's ports, a disk that fills.
+"""What the recorder tells beside the record: who is linked, what goes wrong on its host.
 
-No other service has the time to look.
+No other service has the time to look for floods of the bus's ports and for a disk that fills.
 """
 
 from __future__ import annotations
@@ -11,8 +11,11 @@ from typing import Final
 
 from services.recorder.disk_guard import MIB, DiskChange, SpaceGuard
 from services.recorder.loop import Deadline, free_bytes_at
-from shared.bus.arrivals import Arrivals
-from shared.clock import NS_PER_S
+from shared.bus import topics
+from shared.bus.messages import ToolRoster
+from shared.bus.session import Session
+from shared.bus.sockets import Arrivals
+from shared.clock import NS_PER_MS, NS_PER_S
 
 RUN_DIR_MIN_MIB: Final = 16
 """Free space below which the run directory is called full: its logs lose lines soon."""
@@ -22,21 +25,17 @@ _AGAIN_NS: Final = 10 * NS_PER_S
 
 
 class HostWatch:
-    """Looks every two seconds.
-
-    Attributes:
-        trouble: what is wrong with the run directory's disk, in words; empty if nothing is.
-    """
+    """Looks every two seconds."""
 
     def __init__(
         self, arrivals: Arrivals, run_dir: Path, logger: logging.Logger, now_ns: int
     ) -> None:
-        """Take where to look and where to say it."""
         self._arrivals, self._run_dir, self._logger = arrivals, run_dir, logger
         self._guard = SpaceGuard(RUN_DIR_MIN_MIB)
         self._look = Deadline(_EVERY_NS, now_ns)
         self._say_at_ns = now_ns
         self.trouble = ""
+        """What is wrong with the run directory's disk, in words; empty if nothing is."""
 
     def look_if_due(self, now_ns: int) -> None:
         """Look, if it is time to, and say what there is to say."""
@@ -59,3 +58,32 @@ class HostWatch:
         self.trouble = "" if self._guard.enough else f"{told}: logs lose lines; free some space"
         if change in (DiskChange.LOW, DiskChange.FULL):
             self._logger.warning("%s: logs lose lines when it is full; free some space", told)
+
+
+NEWS_NS: Final = 100 * NS_PER_MS
+"""Between two messages, however many tools come and go."""
+
+
+class Roster:
+    """Tells twice a second, and at each change, who is linked and why nothing is recorded.
+
+    For `xrl status` and the log. Every tool dials the recorder, so it knows all that are linked.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self._watch = session.linked_tools()
+        self._publisher = session.publisher(topics.TOOLS, ToolRoster)
+        self._told: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
+        self._told_ns = self._due_ns = 0
+        self._seq = 0
+
+    def put_if_due(self, now_ns: int, trouble: tuple[str, ...]) -> None:
+        """Say who is linked and what is wrong, if that is news or due again; never blocks."""
+        told = self._watch.names(), trouble
+        is_news = told != self._told and now_ns >= self._told_ns + NEWS_NS
+        if not is_news and now_ns < self._due_ns:
+            return
+        self._told_ns = now_ns
+        self._told, self._due_ns = told, now_ns + round(NS_PER_S / topics.TOOLS.rate_hz)
+        self._seq += 1
+        self._publisher.put(ToolRoster(t_ns=now_ns, seq=self._seq, tools=told[0], trouble=trouble))

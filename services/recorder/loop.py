@@ -57,17 +57,9 @@ class Recorder:
     ) -> None:
         """Look at the disk, and start the first file unless there is a snapshot.
 
-        Args:
-            source: the bus.
-            writer: of the run, with no file started.
-            config: periods and limits.
-            logger: for notable changes.
-            free_bytes: returns the free space where the run is written.
-            now_ns: monotonic.
-            snapshot: write only the messages around a fault.
-
-        Raises:
-            RunError: the first file cannot be written.
+        `writer` has no file started; `free_bytes` returns the free space where the run is written;
+        a `snapshot` writes only the messages around a fault. Raises RunError if a file cannot be
+        written, as all methods do.
         """
         self._source, self._writer, self._snapshot = source, writer, snapshot
         self._logger, self._free_bytes = logger, free_bytes
@@ -89,11 +81,7 @@ class Recorder:
             self._begin(now_ns, {})
 
     def cycle(self, now_ns: int) -> None:
-        """Write new messages, and do what is due.
-
-        Raises:
-            RunError: the file cannot be written.
-        """
+        """Write new messages, and do what is due."""
         if self._snapshot is None:
             self._writer.take_from(self._source, CAPACITY)
         else:
@@ -212,11 +200,7 @@ class Recorder:
                 pass
 
     def close(self) -> None:
-        """Write the queued rest; the writer finishes the file.
-
-        Raises:
-            RunError: the file cannot be written.
-        """
+        """Write the queued rest; the writer finishes the file."""
         if self._snapshot is None:
             self._writer.take_from(self._source, CAPACITY)
         else:
@@ -227,11 +211,7 @@ class Recorder:
 
 
 def free_bytes_at(directory: Path) -> int:
-    """Return the free space where a directory is or will be.
-
-    Raises:
-        OSError: it cannot be read.
-    """
+    """Return the free space where a directory is or will be; OSError if it cannot be read."""
     while not directory.exists() and directory != directory.parent:
         directory = directory.parent
     found = os.statvfs(directory)

@@ -37,16 +37,9 @@ class _Event(msgspec.Struct, gc=False):
 
 
 class SnapshotRing:
-    """A ring of messages; a `MessageSource` of those to be written."""
+    """A ring of messages, `seconds` of them; a `MessageSource` of those to be written."""
 
     def __init__(self, seconds: float, most_bytes: int, keys: Mapping[str, Topic]) -> None:
-        """Keep the messages of some keys.
-
-        Args:
-            seconds: so long before a fault, and after it.
-            most_bytes: of memory.
-            keys: topic of every key to record.
-        """
         self.dropped = 0
         """Messages younger than `seconds` that memory had no room for."""
         self.reason = ""

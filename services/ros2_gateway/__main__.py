@@ -19,8 +19,8 @@ from services.ros2_gateway.ros_types import RosTypes
 from shared import log, process
 from shared.bus import session as bus
 from shared.bus import topics
+from shared.bus.credentials import require_operator
 from shared.bus.messages import Estop, OperatorIntent
-from shared.bus.operator_key import require_operator
 from shared.clock import now_ns, sleep_until
 from shared.config.files import load
 from shared.joints import MODULES

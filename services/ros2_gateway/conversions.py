@@ -21,16 +21,9 @@ from shared.bus.messages import (
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.joints import AXES, MODULES, SIDES
-from shared.robot.frames import (
-    ORIGIN,
-    UPRIGHT,
-    FramePose,
-    leg_offsets,
-    rotation_about,
-    torso_pose,
-)
-from shared.robot.remedies import reason_of, remedy_of
+from shared.robot.frames import ORIGIN, UPRIGHT, FramePose, leg_offsets, rotation_about, torso_pose
 from shared.robot.robot_urdf import cross_of
+from shared.robot.trip_table import reason_of, remedy_of
 
 JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"
@@ -62,14 +55,14 @@ def knows_position(state: JointState) -> bool:
 
 
 class Conversions:
-    """Makes the messages of one robot. Each method returns a message in CDR.
+    """Makes the messages of one robot, whose namespace the names of the frames begin with.
 
-    Times are in ns since 1970, or of the log's clock; one that ROS 2 cannot say becomes the first
-    or the last that it can.
+    Each method returns a message in CDR. Times are in ns since 1970, or of the log's clock; one
+    that ROS 2 cannot say becomes the first or the last that it can. A state, status or wrench that
+    is missing belongs to a process that is silent.
     """
 
     def __init__(self, config: RobotConfig, types: RosTypes) -> None:
-        """Take the robot, whose namespace the names of the frames begin with."""
         self._config, self._types = config, types
         self._prefix = f"{config.ros2.namespace}/" if config.ros2.namespace else ""
 
@@ -99,10 +92,7 @@ class Conversions:
     ) -> bytes:
         """Return `tf2_msgs/msg/TFMessage`: torso in the world, COM, and the links of the URDF.
 
-        Args:
-            ns: time.
-            states: as for `joint_states`; the torso is placed if there are all six.
-            status: newest status of the planner, for COM and stance; None: it is silent.
+        The torso is placed if there are all six states; the status gives COM and stance.
         """
         geometry = self._config.geometry
         rows = [FramePose("torso", "harness", geometry.harness_point, UPRIGHT)]

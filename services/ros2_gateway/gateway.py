@@ -57,22 +57,13 @@ def topics_of(namespace: str) -> RosTopics:
 
 
 class Gateway:
-    """Newest messages in, messages for ROS 2 out, each topic at its rate.
+    """Newest messages in, messages for ROS 2 out, each topic at its rate (`config.ros2`).
 
-    What is silent is not repeated: a joint state without a module, a transform without its torso.
-
-    Attributes:
-        topics: those that it may send.
+    What is silent is not repeated: a joint state without a module, a transform without its torso. A
+    simulated robot tells the time as well.
     """
 
     def __init__(self, config: RobotConfig, convert: Conversions, *, simulated: bool) -> None:
-        """Begin with nothing received.
-
-        Args:
-            config: the robot; `ros2` has the rates.
-            convert: makes the messages.
-            simulated: it tells the time as well.
-        """
         self.topics = topics_of(config.ros2.namespace)
         self._convert, self._config = convert, config
         self._newest: dict[tuple[Topic, str], tuple[int, Message]] = {}

@@ -42,11 +42,7 @@ def inbound_topics(namespace: str) -> InboundTopics:
 
 
 def acceptable(words: str) -> tuple[str, ...]:
-    """Return what `--accept` names, such as `intent,estop`.
-
-    Raises:
-        FleetError: it is not a list of `ACCEPTABLE`.
-    """
+    """Return what `--accept` names, such as `intent,estop`; FleetError if it is none of these."""
     names = [word for word in words.split(",") if word]
     if not names or not set(names) <= set(ACCEPTABLE):
         raise FleetError(f"--accept {words}: intent or estop or intent,estop is right")
@@ -62,7 +58,6 @@ class Inbound:
     """
 
     def __init__(self, config: RobotConfig) -> None:
-        """Begin without a request."""
         self._topics = inbound_topics(config.ros2.namespace)
         self._most_n = config.assist.force_max
         self._assist_n: float | None = None
@@ -89,10 +84,8 @@ class Inbound:
     ) -> OperatorIntent | None:
         """Return the intent that just came, once; None: there is none, or another leads.
 
-        Args:
-            now_ns: the fleet's clock.
-            number: of the intents sent so far.
-            status: of the planner: whose intent it follows.
+        `number` is that of the intents sent so far; `status` tells whose intent the planner
+        follows.
         """
         assist_n, self._assist_n = self._assist_n, None
         if assist_n is None:
@@ -105,12 +98,8 @@ class Inbound:
     def stop_due(self, now_ns: int, modes: Sequence[tuple[int, int]], of: int) -> bool:
         """Return True if the stop is to be put on the bus now.
 
-        What was heard before the request does not count: a module may be silent since.
-
-        Args:
-            now_ns: the fleet's clock.
-            modes: when each module's newest state arrived, ns, and its mode.
-            of: number of all modules.
+        `modes` has when each module's newest state arrived, ns, and its mode. What was heard before
+        the request does not count: a module may be silent since.
         """
         since_ns = self._stop_since_ns
         if since_ns is None:

@@ -26,7 +26,6 @@ class GatewayLoop:
     """One cycle of the gateway."""
 
     def __init__(self, gateway: Gateway, inputs: Sequence[Input], link: RosLink) -> None:
-        """Take the robot's subscribers and the link with ROS 2."""
         self._gateway, self._inputs, self._link = gateway, inputs, link
         gateway.figures = self.figures
         self._inbound: Inbound | None = None
@@ -48,12 +47,7 @@ class GatewayLoop:
         self._inbound, self._intents, self._stops = inbound, intents, stops
 
     def cycle(self, now_ns: int, unix_ns: int) -> None:
-        """Run one cycle.
-
-        Args:
-            now_ns: the fleet's clock.
-            unix_ns: the same moment, ns since 1970.
-        """
+        """Run one cycle; `unix_ns` is the same moment as `now_ns`, ns since 1970."""
         for topic, module, latest in self._inputs:
             message = latest.take()
             if message is None:

@@ -65,11 +65,7 @@ class RosNode(NamedTuple):
 
 
 def domain(text: str) -> int:
-    """Return a domain from a command line.
-
-    Raises:
-        argparse.ArgumentTypeError: it is none: 0 to 232.
-    """
+    """Return a domain from a command line; ArgumentTypeError if it is none: 0 to 232."""
     if not (text.strip().isdecimal() and int(text) <= DOMAIN_MAX):
         raise argparse.ArgumentTypeError(f"{text[:40]!r}: a domain is from 0 to {DOMAIN_MAX}")
     return int(text)
@@ -95,12 +91,7 @@ def node_token(node: RosNode) -> str:
 def endpoint_token(node: RosNode, number: int, kind: Kind, topic: RosTopic, type_hash: str) -> str:
     """Return the key of the liveliness token of a node's publisher or subscription.
 
-    Args:
-        node: of the endpoint.
-        number: of the endpoint within its session.
-        kind: of the endpoint.
-        topic: its topic.
-        type_hash: of the topic's type.
+    `number` is that of the endpoint within its session.
     """
     place = f"{ADMIN_SPACE}/{node.domain}/{node.session}/0/{number}/{kind}"
     names = f"%/{_mangled(node.namespace)}/{node.name}/{_mangled(topic.name)}"

@@ -26,11 +26,7 @@ _SETTINGS: Final[dict[str, object]] = {
     "scouting/multicast/enabled": False,
     "connect/timeout_ms": 1000,
     "connect/exit_on_failure": True,
-    "connect/retry": {
-        "period_init_ms": 200,
-        "period_max_ms": 2000,
-        "period_increase_factor": 2.0,
-    },
+    "connect/retry": {"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 2.0},
     "timestamping/enabled": True,  # the cache of a transient-local publisher asks for it
 }
 _QUEUE: Final = 64
@@ -43,25 +39,11 @@ class RosSession:
     """A node with publishers and subscriptions. Use it in a `with` statement."""
 
     def __init__(
-        self,
-        router: str,
-        domain: int,
-        types: RosTypes,
-        *,
-        namespace: str = "",
-        name: str = NODE,
+        self, router: str, domain: int, types: RosTypes, *, namespace: str = "", name: str = NODE
     ) -> None:
-        """Open the session; takes up to a second.
+        """Open the session by the router's endpoint; takes up to a second.
 
-        Args:
-            router: Zenoh endpoint of the network's router.
-            domain: ROS_DOMAIN_ID.
-            types: of the network's distribution.
-            namespace: of the node, such as `legs`.
-            name: of the node.
-
-        Raises:
-            BusError: the router does not answer.
+        BusError without an answer.
         """
         config = zenoh.Config()
         for key, value in {**_SETTINGS, "connect/endpoints": [router]}.items():
@@ -157,17 +139,15 @@ class RosSession:
 
 
 class RosLink:
-    """Opens a session in a thread of its own, again and again until the router is there."""
+    """Opens a session in a thread of its own, again and again until the router is there.
+
+    `opened` opens and declares, and raises where there is no router; `failed` is told the first
+    time.
+    """
 
     def __init__(
         self, opened: Callable[[], RosSession], failed: Callable[[Exception], None]
     ) -> None:
-        """Begin.
-
-        Args:
-            opened: opens and declares; raises where there is no router.
-            failed: is told the first time that it does.
-        """
         self._open, self._failed = opened, failed
         self._left = threading.Event()
         self.session: RosSession | None = None

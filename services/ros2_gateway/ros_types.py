@@ -13,14 +13,9 @@ else:
 
 
 class RosTypes:
-    """The types of one distribution of ROS 2."""
+    """The types of one of `shared.config.checks.ROS2_DISTRIBUTIONS`."""
 
     def __init__(self, distribution: str) -> None:
-        """Load them.
-
-        Args:
-            distribution: of `shared.config.checks.ROS2_DISTRIBUTIONS`.
-        """
         self._store = typesys.get_typestore(typesys.Stores[f"ROS2_{distribution.upper()}"])
 
     def hash(self, type_name: str) -> str:

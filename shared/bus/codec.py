@@ -17,9 +17,8 @@ _ENCODER = msgspec.json.Encoder()
 def encode(message: Message) -> bytes:
     """Return the JSON of a message.
 
-    Raises:
-        NonFiniteError: a number in it is NaN or infinite. msgspec writes those as
-            null, which no message's type allows: it has no optional field.
+    Raises NonFiniteError for a number that is NaN or infinite: msgspec writes it as null, which no
+    message's type allows, since it has no optional field.
     """
     payload = _ENCODER.encode(message)
     if b"null" in payload:  # or the word in a text: its own type tells
@@ -36,15 +35,14 @@ class Decoder(Generic[M]):
     """Decodes one type of message; what does not fit is counted, not raised."""
 
     def __init__(self, message_type: type[M]) -> None:
-        """Prepare for one message type."""
         self._decoder = msgspec.json.Decoder(message_type)
         self.refused = 0
 
     def decode(self, payload: bytes) -> M | None:
         """Return the message, or None if the payload is malformed, which is counted.
 
-        null, NaN and infinities fail the type check: null is no float, and JSON has no literal for
-        the others.
+        null, NaN and infinities fail the type check: null is no float, JSON has no literal for the
+        others.
         """
         try:
             return self._decoder.decode(payload)

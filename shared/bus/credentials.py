@@ -15,11 +15,10 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from shared.bus.access import PRINCIPALS
-from shared.bus.topics import OPERATOR, VIEWER
+from shared.bus.topics import OPERATOR, PRINCIPALS, VIEWER
 from shared.config.endpoints import ROBOT, filled
 from shared.config.robot_config import SERVICES, RobotConfig
-from shared.exceptions import BusError, ConfigError
+from shared.exceptions import BusError, ConfigError, FleetError
 from shared.toml_file import Section, read_toml
 from shared.user import in_home
 
@@ -48,11 +47,7 @@ class Credentials(NamedTuple):
 
 
 def keys_folder(robot: RobotConfig) -> Path:
-    """Return the folder that `bus.security.keys` names.
-
-    Raises:
-        XrlError: it is in a home that this user does not have.
-    """
+    """Return the folder that `bus.security.keys` names; XrlError if this user has no such home."""
     return in_home(filled(robot.bus.security.keys, {ROBOT: robot.name}))
 
 
@@ -67,11 +62,7 @@ def key_file(folder: Path, name: str) -> Path:
 
 
 def read_names(folder: Path) -> Names:
-    """Return whose keys a folder holds.
-
-    Raises:
-        BusError: there are none, or `names.toml` is not as it should be.
-    """
+    """Return whose keys a folder holds; BusError if there are none, or `names.toml` is wrong."""
     file = folder / NAMES
     if not file.is_file():
         raise BusError(f"{folder}: no keys for `mtls` here ({NAMES} is missing); {_HELP}")
@@ -87,24 +78,15 @@ def read_names(folder: Path) -> Names:
 
 
 def held_names(folder: Path) -> frozenset[str]:
-    """Return the current names whose private keys a folder holds.
-
-    Raises:
-        BusError: as `read_names`.
-    """
+    """Return the current names whose private keys a folder holds; BusError as `read_names`."""
     return frozenset(n for n in read_names(folder).generations if key_file(folder, n).exists())
 
 
 def read_credentials(robot: RobotConfig, process: str) -> Credentials:
     """Return what a process of this host proves itself with.
 
-    Args:
-        robot: its `bus.security.keys` names the folder.
-        process: a service, or a tool: it is the operator if this host has the operator's key,
-            else a viewer.
-
-    Raises:
-        BusError: something is missing, another robot's, or readable for others.
+    A tool is the operator if this host has the operator's key, else a viewer. Raises BusError if
+    something is missing, another robot's, or readable for others.
     """
     folder = keys_folder(robot)
     names = read_names(folder)
@@ -114,13 +96,8 @@ def read_credentials(robot: RobotConfig, process: str) -> Credentials:
         )
     wanted = (process,) if process in SERVICES else (OPERATOR, VIEWER)
     name = next((name for name in wanted if key_file(folder, name).exists()), wanted[-1])
-    credentials = Credentials(
-        name,
-        certificate_file(folder, name),
-        key_file(folder, name),
-        folder / AUTHORITY,
-        names.generations,
-    )
+    certificate, key = certificate_file(folder, name), key_file(folder, name)
+    credentials = Credentials(name, certificate, key, folder / AUTHORITY, names.generations)
     for file in (credentials.certificate, credentials.key, credentials.authority):
         if not file.is_file():
             raise BusError(
@@ -130,12 +107,20 @@ def read_credentials(robot: RobotConfig, process: str) -> Credentials:
     return credentials
 
 
-def check_private(key: Path) -> None:
-    """Refuse a private key that is not this user's alone.
+def require_operator(robot: RobotConfig, process: str) -> None:
+    """Make sure that the modules heed what this host sends; only `mtls` tells who sends.
 
-    Raises:
-        BusError: it is somebody else's, or others may read it.
+    Raises BusError if this host has no key, FleetError if it has another than an operator's.
     """
+    if robot.bus.security.mode != "mtls":
+        return
+    name = read_credentials(robot, process).name
+    if name != OPERATOR:
+        raise FleetError(f"this host has the key of a {name}; to act takes an operator's")
+
+
+def check_private(key: Path) -> None:
+    """Raise BusError for a private key that is somebody else's, or that others may read."""
     found = key.stat()
     if found.st_uid != os.geteuid():
         raise BusError(f"{key}: belongs to another user; a private key is its service's own")

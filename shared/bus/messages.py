@@ -228,6 +228,14 @@ class RunEventKind(IntEnum):
     subject says which, the detail for how long."""
 
 
+def name_of(kind: type[IntEnum], code: int) -> str:
+    """Return the name of a code, for example TRACK, or "unknown (99)": of another version."""
+    try:
+        return kind(code).name
+    except ValueError:
+        return f"unknown ({code})"
+
+
 class Message(msgspec.Struct, gc=False, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Base of all messages: the sender's monotonic time and a sequence number."""
 

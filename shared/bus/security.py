@@ -1,16 +1,28 @@
-"""Zenoh's settings for each `bus.security.mode` (docs/security.md)."""
+"""Who gets onto the bus, and what each may put and receive there (docs/security.md).
+
+Zenoh's settings for each `bus.security.mode`, and what `mtls` adds. Each process checks what its
+peers send by the name in their certificate: service and generation. The rules follow from the
+topics' columns `writers` and `readers`; what no rule allows is denied. Zenoh has no list of revoked
+certificates: the rules name the current generation of each name only.
+
+Services of one host are linked by UNIX sockets: a TLS listener of Zenoh reports ten failed
+handshakes a second and keeps the sockets of all others until then, so whoever may connect to its
+port can keep new links off. A socket in the run directory is this user's alone; a peer on it may do
+what any of the keys here allows, because its user reads them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import ipaddress
+import socket
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, Final
 
 from shared import log
-from shared.bus import allow_list
-from shared.bus.access import access_control
-from shared.bus.credentials import held_names, read_credentials
+from shared.bus import sockets, topics
+from shared.bus.credentials import held_names, keys_folder, read_credentials
 from shared.config.endpoints import host_and_port
-from shared.config.robot_config import ENDPOINTS_OF_MODE, RobotConfig
+from shared.config.robot_config import ENDPOINTS_OF_MODE, SERVICES, RobotConfig
 from shared.exceptions import BusError
 
 UNIX: Final = "unixsock-stream/"
@@ -25,17 +37,27 @@ HANDSHAKE_MS: Final = 2_000
 SESSIONS_MAX: Final = 128
 """Peers at a time, of all names together: viewers that hang are not to shut a planner out."""
 
+_LOW_PASS: Final[dict[str, Any]] = {
+    "id": "payloads",
+    "flows": ["ingress"],
+    "messages": ["put"],
+    "key_exprs": ["**"],
+    "size_limit": PAYLOAD_MAX,
+}
+_SOCKET: Final = "unixsock-stream/{{run}}/{service}.zenoh"
+_ANY_PORT: Final = 9
+"""Nothing is sent there."""
+_THIS_HOST: Final = "this-host"
+_RECEIVED: Final = ("declare_subscriber",)
+_TOKENS: Final = ("liveliness_token",)
+_QUERIES: Final = ("liveliness_query", "declare_liveliness_subscriber")
+
 
 def settings(robot: RobotConfig, process: str, endpoints: Sequence[str]) -> dict[str, object]:
-    """Return the settings that keep strangers off.
+    """Return Zenoh's settings that keep strangers off.
 
-    Args:
-        robot: its `bus.security`.
-        process: its name on the bus.
-        endpoints: all that it listens on or dials, as Zenoh takes them.
-
-    Raises:
-        BusError: an endpoint is none of the mode's, or a key is missing.
+    `endpoints` are all that the process listens on or dials, as Zenoh takes them. Raises BusError
+    if one is none of the mode's, or a key is missing.
     """
     mode = robot.bus.security.mode
     right_ones = ENDPOINTS_OF_MODE[mode] + ((UNIX,) if mode == "mtls" else ())
@@ -53,44 +75,10 @@ def settings(robot: RobotConfig, process: str, endpoints: Sequence[str]) -> dict
     return found
 
 
-_LOW_PASS: Final[dict[str, Any]] = {
-    "id": "payloads",
-    "flows": ["ingress"],
-    "messages": ["put"],
-    "key_exprs": ["**"],
-    "size_limit": PAYLOAD_MAX,
-}
-
-
-def allow_robots_hosts(robot: RobotConfig, listening: Sequence[str]) -> None:
-    """Under `mtls`, have this process hear the hosts of the endpoints and of `allow` only.
-
-    A host whose name is not known now is left out, and told: its own link fails, and no other.
-
-    Raises:
-        BusError: the kernel takes no filter.
-    """
-    if robot.bus.security.mode != "mtls":
-        return
-    hosts = {host_and_port(endpoint)[0] for endpoint in robot.bus.endpoints.values()}
-    ports = {host_and_port(each)[1] for each in listening if each.startswith(TCP)}
-    if not ports:
-        return
-    addresses, unknown = allow_list.resolved([*hosts, *robot.bus.security.allow])
-    for name in unknown:
-        log.get("xrl").warning("%s: no such host now; what comes from it is dropped", name)
-    allow_list.restrict(ports, addresses)
-
-
-def listener(endpoint: str) -> str:
-    """Return an endpoint to listen on as Zenoh takes it: a silent handshake is dropped soon."""
-    of_tls = endpoint.startswith("tls/")
-    return f"{endpoint}#tls_handshake_timeout_ms={HANDSHAKE_MS}" if of_tls else endpoint
-
-
 def _mutual_tls(robot: RobotConfig, process: str) -> dict[str, object]:
     own = read_credentials(robot, process)
     certificate, key = str(own.certificate), str(own.key)
+    held = held_names(own.authority.parent)
     return {
         "transport/link/protocols": ["tls", "unixsock-stream"],
         "transport/link/tls": {
@@ -104,7 +92,179 @@ def _mutual_tls(robot: RobotConfig, process: str) -> dict[str, object]:
             # An expiry must not cut a robot that stands; `xrl doctor` warns before.
             "close_link_on_expiration": False,
         },
-        "access_control": access_control(
-            robot.name, own.name, own.generations, held_names(own.authority.parent)
-        ),
+        "access_control": access_control(robot.name, own.name, own.generations, held),
     }
+
+
+def listener(endpoint: str) -> str:
+    """Return an endpoint to listen on as Zenoh takes it: a silent handshake is dropped soon."""
+    of_tls = endpoint.startswith("tls/")
+    return f"{endpoint}#tls_handshake_timeout_ms={HANDSHAKE_MS}" if of_tls else endpoint
+
+
+def allow_robots_hosts(robot: RobotConfig, listening: Sequence[str]) -> None:
+    """Under `mtls`, have this process hear the hosts of the endpoints and of `allow` only.
+
+    A host whose name is not known now is left out, and told: its own link fails, and no other.
+    Raises BusError if the kernel takes no filter.
+    """
+    if robot.bus.security.mode != "mtls":
+        return
+    hosts = {host_and_port(endpoint)[0] for endpoint in robot.bus.endpoints.values()}
+    ports = {host_and_port(each)[1] for each in listening if each.startswith(TCP)}
+    if not ports:
+        return
+    addresses, unknown = sockets.resolved([*hosts, *robot.bus.security.allow])
+    for name in unknown:
+        log.get("xrl").warning("%s: no such host now; what comes from it is dropped", name)
+    sockets.restrict(ports, addresses)
+
+
+# ---- access rules
+
+
+def access_control(
+    robot: str, own: str, generations: Mapping[str, int], held: Collection[str] = ()
+) -> dict[str, Any]:
+    """Return Zenoh's setting `access_control` of one process, one of `PRINCIPALS`.
+
+    `generations` are the current ones of each certified name; `held` are the names whose keys this
+    host holds, which its UNIX sockets serve.
+    """
+    shown = (f"{alive_prefix(robot)}/*", f"{tools_prefix(robot)}/*")
+    rules = [
+        _rule("subscribe", "egress", _RECEIVED, topics.read_keys(robot, own)),
+        _rule("show-me", "egress", _TOKENS, _token_keys(robot, own)),
+        _rule("look-round", "egress", _QUERIES, shown),
+        _rule("be-looked-at", "ingress", _QUERIES, shown),
+    ]
+    everybody = [rule["id"] for rule in rules if rule is not None]
+    subjects: list[dict[str, Any]] = []
+    policies, here = [], set(everybody)
+    for name, generation in generations.items():
+        own_rules = [
+            # By receiver: until a new peer has told its subscriptions, Zenoh sends it everything.
+            _rule(f"to-{name}", "egress", ("put",), topics.keys_between(robot, own, name)),
+            _rule(f"{name}-puts", "ingress", ("put",), topics.written_keys(robot, name)),
+            _rule(f"{name}-subscribes", "ingress", _RECEIVED, topics.read_keys(robot, name)),
+            _rule(f"{name}-shows", "ingress", _TOKENS, _token_keys(robot, name)),
+        ]
+        rules += own_rules
+        subjects.append({"id": name, "cert_common_names": [common_name(name, generation)]})
+        own_ids = [rule["id"] for rule in own_rules if rule is not None]
+        policies.append({"rules": [*everybody, *own_ids], "subjects": [name]})
+        here.update(own_ids if name in held else ())
+    if held:
+        subjects.append({"id": _THIS_HOST, "link_protocols": ["unixsock-stream"]})
+        policies.append({"rules": sorted(here), "subjects": [_THIS_HOST]})
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": [rule for rule in rules if rule is not None],
+        "subjects": subjects,
+        "policies": policies,
+    }
+
+
+def _rule(
+    name: str, flow: str, messages: Iterable[str], keys: tuple[str, ...]
+) -> dict[str, Any] | None:
+    """Return a rule; None where there is nothing to allow, which Zenoh refuses as a rule."""
+    if not keys:
+        return None
+    return {
+        "id": name,
+        "permission": "allow",
+        "flows": [flow],
+        "messages": list(messages),
+        "key_exprs": list(keys),
+    }
+
+
+def common_name(name: str, generation: int) -> str:
+    """Return the name in a certificate, for example `planner.2`."""
+    return f"{name}.{generation}"
+
+
+def alive_prefix(robot: str) -> str:
+    """Return what the keys of the liveliness tokens begin with."""
+    return f"xrl/{robot}/alive"
+
+
+def tools_prefix(robot: str) -> str:
+    """Return what the keys of the tools' liveliness tokens begin with."""
+    return f"{alive_prefix(robot)}/tool"
+
+
+def token_key(robot: str, name: str, place: str = "") -> str:
+    """Return the key of a process's liveliness token; `place` tells tools of one name apart."""
+    if name in SERVICES:
+        return f"{alive_prefix(robot)}/{name}"
+    return f"{tools_prefix(robot)}/{name}{place and f'.{place}'}"
+
+
+def _token_keys(robot: str, name: str) -> tuple[str, ...]:
+    if name in SERVICES:
+        return (token_key(robot, name),)
+    return (f"{tools_prefix(robot)}/*",)
+
+
+# ---- services of one host
+
+
+def services_here(robot: RobotConfig) -> frozenset[str]:
+    """Return the services that run on this host: their keys are here, and their address is its own.
+
+    None unless the bus is `mtls`, or where this host has no keys. A name lookup may block: at the
+    start only.
+    """
+    if robot.bus.security.mode != "mtls":
+        return frozenset()
+    try:
+        held = held_names(keys_folder(robot))
+    except BusError:
+        return frozenset()  # `open_session` refuses to go on without them
+    return frozenset(s for s in robot.services if s in held and _is_own(robot.bus.endpoints[s]))
+
+
+def endpoint_here(robot: RobotConfig, service: str, here: frozenset[str]) -> str:
+    """Return where a process of this host, with these `services_here`, reaches a service."""
+    return _SOCKET.format(service=service) if service in here else robot.bus.endpoints[service]
+
+
+def listening(robot: RobotConfig, service: str, here: frozenset[str]) -> tuple[str, ...]:
+    """Return where a service here listens; at a port only if another host may link to it."""
+    own = endpoint_here(robot, service, here)
+    public = robot.bus.endpoints[service]
+    # The simulator runs where the fleet starts it; a real robot's hosts have no key of it.
+    others = set(robot.services) - here - {"simulator"}
+    return (own, public) if own != public and (others or robot.bus.security.allow) else (own,)
+
+
+def ports_here(robot: RobotConfig) -> frozenset[int]:
+    """Return the ports at which this host's services listen under `mtls`."""
+    here = services_here(robot)
+    endpoints = [endpoint for service in here for endpoint in listening(robot, service, here)]
+    return frozenset(host_and_port(each)[1] for each in endpoints if each.startswith(TCP))
+
+
+def _is_own(endpoint: str) -> bool:
+    """Return True if an endpoint's host is this one. Nothing is sent."""
+    addresses, _ = sockets.resolved([host_and_port(endpoint)[0]])
+    return any(map(_is_own_address, addresses))
+
+
+def _is_own_address(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> bool:
+    """Ask for the route: to an own address it begins there.
+
+    Binding would not tell: with `net.ipv4.ip_nonlocal_bind` any address can be bound.
+    """
+    if address.is_loopback:
+        return True
+    family = socket.AF_INET if address.version == 4 else socket.AF_INET6
+    with socket.socket(family, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect((str(address), _ANY_PORT))
+        except OSError:  # no route
+            return False
+        return str(probe.getsockname()[0]) == str(address)

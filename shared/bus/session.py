@@ -18,21 +18,19 @@ import os
 import re
 import socket
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Final, Generic, Self, TypeAlias, TypeVar
 
 import zenoh
 
 from shared import log
-from shared.bus import same_host, security, socket_linger, tls_probe
-from shared.bus.access import alive_prefix, token_key, tools_prefix
-from shared.bus.allow_list import resolved
+from shared.bus import security, sockets, tls_probe
 from shared.bus.codec import Decoder, encode
 from shared.bus.credentials import Credentials, read_credentials
 from shared.bus.messages import Message
-from shared.bus.socket_linger import Address
+from shared.bus.security import alive_prefix, token_key, tools_prefix
+from shared.bus.sockets import Address
 from shared.bus.tls_probe import LinkWatch
 from shared.bus.topics import Priority, Topic
 from shared.clock import keep_pace, now_ns
@@ -45,6 +43,7 @@ from shared.process import SOCKET_PATH_MAX
 from shared.run_directory import private_files
 
 M = TypeVar("M", bound=Message)
+T = TypeVar("T")
 _Subscriber: TypeAlias = "zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]"
 
 _SETTINGS: Final[dict[str, object]] = {
@@ -57,11 +56,7 @@ _SETTINGS: Final[dict[str, object]] = {
     "connect/timeout_ms": -1,
     "connect/exit_on_failure": False,
     # One object: Zenoh knows no key for its parts.
-    "connect/retry": {
-        "period_init_ms": 20,
-        "period_max_ms": 200,
-        "period_increase_factor": 2.0,
-    },
+    "connect/retry": {"period_init_ms": 20, "period_max_ms": 200, "period_increase_factor": 2.0},
     # Else open() waits half a second for peers that are not up.
     "open/return_conditions/connect_scouted": False,
     "transport/link/tx/keep_alive": 4,
@@ -105,35 +100,33 @@ def peers_of(name: str, services: Sequence[str] = SERVICES) -> tuple[str, ...]:
     return (*MODULES, *central[: central.index(name)])
 
 
-class Publisher(Generic[M]):
+class Publisher(Generic[T]):
     """Puts the messages of one key on the bus."""
 
-    def __init__(self, publisher: zenoh.Publisher) -> None:
-        self._put = publisher.put
+    def __init__(self, publisher: zenoh.Publisher, encoded: Callable[[T], bytes]) -> None:
+        self._publisher, self._put, self._encoded = publisher, publisher.put, encoded
         self.failed = 0
         """Messages that were not sent: not finite, or the session is closed."""
 
-    def put(self, message: M) -> bool:
+    def put(self, message: T) -> bool:
         """Send a message; return False and count it if it cannot be sent.
 
         Never blocks and never raises. Where a subscriber's queue is full the message is
         dropped for that subscriber only, and that is not counted.
         """
         try:
-            self._put(encode(message))
+            self._put(self._encoded(message))
         except (NonFiniteError, zenoh.ZError):
             self.failed += 1
             return False
         return True
 
 
-class RawPublisher:
+class RawPublisher(Publisher[bytes]):
     """Puts payloads on one key as they are: for a player of logs, never for a service."""
 
     def __init__(self, publisher: zenoh.Publisher) -> None:
-        self._publisher = publisher
-        self.failed = 0
-        """Payloads that were not sent: the session is closed."""
+        super().__init__(publisher, bytes)
 
     @property
     def matched(self) -> bool:
@@ -142,15 +135,6 @@ class RawPublisher:
             return bool(self._publisher.matching_status.matching)  # type: ignore[attr-defined]  # zenoh's stub
         except zenoh.ZError:
             return False
-
-    def put(self, payload: bytes) -> bool:
-        """Send a payload; return False and count it if it cannot be sent; never raises."""
-        try:
-            self._publisher.put(payload)
-        except zenoh.ZError:
-            self.failed += 1
-            return False
-        return True
 
 
 class Latest(Generic[M]):
@@ -244,12 +228,7 @@ class Session:
         """Return the session itself."""
         return self
 
-    def __exit__(
-        self,
-        error_type: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         """Close the session."""
         self.close()
 
@@ -266,13 +245,8 @@ class Session:
     def publisher(self, topic: Topic, message_type: type[M], module: str = "") -> Publisher[M]:
         """Declare a publisher; do it at the start, not in a loop.
 
-        Args:
-            topic: a row of `shared.bus.topics`.
-            message_type: its type, for the type checker and checked here.
-            module: the module, for a topic with one key per module.
-
-        Raises:
-            BusError: the type or the module does not fit the topic.
+        `module` is for a topic with one key per module. Raises BusError if the type or the module
+        does not fit the topic.
         """
         key = self._key(topic, message_type, module)
         publisher = self._session.declare_publisher(
@@ -281,21 +255,14 @@ class Session:
             priority=_PRIORITIES[topic.priority],
             express=False,
         )
-        return Publisher(publisher)
+        return Publisher(publisher, encode)
 
     def raw_publisher(self, key: str, *, patient: bool) -> RawPublisher:
-        """Declare a publisher of encoded payloads on any key.
+        """Declare a publisher of encoded payloads on any full key; BusError if it is malformed.
 
         All such publishers have one priority: payloads arrive in the order of `put`, over all keys.
-
-        Args:
-            key: a full key, without wildcards.
-            patient: `put` waits for a slow subscriber, up to `wait_before_close` (5 s) and then
-                drops the link, instead of dropping the message. Only for a caller that nothing
-                waits for.
-
-        Raises:
-            BusError: the key is malformed.
+        With `patient` the `put` waits for a slow subscriber, up to `wait_before_close` (5 s), and
+        then drops the link instead of the message: only for a caller that nothing waits for.
         """
         control = zenoh.CongestionControl.BLOCK if patient else zenoh.CongestionControl.DROP
         try:
@@ -307,24 +274,15 @@ class Session:
         return RawPublisher(publisher)
 
     def latest(self, topic: Topic, message_type: type[M], module: str = "") -> Latest[M]:
-        """Declare a subscriber that keeps the newest message only; arguments as `publisher`.
-
-        Raises:
-            BusError: the type or the module does not fit the topic.
-        """
+        """Declare a subscriber that keeps the newest message only; as `publisher`."""
         key = self._key(topic, message_type, module)
         return Latest(_ring(self._session, key, 1), message_type)
 
     def stream(self, key_expressions: Sequence[str], capacity: int = 65536) -> Stream:
         """Declare a subscriber that keeps every sample, up to `capacity` per expression.
 
-        Args:
-            key_expressions: full keys, or with wildcards such as `xrl/lab/joint/*/state`;
-                a key that fits two of them comes twice.
-            capacity: samples that are kept until they are taken.
-
-        Raises:
-            BusError: an expression is not one.
+        Expressions are full keys, or with wildcards such as `xrl/lab/joint/*/state`; a key that
+        fits two of them comes twice. Raises BusError for one that is none.
         """
         try:
             return Stream([_ring(self._session, key, capacity) for key in key_expressions])
@@ -354,19 +312,14 @@ class Session:
         )
 
     def watch_links(self, own: Credentials, dialled: Mapping[str, str]) -> None:
-        """Log from now on why TLS links to these peers do not come (`shared.bus.tls_probe`).
-
-        Args:
-            own: with which they are dialled.
-            dialled: endpoint of each peer.
-        """
+        """Log from now on why TLS links to these peers do not come (`shared.bus.tls_probe`)."""
         if dialled:
             self._link_watch = LinkWatch(own, dialled, self.is_linked)
 
     def is_linked(self, endpoint: str) -> bool:
         """Return True if there is a link with tls/HOST:PORT."""
         host, port = host_and_port(endpoint)
-        addresses, _ = resolved([host])
+        addresses, _ = sockets.resolved([host])
         return any((str(address), port) in self._linked for address in addresses)
 
     def _meet(self, event: zenoh.LinkEvent) -> None:
@@ -375,7 +328,9 @@ class Session:
         there = host_and_port(event.link.dst)
         if event.kind == zenoh.SampleKind.PUT:
             self._linked.add(there)
-            _close_at_once(event.link)
+            # Zenoh sets SO_LINGER to 10 s and closes from its only thread. After a cable was cut
+            # for longer than the lease, all links stalled for up to 10 s for each lost link.
+            sockets.reset_on_close(host_and_port(event.link.src), there)
         else:
             self._linked.discard(there)
 
@@ -405,7 +360,8 @@ def open_session(
 
     Use it as `with open_session(config, "planner", run_dir) as session:`. Raise the priority of the
     process before: Zenoh's thread inherits it. From then on the process uses the clock of the fleet
-    in `run_dir` (`shared.clock.keep_pace`).
+    in `run_dir` (`shared.clock.keep_pace`). The socket that a killed process left behind is no
+    obstacle.
 
     Args:
         config: the robot; `config.bus` holds the endpoints and the lease.
@@ -419,19 +375,18 @@ def open_session(
             (`shared.links.PAIRS`).
 
     Raises:
-        BusError: the name cannot be used, or the endpoint is taken, too long or not
-            possible. The socket that a killed process left behind is no obstacle.
+        BusError: the name cannot be used, or the endpoint is taken, too long or not possible.
     """
     keep_pace(run_dir)
     if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
         raise BusError(f"{name!r} is no name for a process; use letters, digits, _ and - only")
-    here = same_host.services_here(config)
-    own = same_host.listening(config, name, here) if name in SERVICES else ()
+    here = security.services_here(config)
+    own = security.listening(config, name, here) if name in SERVICES else ()
     peers = [peer for peer in peers_of(name, config.services) if only is None or peer in only]
     endpoints = [
         endpoint_through(Pair(name, peer))
         if injected and Pair(name, peer) in PAIRS
-        else same_host.endpoint_here(config, peer, here)
+        else security.endpoint_here(config, peer, here)
         for peer in peers
     ]
     listening = [_endpoint(text, run_dir) for text in (*own, *listen)]
@@ -481,16 +436,6 @@ def _look_after_links(
     if name in SERVICES:
         over_tls = {peer: at for peer, at in dialled.items() if at.startswith(security.TCP)}
         session.watch_links(own, over_tls)
-
-
-def _close_at_once(link: zenoh.Link) -> None:
-    """Make the socket of a new TCP link close at once when the link is given up.
-
-    Zenoh sets SO_LINGER to 10 s and closes from its only thread. After a cable was cut for longer
-    than the lease, all links of the process stalled for up to 10 s for each lost link.
-    """
-    ends = host_and_port(link.src), host_and_port(link.dst)
-    socket_linger.reset_on_close(*ends)
 
 
 def _ring(session: zenoh.Session, key: str, capacity: int) -> _Subscriber:

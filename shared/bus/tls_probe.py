@@ -91,7 +91,8 @@ def refusal(own: Credentials, endpoint: str) -> str:
 class LinkWatch:
     """Logs why the TLS links that a process dials do not come, in a thread of its own.
 
-    Only for processes that dial: a joint service dials nobody, and has one thread.
+    `dialled` has the endpoint of each peer, `is_linked` takes one. Only for processes that dial: a
+    joint service dials nobody, and has one thread.
     """
 
     def __init__(
@@ -101,14 +102,6 @@ class LinkWatch:
         is_linked: Callable[[str], bool],
         every_s: float = _EVERY_S,
     ) -> None:
-        """Begin.
-
-        Args:
-            own: with which links are tried.
-            dialled: endpoint of each peer.
-            is_linked: takes an endpoint.
-            every_s: between two looks.
-        """
         self._own, self._dialled, self._is_linked = own, dialled, is_linked
         self._every_s = every_s
         self._told: dict[str, str] = {}

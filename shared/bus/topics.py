@@ -8,6 +8,7 @@ from typing import Final
 import msgspec
 
 from shared.bus import messages, traces
+from shared.config.robot_config import SERVICES
 from shared.joints import MODULES
 
 
@@ -19,6 +20,8 @@ class Priority(IntEnum):
     BACKGROUND = 7
 
 
+_REAL_TIME, _DATA, _BACKGROUND = Priority
+
 OPERATOR: Final = "operator"
 """Who leads by a tool: `xrl estop`, `xrl demo`, ..."""
 VIEWER: Final = "viewer"
@@ -27,9 +30,11 @@ RECORDER: Final = "recorder"
 HOST_RECORDER: Final = "host_recorder"
 """One host's own recorder: on the bus a tool, which listens nowhere."""
 READERS_OF_ALL: Final = (RECORDER, OPERATOR, VIEWER)
+PRINCIPALS: Final = (*SERVICES, OPERATOR, VIEWER)
+"""Every name that a certificate can have under `mtls`; the network proxy is no part of it."""
 
 
-class Topic(msgspec.Struct, frozen=True, kw_only=True):
+class Topic(msgspec.Struct, frozen=True):
     """One row of the table."""
 
     name: str
@@ -38,12 +43,12 @@ class Topic(msgspec.Struct, frozen=True, kw_only=True):
     rate_hz: float
     """Nominal rate, as `deploy/robot.toml` sets it; 0 for events."""
     priority: Priority
-    recorded: bool
     writers: tuple[str, ...]
     """Who may put it: services, `operator`, or `*`, the module of the key (docs/security.md)."""
-    readers: tuple[str, ...] = ()
+    readers: tuple[str, ...]
     """Services that use it; `READERS_OF_ALL` may read every topic."""
     why: str
+    recorded: bool = True
 
     def key(self, robot: str, module: str = "") -> str:
         """Return the full key, for example `xrl/lab/joint/ankle_right/state`."""
@@ -56,206 +61,87 @@ class Topic(msgspec.Struct, frozen=True, kw_only=True):
 
 
 JOINT_STATE: Final = Topic(
-    name="joint/*/state",
-    type=messages.JointState,
-    rate_hz=250.0,
-    priority=Priority.REAL_TIME,
-    recorded=True,
-    writers=("*",),
-    readers=("planner",),
-    why="the planner's input; its stamp is echoed",
-)
+    "joint/*/state", messages.JointState, 250.0, _REAL_TIME, ("*",), ("planner",),
+    "the planner's input; its stamp is echoed",
+)  # fmt: skip
 JOINT_COMMAND: Final = Topic(
-    name="joint/*/command",
-    type=messages.JointCommand,
-    rate_hz=250.0,
-    priority=Priority.REAL_TIME,
-    recorded=True,
-    writers=("planner",),
-    readers=("*",),
-    why="references, gains and torques of the law",
-)
+    "joint/*/command", messages.JointCommand, 250.0, _REAL_TIME, ("planner",), ("*",),
+    "references, gains and torques of the law",
+)  # fmt: skip
 JOINT_EVENT: Final = Topic(
-    name="joint/*/event",
-    type=messages.JointEvent,
-    rate_hz=0.0,
-    priority=Priority.DATA,
-    recorded=True,
-    writers=("*",),
-    why="every change of state, with its cause and torque step",
-)
+    "joint/*/event", messages.JointEvent, 0.0, _DATA, ("*",), (),
+    "every change of state, with its cause and torque step",
+)  # fmt: skip
 JOINT_TRACE: Final = Topic(
-    name="joint/*/trace",
-    type=traces.JointTrace,
-    rate_hz=50.0,
-    priority=Priority.BACKGROUND,
-    recorded=True,
-    writers=("*",),
-    why="every cycle's inputs: a joint service can be re-executed from them, bit for bit",
-)
-PLANNER_CHECKPOINT: Final = Topic(
-    name="planner/checkpoint",
-    type=traces.PlannerCheckpoint,
-    rate_hz=1.0,
-    priority=Priority.BACKGROUND,
-    recorded=True,
-    writers=("planner",),
-    why="the planner's state: re-execution can start here",
-)
+    "joint/*/trace", traces.JointTrace, 50.0, _BACKGROUND, ("*",), (),
+    "every cycle's inputs: a joint service can be re-executed from them, bit for bit",
+)  # fmt: skip
 WRENCH: Final = Topic(
-    name="harness/wrench",
-    type=messages.Wrench,
-    rate_hz=250.0,
-    priority=Priority.DATA,
-    recorded=True,
-    writers=("harness",),
-    readers=("planner",),
-    why="wrench of the operator on the torso",
-)
+    "harness/wrench", messages.Wrench, 250.0, _DATA, ("harness",), ("planner",),
+    "wrench of the operator on the torso",
+)  # fmt: skip
 ATTITUDE: Final = Topic(
-    name="imu/attitude",
-    type=messages.Attitude,
-    rate_hz=100.0,
-    priority=Priority.DATA,
-    recorded=True,
-    writers=("imu",),
-    readers=("planner",),
-    why="direction of up, where an IMU is fitted",
-)
+    "imu/attitude", messages.Attitude, 100.0, _DATA, ("imu",), ("planner",),
+    "direction of up, where an IMU is fitted",
+)  # fmt: skip
 HARNESS_TARE: Final = Topic(
-    name="harness/tare",
-    type=messages.TareRequest,
-    rate_hz=0.0,
-    priority=Priority.DATA,
-    recorded=True,
-    writers=(OPERATOR,),
-    readers=("harness",),
-    why="request for a new zero of the harness sensor",
-)
+    "harness/tare", messages.TareRequest, 0.0, _DATA, (OPERATOR,), ("harness",),
+    "request for a new zero of the harness sensor",
+)  # fmt: skip
 PLANNER_STATUS: Final = Topic(
-    name="planner/status",
-    type=messages.PlannerStatus,
-    rate_hz=250.0,
-    priority=Priority.DATA,
-    recorded=True,
-    writers=("planner",),
-    why="inputs and decisions of the law",
-)
+    "planner/status", messages.PlannerStatus, 250.0, _DATA, ("planner",), (),
+    "inputs and decisions of the law",
+)  # fmt: skip
+PLANNER_CHECKPOINT: Final = Topic(
+    "planner/checkpoint", traces.PlannerCheckpoint, 1.0, _BACKGROUND, ("planner",), (),
+    "the planner's state: re-execution can start here",
+)  # fmt: skip
 OPERATOR_INTENT: Final = Topic(
-    name="operator/intent",
-    type=messages.OperatorIntent,
-    rate_hz=50.0,
-    priority=Priority.DATA,
-    recorded=True,
-    writers=(OPERATOR, "simulator"),
-    readers=("planner", "simulator"),
-    why="assist and shift that the person requests",
-)
+    "operator/intent", messages.OperatorIntent, 50.0, _DATA, (OPERATOR, "simulator"),
+    ("planner", "simulator"), "assist and shift that the person requests",
+)  # fmt: skip
 OPERATOR_HAND: Final = Topic(
-    name="operator/hand",
-    type=messages.HandLead,
-    rate_hz=0.0,
-    priority=Priority.DATA,
-    recorded=True,
-    writers=(OPERATOR,),
-    readers=("simulator",),
-    why="leads and pushes the simulated robot by hand; nothing on a real one reads it",
-)
+    "operator/hand", messages.HandLead, 0.0, _DATA, (OPERATOR,), ("simulator",),
+    "leads and pushes the simulated robot by hand; nothing on a real one reads it",
+)  # fmt: skip
 ESTOP: Final = Topic(
-    name="estop",
-    type=messages.Estop,
-    rate_hz=0.0,
-    priority=Priority.REAL_TIME,
-    recorded=True,
-    writers=(OPERATOR,),
-    readers=MODULES,
-    why="emergency stop: every module to DAMP",
-)
+    "estop", messages.Estop, 0.0, _REAL_TIME, (OPERATOR,), MODULES,
+    "emergency stop: every module to DAMP",
+)  # fmt: skip
 SIM_TRUTH: Final = Topic(
-    name="sim/truth",
-    type=messages.SimTruth,
-    rate_hz=100.0,
-    priority=Priority.BACKGROUND,
-    recorded=True,
-    writers=("simulator",),
-    why="true state of the world, for the verdict; no controller reads it",
-)
+    "sim/truth", messages.SimTruth, 100.0, _BACKGROUND, ("simulator",), (),
+    "true state of the world, for the verdict; no controller reads it",
+)  # fmt: skip
 SIM_STATE: Final = Topic(
-    name="sim/state",
-    type=traces.SimState,
-    rate_hz=10.0,
-    priority=Priority.BACKGROUND,
-    recorded=True,
-    writers=("simulator",),
-    why="complete simulated world: `xrl whatif` continues from it",
-)
+    "sim/state", traces.SimState, 10.0, _BACKGROUND, ("simulator",), (),
+    "complete simulated world: `xrl whatif` continues from it",
+)  # fmt: skip
 SIM_CONTROL: Final = Topic(
-    name="sim/control",
-    type=messages.SimControl,
-    rate_hz=0.0,
-    priority=Priority.DATA,
-    recorded=True,
-    writers=(OPERATOR,),
-    readers=("simulator",),
-    why="starts the scenario",
-)
+    "sim/control", messages.SimControl, 0.0, _DATA, (OPERATOR,), ("simulator",),
+    "starts the scenario",
+)  # fmt: skip
 RUN_EVENT: Final = Topic(
-    name="run/event",
-    type=messages.RunEvent,
-    rate_hz=0.0,
-    priority=Priority.DATA,
-    recorded=True,
-    writers=(OPERATOR,),
-    why="kills, restarts, faults and pushes, for the verdict",
-)
+    "run/event", messages.RunEvent, 0.0, _DATA, (OPERATOR,), (),
+    "kills, restarts, faults and pushes, for the verdict",
+)  # fmt: skip
 LINK_EVENT: Final = Topic(
-    name="link/event",
-    type=traces.LinkEvent,
-    rate_hz=0.0,
-    priority=Priority.DATA,
-    recorded=True,
-    writers=("network_proxy",),
-    why="impairments of the network on purpose: a log without them is no evidence",
-)
-
+    "link/event", traces.LinkEvent, 0.0, _DATA, ("network_proxy",), (),
+    "impairments of the network on purpose: a log without them is no evidence",
+)  # fmt: skip
 TOOLS: Final = Topic(
-    name="recorder/tools",
-    type=messages.ToolRoster,
-    rate_hz=2.0,
-    priority=Priority.BACKGROUND,
-    recorded=True,
-    writers=(RECORDER,),
-    why="who looks on or leads by a tool, and when",
-)
+    "recorder/tools", messages.ToolRoster, 2.0, _BACKGROUND, (RECORDER,), (),
+    "who looks on or leads by a tool, and when",
+)  # fmt: skip
 
-TOPICS: Final = (
-    JOINT_STATE,
-    JOINT_COMMAND,
-    JOINT_EVENT,
-    JOINT_TRACE,
-    WRENCH,
-    ATTITUDE,
-    HARNESS_TARE,
-    PLANNER_STATUS,
-    PLANNER_CHECKPOINT,
-    OPERATOR_INTENT,
-    OPERATOR_HAND,
-    ESTOP,
-    SIM_TRUTH,
-    SIM_STATE,
-    SIM_CONTROL,
-    RUN_EVENT,
-    LINK_EVENT,
-    TOOLS,
-)
+TOPICS: Final = tuple(row for row in tuple(globals().values()) if isinstance(row, Topic))
+"""All of the rows above, in their order."""
+
+_OF_TOOLS: Final = frozenset(topic.name for topic in TOPICS if OPERATOR in topic.writers)
 
 
 def several_may_write(key: str) -> bool:
     """Return True for a full key on which several tools may put, each with its own numbers."""
     return key.split("/", 2)[-1] in _OF_TOOLS
-
-
-_OF_TOOLS: Final = frozenset(topic.name for topic in TOPICS if OPERATOR in topic.writers)
 
 
 def keys(topic: Topic, robot: str) -> tuple[str, ...]:

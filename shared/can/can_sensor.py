@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-from typing import Final, Generic, Protocol, TypeVar
+from typing import Final, Generic, TypeVar
 
 import can
 
+from shared.can.frame_group import FrameGroup
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.exceptions import ConfigError
 
 S = TypeVar("S")
-S_co = TypeVar("S_co", covariant=True)
 
 RETRY_NS: Final = 200 * NS_PER_MS
 """Shortest time between two attempts to open the link."""
@@ -28,38 +28,17 @@ def pause_ns(stale_ms: float, rate_hz: float) -> int:
     return round(max(stale_ms * NS_PER_MS, 2.0 * NS_PER_S / rate_hz))
 
 
-class Assembler(Protocol[S_co]):
-    """Makes samples of a sensor's frames."""
-
-    @property
-    def malformed(self) -> int:
-        """Frames of the sensor that were of the wrong length or out of order."""
-
-    def add(self, can_id: int, data: bytes | bytearray, /) -> S_co | None:
-        """Take one frame; return the sample that it completes, or None."""
-
-    def reset(self) -> None:
-        """Forget a sample that is not complete."""
-
-
 class CanSensor(Generic[S]):
     """A sensor through python-can; opens the link again by itself when it goes away."""
 
     def __init__(
-        self, interface: str, channel: str, assembler: Assembler[S], *, pause_ns: int
+        self, interface: str, channel: str, assembler: FrameGroup[S], *, pause_ns: int
     ) -> None:
         """Prepare; the link is opened by the first `newest`.
 
-        Args:
-            interface: python-can's name of the interface.
-            channel: as that interface takes it.
-            assembler: makes samples of its frames.
-            pause_ns: after a longer time between two reads, frames that waited on the link have an
-                unknown age (this process was stopped, and a full queue keeps the oldest frames) and
-                are discarded.
-
-        Raises:
-            ConfigError: python-can knows no such interface.
+        After a longer time than `pause_ns` between two reads, frames that waited on the link have
+        an unknown age (this process was stopped, and a full queue keeps the oldest frames) and are
+        discarded. Raises ConfigError if python-can knows no such interface.
         """
         if interface not in can.VALID_INTERFACES:
             raise _unusable(interface, "not known to python-can")
@@ -118,8 +97,7 @@ class CanSensor(Generic[S]):
     def _open(self, now_ns: int) -> can.BusABC | None:
         """Return the link, or None if it is not there or was tried a moment ago.
 
-        Raises:
-            ConfigError: the interface cannot be used on this machine, now or later.
+        Raises ConfigError if the interface cannot be used on this machine, now or later.
         """
         if self._retry_ns is not None and now_ns < self._retry_ns:
             return None

@@ -11,6 +11,7 @@ and heartbeat bytes 5 to 7: see `shared.can.cansimple_06`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import IntEnum, IntFlag
 from struct import Struct
 from typing import Final, NamedTuple
@@ -190,12 +191,7 @@ class Heartbeat(NamedTuple):
 
 _HEARTBEAT = Struct("<IBBBB")
 _TRAJECTORY_DONE = 0x80
-_U32 = Struct("<I")
-_I32 = Struct("<i")
-_U64 = Struct("<Q")
-_TWO_I32 = Struct("<ii")
-_F32 = Struct("<f")
-_TWO_F32 = Struct("<ff")
+_U32, _F32, _TWO_I32, _TWO_F32 = Struct("<I"), Struct("<f"), Struct("<ii"), Struct("<ff")
 _INPUT_POS = Struct("<fhh")
 _MILLI = 1000.0
 _I16_MAX = (1 << 15) - 1
@@ -235,63 +231,34 @@ def unpack_heartbeat(data: bytes) -> Heartbeat:
     )
 
 
-def pack_u32(value: int) -> bytes:
-    """Pack one unsigned word: 0x004, 0x005, 0x006, 0x007 and 0x01D."""
-    return _U32.pack(value)
+pack_u32: Callable[[int], bytes] = _U32.pack
+"""Pack one unsigned word: 0x004, 0x005, 0x006, 0x007 and 0x01D."""
+pack_i32: Callable[[int], bytes] = Struct("<i").pack
+"""Pack one signed word: 0x019 encoder counts."""
+pack_motor_error: Callable[[int], bytes] = Struct("<Q").pack
+"""Pack 0x003: 64 bits in firmware 0.5.6."""
+pack_float: Callable[[float], bytes] = _F32.pack
+"""Pack one number: 0x00E torque, 0x01A position gain."""
+pack_two_floats: Callable[[float, float], bytes] = _TWO_F32.pack
+"""Pack two numbers: 0x009 position and velocity; 0x00D velocity and torque; 0x00F velocity limit
+and current limit; 0x014 Iq set and measured; 0x017 bus voltage and current; 0x01B velocity gain and
+integrator gain."""
+pack_two_ints: Callable[[int, int], bytes] = _TWO_I32.pack
+"""Pack two signed words: 0x00A shadow count and count in turn, 0x00B control and input mode."""
+unpack_two_floats: Callable[[bytes], tuple[float, float]] = _TWO_F32.unpack_from
+unpack_two_ints: Callable[[bytes], tuple[int, int]] = _TWO_I32.unpack_from
 
 
 def unpack_u32(data: bytes) -> int:
-    """Unpack one unsigned word: 0x004, 0x005, 0x006, 0x007 and 0x01D."""
+    """Unpack what `pack_u32` packs."""
     value: int = _U32.unpack_from(data)[0]
     return value
 
 
-def pack_i32(value: int) -> bytes:
-    """Pack one signed word: 0x019 encoder counts."""
-    return _I32.pack(value)
-
-
-def pack_motor_error(error: int) -> bytes:
-    """Pack 0x003: 64 bits in firmware 0.5.6."""
-    return _U64.pack(error)
-
-
-def pack_two_floats(first: float, second: float) -> bytes:
-    """Pack two numbers.
-
-    0x009 position and velocity; 0x00D velocity and torque; 0x00F velocity limit and
-    current limit; 0x014 Iq set and measured; 0x017 bus voltage and current; 0x01B
-    velocity gain and integrator gain.
-    """
-    return _TWO_F32.pack(first, second)
-
-
-def unpack_two_floats(data: bytes) -> tuple[float, float]:
-    """Unpack two numbers, see `pack_two_floats`."""
-    first, second = _TWO_F32.unpack_from(data)
-    return first, second
-
-
-def pack_float(value: float) -> bytes:
-    """Pack one number: 0x00E torque, 0x01A position gain."""
-    return _F32.pack(value)
-
-
 def unpack_float(data: bytes) -> float:
-    """Unpack one number: 0x00E torque, 0x01A position gain."""
+    """Unpack what `pack_float` packs."""
     value: float = _F32.unpack_from(data)[0]
     return value
-
-
-def pack_two_ints(first: int, second: int) -> bytes:
-    """Pack two signed words: 0x00A shadow count and count in turn, 0x00B control and input mode."""
-    return _TWO_I32.pack(first, second)
-
-
-def unpack_two_ints(data: bytes) -> tuple[int, int]:
-    """Unpack two signed words, see `pack_two_ints`."""
-    first, second = _TWO_I32.unpack_from(data)
-    return first, second
 
 
 def pack_input_pos(pos: float, vel: float, torque: float) -> bytes:

@@ -1,28 +1,41 @@
-"""Samples that a CAN sensor sends as a fixed sequence of frames."""
+"""Samples that a CAN sensor sends as a fixed sequence of frames. Pure."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Generic, TypeVar
+
+S = TypeVar("S")
 
 
-class FrameGroup:
+def split(frames: Sequence[tuple[int, int]], data: bytes) -> list[tuple[int, bytes]]:
+    """Return the frames (id, data) of a sample's bytes; `frames` has (id, bytes) of each."""
+    found, begin = [], 0
+    for can_id, size in frames:
+        found.append((can_id, data[begin : begin + size]))
+        begin += size
+    return found
+
+
+class FrameGroup(Generic[S]):
     """Puts the frames of a sample together; never mixes frames across a gap.
 
-    A sample is its frames in order with no other of them in between.
+    A sample is its frames, (id, bytes) of each, in this order with no other of them in between;
+    `unpack` makes it of their bytes.
     """
 
-    def __init__(self, frames: Sequence[tuple[int, int]]) -> None:
-        """Take (id, bytes) of each frame, in the order in which they are sent."""
+    def __init__(self, frames: Sequence[tuple[int, int]], unpack: Callable[[bytes], S]) -> None:
         self.malformed = 0
         """Frames of the sensor that were of the wrong length or out of order."""
+        self._unpack = unpack
         self._index = {can_id: index for index, (can_id, _) in enumerate(frames)}
         self._bytes = [size for _, size in frames]
         self._last = len(frames) - 1
         self._data = bytearray()
         self._next = 0
 
-    def add(self, can_id: int, data: bytes | bytearray) -> bytes | None:
-        """Take one frame; return the sample's bytes if it completes one.
+    def add(self, can_id: int, data: bytes | bytearray) -> S | None:
+        """Take one frame; return the sample that it completes, or None.
 
         Frames of other ids are ignored.
         """
@@ -45,7 +58,7 @@ class FrameGroup:
             self._next = index + 1
             return None
         self._next = 0
-        return bytes(self._data)
+        return self._unpack(bytes(self._data))
 
     def reset(self) -> None:
         """Forget a sample that is not complete: its rest belongs to another link."""

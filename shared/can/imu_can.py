@@ -20,7 +20,7 @@ from typing import Final
 import msgspec
 
 from shared.bus.messages import Vector3, Vector4
-from shared.can.frame_group import FrameGroup
+from shared.can.frame_group import FrameGroup, split
 
 STATUS_ID: Final = 0x11
 QUATERNION_ID: Final = 0x21
@@ -52,10 +52,7 @@ def pack(
 ) -> list[tuple[int, bytes]]:
     """Return the three frames (id, data) of a sample; values out of range are clipped.
 
-    Args:
-        quaternion: w, x, y, z of unit length.
-        rate: (3,) rad/s, sensor axes.
-        valid: the status word's bit.
+    The quaternion is w, x, y, z of unit length, the rate (3,) rad/s in sensor axes.
     """
     status = SELF_TEST_OK | (VALID if valid else 0)
     data = _SAMPLE.pack(
@@ -63,36 +60,20 @@ def pack(
         *(_int16(part * _QUATERNION_SCALE) for part in quaternion),
         *(_int16(part * _RATE_SCALE) for part in rate),
     )
-    frames, begin = [], 0
-    for can_id, size in _FRAMES:
-        frames.append((can_id, data[begin : begin + size]))
-        begin += size
-    return frames
+    return split(_FRAMES, data)
 
 
-class ImuAssembler:
+def _sample(data: bytes) -> ImuSample:
+    status, w, x, y, z, a, b, c = _SAMPLE.unpack(data)
+    q, r = _QUATERNION_SCALE, _RATE_SCALE
+    return ImuSample((w / q, x / q, y / q, z / q), (a / r, b / r, c / r), bool(status & VALID))
+
+
+class ImuAssembler(FrameGroup[ImuSample]):
     """Makes samples of frames."""
 
     def __init__(self) -> None:
-        self._group = FrameGroup(_FRAMES)
-
-    @property
-    def malformed(self) -> int:
-        """Frames of the sensor that were of the wrong length or out of order."""
-        return self._group.malformed
-
-    def add(self, can_id: int, data: bytes | bytearray) -> ImuSample | None:
-        """Take one frame; return the sample that it completes, or None."""
-        sample = self._group.add(can_id, data)
-        if sample is None:
-            return None
-        status, w, x, y, z, a, b, c = _SAMPLE.unpack(sample)
-        q, r = _QUATERNION_SCALE, _RATE_SCALE
-        return ImuSample((w / q, x / q, y / q, z / q), (a / r, b / r, c / r), bool(status & VALID))
-
-    def reset(self) -> None:
-        """Forget a sample that is not complete."""
-        self._group.reset()
+        super().__init__(_FRAMES, _sample)
 
 
 def _int16(value: float) -> int:

@@ -18,26 +18,15 @@ import struct
 from collections.abc import Sequence
 from typing import Final
 
-import msgspec
-
 from shared.bus.messages import Vector6
-from shared.can.frame_group import FrameGroup
+from shared.can.frame_group import FrameGroup, split
 
 FIRST_ID: Final = 0x300
 FRAME_IDS: Final = (FIRST_ID, FIRST_ID + 1, FIRST_ID + 2)
-FRAME_BYTES: Final = 8
+_FRAMES: Final = tuple((can_id, 8) for can_id in FRAME_IDS)
 
 _SAMPLE: Final = struct.Struct("<6f")
 _FLOAT32: Final = struct.Struct("<f")
-
-
-class LegSample(msgspec.Struct, frozen=True, gc=False):
-    """Six leg forces of one moment."""
-
-    t_ns: int
-    """Monotonic time at which they were read from the link."""
-    forces: Vector6
-    """N, tension positive; may hold anything a float32 can, NaN included."""
 
 
 def as_sent(force: float) -> float:
@@ -48,35 +37,14 @@ def as_sent(force: float) -> float:
 
 def pack(forces: Sequence[float]) -> list[tuple[int, bytes]]:
     """Return the three frames (id, 8 bytes) of six leg forces in N."""
-    data = _SAMPLE.pack(*forces)
-    return [
-        (can_id, data[FRAME_BYTES * index : FRAME_BYTES * (index + 1)])
-        for index, can_id in enumerate(FRAME_IDS)
-    ]
+    return split(_FRAMES, _SAMPLE.pack(*forces))
 
 
-class SampleAssembler:
-    """Makes samples of frames."""
+class SampleAssembler(FrameGroup[Vector6]):
+    """Makes samples of frames: six leg forces of one moment, N, tension positive.
+
+    They may be anything that a float32 can, NaN included.
+    """
 
     def __init__(self) -> None:
-        self._group = FrameGroup([(can_id, FRAME_BYTES) for can_id in FRAME_IDS])
-
-    @property
-    def malformed(self) -> int:
-        """Frames of the sensor that were of the wrong length or out of order."""
-        return self._group.malformed
-
-    def add(self, can_id: int, data: bytes | bytearray) -> Vector6 | None:
-        """Take one frame; return six leg forces in N if it completes a sample.
-
-        Frames of other ids are ignored.
-        """
-        sample = self._group.add(can_id, data)
-        if sample is None:
-            return None
-        forces: Vector6 = _SAMPLE.unpack(sample)
-        return forces
-
-    def reset(self) -> None:
-        """Forget a sample that is not complete: its rest belongs to another link."""
-        self._group.reset()
+        super().__init__(_FRAMES, _SAMPLE.unpack)

@@ -60,16 +60,9 @@ class UnixCanBus(can.BusABC):
     """
 
     def __init__(
-        self,
-        channel: str,
-        can_filters: can.typechecking.CanFilters | None = None,
-        **kwargs: object,
+        self, channel: str, can_filters: can.typechecking.CanFilters | None = None, **kwargs: object
     ) -> None:
-        """Connect to the hub that listens on path `channel`.
-
-        Raises:
-            can.CanInitializationError: nobody listens there.
-        """
+        """Connect to the hub that listens on path `channel`, or can.CanInitializationError."""
         self.dropped = 0
         self.channel_info = f"xrl_unix {channel}"
         self._waiting: deque[can.Message] = deque()
@@ -80,19 +73,11 @@ class UnixCanBus(can.BusABC):
         super().__init__(channel, can_filters, **kwargs)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:  # noqa: ARG002
-        """Send one frame without waiting, whatever `timeout` says.
-
-        Raises:
-            can.CanOperationError: the hub is gone.
-        """
+        """Send one frame without waiting, whatever `timeout` says; as `send_many`."""
         self.send_many((msg,))
 
     def send_many(self, messages: Sequence[can.Message]) -> None:
-        """Send frames in one packet without waiting.
-
-        Raises:
-            can.CanOperationError: the hub is gone.
-        """
+        """Send frames in one packet without waiting; can.CanOperationError once the hub is gone."""
         packet = b"".join(
             [
                 _FRAME.pack(_can_id(message), message.dlc, bytes(message.data))
@@ -109,11 +94,8 @@ class UnixCanBus(can.BusABC):
     def recv_many(self, timeout: float) -> list[Frame]:
         """Wait for a packet and return the frames of all packets that are there, in order.
 
-        The fast path around `can.Message`; filters are not applied. Empty after
-        `timeout` seconds.
-
-        Raises:
-            can.CanOperationError: the hub is gone.
+        The fast path around `can.Message`; filters are not applied. Empty after `timeout` seconds.
+        Raises can.CanOperationError once the hub is gone.
         """
         packet = self._receive(timeout)
         if packet is None:

@@ -78,19 +78,12 @@ def frame_bits(data_bytes: int) -> float:
 
 
 def bus_load(
-    axes: int,
-    *,
-    onboard: bool,
-    heartbeat_period_ms: float,
-    loadcell_rate_hz: float = 0.0,
+    axes: int, *, onboard: bool, heartbeat_period_ms: float, loadcell_rate_hz: float = 0.0
 ) -> BusLoad:
     """Return the load of a bus: per cycle, an estimate from each axis and a target to it.
 
-    Args:
-        axes: on this bus.
-        onboard: targets of the motors' own loops, 8 bytes, and their gains; else torques, 4.
-        heartbeat_period_ms: of each axis.
-        loadcell_rate_hz: samples of a harness sensor on this bus.
+    Onboard, targets of the motors' own loops take 8 bytes, and their gains; else torques take 4.
+    `loadcell_rate_hz` are samples of a harness sensor on this bus.
     """
     full, half = frame_bits(8), frame_bits(4)
     gains = full + half if onboard else 0.0
@@ -104,11 +97,7 @@ def bus_load(
 
 
 def check_buses(file: str, config: RobotConfig) -> None:
-    """Refuse a bus that cannot carry the modules on it.
-
-    Raises:
-        ConfigError: names the bus, its load and the load that it can carry.
-    """
+    """Refuse a bus that cannot carry the modules on it: ConfigError says what it can carry."""
     if config.joint_service.driver != "odrive_can":
         return
     modules: dict[str, int] = {}

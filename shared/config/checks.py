@@ -6,9 +6,9 @@ import difflib
 import ipaddress
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from importlib.metadata import entry_points
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import msgspec
 
@@ -18,6 +18,9 @@ from shared.config.robot_config import ENDPOINTS_OF_MODE, SERVICES, RobotConfig
 from shared.config.sections import LimitConfig
 from shared.exceptions import ConfigError
 from shared.joints import KINDS, MODULES
+
+Problems: TypeAlias = Iterator[tuple[str, str, str]]
+"""Key, what stands there, what would be right; the first one is what the file is refused for."""
 
 INTERFACES: Final = (
     "canalystii", "cantact", "etas", "gs_usb", "iscan", "ixxat", "kvaser", "neousys", "neovi",
@@ -40,42 +43,42 @@ _POWER_UP_TURNS: Final = 1.0
 def check(file: str, config: RobotConfig) -> None:
     """Check what no single number shows: duplicates, crossings, dangling names.
 
-    Args:
-        file: for the error.
-        config: the robot, each of its values in range.
-
-    Raises:
-        ConfigError: naming the file, the key, what stands there and what would be right.
+    Each value of the robot is in its range; `file` names it in the ConfigError.
     """
-    _check_names(file, config)
-    _check_interfaces(file, config)
-    _check_physics(file, config)
-    _check_drive(file, config)
-    _check_timing(file, config)
+    for problems in (_names, _interfaces, _physics, _drive, _timing):
+        _refuse(file, problems(config))
     check_buses(file, config)
 
 
 def check_security(file: str, config: RobotConfig) -> None:
     """Check that the endpoints are those of `bus.security.mode`; not done for a robot of a log.
 
-    Raises:
-        ConfigError: a port would be open to anyone, and the file does not say so.
+    Raises ConfigError if a port would be open to anyone, and the file does not say so.
     """
+    _refuse(file, _security(config))
+
+
+def _refuse(file: str, problems: Problems) -> None:
+    for problem in problems:
+        raise ConfigError(file, *problem)
+
+
+def _security(config: RobotConfig) -> Problems:
     security = config.bus.security
     if not re.match(r"[~/]", security.keys):
         found = f"{security.keys!r} depends on where a service is started"
-        raise ConfigError(file, "bus.security.keys", found, "a path that begins with / or ~")
-    _check_placeholders(file, "bus.security.keys", security.keys, ROBOT)
+        yield "bus.security.keys", found, "a path that begins with / or ~"
+    yield from _placeholders("bus.security.keys", security.keys, ROBOT)
     for index, host in enumerate(security.allow):
         if not _is_address(host):
             right = "an IP address, without a port: a name may not be known when a service starts"
-            raise ConfigError(file, f"bus.security.allow[{index}]", f"{host!r}", right)
+            yield f"bus.security.allow[{index}]", f"{host!r}", right
     for service, endpoint in config.bus.endpoints.items():
         if not endpoint.startswith(ENDPOINTS_OF_MODE[security.mode]):
             words = _words(f"{start}..." for start in ENDPOINTS_OF_MODE[security.mode])
             found = f"{endpoint!r} is not one of bus.security.mode = {security.mode!r}"
             right = f"{words}; or mode = " + _OTHER_MODE[endpoint.partition("/")[0]]
-            raise ConfigError(file, f"bus.endpoints.{service}", found, right)
+            yield f"bus.endpoints.{service}", found, right
 
 
 def _is_address(text: str) -> bool:
@@ -94,74 +97,74 @@ _OTHER_MODE: Final = {
 """By the kind of an endpoint: the mode in which it would be right."""
 
 
-def _check_names(file: str, config: RobotConfig) -> None:
+def _names(config: RobotConfig) -> Problems:
     if not re.fullmatch(r"[A-Za-z0-9_-]+", config.name):
-        raise ConfigError(file, "name", f"{config.name!r}", "use letters, digits, _ and - only")
+        yield "name", f"{config.name!r}", "use letters, digits, _ and - only"
     names = [module.name for module in config.module]
     for index, name in enumerate(names):
-        where = f"module[{index}].name"
         if name in names[:index]:
-            raise ConfigError(file, where, f"{name!r} stands twice", "each module once")
+            yield f"module[{index}].name", f"{name!r} stands twice", "each module once"
         if name not in MODULES:
-            raise ConfigError(file, where, f"{name!r} is no module", f"one of {_words(MODULES)}")
+            yield f"module[{index}].name", f"{name!r} is no module", f"one of {_words(MODULES)}"
     absent = [name for name in MODULES if name not in names]
     if absent:
-        raise ConfigError(file, "module", f"no entry for {_words(absent)}", "six modules in all")
+        yield "module", f"no entry for {_words(absent)}", "six modules in all"
+    buses = f"one of {_words(config.can)}"
     nodes: dict[tuple[str, int], str] = {}
     for index, module in enumerate(config.module):
         if module.bus not in config.can:
-            buses = _words(config.can)
-            raise ConfigError(file, f"module[{index}].bus", f"{module.bus!r}", f"one of {buses}")
+            yield f"module[{index}].bus", f"{module.bus!r}", buses
         for node in module.node_ids:
             other = nodes.setdefault((config.can[module.bus].channel, node), module.name)
             if other != module.name or len(set(module.node_ids)) < 2:
-                where = f"module[{index}].node_ids"
-                raise ConfigError(file, where, f"node {node} is taken on this bus", "a free node")
-    _check_serial_numbers(file, config)
+                yield (
+                    f"module[{index}].node_ids",
+                    f"node {node} is taken on this bus",
+                    "a free node",
+                )
+    yield from _serial_numbers(config)
     if config.harness.bus not in config.can:
-        buses = _words(config.can)
-        raise ConfigError(file, "harness.bus", f"{config.harness.bus!r}", f"one of {buses}")
-    _check_imu(file, config)
-    _check_ros2(file, config)
-    _check_endpoints(file, config)
+        yield "harness.bus", f"{config.harness.bus!r}", buses
+    yield from _imu(config)
+    yield from _ros2(config)
+    yield from _endpoints(config)
     table = msgspec.to_builtins(config)
     for index, key in enumerate(config.assumed):
         value: Any = table
         for part in key.split("."):
             value = value.get(part) if isinstance(value, dict) else None
         if value is None:
-            raise ConfigError(file, f"assumed[{index}]", f"{key!r} is no key", "a dotted key")
+            yield f"assumed[{index}]", f"{key!r} is no key", "a dotted key"
 
 
-def _check_ros2(file: str, config: RobotConfig) -> None:
-    ros2, right = config.ros2, _words(ROS2_DISTRIBUTIONS)
+def _ros2(config: RobotConfig) -> Problems:
+    ros2 = config.ros2
     if ros2.distribution not in ROS2_DISTRIBUTIONS:
         found = f"{ros2.distribution!r}"
         if ros2.distribution == "humble":
             found += ", whose topics have no type hash, so that nobody would find these"
-        raise ConfigError(file, "ros2.distribution", found, f"one of {right}")
+        yield "ros2.distribution", found, f"one of {_words(ROS2_DISTRIBUTIONS)}"
     if ros2.router.startswith("unixsock") or not is_endpoint(ros2.router):
-        raise ConfigError(file, "ros2.router", f"{ros2.router!r}", "such as tcp/localhost:7447")
+        yield "ros2.router", f"{ros2.router!r}", "such as tcp/localhost:7447"
     if not re.fullmatch(r"([A-Za-z]\w*(/[A-Za-z]\w*)*)?", ros2.namespace):
         right = "letters, digits and _, such as legs; or nothing"
-        raise ConfigError(file, "ros2.namespace", f"{ros2.namespace!r}", right)
+        yield "ros2.namespace", f"{ros2.namespace!r}", right
 
 
-def _check_imu(file: str, config: RobotConfig) -> None:
+def _imu(config: RobotConfig) -> Problems:
     imu = config.imu
     if not imu.fitted:
         return
     if imu.bus not in config.can:
-        raise ConfigError(file, "imu.bus", f"{imu.bus!r}", f"one of {_words(config.can)}")
+        yield "imu.bus", f"{imu.bus!r}", f"one of {_words(config.can)}"
     channel = config.can[imu.bus].channel
     for module in config.module:
         if config.can[module.bus].channel == channel:
-            found = f"{imu.bus!r} is {module.name}'s bus too"
             right = "one without drives: the IMU's frames 0x11, 0x21 and 0x32 are nodes 0 and 1"
-            raise ConfigError(file, "imu.bus", found, right)
+            yield "imu.bus", f"{imu.bus!r} is {module.name}'s bus too", right
 
 
-def _check_serial_numbers(file: str, config: RobotConfig) -> None:
+def _serial_numbers(config: RobotConfig) -> Problems:
     """Check USB and CAN settings, whichever driver is used: a drive has both."""
     wanted = config.joint_service.driver == "odrive_usb"
     seen: set[str] = set()
@@ -171,112 +174,105 @@ def _check_serial_numbers(file: str, config: RobotConfig) -> None:
             continue
         if not re.fullmatch(r"[0-9A-F]{12}", serial):
             found = f"{module.serial_number!r} of {module.name}"
-            raise ConfigError(file, where, found, "12 hexadecimal digits, as `odrivetool` shows")
+            yield where, found, "12 hexadecimal digits, as `odrivetool` shows"
         if serial in seen:
-            raise ConfigError(file, where, f"{serial} stands twice", "each drive once")
+            yield where, f"{serial} stands twice", "each drive once"
         seen.add(serial)
 
 
-def _check_endpoints(file: str, config: RobotConfig) -> None:
+def _endpoints(config: RobotConfig) -> Problems:
     endpoints = config.bus.endpoints
     for service in config.services:
         if service not in endpoints:
-            raise ConfigError(file, f"bus.endpoints.{service}", "missing", "one for each service")
+            yield f"bus.endpoints.{service}", "missing", "one for each service"
     seen: dict[str, str] = {}
     for service, endpoint in endpoints.items():
         where = f"bus.endpoints.{service}"
         if service not in SERVICES:
-            raise ConfigError(file, where, "no such service", f"one of {_words(SERVICES)}")
+            yield where, "no such service", f"one of {_words(SERVICES)}"
         if not is_endpoint(endpoint):
             right = "unixsock-stream/PATH, tcp/HOST:PORT or tls/HOST:PORT"
-            right += f", with a port from 1 to {PORT_MAX}"
-            raise ConfigError(file, where, f"{endpoint!r}", right)
-        _check_placeholders(file, where, endpoint, RUN)
+            yield where, f"{endpoint!r}", f"{right}, with a port from 1 to {PORT_MAX}"
+        yield from _placeholders(where, endpoint, RUN)
         if endpoint in seen:
-            raise ConfigError(
-                file, where, f"{endpoint!r} is {seen[endpoint]}'s too", "one for each service"
-            )
+            yield where, f"{endpoint!r} is {seen[endpoint]}'s too", "one for each service"
         seen[endpoint] = service
 
 
-def _check_placeholders(file: str, where: str, text: str, placeholder: str) -> None:
+def _placeholders(where: str, text: str, placeholder: str) -> Problems:
     stray = stray_braces(text, [placeholder])
     if stray:
         found = f"{text!r}: {stray} is no placeholder"
-        raise ConfigError(file, where, found, f"only {placeholder} is filled in")
+        yield where, found, f"only {placeholder} is filled in"
 
 
-def _check_physics(file: str, config: RobotConfig) -> None:
-    mass, geometry = config.mass, config.geometry
+def _physics(config: RobotConfig) -> Problems:
+    mass, geometry, height = config.mass, config.geometry, config.simulation.stand_height
     if mass.payload > mass.payload_max:
         found = f"{mass.payload:g} kg is more than payload_max"
-        raise ConfigError(file, "mass.payload", found, f"at most {mass.payload_max:g} kg")
+        yield "mass.payload", found, f"at most {mass.payload_max:g} kg"
     for kind in KINDS:
         limit: LimitConfig = getattr(config.limits, kind)
         for axis, (low, high) in (("phi", limit.phi), ("theta", limit.theta)):
             if low >= high:
-                where = f"limits.{kind}.{axis}"
-                raise ConfigError(file, where, f"[{low:g}, {high:g}] is crossed", "low below high")
+                found = f"[{low:g}, {high:g}] is crossed"
+                yield f"limits.{kind}.{axis}", found, "low below high"
     if config.limits.knee.theta[1] >= 0.0:
         found = f"{config.limits.knee.theta[1]:g} rad lets the knee straighten"
-        right = "negative: a straight knee (0) is singular"
-        raise ConfigError(file, "limits.knee.theta[1]", found, right)
-    reach = geometry.l1 + geometry.l2
-    if not abs(geometry.l1 - geometry.l2) < config.simulation.stand_height < reach:
-        found = f"{config.simulation.stand_height:g} m"
-        right = f"inside the legs' reach, {abs(geometry.l1 - geometry.l2):.3f} to {reach:.3f} m"
-        raise ConfigError(file, "simulation.stand_height", found, right)
+        yield "limits.knee.theta[1]", found, "negative: a straight knee (0) is singular"
+    least, reach = abs(geometry.l1 - geometry.l2), geometry.l1 + geometry.l2
+    if not least < height < reach:
+        right = f"inside the legs' reach, {least:.3f} to {reach:.3f} m"
+        yield "simulation.stand_height", f"{height:g} m", right
     if geometry.l1 >= geometry.l2:
         found = f"{geometry.l1:g} m is not below l2 = {geometry.l2:g} m"
-        raise ConfigError(file, "geometry.l1", found, "a thigh shorter than the shin")
+        yield "geometry.l1", found, "a thigh shorter than the shin"
     for index, selected in enumerate(config.law.S):
         if selected and index not in LEADABLE:
             found = "1: nobody would balance this direction"
-            raise ConfigError(file, f"law.S[{index}]", found, "0; only z and pitch can be led")
+            yield f"law.S[{index}]", found, "0; only z and pitch can be led"
         if not selected and config.law.K_p[index] <= 0.0:
-            where = f"law.K_p[{index}]"
-            raise ConfigError(file, where, "0 in a direction the robot balances", "positive")
+            yield f"law.K_p[{index}]", "0 in a direction the robot balances", "positive"
 
 
-def _check_interfaces(file: str, config: RobotConfig) -> None:
+def _interfaces(config: RobotConfig) -> Problems:
     """Check that python-can knows each bus's interface, and what is filled into its channel."""
     known = set(INTERFACES)
     for name, bus in config.can.items():
-        _check_placeholders(file, f"can.{name}.channel", bus.channel, RUN)
+        yield from _placeholders(f"can.{name}.channel", bus.channel, RUN)
         if bus.interface not in known:
             known |= {entry.name for entry in entry_points(group="can.interface")}
         if bus.interface not in known:
-            found = f"{bus.interface!r} is no interface of python-can"
             near = difflib.get_close_matches(bus.interface, known, n=1)
             right = f"did you mean {near[0]!r}?" if near else f"one of {_words(sorted(known))}"
-            raise ConfigError(file, f"can.{name}.interface", found, right)
+            found = f"{bus.interface!r} is no interface of python-can"
+            yield f"can.{name}.interface", found, right
 
 
-def _check_drive(file: str, config: RobotConfig) -> None:
+def _drive(config: RobotConfig) -> Problems:
     """Check the drives' limits against the joints' needs."""
     drive, turns_per_rad = config.drive, config.joint.gear_ratio / (2 * math.pi)
     tau_per_ampere = 2 * config.joint.gear_ratio * drive.torque_constant
     if tau_per_ampere * drive.current_lim < config.joint.tau_module_max:
         found = f"{drive.current_lim:g} A gives less than tau_module_max"
         right = f"at least {config.joint.tau_module_max / tau_per_ampere:.1f} A"
-        raise ConfigError(file, "drive.current_lim", found, right)
+        yield "drive.current_lim", found, right
     if drive.current_lim > CURRENT_RANGE:
         found = f"{drive.current_lim:g} A is more than an ODrive v3 measures"
         right = f"at most {CURRENT_RANGE:g} A, its requested_current_range"
-        raise ConfigError(file, "drive.current_lim", found, right)
+        yield "drive.current_lim", found, right
     # Up to vel_limit_tolerance times vel_limit remain for the other axis.
     speed = config.joint_service.v_max * turns_per_rad
     if drive.vel_limit < speed:
         found = f"{drive.vel_limit:g} turn/s is slower than joint_service.v_max"
         right = f"at least {speed:.1f} turn/s, v_max at the motor; beyond vel_limit a drive disarms"
-        raise ConfigError(file, "drive.vel_limit", found, right)
-    if drive.zero_mark_turns > 0.0:
-        kind, turns = max(((kind, _turns(config, kind)) for kind in KINDS), key=lambda row: row[1])
-        least = 2 * (turns + _POWER_UP_TURNS)
-        if drive.zero_mark_turns < least:
-            found = f"{drive.zero_mark_turns:g} turns: the {kind} comes to half of it"
-            right = f"at least {math.ceil(least)} turns, twice a joint's range; 0: no such check"
-            raise ConfigError(file, "drive.zero_mark_turns", found, right)
+        yield "drive.vel_limit", found, right
+    kind, turns = max(((kind, _turns(config, kind)) for kind in KINDS), key=lambda row: row[1])
+    least = 2 * (turns + _POWER_UP_TURNS)
+    if 0.0 < drive.zero_mark_turns < least:
+        found = f"{drive.zero_mark_turns:g} turns: the {kind} comes to half of it"
+        right = f"at least {math.ceil(least)} turns, twice a joint's range; 0: no such check"
+        yield "drive.zero_mark_turns", found, right
 
 
 def _turns(config: RobotConfig, kind: str) -> float:
@@ -291,48 +287,41 @@ def _turns(config: RobotConfig, kind: str) -> float:
     return config.joint.gear_ratio * max(span, farthest) / (2 * math.pi)
 
 
-def _check_timing(file: str, config: RobotConfig) -> None:
-    service = config.joint_service
-    pairs = (
+def _timing(config: RobotConfig) -> Problems:
+    service, drive, simulation = config.joint_service, config.drive, config.simulation
+    for key, value, limit in (
         ("joint_service.state_rate_hz", service.state_rate_hz, service.rate_hz),
         ("planner.rate_hz", config.planner.rate_hz, service.state_rate_hz),
         ("joint_service.command_aging_max_ms", service.command_aging_max_ms,
          service.max_command_age_ms),
         ("joint_service.engage_after_ms", service.engage_after_ms, service.engage_after_max_ms),
-    )  # fmt: skip
-    for key, value, limit in pairs:
+    ):  # fmt: skip
         if value > limit:
-            raise ConfigError(file, key, f"{value:g} is too large", f"at most {limit:g}")
+            yield key, f"{value:g} is too large", f"at most {limit:g}"
     period_ms = 1e3 / service.rate_hz
-    if abs(config.simulation.encoder_rate_hz - service.rate_hz) > 1e-6:
-        found = f"{config.simulation.encoder_rate_hz:g} Hz is not joint_service.rate_hz"
-        raise ConfigError(
-            file, "simulation.encoder_rate_hz", found, f"{service.rate_hz:g} Hz: they are its clock"
-        )
-    if abs(config.drive.encoder_period_ms - period_ms) > 1e-6:
-        found = f"{config.drive.encoder_period_ms} ms is not the period of joint_service.rate_hz"
-        raise ConfigError(file, "drive.encoder_period_ms", found, f"{period_ms:g} ms")
-    if (
-        abs(
-            round(service.rate_hz / service.state_rate_hz) * service.state_rate_hz - service.rate_hz
-        )
-        > 1e-6
-    ):
+    if abs(simulation.encoder_rate_hz - service.rate_hz) > 1e-6:
+        found = f"{simulation.encoder_rate_hz:g} Hz is not joint_service.rate_hz"
+        yield "simulation.encoder_rate_hz", found, f"{service.rate_hz:g} Hz: they are its clock"
+    if abs(drive.encoder_period_ms - period_ms) > 1e-6:
+        found = f"{drive.encoder_period_ms} ms is not the period of joint_service.rate_hz"
+        yield "drive.encoder_period_ms", found, f"{period_ms:g} ms"
+    periods = round(service.rate_hz / service.state_rate_hz)
+    if abs(periods * service.state_rate_hz - service.rate_hz) > 1e-6:
         found = f"{service.state_rate_hz:g} Hz does not divide joint_service.rate_hz"
         right = f"{service.rate_hz:g} Hz divided by a whole number"
-        raise ConfigError(file, "joint_service.state_rate_hz", found, right)
-    if service.loop == "onboard" and config.drive.watchdog_timeout > 0.0:
-        found = f"{config.drive.watchdog_timeout:g} s disarms what the onboard loop is to hold"
-        raise ConfigError(file, "drive.watchdog_timeout", found, "0 s: off")
-    if service.loop == "service" and config.drive.watchdog_timeout < 10e-3 * period_ms:
-        found = f"{config.drive.watchdog_timeout:g} s is under ten control periods"
+        yield "joint_service.state_rate_hz", found, right
+    if service.loop == "onboard" and drive.watchdog_timeout > 0.0:
+        found = f"{drive.watchdog_timeout:g} s disarms what the onboard loop is to hold"
+        yield "drive.watchdog_timeout", found, "0 s: off"
+    if service.loop == "service" and drive.watchdog_timeout < 10e-3 * period_ms:
+        found = f"{drive.watchdog_timeout:g} s is under ten control periods"
         right = f"at least {10e-3 * period_ms:g} s, or a hiccup disarms the drive"
-        raise ConfigError(file, "drive.watchdog_timeout", found, right)
+        yield "drive.watchdog_timeout", found, right
     command_period_ms = 1e3 / config.planner.rate_hz
     if service.max_command_age_ms < 3 * command_period_ms:
         found = f"{service.max_command_age_ms:g} ms is under three planner periods"
         right = f"at least {3 * command_period_ms:g} ms, or every hiccup is a drop-out"
-        raise ConfigError(file, "joint_service.max_command_age_ms", found, right)
+        yield "joint_service.max_command_age_ms", found, right
 
 
 def _words(names: Iterable[str]) -> str:

@@ -22,11 +22,7 @@ _BRACES: Final = re.compile(r"\{[^{}]*\}?|\}")
 
 
 def host_and_port(endpoint: str) -> tuple[str, int]:
-    """Return the host and the port of tcp/HOST:PORT, tls/[HOST]:PORT and the like.
-
-    Raises:
-        BusError: it is none, or has no port that there can be.
-    """
+    """Return host and port of tcp/HOST:PORT, tls/[HOST]:PORT and the like, else BusError."""
     found = _ADDRESS.fullmatch(endpoint)
     if found is None or not 0 < int(found[2]) <= PORT_MAX:
         raise BusError(

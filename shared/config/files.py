@@ -19,10 +19,9 @@ from shared.toml_file import parse_toml, read_toml
 
 
 def load(path: Path) -> RobotConfig:
-    """Read and check a robot file, and the gain schedule beside it if there is one.
+    """Read and check a robot file, with the gain schedule beside it if there is one.
 
-    Raises:
-        ConfigError: a file cannot be read, or a key or value is not as it should be.
+    Raises ConfigError if a file cannot be read, or a key or value is not as it should be.
     """
     config = load_without_schedule(path)
     schedule = gain_schedule.read(gain_schedule.path_beside(path))
@@ -30,22 +29,14 @@ def load(path: Path) -> RobotConfig:
 
 
 def load_without_schedule(path: Path) -> RobotConfig:
-    """Read and check a robot file alone.
-
-    Raises:
-        ConfigError: the file cannot be read, or a key or value is not as it should be.
-    """
+    """Read and check a robot file alone, or ConfigError."""
     config = _checked(read_toml(path, RobotConfig), str(path))
     config_check.check_security(str(path), config)
     return config
 
 
 def parse(text: str, file: str) -> RobotConfig:
-    """Return the robot that a TOML text describes, without a gain schedule.
-
-    Raises:
-        ConfigError: a key or value is not as it should be; `file` names the text.
-    """
+    """Return the robot that a TOML text describes, without a gain schedule, or ConfigError."""
     return _checked(parse_toml(text, file, RobotConfig), file)
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import msgspec
 
@@ -18,7 +18,7 @@ from shared.atomic_file import replace_file
 from shared.config.gain_table import GainSchedule, ModuleBounds
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
-from shared.joints import MODULES, kind_of
+from shared.joints import KINDS, MODULES, kind_of
 from shared.text_file import read_text
 from shared.toml_file import check_ranges
 
@@ -26,54 +26,37 @@ VERSION = 2
 """Version of the file and of the program that makes it; a file of another version is made again."""
 
 
+_INPUTS: Final[dict[str, tuple[str, ...]]] = {
+    "mass": (),
+    "geometry": (),
+    "certificate": ("K_required", "onboard_fraction", "k_q_fraction_max"),
+    "law": ("K_p", "K_0", "B_p", "S", "jacobian", "damping_lambda", "load_sharing_moment_arms"),
+    "robustness": (),
+    "stand": KINDS,
+    "joint": ("armature",),
+    "planner": ("rate_hz",),
+    "harness": ("low_pass_hz",),
+    "drive": ("encoder_bandwidth",),
+    "assist": ("force_max",),
+    "joint_service": ("k_p_max", "rate_hz", "hold_stiffens_theta"),
+    "limits": KINDS,
+}
+"""Keys of each section that the schedule depends on; empty: all. Of gains and limits by kind, the
+numbers in one row."""
+
+
 def inputs_of(config: RobotConfig) -> dict[str, Any]:
     """Return everything that the schedule depends on, by dotted key."""
-    law, limits = config.law, config.limits
-    table = {
-        "mass": msgspec.to_builtins(config.mass),
-        "geometry": msgspec.to_builtins(config.geometry),
-        "certificate": {
-            "K_required": config.certificate.K_required,
-            "onboard_fraction": config.certificate.onboard_fraction,
-            "k_q_fraction_max": config.certificate.k_q_fraction_max,
-        },
-        "law": {
-            "K_p": law.K_p,
-            "K_0": law.K_0,
-            "B_p": law.B_p,
-            "S": law.S,
-            "jacobian": law.jacobian,
-            "damping_lambda": law.damping_lambda,
-            "load_sharing_moment_arms": law.load_sharing_moment_arms,
-        },
-        "robustness": msgspec.to_builtins(config.robustness),
-        "stand": {
-            kind: [*gains.k_p, *gains.k_d]
-            for kind, gains in (
-                ("ankle", config.stand.ankle), ("knee", config.stand.knee),
-                ("hip", config.stand.hip),
-            )
-        },
-        "joint": {"armature": config.joint.armature},
-        "planner": {"rate_hz": config.planner.rate_hz},
-        "harness": {"low_pass_hz": config.harness.low_pass_hz},
-        "drive": {"encoder_bandwidth": config.drive.encoder_bandwidth},
-        "assist": {"force_max": config.assist.force_max},
-        "joint_service": {
-            "k_p_max": config.joint_service.k_p_max,
-            "rate_hz": config.joint_service.rate_hz,
-            "hold_stiffens_theta": config.joint_service.hold_stiffens_theta,
-        },
-        "limits": {
-            kind: [*limit.phi, *limit.theta]
-            for kind, limit in (
-                ("ankle", limits.ankle), ("knee", limits.knee), ("hip", limits.hip),
-            )
-        },
-    }  # fmt: skip
-    flat = {
-        f"{section}.{key}": value for section, part in table.items() for key, value in part.items()
-    }
+    flat: dict[str, Any] = {}
+    for section, keys in _INPUTS.items():
+        table: dict[str, Any] = msgspec.to_builtins(getattr(config, section))
+        for key in keys or table:
+            value = table[key]
+            if isinstance(value, dict):
+                value = [
+                    number for row in value.values() if not isinstance(row, str) for number in row
+                ]
+            flat[f"{section}.{key}"] = value
     if not any(config.mass.payload_com):
         del flat["mass.payload_com"]  # younger than schedules that are still right
     plain: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(flat))
@@ -91,11 +74,7 @@ def path_beside(robot_file: Path) -> Path:
 
 
 def read(path: Path) -> GainSchedule | None:
-    """Read a schedule; return None if there is no such file.
-
-    Raises:
-        ConfigError: the file cannot be read, or its tables do not fit together.
-    """
+    """Read a schedule; None if there is no such file, ConfigError if it is not as it should be."""
     again = "make it again: `xrl gains`"
     try:
         schedule = msgspec.json.decode(read_text(path), type=GainSchedule)
@@ -182,11 +161,7 @@ def believing(config: RobotConfig) -> RobotConfig:
 
 
 def require(config: RobotConfig, robot_file: Path) -> None:
-    """Refuse a robot whose gain split needs a schedule that it has not.
-
-    Raises:
-        ConfigError: naming the difference and the command to run.
-    """
+    """Refuse a robot whose gain split needs a schedule that it has not, by a ConfigError."""
     if config.law.split != "certified":
         return
     stale = why_stale(config)

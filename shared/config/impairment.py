@@ -102,10 +102,9 @@ def _digits(value: float, places: int) -> str:
 
 
 class Impairer:
-    """Decides when each message of one direction comes out, and how often."""
+    """Decides when each message of one direction comes out, and how often; by its seed."""
 
     def __init__(self, what: Impairment, seed: str) -> None:
-        """Begin; the same seed decides the same."""
         self.what = what
         self.passed = self.lost = 0
         """Messages that came out, or will; and messages that were lost. A duplicated message counts
@@ -117,11 +116,9 @@ class Impairer:
         self._last_ns = 0
 
     def passes(self, now_ns: int, size: int) -> tuple[int, ...]:
-        """Take a message in; return when it comes out, ns: never, once or twice.
+        """Take a message of some bytes in; return when it comes out, ns: never, once or twice.
 
-        Args:
-            now_ns: any monotonic clock; it must not go back.
-            size: bytes of the message, for `rate`.
+        The clock is any monotonic one.
         """
         what = self.what
         if (what.partition and not what.ordered) or (what.loss and self._is_lost()):
@@ -200,12 +197,6 @@ class Direction:
     """
 
     def __init__(self, name: str, seed: int) -> None:
-        """Begin unimpaired.
-
-        Args:
-            name: of `shared.links`.
-            seed: of all that will be decided here.
-        """
         self.name = name
         self.active: Impairer | None = None
         """What decides now; None: everything passes at once."""

@@ -4,34 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from shared.config import sections
 from shared.config.endpoints import RUN, filled, stray_braces
 from shared.config.gain_table import GainSchedule
-from shared.config.sections import (
-    AssistConfig,
-    BusConfig,
-    CanConfig,
-    CertificateConfig,
-    DriveConfig,
-    EnvelopeConfig,
-    GeometryConfig,
-    HarnessConfig,
-    ImuConfig,
-    JointConfig,
-    JointServiceConfig,
-    LawConfig,
-    LimitConfig,
-    LimitsConfig,
-    MassConfig,
-    ModuleConfig,
-    PlannerConfig,
-    RecorderConfig,
-    RobustnessConfig,
-    Ros2Config,
-    SimulationConfig,
-    StandConfig,
-    StandGains,
-    TripsConfig,
-)
 from shared.exceptions import BusError
 from shared.joints import MODULES, kind_of
 from shared.toml_file import Section
@@ -58,28 +33,28 @@ class RobotConfig(Section, frozen=True):
     name: str
     assumed: tuple[str, ...]
     """Keys whose values the paper does not give; measure them, and remove them from this list."""
-    mass: MassConfig
-    geometry: GeometryConfig
-    joint: JointConfig
-    limits: LimitsConfig
-    module: tuple[ModuleConfig, ...]
-    law: LawConfig
-    certificate: CertificateConfig
-    robustness: RobustnessConfig
-    assist: AssistConfig
-    stand: StandConfig
-    joint_service: JointServiceConfig
-    planner: PlannerConfig
-    harness: HarnessConfig
-    drive: DriveConfig
-    can: dict[str, CanConfig]
-    bus: BusConfig
-    recorder: RecorderConfig
-    simulation: SimulationConfig
-    imu: ImuConfig = ImuConfig()
-    envelope: EnvelopeConfig = EnvelopeConfig()
-    trips: TripsConfig = TripsConfig()
-    ros2: Ros2Config = Ros2Config()
+    mass: sections.MassConfig
+    geometry: sections.GeometryConfig
+    joint: sections.JointConfig
+    limits: sections.LimitsConfig
+    module: tuple[sections.ModuleConfig, ...]
+    law: sections.LawConfig
+    certificate: sections.CertificateConfig
+    robustness: sections.RobustnessConfig
+    assist: sections.AssistConfig
+    stand: sections.StandConfig
+    joint_service: sections.JointServiceConfig
+    planner: sections.PlannerConfig
+    harness: sections.HarnessConfig
+    drive: sections.DriveConfig
+    can: dict[str, sections.CanConfig]
+    bus: sections.BusConfig
+    recorder: sections.RecorderConfig
+    simulation: sections.SimulationConfig
+    imu: sections.ImuConfig = sections.ImuConfig()
+    envelope: sections.EnvelopeConfig = sections.EnvelopeConfig()
+    trips: sections.TripsConfig = sections.TripsConfig()
+    ros2: sections.Ros2Config = sections.Ros2Config()
     gain_schedule: GainSchedule | None = None
     """Not in this file but beside it; None if it has not been made."""
 
@@ -94,7 +69,7 @@ class RobotConfig(Section, frozen=True):
         names = [module.bus for module in self.module] + [self.harness.bus]
         return tuple(dict.fromkeys([*names, *([self.imu.bus] if self.imu.fitted else [])]))
 
-    def module_named(self, name: str) -> ModuleConfig:
+    def module_named(self, name: str) -> sections.ModuleConfig:
         """Return a module by its name."""
         return next(module for module in self.module if module.name == name)
 
@@ -106,13 +81,13 @@ class RobotConfig(Section, frozen=True):
         """Return (low, high) in rad for each of the 12 joints, in `JOINTS` order."""
         rows = []
         for module in MODULES:
-            limit: LimitConfig = getattr(self.limits, kind_of(module))
+            limit: sections.LimitConfig = getattr(self.limits, kind_of(module))
             rows += [limit.phi, limit.theta]
         return tuple(rows)
 
-    def stand_gains(self, module: str) -> StandGains:
+    def stand_gains(self, module: str) -> sections.StandGains:
         """Return the power-up gains of a module."""
-        gains: StandGains = getattr(self.stand, kind_of(module))
+        gains: sections.StandGains = getattr(self.stand, kind_of(module))
         return gains
 
     def hold_gains(self, module: str) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -166,8 +141,7 @@ class RobotConfig(Section, frozen=True):
 def expand(text: str, run_dir: Path) -> str:
     """Return a path or endpoint with `{run}` replaced by the run directory.
 
-    Raises:
-        BusError: something else stands in braces; it would be taken as it is.
+    Raises BusError if something else stands in braces; it would be taken as it is.
     """
     stray = stray_braces(text, [RUN])
     if stray:

@@ -6,7 +6,7 @@ A scenario is a TOML file (`deploy/scenarios/`); `xrl demo` adds to it from its 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Final, Literal, NamedTuple
@@ -172,11 +172,8 @@ class Lead(NamedTuple):
 def lead(scenario: Scenario, t: float) -> Lead:
     """Return where the hand leads at scenario time t (s); before 0, the first keyframe."""
     frames = scenario.keyframe
-    if t <= frames[0].at:
-        first = frames[0]
-        return Lead(first.height, 0.0, first.pitch, 0.0, first.assist, first.shift)
     for a, b in pairwise(frames):
-        if t < b.at:
+        if frames[0].at < t < b.at:
             span = b.at - a.at
             phase = math.pi * (t - a.at) / span
             s = 0.5 - 0.5 * math.cos(phase)
@@ -189,8 +186,8 @@ def lead(scenario: Scenario, t: float) -> Lead:
                 a.assist + (b.assist - a.assist) * s,
                 _eased(a.shift, b.shift, s),
             )
-    last = frames[-1]
-    return Lead(last.height, 0.0, last.pitch, 0.0, last.assist, last.shift)
+    rest = frames[0] if t <= frames[0].at else frames[-1]
+    return Lead(rest.height, 0.0, rest.pitch, 0.0, rest.assist, rest.shift)
 
 
 def _eased(a: Shift, b: Shift, s: float) -> Shift:
@@ -210,11 +207,7 @@ def push_at(scenario: Scenario, t: float) -> tuple[float, float, float]:
 
 
 def load(path: Path) -> Scenario:
-    """Read and check a scenario file.
-
-    Raises:
-        ConfigError: naming the file, the key, what stands there and what would be right.
-    """
+    """Read and check a scenario file, or ConfigError."""
     scenario = read_toml(path, Scenario)
     check(str(path), scenario)
     return scenario
@@ -223,63 +216,55 @@ def load(path: Path) -> Scenario:
 def check(file: str, scenario: Scenario) -> None:
     """Check what no single value shows: order, services, times inside the run."""
     check_ranges(file, scenario)
-    if not scenario.keyframe:
-        raise ConfigError(file, "keyframe", "none", "at least one [[keyframe]]")
-    times = [frame.at for frame in scenario.keyframe]
-    for index, (a, b) in enumerate(pairwise(times)):
-        if b <= a:
-            found = f"at {b:g} s does not follow {a:g} s"
-            raise ConfigError(file, f"keyframe[{index + 1}].at", found, "times must rise")
-    tables: tuple[tuple[str, Sequence[Kill | Restart]], ...] = (
-        ("kill", scenario.kill),
-        ("restart", scenario.restart),
-    )
-    for kind, rows in tables:
-        for index, row in enumerate(rows):
-            where = f"{kind}[{index}]"
-            if row.service not in SERVICES:
-                right = f"one of {', '.join(SERVICES)}"
-                raise ConfigError(file, f"{where}.service", f"{row.service!r}", right)
-            _check_inside(file, f"{where}.at", row.at, scenario.duration)
-    for index, push in enumerate(scenario.push):
-        _check_inside(file, f"push[{index}].at", push.at, scenario.duration)
-    for index, fault in enumerate(scenario.fault):
-        _check_fault(file, f"fault[{index}]", fault)
-        _check_inside(file, f"fault[{index}].at", fault.at, scenario.duration)
     for index, inject in enumerate(scenario.inject):
         directions_of(inject.link, file, f"inject[{index}].link")
-        if problem := inject.fault():
-            found, _, right = problem.partition("; ")
-            raise ConfigError(file, f"inject[{index}]", found, right)
-        _check_inside(file, f"inject[{index}].at", inject.at, scenario.duration)
+    for problem in _problems(scenario):
+        raise ConfigError(file, *problem)
+
+
+def _problems(scenario: Scenario) -> Iterator[tuple[str, str, str]]:
+    """Yield the key, what stands there and what would be right."""
+    if not scenario.keyframe:
+        yield "keyframe", "none", "at least one [[keyframe]]"
+    for index, (a, b) in enumerate(pairwise(frame.at for frame in scenario.keyframe)):
+        if b <= a:
+            found = f"at {b:g} s does not follow {a:g} s"
+            yield f"keyframe[{index + 1}].at", found, "times must rise"
+    for kind in ("kill", "restart", "push", "fault", "inject"):
+        rows: Sequence[Kill | Restart | Push | Fault | Inject] = getattr(scenario, kind)
+        for index, row in enumerate(rows):
+            where = f"{kind}[{index}]"
+            if isinstance(row, Kill | Restart) and row.service not in SERVICES:
+                yield f"{where}.service", f"{row.service!r}", f"one of {', '.join(SERVICES)}"
+            if isinstance(row, Fault):
+                yield from _fault_problems(where, row)
+            if isinstance(row, Inject) and (problem := row.fault()):
+                found, _, right = problem.partition("; ")
+                yield where, found, right
+            if row.at >= scenario.duration:
+                found = f"{row.at:g} s is not inside the run of {scenario.duration:g} s"
+                yield f"{where}.at", found, "an earlier time, or a longer duration"
     for index, restart in enumerate(scenario.restart):
         if not any(k.service == restart.service and k.at < restart.at for k in scenario.kill):
             found = f"{restart.service} is not killed before {restart.at:g} s"
-            raise ConfigError(file, f"restart[{index}]", found, "kill it first")
+            yield f"restart[{index}]", found, "kill it first"
 
 
-def _check_fault(file: str, where: str, fault: Fault) -> None:
+def _fault_problems(where: str, fault: Fault) -> Iterator[tuple[str, str, str]]:
     if fault.module not in MODULES:
-        right = f"one of {', '.join(MODULES)}"
-        raise ConfigError(file, f"{where}.module", f"{fault.module!r}", right)
+        yield f"{where}.module", f"{fault.module!r}", f"one of {', '.join(MODULES)}"
     traits = FAULT_KINDS[fault.kind]
     if fault.axis not in (None, 0, 1):
-        raise ConfigError(file, f"{where}.axis", f"{fault.axis}", "0 or 1")
+        yield f"{where}.axis", f"{fault.axis}", "0 or 1"
     if fault.axis is not None and traits.whole:
         found = f"{fault.axis}, but {fault.kind} is of the whole ODrive"
-        raise ConfigError(file, f"{where}.axis", found, "leave it out")
+        yield f"{where}.axis", found, "leave it out"
     if fault.duration is not None and traits.duration is None:
         found = f"{fault.duration:g} s, but {fault.kind} is of a moment"
-        raise ConfigError(file, f"{where}.duration", found, "leave it out")
+        yield f"{where}.duration", found, "leave it out"
     if fault.duration is not None and not 0.001 <= fault.duration <= 600.0:
         found = f"{fault.duration!r} is out of range"
-        raise ConfigError(file, f"{where}.duration", found, "must be from 0.001 to 600 s")
-
-
-def _check_inside(file: str, key: str, at: float, duration: float) -> None:
-    if at >= duration:
-        found = f"{at:g} s is not inside the run of {duration:g} s"
-        raise ConfigError(file, key, found, "an earlier time, or a longer duration")
+        yield f"{where}.duration", found, "must be from 0.001 to 600 s"
 
 
 def to_toml(scenario: Scenario) -> str:

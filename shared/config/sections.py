@@ -9,6 +9,7 @@ from shared.toml_file import Range, Section
 
 Mass = Annotated[float, Range(0.0, 200.0, "kg")]
 PayloadPlace = Annotated[float, Range(-0.3, 0.3, "m")]
+Place = Annotated[float, Range(-1.0, 1.0, "m")]
 Length = Annotated[float, Range(0.005, 2.0, "m")]
 Share = Annotated[float, Range(0.0, 1.0, "1")]
 Rate = Annotated[float, Range(1.0, 8000.0, "Hz")]
@@ -38,11 +39,7 @@ class GeometryConfig(Section, frozen=True):
     l_foot: Length
     w_foot: Length
     foot_height: Length
-    harness_point: tuple[
-        Annotated[float, Range(-1.0, 1.0, "m")],
-        Annotated[float, Range(-1.0, 1.0, "m")],
-        Annotated[float, Range(-1.0, 1.0, "m")],
-    ]
+    harness_point: tuple[Place, Place, Place]
     torso_size: tuple[Length, Length, Length]
 
 
@@ -83,34 +80,23 @@ class ModuleConfig(Section, frozen=True):
     """12 hexadecimal digits, as USB shows them; for `joint_service.driver = "odrive_usb"`."""
 
 
+LinearStiffness = Annotated[float, Range(0.0, 1e5, "N/m")]
+AngularStiffness = Annotated[float, Range(0.0, 1e5, "N m/rad")]
+LinearDamping = Annotated[float, Range(0.0, 1e5, "N s/m")]
+AngularDamping = Annotated[float, Range(0.0, 1e5, "N m s/rad")]
 Stiffness6 = tuple[
-    Annotated[float, Range(0.0, 1e5, "N/m")],
-    Annotated[float, Range(0.0, 1e5, "N/m")],
-    Annotated[float, Range(0.0, 1e5, "N/m")],
-    Annotated[float, Range(0.0, 1e5, "N m/rad")],
-    Annotated[float, Range(0.0, 1e5, "N m/rad")],
-    Annotated[float, Range(0.0, 1e5, "N m/rad")],
-]
+    LinearStiffness, LinearStiffness, LinearStiffness,
+    AngularStiffness, AngularStiffness, AngularStiffness,
+]  # fmt: skip
 Damping6 = tuple[
-    Annotated[float, Range(0.0, 1e5, "N s/m")],
-    Annotated[float, Range(0.0, 1e5, "N s/m")],
-    Annotated[float, Range(0.0, 1e5, "N s/m")],
-    Annotated[float, Range(0.0, 1e5, "N m s/rad")],
-    Annotated[float, Range(0.0, 1e5, "N m s/rad")],
-    Annotated[float, Range(0.0, 1e5, "N m s/rad")],
+    LinearDamping, LinearDamping, LinearDamping, AngularDamping, AngularDamping, AngularDamping
 ]
 Selection = Literal[0, 1]
-
-
 ShiftLength = Annotated[float, Range(0.0, 0.1, "m")]
 ShiftAngle = Annotated[float, Range(0.0, 0.3, "rad")]
-
-
 StanceLength = Annotated[float, Range(0.0, 0.3, "m")]
 StanceAngle = Annotated[float, Range(0.0, 0.8, "rad")]
 Stance6 = tuple[StanceLength, StanceLength, StanceLength, StanceAngle, StanceAngle, StanceAngle]
-
-
 ProbeLength = Annotated[float, Range(0.0, 0.03, "m")]
 ProbeAngle = Annotated[float, Range(0.0, 0.1, "rad")]
 Probe6 = tuple[ProbeLength, ProbeLength, ProbeLength, ProbeAngle, ProbeAngle, ProbeAngle]
@@ -139,14 +125,12 @@ class LawConfig(Section, frozen=True):
     ] = (0.0, 0.0)
 
 
+RequiredLinear = Annotated[float, Range(1.0, 1e5, "N/m")]
+RequiredAngular = Annotated[float, Range(1.0, 1e5, "N m/rad")]
 RequiredStiffness6 = tuple[
-    Annotated[float, Range(1.0, 1e5, "N/m")],
-    Annotated[float, Range(1.0, 1e5, "N/m")],
-    Annotated[float, Range(1.0, 1e5, "N/m")],
-    Annotated[float, Range(1.0, 1e5, "N m/rad")],
-    Annotated[float, Range(1.0, 1e5, "N m/rad")],
-    Annotated[float, Range(1.0, 1e5, "N m/rad")],
-]
+    RequiredLinear, RequiredLinear, RequiredLinear,
+    RequiredAngular, RequiredAngular, RequiredAngular,
+]  # fmt: skip
 
 
 class CertificateConfig(Section, frozen=True):

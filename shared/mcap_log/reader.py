@@ -109,7 +109,6 @@ class LogReader:
     """
 
     def __init__(self, data: bytes | mmap.mmap) -> None:
-        """Take the file's bytes, which begin with the magic."""
         self._data = data
         self.size = len(data)
         self.finished = False
@@ -189,8 +188,7 @@ class LogReader:
     def read_at(self, start: int) -> LogRecord | None:
         """Return the record at a place that `skim` found; None if it turns out damaged.
 
-        Raises:
-            RunError: what was read so far is far larger than any run of that size.
+        Raises RunError if what was read so far is far larger than any run of that size.
         """
         damage, self.damage = self.damage, []
         record, _ = self._next(start)
@@ -444,8 +442,8 @@ def _times(body: bytes, opcode: int) -> tuple[int, int]:
 def open_log(path: Path) -> Iterator[LogReader]:
     """Open a file to read what can be read of it.
 
-    Raises:
-        RunError: it is missing, a directory or no ordinary file, empty, or no MCAP file.
+    Raises RunError for a missing or empty file, a directory or a pipe, and one that is no MCAP
+    file.
     """
     with contextlib.ExitStack() as stack:
         try:

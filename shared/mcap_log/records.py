@@ -1,4 +1,4 @@
-"""MCAP records as bytes, decoded without trusting one of them. Pure.
+"""MCAP records as bytes: encoded, and decoded without trusting one of them. Pure.
 
 The records are the classes of the mcap package; its own readers trust each length: a wrong one
 makes them read on, allocate or raise (docs/logs.md). Here a record counts only if its fields fit
@@ -12,7 +12,7 @@ import contextlib
 import mmap
 import struct
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from io import BytesIO
 from types import MappingProxyType
 from typing import Final, NamedTuple
@@ -26,10 +26,12 @@ from mcap.records import (
     Channel,
     Chunk,
     DataEnd,
+    Footer,
     Header,
     McapRecord,
     Metadata,
     Schema,
+    SummaryOffset,
 )
 
 __all__ = ["Attachment", "Channel", "Chunk", "Header", "McapRecord", "Metadata", "Schema"]
@@ -96,19 +98,58 @@ def with_prefix(opcode: int, body: bytes) -> bytes:
     return PREFIX.pack(opcode, len(body)) + body
 
 
+def compressed_chunk(first_ns: int, last_ns: int, content: bytes) -> Chunk:
+    """Return a zstd chunk of these records; its messages have the first and the last log time."""
+    return Chunk(
+        compression="zstd",
+        data=zstandard.ZstdCompressor().compress(content),
+        message_start_time=first_ns,
+        message_end_time=last_ns,
+        uncompressed_size=len(content),
+        uncompressed_crc=zlib.crc32(content),
+    )
+
+
+def message_index(channel_id: int, rows: Iterable[tuple[int, int]]) -> bytes:
+    """Return the record that says where a channel's messages are in their chunk.
+
+    `rows` have log time and offset in the decompressed chunk of each message.
+    """
+    entries = b"".join(struct.pack("<QQ", *row) for row in rows)
+    return with_prefix(Opcode.MESSAGE_INDEX, struct.pack("<HI", channel_id, len(entries)) + entries)
+
+
+def file_end(position: int, groups: Mapping[int, bytes]) -> bytes:
+    """Return what follows the last message of a finished file: data end, summary, footer, magic.
+
+    It begins at the offset `position`; `groups` are the records of the summary by opcode, joined.
+    """
+    data_end = encode(DataEnd(data_section_crc=0))
+    summary_start = position + len(data_end)
+    summary, offsets = b"", b""
+    for opcode, records in groups.items():
+        if records:
+            start = summary_start + len(summary)
+            offsets += encode(
+                SummaryOffset(group_opcode=opcode, group_start=start, group_length=len(records))
+            )
+            summary += records
+    footer = Footer(
+        summary_start=summary_start,
+        summary_offset_start=summary_start + len(summary),
+        summary_crc=0,
+    )
+    without_crc = encode(footer)[: -CRC.size]
+    footer.summary_crc = zlib.crc32(summary + offsets + without_crc)
+    return data_end + summary + offsets + encode(footer) + MAGIC
+
+
 def decode(opcode: int, body: bytes) -> tuple[McapRecord | None, int]:
     """Decode a record of the data section that is neither chunk nor message.
 
-    Args:
-        opcode: of the record.
-        body: its content.
-
-    Returns:
-        The record, None for a message index, of which only the length is checked; and the size of
-        its fields, which a later version's may follow.
-
-    Raises:
-        Malformed: the content does not fit the opcode or the length, or its CRC is wrong.
+    Returns the record, None for a message index, of which only the length is checked; and the size
+    of its fields, which a later version's may follow. Raises Malformed if the content does not fit
+    the opcode or the length, or its CRC is wrong.
     """
     if opcode == Opcode.MESSAGE_INDEX:
         size = 6 + int.from_bytes(body[2:6], "little")
@@ -135,12 +176,8 @@ def decode(opcode: int, body: bytes) -> tuple[McapRecord | None, int]:
 def decode_chunk(body: bytes, *, cut: bool = False) -> tuple[Chunk, int]:
     """Decode a chunk's head; its data stays compressed. Return it, and the size of its fields.
 
-    Args:
-        body: content of the record.
-        cut: the file ends inside the chunk, so `data` is only its start.
-
-    Raises:
-        Malformed: the data is shorter than the head says.
+    `cut`: the file ends inside the chunk, so `data` is only its start. Else raises Malformed if the
+    data is shorter than the head says.
     """
     fields = _Fields(body)
     first_ns, last_ns, size, crc = CHUNK_TIMES.unpack(fields.read(CHUNK_TIMES.size))
@@ -166,9 +203,8 @@ def decode_chunk(body: bytes, *, cut: bool = False) -> tuple[Chunk, int]:
 def decompressed(chunk: Chunk) -> bytes:
     """Return a chunk's records.
 
-    Raises:
-        Malformed: size or CRC are not as the head gives them, or nothing here reads the
-            compression.
+    Raises Malformed if size or CRC are not as the head gives them, or nothing here reads the
+    compression.
     """
     if chunk.uncompressed_size > max(DECOMPRESSED_MAX, EXPANSION_MAX * len(chunk.data)):
         raise Malformed
@@ -242,17 +278,10 @@ class ChunkMessage(NamedTuple):
 def split_messages(
     data: bytes | mmap.mmap, begin: int, end: int, enough: int
 ) -> tuple[list[ChunkMessage], int]:
-    """Return the messages that follow each other from a place of a file on.
+    """Return the messages that follow each other from `begin` on, and where they end.
 
-    Args:
-        data: the file.
-        begin: where the first one is.
-        end: of what may be read.
-        enough: size, bytes, at which no further message is taken.
-
-    Returns:
-        The messages, with places counted from `begin`, and where they end. A message that does not
-        fit before `end`, or is too short, is left out with all behind it.
+    Their places are counted from `begin`. A message that does not fit before `end`, or is too
+    short, is left out with all behind it; at `enough` bytes no further message is taken.
     """
     rows: list[ChunkMessage] = []
     at, new, message, head = begin, ChunkMessage._make, int(Opcode.MESSAGE), MESSAGE_RECORD
@@ -267,12 +296,9 @@ def split_messages(
 
 
 def split_chunk(data: bytes) -> tuple[list[ChunkMessage], list[tuple[int, bytes]]]:
-    """Split a chunk's decompressed data into its messages and its other records.
+    """Split a chunk's decompressed data into its messages, and (opcode, body) of each other record.
 
     An incomplete record at the end is left out, so this reads the start of a cut chunk too.
-
-    Returns:
-        The messages, and (opcode, body) of each other record.
     """
     rows: list[ChunkMessage] = []
     others: list[tuple[int, bytes]] = []

@@ -1,6 +1,6 @@
 """Recovers a file that was never finished: a copy with the index that every reader needs.
 
-Chunks are copied as they are. The original stays until the copy is complete and on the disk; a
+The original stays until the copy is complete and on the disk; a
 recovery that is killed leaves the original as it was, and the next one starts over.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
-from typing import BinaryIO, Final, TypeAlias
+from typing import Final, TypeAlias
 
 import msgspec
 from mcap.opcode import Opcode
@@ -18,8 +18,8 @@ from mcap.records import Metadata
 from shared.atomic_file import atomic_file
 from shared.clock import NS_PER_S
 from shared.exceptions import RunError
+from shared.mcap_log.log_copy import LogCopy
 from shared.mcap_log.reader import LogReader, LostBytes, open_log
-from shared.mcap_log.recovered_copy import LogCopy
 
 Stop: TypeAlias = Callable[[], bool]
 
@@ -52,21 +52,13 @@ class RecoveryResult(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def is_finished(path: Path) -> bool:
-    """Return True if an MCAP file is finished.
-
-    Raises:
-        RunError: it cannot be read.
-    """
+    """Return True if an MCAP file is finished; RunError if it cannot be read."""
     with open_log(path) as reader:
         return reader.finished
 
 
 def is_whole(path: Path) -> bool:
-    """Return True if a file is finished, undamaged, and has an index of all its messages.
-
-    Raises:
-        RunError: it cannot be read.
-    """
+    """Return True if a file is finished, undamaged, and has an index of all its messages."""
     with open_log(path) as reader:
         if not reader.finished:
             return False
@@ -79,21 +71,19 @@ def is_whole(path: Path) -> bool:
 
 
 def recover(path: Path, out: Path, stop: Stop = lambda: False) -> RecoveryResult:
-    """Copy what can be read of a file into a finished one.
+    """Copy what can be read of a file into a finished one, which then replaces `out`.
 
-    Args:
-        path: an MCAP file; not touched, unless `out` is the same.
-        out: the file to write; one of that name is replaced when the copy is complete.
-        stop: called between chunks; True interrupts.
-
-    Raises:
-        RunError: the file cannot be read, or the copy cannot be written.
-        Interrupted: `stop` returned True.
+    `stop` is called between chunks; True interrupts. Raises RunError if the file cannot be read or
+    the copy cannot be written, and Interrupted.
     """
     with open_log(path) as reader:
         try:
             with atomic_file(out, lasting=True) as file:
-                copy = _copied(reader, file, stop)
+                copy = LogCopy(file, reader.raw)
+                for record in reader:
+                    if stop():
+                        raise Interrupted
+                    copy.take(record)
                 copy.finish(_note(path, copy, reader))
         except OSError as error:
             raise RunError(
@@ -104,11 +94,11 @@ def recover(path: Path, out: Path, stop: Stop = lambda: False) -> RecoveryResult
         source=path,
         out=out,
         finished=reader.finished,
-        messages=copy.messages,
+        messages=copy.counts.message_count,
         channels=len(copy.channels),
-        attachments=copy.attachments,
-        first_ns=copy.first_ns,
-        last_ns=copy.last_ns,
+        attachments=copy.counts.attachment_count,
+        first_ns=copy.counts.message_start_time,
+        last_ns=copy.counts.message_end_time,
         orphans=copy.orphans,
         passed_over=reader.passed_over,
         cut=reader.cut,
@@ -167,19 +157,10 @@ def clock_time(time_ns: int) -> str:
     return date.isoformat(sep=" ", timespec="milliseconds")
 
 
-def _copied(reader: LogReader, file: BinaryIO, stop: Stop) -> LogCopy:
-    copy = LogCopy(file, reader.raw)
-    for record in reader:
-        if stop():
-            raise Interrupted
-        copy.take(record)
-    return copy
-
-
 def _note(path: Path, copy: LogCopy, reader: LogReader) -> Metadata:
     losses = [*reader.damage, *([reader.cut] if reader.cut else [])]
     lost = sum(loss.end - loss.start for loss in losses)
-    note = {"from": path.name, "messages": str(copy.messages), "lost_bytes": str(lost)}
+    note = {"from": path.name, "messages": str(copy.counts.message_count), "lost_bytes": str(lost)}
     return Metadata(name="recovered", metadata=note)
 
 

@@ -51,11 +51,7 @@ def name_of(message_type: type[Message]) -> str:
 
 
 def json_schema(message_type: type[msgspec.Struct]) -> dict[str, Any]:
-    """Return the flat JSON schema of a message type.
-
-    Raises:
-        RunError: a field's type has no place in a flat schema; names type and field.
-    """
+    """Return the flat JSON schema of a message type; RunError for a field without a place in it."""
     info = inspect.type_info(message_type)
     if not isinstance(info, inspect.StructType):
         raise RunError(f"{message_type}: no msgspec struct; recorded messages are structs")

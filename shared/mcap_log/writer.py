@@ -25,7 +25,6 @@ import secrets
 from collections.abc import Callable, Iterator, Mapping
 from enum import Enum
 from pathlib import Path
-from types import TracebackType
 from typing import Annotated, BinaryIO, Final, Protocol
 
 import msgspec
@@ -37,7 +36,6 @@ from mcap.writer import CompressionType, Writer
 from shared.bus.topics import Topic, several_may_write
 from shared.exceptions import RunError
 from shared.mcap_log import files, schema
-from shared.mcap_log.fsync_thread import FsyncThread
 from shared.mcap_log.sequence_stats import KeyCount
 
 SCHEMA_VERSION: Final = "6"
@@ -101,17 +99,10 @@ class RunWriter:
     ) -> None:
         """Create `run.mcap` in `directory`, or `run-1.mcap`, ... if there is a run already.
 
-        Args:
-            directory: made if absent.
-            topics: topic of every key to record; each gets a channel.
-            offset_ns: wall minus monotonic clock.
-            metadata: records for the start of each file, by name.
-            attachments: contents by file name.
-            chunk_kib: size of a chunk before compression.
-            begin: False leaves the first file to `begin`.
-
-        Raises:
-            RunError: the file cannot be created or written.
+        `topics` are those of every key to record, `offset_ns` is wall minus monotonic clock;
+        `metadata` records, by name, and `attachments`, by file name, go into each file; `chunk_kib`
+        is the size of a chunk before compression. Without `begin` the first file is left to
+        `begin`. Raises RunError if the file cannot be created or written, as all methods do.
         """
         self.path = directory / FILE_NAME
         """The file being written, or the last one."""
@@ -137,7 +128,7 @@ class RunWriter:
         """Counts at the start of the file."""
         self._decode = msgspec.json.Decoder(MessageHead).decode
         self._file: BinaryIO | None = None
-        self._syncer = FsyncThread()
+        self._syncer = files.FsyncThread()
         if begin:
             self.begin()
 
@@ -145,17 +136,8 @@ class RunWriter:
         """Return the writer itself."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Finish the file; after an error only close it.
-
-        Raises:
-            RunError: the end of the file cannot be written.
-        """
+    def __exit__(self, kind: type[BaseException] | None, *_error: object) -> None:
+        """Finish the file; after an error only close it."""
         try:
             if kind is None:
                 self.finish()
@@ -202,14 +184,7 @@ class RunWriter:
         return FilePlace.MOVED if own.st_nlink else FilePlace.REMOVED
 
     def begin(self, note: Mapping[str, str] | None = None) -> None:
-        """Start the run's next file, with all metadata and attachments.
-
-        Args:
-            note: added to its metadata `split`: why it was started.
-
-        Raises:
-            RunError: the file cannot be created or written.
-        """
+        """Start the run's next file, with metadata and attachments; `note` goes into `split`."""
         with self._as_run_error("cannot be created"):
             self._directory.mkdir(parents=True, exist_ok=True)
             self._stem = self._stem or files.free_stem(self._directory)
@@ -233,9 +208,6 @@ class RunWriter:
         """Write messages until the source is empty; return their number.
 
         While no file is open, messages are only counted as left out.
-
-        Raises:
-            RunError: the file cannot be written.
         """
         if self._file is None:
             return self._leave_out(source, at_most)
@@ -267,34 +239,20 @@ class RunWriter:
         return taken
 
     def flush(self) -> None:
-        """Hand everything to the kernel: it then survives a kill of this process.
-
-        Raises:
-            RunError: the file cannot be written.
-        """
+        """Hand everything to the kernel: it then survives a kill of this process."""
         if self._file is not None:
             with self._as_run_error("cannot be written"):
                 self._flush_writer()
 
     def sync(self) -> None:
-        """Flush, and have it brought to the disk: it then survives a loss of power.
-
-        Returns without waiting for the disk.
-
-        Raises:
-            RunError: the file cannot be written, or the last sync failed.
-        """
+        """Flush, and have it brought to the disk meanwhile: it then survives a loss of power."""
         if self._file is not None:
             with self._as_run_error("cannot be written"):
                 self._flush_writer()
                 self._syncer.request(self._file.fileno())
 
     def finish(self) -> None:
-        """Finish the open file, if there is one; `begin` begins the next.
-
-        Raises:
-            RunError: the end of the file cannot be written.
-        """
+        """Finish the open file, if there is one; `begin` begins the next."""
         if self._file is None:
             return
         with self._as_run_error("cannot be finished"):

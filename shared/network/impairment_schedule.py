@@ -27,17 +27,15 @@ class PendingImpairment(NamedTuple):
 
 
 class ImpairmentSchedule:
-    """All of them, by number."""
+    """All of them, by number. `report` takes an event for each direction as one begins or ends.
+
+    Times are on the owner's clock; `now_ns` is the stamp of the events. A link is one of
+    `shared.links`, else ConfigError.
+    """
 
     def __init__(
         self, directions: Mapping[str, Direction], report: Callable[[LinkEvent], object]
     ) -> None:
-        """Begin with none.
-
-        Args:
-            directions: every one, by name.
-            report: takes an event for each direction whenever something begins or ends.
-        """
         self.requested: dict[int, PendingImpairment] = {}
         self.next_due = math.inf
         """When the first of them begins or ends, on the owner's clock."""
@@ -48,34 +46,14 @@ class ImpairmentSchedule:
         self._count = self._reported = 0
 
     def begin(self, link: str, what: Impairment, until: float, now_ns: int) -> int:
-        """Start an impairment now; return its number.
-
-        Args:
-            link: of `shared.links`.
-            what: the impairment.
-            until: when it ends, on the owner's clock.
-            now_ns: stamp of the events.
-
-        Raises:
-            ConfigError: there is no such link.
-        """
+        """Start an impairment now; return its number."""
         number = self.plan(link, what, -math.inf, until)
         self._begin(number, now_ns)
         self._find_next()
         return number
 
     def plan(self, link: str, what: Impairment, begins: float, until: float) -> int:
-        """Plan an impairment that `advance` starts when it is due; return its number.
-
-        Args:
-            link: of `shared.links`.
-            what: the impairment.
-            begins: its start, on the owner's clock.
-            until: its end, on the same.
-
-        Raises:
-            ConfigError: there is no such link.
-        """
+        """Plan an impairment that `advance` starts when it is due; return its number."""
         directions_of(link)
         self._count += 1
         self.requested[self._count] = PendingImpairment(begins, until, link, what)
@@ -112,11 +90,7 @@ class ImpairmentSchedule:
         return True
 
     def clear(self, link: str, now_ns: int) -> int:
-        """End every impairment of a link, started or not; return their number.
-
-        Raises:
-            ConfigError: there is no such link.
-        """
+        """End every impairment of a link, started or not; return their number."""
         names = set(directions_of(link))
         found = [n for n, row in self.requested.items() if names & set(directions_of(row.link))]
         for number in found:

@@ -40,7 +40,6 @@ class CompiledGraph:
     """
 
     def __init__(self, function: ca.Function) -> None:
-        """Take the graph."""
         translated = _translated(function)
         self.translated = translated is not None
         function = translated or function
@@ -54,12 +53,7 @@ class CompiledGraph:
             buffer.set_res(index, memoryview(array.T.reshape(-1)))  # type: ignore[call-arg, arg-type]  # casadi's stub
 
     def bind(self, index: int, array: Array) -> None:
-        """Read an argument from a caller's array (n,), which must live as long as the graph does.
-
-        Args:
-            index: of the argument.
-            array: contiguous; of the argument's length.
-        """
+        """Read an argument from a caller's contiguous array (n,), which must live as long."""
         assert array.shape == self.arguments[index].shape  # noqa: S101 - else it reads beyond
         self.arguments[index] = array
         self._buffer.set_arg(index, memoryview(array))  # type: ignore[call-arg, arg-type]  # casadi's stub

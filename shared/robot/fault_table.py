@@ -23,7 +23,7 @@ class DriveFault(NamedTuple):
     The module goes to FAULT, and the planner holds the other five, so that no leg works against
     the other. If a knee may be limp the other five stiffen: its leg then stands as a strut between
     a stiff ankle and a stiff hip. If an ankle may be limp the knees stiffen
-    (`shared.robot.limp_leg_support`).
+    (`shared.robot.hold_rules`).
     """
 
     drive: str
@@ -44,62 +44,41 @@ _HANG: Final = "hang the robot"
 
 DRIVE_FAULTS: Final[dict[FaultKind, DriveFault]] = {
     "over_temperature": DriveFault(
-        f"less current near the limit, beyond it {_LIMP}",
-        limp=True,
-        cause=Cause.DRIVE_DISARMED,
-        zero_lost=False,
+        f"less current near the limit, beyond it {_LIMP}", limp=True,
+        cause=Cause.DRIVE_DISARMED, zero_lost=False,
         recovery=f"{_HANG}; let the drive cool, check its airflow and current_lim",
     ),
     "over_voltage": DriveFault(
-        _BOTH_LIMP,
-        limp=True,
-        cause=Cause.DRIVE_DISARMED,
-        zero_lost=False,
+        _BOTH_LIMP, limp=True, cause=Cause.DRIVE_DISARMED, zero_lost=False,
         recovery=f"{_HANG}; make the supply absorb the current of braking legs",
     ),
     "encoder": DriveFault(
-        f"it goes on reporting the last position; {_LIMP}",
-        limp=True,
-        cause=Cause.DRIVE_DISARMED,
-        zero_lost=True,
+        f"it goes on reporting the last position; {_LIMP}", limp=True,
+        cause=Cause.DRIVE_DISARMED, zero_lost=True,
         recovery=f"{_HANG}; repair the encoder or its cable, then `xrl zero`",
     ),
     "watchdog": DriveFault(
-        _LIMP,
-        limp=True,
-        cause=Cause.DRIVE_DISARMED,
-        zero_lost=False,
+        _LIMP, limp=True, cause=Cause.DRIVE_DISARMED, zero_lost=False,
         recovery=f"{_HANG}; switch the watchdog off for the onboard loop: `xrl doctor`",
     ),
     "link_lost": DriveFault(
-        "its own loop holds the last target",
-        limp=False,
-        cause=Cause.DRIVE_LOST,
-        zero_lost=False,
+        "its own loop holds the last target", limp=False, cause=Cause.DRIVE_LOST, zero_lost=False,
         recovery="mend the cable; the restarted service takes the drive over without a torque step",
     ),
     "disarmed": DriveFault(
-        _LIMP,
-        limp=True,
-        cause=Cause.DRIVE_DISARMED,
-        zero_lost=False,
+        _LIMP, limp=True, cause=Cause.DRIVE_DISARMED, zero_lost=False,
         recovery=f"{_HANG}; find out what requested idle",
     ),
     "overspeed": DriveFault(
-        _LIMP,
-        limp=True,
-        cause=Cause.DRIVE_DISARMED,
-        zero_lost=False,
+        _LIMP, limp=True, cause=Cause.DRIVE_DISARMED, zero_lost=False,
         recovery=f"{_HANG}; check vel_limit by `xrl doctor`, and what moved so fast",
     ),
     "brown_out": DriveFault(
-        "no power: both axes float; it restarts without a zero",
-        limp=True,
-        cause=Cause.DRIVE_LOST,
-        zero_lost=True,
+        "no power: both axes float; it restarts without a zero", limp=True,
+        cause=Cause.DRIVE_LOST, zero_lost=True,
         recovery=f"{_HANG}; mend the supply, then `xrl zero`",
     ),
-}
+}  # fmt: skip
 """By the name that scenarios and `--fault` use."""
 
 

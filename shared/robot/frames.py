@@ -1,4 +1,4 @@
-"""Frames of the robot: where torso, modules and harness are, one in the other. Pure.
+"""Where torso, modules and harness are, one in the other, and the body over the feet. Pure.
 
 Rotations are unit quaternions (x, y, z, w). The frames are `world`; `torso`; below it on each leg
 `hip_*` (carries the thigh), `knee_*` (the shin) and `ankle_*` (the foot); `harness` on the torso
@@ -12,7 +12,8 @@ import operator
 from collections.abc import Sequence
 from typing import Final, NamedTuple, TypeAlias
 
-from shared.bus.messages import Vector3, Vector6
+from shared.bus.messages import Pair, Vector3, Vector6
+from shared.config.robot_config import GRAVITY
 from shared.config.sections import GeometryConfig
 from shared.joints import MODULE_INDEX, SIDES
 from shared.robot.robot_model import side_sign
@@ -33,12 +34,7 @@ class FramePose(NamedTuple):
 
 
 def body_frames(geometry: GeometryConfig, q: Sequence[float]) -> list[FramePose]:
-    """Return the frames on the torso and below it.
-
-    Args:
-        geometry: of the robot.
-        q: joint angles (12,), rad.
-    """
+    """Return the frames on the torso and below it, at joint angles (12,), rad."""
     found = [FramePose("torso", "harness", geometry.harness_point, UPRIGHT)]
     for side in SIDES:
         parent = "torso"
@@ -71,11 +67,7 @@ def torso_pose(
     """Return the torso's pose in the world, m: the mean of what the two legs say.
 
     The world is midway between the feet, at the height of the ankles; both feet lie on the floor.
-
-    Args:
-        geometry: of the robot.
-        q: joint angles (12,), rad.
-        stance: place of the right foot relative to the left, as in `PlannerStatus`.
+    Joint angles are (12,), rad; `stance` is the place of the right foot, as in `PlannerStatus`.
     """
     positions, rotations = [], []
     for side in SIDES:
@@ -163,3 +155,14 @@ def rotated(rotation: Quaternion, vector: Vector3) -> Vector3:
     """Return a vector turned by a rotation."""
     turned = product(product(rotation, (*vector, 0.0)), inverse(rotation))
     return turned[0], turned[1], turned[2]
+
+
+def capture_point(p: Sequence[float], pdot: Sequence[float], slope: Pair = (0.0, 0.0)) -> Pair:
+    """Return where the body would come to rest as an inverted pendulum: x - slope z + x' sqrt(z/g).
+
+    x and y, m, from midway between the ankles. The pose p begins with COM x y z, m, z > 0, its rate
+    pdot is in m/s; the slope is the floor's rise along x and y, rad: uphill of the ankles the COM
+    is over them.
+    """
+    swing = math.sqrt(p[2] / GRAVITY)
+    return p[0] - slope[0] * p[2] + swing * pdot[0], p[1] - slope[1] * p[2] + swing * pdot[1]

@@ -125,15 +125,11 @@ def _numbers(*values: float) -> str:
 def stand_pose(config: RobotConfig, height: float) -> tuple[float, ...]:
     """Return q (12, rad) close to a stand with the torso upright and the COM over the ankles.
 
-    In the plane of a leg: the shin leans by a, the thigh by b, with
-    x_COM = 0: m_torso (l2 sin a + l1 sin b) + 2 m_act l2 sin a = 0 and the leg's length
-    l2 cos a + l1 cos b = hypot(height, span); solved by bisection on a. The small frontal
-    angles that lean each leg by its span from ankle to hip are left at zero: an inverse
+    `height` is that of the torso above the ankles, m. In the plane of a leg: the shin leans by a,
+    the thigh by b, with x_COM = 0: m_torso (l2 sin a + l1 sin b) + 2 m_act l2 sin a = 0 and the
+    leg's length l2 cos a + l1 cos b = hypot(height, span); solved by bisection on a. The small
+    frontal angles that lean each leg by its span from ankle to hip are left at zero: an inverse
     kinematics finds them from here.
-
-    Args:
-        config: the robot.
-        height: of the torso above the ankles, m.
     """
     l1, l2 = config.geometry.l1, config.geometry.l2
     share = (config.torso_mass + 2 * config.mass.module) / config.torso_mass

@@ -38,10 +38,8 @@ CONDITION_MAX: Final = 100.0
 def leg_points(base_radius: float, platform_radius: float, height: float) -> tuple[Matrix, Matrix]:
     """Return where the six legs begin and end, in m, torso axes, from the harness point.
 
-    Angles run from +y towards +z. Legs 0..5 go around in that direction.
-
-    Returns:
-        Base points (6, 3) at x = -height, and platform points (6, 3) at x = 0.
+    Base points (6, 3) at x = -height, and platform points (6, 3) at x = 0. Angles run from +y
+    towards +z. Legs 0..5 go around in that direction.
     """
     turns = 2.0 * math.pi / 3.0 * np.repeat(np.arange(3), 2)
     sides = np.tile([1.0, -1.0], 3)
@@ -56,16 +54,10 @@ def leg_points(base_radius: float, platform_radius: float, height: float) -> tup
 def geometry_matrix(base_radius: float, platform_radius: float, height: float) -> Matrix:
     """Return G (6, 6): operator's wrench on the torso = G @ leg forces.
 
-    Column i is [u_i; b_i x u_i]. The wrench is [force in N; moment in N m] about the
-    harness point in torso axes; leg forces are in N, tension positive.
-
-    Args:
-        base_radius: of the circle on the torso side, m.
-        platform_radius: of the circle on the operator's side, m.
-        height: between the two circles, m.
-
-    Raises:
-        ConfigError: G is singular or so near to it that the wrench would be noise.
+    Column i is [u_i; b_i x u_i]. The wrench is [force in N; moment in N m] about the harness point
+    in torso axes; leg forces are in N, tension positive. The radii of the circles on the torso's
+    and the operator's side, and the height between them, are in m. Raises ConfigError if G is
+    singular or so near to it that the wrench would be noise.
     """
     base, platform = leg_points(base_radius, platform_radius, height)
     u = platform - base

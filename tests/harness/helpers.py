@@ -1,11 +1,9 @@
-"""What the tests of the harness share: a configuration, samples, a virtual CAN bus."""
+"""What the tests of the harness share: a configuration, leg forces, a scripted sensor and bus."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import cast
 
-import can
 import msgspec
 import numpy as np
 import numpy.typing as npt
@@ -14,11 +12,8 @@ from services.harness.filter import WrenchFilter
 from services.harness.loop import HarnessLoop
 from shared.bus.codec import encode
 from shared.bus.messages import TareRequest, Vector6, Wrench
-from shared.can import loadcell_can
-from shared.can.loadcell_can import LegSample
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import files as config_file
-from shared.config.robot_config import RobotConfig
 from shared.config.sections import HarnessConfig
 from shared.places import DEFAULT_CONFIG
 from shared.robot.stewart import geometry_matrix
@@ -36,11 +31,6 @@ def harness_with(**changes: object) -> HarnessConfig:
     return msgspec.structs.replace(HARNESS, **changes)
 
 
-def robot_with(**simulation: object) -> RobotConfig:
-    changed = msgspec.structs.replace(ROBOT.simulation, **simulation)
-    return msgspec.structs.replace(ROBOT, simulation=changed)
-
-
 def six(values: npt.ArrayLike) -> Vector6:
     return cast(Vector6, tuple(np.asarray(values, float).tolist()))
 
@@ -50,38 +40,14 @@ def legs(wrench: npt.ArrayLike) -> Vector6:
     return six(np.linalg.solve(G, np.asarray(wrench, float)))
 
 
-def sample(t_ns: int, forces: Sequence[float] = ZERO) -> LegSample:
-    return LegSample(t_ns, cast(Vector6, tuple(forces)))
-
-
-class CanHub:
-    """Stands for the simulator's hub on any python-can bus."""
-
-    def __init__(self, bus: can.BusABC) -> None:
-        self._bus = bus
-
-    def poll(self) -> None:
-        """Nobody speaks to a load cell."""
-
-    def broadcast(self, frames: list[tuple[int, bytes]]) -> None:
-        for can_id, data in frames:
-            self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
-
-    def send_forces(self, forces: Sequence[float]) -> None:
-        self.broadcast(loadcell_can.pack(forces))
-
-
 class ScriptedSensor:
     """Gives the forces it is told to."""
 
     def __init__(self) -> None:
         self.forces: Vector6 | None = ZERO
 
-    def read(self, now_ns: int) -> LegSample | None:
-        return None if self.forces is None else sample(now_ns, self.forces)
-
-    def close(self) -> None:
-        pass
+    def newest(self, _now_ns: int) -> Vector6 | None:
+        return self.forces
 
 
 class Sink:

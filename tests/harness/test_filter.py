@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from services.harness.filter import (
+    TARE_DEVIATION_MAX,
     FilteredWrench,
     FilterState,
     WrenchFilter,
@@ -18,7 +19,17 @@ from services.harness.filter import (
 from shared.bus.messages import Tare
 from shared.can.loadcell_can import as_sent
 from shared.clock import NS_PER_MS, NS_PER_S
-from tests.harness.helpers import HARNESS, PERIOD_NS, T0, ZERO, G, harness_with, legs, sample
+from tests.harness.helpers import (
+    HARNESS,
+    PERIOD_NS,
+    T0,
+    TARE_CYCLES,
+    ZERO,
+    G,
+    harness_with,
+    legs,
+    six,
+)  # fmt: skip
 
 Array = npt.NDArray[np.float64]
 LAW = WrenchFilter(HARNESS)
@@ -32,7 +43,7 @@ biases = st.tuples(*[st.floats(-200.0, 200.0)] * 6)
 def feed(
     law: WrenchFilter, state: FilterState, t_ns: int, forces: tuple[float, ...]
 ) -> tuple[FilterState, FilteredWrench]:
-    return law.step(state, t_ns, sample(t_ns, forces))
+    return law.step(state, t_ns, six(forces))
 
 
 def tared(law: WrenchFilter = LAW, bias: tuple[float, ...] = ZERO) -> tuple[FilterState, int]:
@@ -55,9 +66,6 @@ def settled(
         t_ns += PERIOD_NS
         state, reading = feed(law, state, t_ns, forces)
     return state, reading, t_ns
-
-
-# -- tare ------------------------------------------------------------------------------
 
 
 def test_nothing_is_valid_before_the_first_sample() -> None:
@@ -101,7 +109,7 @@ def test_tare_averages_noise() -> None:
 
 
 @pytest.mark.parametrize("disturbance", ["gap", "saturation"])
-def test_a_disturbed_tare_begins_anew_and_forgets_what_it_had(disturbance: str) -> None:
+def test_a_disturbed_tare_starts_over_and_forgets_what_it_had(disturbance: str) -> None:
     state, t_ns = initial_state(), T0
     for _ in range(100):
         state, _ = feed(LAW, state, t_ns, (100.0,) * 6)
@@ -119,6 +127,20 @@ def test_a_disturbed_tare_begins_anew_and_forgets_what_it_had(disturbance: str) 
     assert t_ns - PERIOD_NS - begun_ns >= TARE_NS
     np.testing.assert_allclose(state.offset, 7.0)
     assert reading.valid
+
+
+@pytest.mark.parametrize("leg", range(6))
+@pytest.mark.parametrize("share", [0.99, 1.01])
+def test_a_tare_is_taken_up_to_the_limit_of_the_forces_deviation(leg: int, share: float) -> None:
+    """Alternating between two values, the deviation is half their distance, whatever the bias."""
+    state, t_ns = initial_state(), T0
+    for n in range(TARE_CYCLES + 1):
+        forces = [1000.0] * 6
+        forces[leg] += 2.0 * share * TARE_DEVIATION_MAX * (n % 2)
+        state, reading = feed(LAW, state, t_ns, tuple(forces))
+        t_ns += PERIOD_NS
+    assert reading.valid is (share < 1.0)
+    assert state.tare is (Tare.DONE if share < 1.0 else Tare.UNSTEADY)
 
 
 def test_a_gap_of_just_the_stale_time_does_not_disturb_the_tare() -> None:
@@ -146,9 +168,6 @@ def test_tare_can_be_started_again_and_keeps_the_last_wrench_meanwhile() -> None
     assert not reading.wrench.any(), "what was there during the tare is now zero"
     _, reading, _ = settled(LAW, state, t_ns, legs((31.0, 0, 0, 0, 0, 0)))
     assert reading.wrench[0] == pytest.approx(1.0, abs=1e-6)
-
-
-# -- low-pass --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("low_pass_hz", [1.0, 10.0, 40.0, 100.0])
@@ -185,8 +204,6 @@ def test_a_sample_seen_twice_or_out_of_order_does_not_move_the_wrench() -> None:
         _, reading = feed(LAW, state, again_ns, legs((999.0, 0, 0, 0, 0, 0)))
         np.testing.assert_array_equal(reading.wrench, before.wrench)
 
-
-# -- saturation ------------------------------------------------------------------------
 
 LAST_BELOW = float(np.nextafter(np.float32(LIMIT), np.float32(0)))
 LEVELS = (
@@ -241,23 +258,11 @@ def test_validity_returns_with_the_first_sample_below_the_limit() -> None:
     assert not reading.saturated
 
 
-# -- staleness -------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("age_ns", "valid"),
-    [
-        (0, True),
-        (1, True),
-        (STALE_NS // 2, True),
-        (STALE_NS - 1, True),
-        (STALE_NS, True),
-        (STALE_NS + 1, False),
-        (STALE_NS + NS_PER_MS, False),
-        (100 * STALE_NS, False),
-        (-1, False),
-    ],
-)
+    [(0, True), (1, True), (STALE_NS // 2, True), (STALE_NS - 1, True), (STALE_NS, True),
+     (STALE_NS + 1, False), (STALE_NS + NS_PER_MS, False), (100 * STALE_NS, False), (-1, False)],
+)  # fmt: skip
 def test_a_sample_is_usable_up_to_the_stale_age_and_not_beyond(age_ns: int, valid: bool) -> None:
     state, t_ns = tared()
     _, reading = LAW.step(state, t_ns + age_ns, None)
@@ -273,9 +278,6 @@ def test_the_last_good_wrench_is_kept_while_stale_and_replaced_by_the_next_sampl
     _, reading = feed(LAW, state, t_ns + NS_PER_S, legs((0, 9.0, 0, 0, 0, 0)))
     assert reading.valid
     np.testing.assert_allclose(reading.wrench, [0, 9.0, 0, 0, 0, 0], atol=1e-9)
-
-
-# -- numbers that are not finite ----------------------------------------------------------
 
 
 @pytest.mark.parametrize("leg", range(6))
@@ -313,7 +315,7 @@ def test_whatever_the_sensor_sends_the_reading_is_finite(
     state, now_ns = initial_state(), T0
     for dt_ns, forces in stream:
         now_ns += dt_ns
-        state, reading = law.step(state, now_ns, None if forces is None else sample(now_ns, forces))
+        state, reading = law.step(state, now_ns, None if forces is None else six(forces))
         assert np.isfinite(reading.wrench).all()
         if reading.valid:
             assert not reading.saturated

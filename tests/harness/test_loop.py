@@ -1,9 +1,6 @@
 from __future__ import annotations
 
 import math
-import shutil
-import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
@@ -17,10 +14,8 @@ from services.harness.loop import HarnessLoop
 from services.simulator.fronts.harness_front import BIAS_MAX, HarnessFront
 from services.simulator.fronts.unix_can_hub import UnixCanHub
 from shared.bus.codec import Decoder
-from shared.bus.messages import Wrench
-from shared.can import sensor_loop
+from shared.bus.messages import Tare, Wrench
 from shared.can.loadcell_can import SampleAssembler, pack
-from shared.can.sensor_loop import next_deadline, run
 from shared.clock import NS_PER_MS
 from shared.config.sections import CanConfig
 from tests.harness.helpers import (
@@ -32,12 +27,10 @@ from tests.harness.helpers import (
     ZERO,
     Asked,
     G,
-    ScriptedSensor,
     Sink,
     cycles,
     legs,
     make_loop,
-    robot_with,
     six,
 )  # fmt: skip
 
@@ -58,16 +51,6 @@ class FrameList:
         assembler = SampleAssembler()
         found = [assembler.add(*frame) for packet in self.packets for frame in packet]
         return np.array([forces for forces in found if forces is not None])
-
-
-@pytest.fixture
-def run_dir() -> Iterator[Path]:
-    directory = tempfile.mkdtemp(dir="/tmp")
-    yield Path(directory)
-    shutil.rmtree(directory)
-
-
-# -- the loop --------------------------------------------------------------------------
 
 
 def test_every_cycle_publishes_once_with_the_next_sequence_number() -> None:
@@ -115,54 +98,47 @@ def test_what_the_bus_did_not_take_is_counted() -> None:
     assert loop.unsent == 2
 
 
-@pytest.mark.parametrize(
-    ("late_ns", "next_ns", "missed"),
-    [
-        (-1, 1000, 0),
-        (0, 1000, 0),
-        (999, 1000, 0),
-        (1000, 2000, 1),
-        (1001, 2000, 1),
-        (7500, 8000, 7),
-    ],
-)
-def test_missed_deadlines_are_skipped_and_the_grid_is_kept(
-    late_ns: int, next_ns: int, missed: int
-) -> None:
-    assert next_deadline(T0, 1000, T0 + late_ns) == (T0 + next_ns, missed)
+def test_a_tare_on_request_makes_the_present_wrench_the_zero_and_is_reported_until_it_is_done() -> (
+    None
+):
+    asked = Asked()
+    loop, sensor, _ = make_loop(asked)
+    _, t_ns = cycles(loop, T0, TARE_CYCLES + 1)
+    sensor.forces = legs((0.0, 0.0, 30.0, 0.0, 0.0, 0.0))
+    message, t_ns = cycles(loop, t_ns, 100)
+    assert message.force[2] == pytest.approx(30.0, abs=1e-3)
+    asked.asked = True
+    message, t_ns = cycles(loop, t_ns, TARE_CYCLES)
+    assert (message.valid, message.tare) == (False, Tare.RUNNING)
+    message, t_ns = cycles(loop, t_ns, 1)
+    assert (message.valid, message.tare) == (True, Tare.DONE)
+    message, _ = cycles(loop, t_ns, 10)
+    np.testing.assert_allclose([*message.force, *message.moment], 0.0, atol=1e-9)
 
 
-def test_a_long_cycle_is_followed_by_one_cycle_and_not_by_many(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    now_ns = T0
-    times: list[int] = []
-
-    class SlowOnce:
-        def put(self, message: Wrench) -> bool:
-            nonlocal now_ns
-            times.append(message.t_ns)
-            if message.seq == 3:
-                now_ns += 10 * PERIOD_NS + 1
-            return True
-
-    class StopAfterSix:
-        def __bool__(self) -> bool:
-            return len(times) >= 6
-
-    def sleep_until(deadline_ns: int) -> None:
-        nonlocal now_ns
-        now_ns = max(now_ns, deadline_ns)
-
-    monkeypatch.setattr(sensor_loop, "now_ns", lambda: now_ns)
-    monkeypatch.setattr(sensor_loop, "sleep_until", sleep_until)
-    loop = HarnessLoop(ScriptedSensor(), WrenchFilter(HARNESS), SlowOnce(), Asked())
-    run(loop, HARNESS.rate_hz, StopAfterSix())
-    assert [(t_ns - T0) // PERIOD_NS for t_ns in times] == [0, 1, 2, 3, 14, 15]
-    assert loop.skipped == 10
+def test_a_repeated_request_does_not_delay_the_running_tare() -> None:
+    asked = Asked()
+    loop, _, _ = make_loop(asked)
+    t_ns = T0
+    for _ in range(TARE_CYCLES + 1):
+        asked.asked = True
+        message, t_ns = cycles(loop, t_ns, 1)
+    assert message.valid
 
 
-# -- the simulated sensor --------------------------------------------------------------
+def test_a_tare_that_shakes_is_reported_and_stays_invalid_until_it_is_still() -> None:
+    loop, sensor, _ = make_loop()
+    t_ns, tares = T0, []
+    for n in range(3 * TARE_CYCLES):
+        sensor.forces = legs((0.0, 0.0, 30.0 * math.sin(0.3 * n), 0.0, 0.0, 0.0))
+        message, t_ns = cycles(loop, t_ns, 1)
+        assert not message.valid
+        tares.append(message.tare)
+    assert tares[0] == Tare.RUNNING
+    assert set(tares[TARE_CYCLES + 1 :]) == {Tare.UNSTEADY}
+    sensor.forces = ZERO
+    message, _ = cycles(loop, t_ns, 2 * TARE_CYCLES + 2)
+    assert (message.valid, message.tare) == (True, Tare.DONE)
 
 
 def test_the_simulated_sensor_sends_three_frames_in_one_packet() -> None:
@@ -208,15 +184,14 @@ def test_the_simulated_cells_clip_and_the_service_calls_that_saturated() -> None
     assert not message.valid
 
 
-# -- end to end ------------------------------------------------------------------------
-
-
 def test_the_operators_wrench_arrives_through_the_simulated_sensor_within_its_noise(
-    run_dir: Path,
+    short_dir: Path,
 ) -> None:
-    robot = robot_with(harness_noise=0.5)
-    path = run_dir / "can_harness.sock"
-    sensor = make_sensor(robot, run_dir)
+    robot = msgspec.structs.replace(
+        ROBOT, simulation=msgspec.structs.replace(ROBOT.simulation, harness_noise=0.5)
+    )
+    path = short_dir / "can_harness.sock"
+    sensor = make_sensor(robot, short_dir)
     law, sink = WrenchFilter(robot.harness), Sink()
     loop = HarnessLoop(sensor, law, sink, Asked())
     wrench = np.array([30.0, -20.0, 150.0, 4.0, 60.0, -5.0])
@@ -244,10 +219,10 @@ def test_the_operators_wrench_arrives_through_the_simulated_sensor_within_its_no
 
 
 def test_the_simulator_going_away_makes_the_wrench_invalid_until_it_is_back(
-    run_dir: Path,
+    short_dir: Path,
 ) -> None:
-    path = run_dir / "can_harness.sock"
-    sensor = make_sensor(ROBOT, run_dir)
+    path = short_dir / "can_harness.sock"
+    sensor = make_sensor(ROBOT, short_dir)
     loop = HarnessLoop(sensor, WrenchFilter(HARNESS), Sink(), Asked())
     seen: list[bool] = []
     t_ns = T0
@@ -269,14 +244,14 @@ def test_the_simulator_going_away_makes_the_wrench_invalid_until_it_is_back(
     assert sensor.opened == 2
 
 
-def test_a_low_rate_is_no_pause_of_the_process(run_dir: Path) -> None:
+def test_a_low_rate_is_no_pause_of_the_process(short_dir: Path) -> None:
     slow = msgspec.structs.replace(
         ROBOT,
         harness=msgspec.structs.replace(HARNESS, rate_hz=20.0),
         can={**ROBOT.can, HARNESS.bus: CanConfig(interface="virtual", channel="{run}")},
     )
-    sensor = make_sensor(slow, run_dir)
-    sensor.read(T0)
-    sensor.read(T0 + 50 * NS_PER_MS)
+    sensor = make_sensor(slow, short_dir)
+    sensor.newest(T0)
+    sensor.newest(T0 + 50 * NS_PER_MS)
     assert sensor.discarded == 0
     sensor.close()

@@ -7,10 +7,8 @@ import socket
 import struct
 from pathlib import Path
 
-from services.network_proxy.event_loop import SocketWatch
-from services.network_proxy.listener import SocketListener
-from services.network_proxy.proxy_endpoint import Address, ProxyEndpoint
 from services.network_proxy.relay import Relay
+from services.network_proxy.sockets import Address, ProxyEndpoint, SocketListener, SocketWatch
 from shared.clock import NS_PER_MS
 from shared.config.impairment import Direction
 from shared.links import Pair
@@ -78,14 +76,20 @@ class Rig:
     def link(self) -> tuple[socket.socket, socket.socket]:
         return self.dial(), self.answer()
 
+    def ended(self, number: int = 1) -> tuple[int, int]:
+        """End an impairment there; return how many passed and were lost."""
+        ended = self.there.end(number)
+        assert ended is not None
+        return ended.passed, ended.lost
+
     def turn(self) -> None:
         """Let out what is due, and take in what is there, until nothing more comes."""
         while True:
             ready = self.watch.wait(QUIET_S)
-            self.relay.let_out_due(self.now_ns)
+            self.relay.release_due(self.now_ns)
             for call, events in ready:
                 call(events, self.now_ns)
-            self.relay.give_up(self.now_ns)
+            self.relay.part_stuck(self.now_ns)
             if not ready:
                 return
 
@@ -113,9 +117,18 @@ class Rig:
             data = data[taken:]
         return data
 
+    def rest_of(self, end: socket.socket, other: socket.socket, rest: bytes, size: int) -> bytes:
+        """Send what was not taken, and return all that comes, of a size."""
+        got = b""
+        while len(got) < size:
+            rest = self.push(end, rest)
+            self.turn()
+            got += heard(other) or b""
+        return got
+
     def release(self) -> None:
         """Go on after a change, as the loop does."""
-        self.relay.release(self.now_ns)
+        self.relay.release_held(self.now_ns)
 
     def close(self) -> None:
         self.relay.close()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from services.network_proxy.direction import PENDING_MAX, WAITING_MAX
+from services.network_proxy.connection import PENDING_MAX, WAITING_MAX
 from shared.config.impairment import Impairment
 from tests.network_proxy.rig import DECLARE, MESSAGE, Rig, batch, heard, numbers
 
@@ -39,9 +39,7 @@ def test_only_messages_are_lost(rig: Rig) -> None:
     planner.send(batch(DECLARE, 99))
     rig.turn()
     assert heard(knee) == batch(DECLARE, 99)
-    ended = rig.there.end(1)
-    assert ended is not None
-    assert (ended.passed, ended.lost) == (0, 20)
+    assert rig.ended() == (0, 20)
 
 
 def test_what_is_doubled_comes_out_twice_byte_for_byte(rig: Rig) -> None:
@@ -196,12 +194,7 @@ def test_a_receiver_that_takes_nothing_stops_the_sender_and_loses_nothing(rig: R
         assert sent < 16 * PENDING_MAX, "the sender was never stopped"
         rest = rig.push(planner, body)
         sent += len(body)
-    got = b""
-    while len(got) < sent:
-        rest = rig.push(planner, rest)
-        rig.turn()
-        got += heard(knee) or b""
-    assert got == sent // len(body) * body
+    assert rig.rest_of(planner, knee, rest, sent) == sent // len(body) * body
 
 
 def test_a_sender_is_stopped_when_too_much_is_on_its_way(rig: Rig) -> None:
@@ -216,9 +209,4 @@ def test_a_sender_is_stopped_when_too_much_is_on_its_way(rig: Rig) -> None:
     rig.at(60_000.0)
     rig.there.end(1)
     rig.release()
-    got = b""
-    while len(got) < sent:
-        rest = rig.push(planner, rest)
-        rig.turn()
-        got += heard(knee) or b""
-    assert got == sent // len(body) * body
+    assert rig.rest_of(planner, knee, rest, sent) == sent // len(body) * body

@@ -19,7 +19,7 @@ from shared.bus.messages import SplitSource
 from shared.config.files import load
 from shared.config.robot_config import RobotConfig
 from shared.places import DEFAULT_CONFIG
-from shared.robot.capture_point import capture_point
+from shared.robot.frames import capture_point
 from shared.robot.robot_model import stand_pose
 from shared.state import copied
 

@@ -10,7 +10,7 @@ from shared.bus.messages import JointCommand, Mode, PlannerMode
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
-from shared.robot.dropouts import Dropouts
+from shared.robot.hold_rules import Dropouts
 from tests.joint.helpers import Bench
 
 T = TypeVar("T")

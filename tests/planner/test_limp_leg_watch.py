@@ -13,7 +13,7 @@ from shared.bus.messages import DriveStatus, JointState, Mode
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULE_INDEX, MODULES, N_MODULES, kind_of
-from shared.robot.limp_leg_support import Support
+from shared.robot.hold_rules import Support
 from tests.planner.conftest import Closed
 from tests.planner.oracle import Array
 from tests.planner.test_planner import SESSION, START_NS, lead, receive_all, state

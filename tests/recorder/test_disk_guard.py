@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -11,29 +12,23 @@ def changes(least_mib: float, *free_mib: float) -> list[DiskChange]:
     return [guard.feed(round(free * MIB)) for free in free_mib]
 
 
-def test_it_warns_once_before_it_stops() -> None:
-    assert changes(100, 900, 201, 199, 150, 101) == [
-        DiskChange.NONE, DiskChange.NONE, DiskChange.LOW, DiskChange.NONE, DiskChange.NONE,
-    ]  # fmt: skip
+NONE, LOW, FULL, BACK = DiskChange
+CASES = {
+    "it warns once before it stops": (100, (900, 201, 199, 150, 101), [NONE, NONE, LOW]),
+    "it stops below the limit once": (100, (99, 50, 0), [FULL]),
+    "it goes on when there is clearly more": (100, (99, 101, 149, 151), [FULL, NONE, NONE, BACK]),
+    "a disk that hovers is told once": (100, (199, 201, 199, 240, 199), [LOW]),
+    "and again after clearly more": (100, (199, 300, 199), [LOW, NONE, LOW]),
+    "zero switches it off": (0, (0, 0), []),
+}
+"""Least space, free space look by look, and what changes; NONE after the last."""
 
 
-def test_it_stops_below_the_limit_and_reports_it_once() -> None:
-    assert changes(100, 99, 50, 0) == [DiskChange.FULL, DiskChange.NONE, DiskChange.NONE]
-
-
-def test_it_goes_on_only_when_there_is_clearly_more() -> None:
-    assert changes(100, 99, 101, 149, 151) == [
-        DiskChange.FULL, DiskChange.NONE, DiskChange.NONE, DiskChange.BACK,
-    ]  # fmt: skip
-
-
-def test_a_disk_that_hovers_at_the_warning_is_reported_once() -> None:
-    assert changes(100, 199, 201, 199, 240, 199).count(DiskChange.LOW) == 1
-    assert changes(100, 199, 300, 199).count(DiskChange.LOW) == 2
-
-
-def test_zero_switches_it_off() -> None:
-    assert changes(0, 0, 0) == [DiskChange.NONE, DiskChange.NONE]
+@pytest.mark.parametrize(("least", "free", "expected"), CASES.values(), ids=CASES)
+def test_what_changes_by_the_free_space(
+    least: float, free: tuple[float, ...], expected: list[DiskChange]
+) -> None:
+    assert changes(least, *free) == expected + [NONE] * (len(free) - len(expected))
 
 
 @given(st.lists(st.floats(0, 400)))

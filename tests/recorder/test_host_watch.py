@@ -10,7 +10,7 @@ import pytest
 from services.recorder import host_watch
 from services.recorder.disk_guard import MIB
 from services.recorder.host_watch import RUN_DIR_MIN_MIB, HostWatch
-from shared.bus.arrivals import Arrivals
+from shared.bus.sockets import Arrivals
 from shared.clock import NS_PER_S
 
 

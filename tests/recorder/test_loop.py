@@ -29,9 +29,11 @@ EVENT_KEY = topics.JOINT_EVENT.key(ROBOT, "knee_right")
 class Rig:
     """A recording of ten messages a cycle; each is stamped when it comes."""
 
-    def __init__(self, out: Path, config: RecorderConfig, snapshot: SnapshotRing | None) -> None:
+    def __init__(
+        self, out: Path, config: RecorderConfig, snapshot: SnapshotRing | None, free: int
+    ) -> None:
         self.now_ns = 0
-        self.free = 10_000 * MIB
+        self.free = free
         self.sent = 0
         self.queue = Queue()
         self.writer: RunWriter = runs.writer(out, begin=False)
@@ -60,9 +62,10 @@ class Rig:
         self.writer.__exit__(None, None, None)
 
 
-def rig(out: Path, *, snapshot: SnapshotRing | None = None, **changes: float) -> Rig:
+def rig(out: Path, *, snapshot_s: float = 0.0, free: int = 10_000 * MIB, **changes: float) -> Rig:
     settings = {"chunk_kib": 64, "flush_ms": 250.0, "fsync_s": 1.0, "free_min_mib": 100}
-    return Rig(out, RecorderConfig(**settings | changes), snapshot)  # type: ignore[arg-type]
+    ring = SnapshotRing(snapshot_s, 1 << 28, runs.recorded_topics()) if snapshot_s else None
+    return Rig(out, RecorderConfig(**settings | changes), ring, free)  # type: ignore[arg-type]
 
 
 def seqs(path: Path) -> list[int]:
@@ -141,19 +144,13 @@ def test_short_of_space_it_warns_stops_with_a_finished_file_and_goes_on_later(
 
 
 def test_a_full_disk_at_the_start_is_waited_for(tmp_path: Path) -> None:
-    settings = RecorderConfig(chunk_kib=64, flush_ms=250.0, fsync_s=1.0, free_min_mib=100)
-    queue, free = Queue(), [10 * MIB]
-    with runs.writer(tmp_path, begin=False) as writer:
-        recording = Recorder(
-            queue, writer, settings, logging.getLogger("test"),
-            free_bytes=lambda: free[0], now_ns=0,
-        )  # fmt: skip
-        recording.cycle(2 * NS_PER_S)
-        assert list(tmp_path.iterdir()) == []
-        free[0] = 1000 * MIB
-        recording.cycle(4 * NS_PER_S)
-        queue.items.append(item(0))
-        recording.cycle(5 * NS_PER_S)
+    run = rig(tmp_path, free=10 * MIB)
+    run.recording.cycle(2 * NS_PER_S)
+    assert list(tmp_path.iterdir()) == []
+    run.free = 1000 * MIB
+    run.recording.cycle(4 * NS_PER_S)
+    run.queue.items.append(item(0))
+    run.finish()
     assert seqs(tmp_path / "run.mcap") == [0]
 
 
@@ -163,7 +160,7 @@ def fault(now_ns: int) -> tuple[str, bytes, int]:
 
 
 def test_a_snapshot_writes_nothing_until_a_fault_and_then_before_and_after(tmp_path: Path) -> None:
-    run = rig(tmp_path, snapshot=SnapshotRing(2.0, 1 << 28, runs.recorded_topics()))
+    run = rig(tmp_path, snapshot_s=2.0)
     run.run(10.0)
     assert list(tmp_path.iterdir()) == []
     run.queue.items.append(fault(run.now_ns))
@@ -185,7 +182,7 @@ def test_a_snapshot_writes_nothing_until_a_fault_and_then_before_and_after(tmp_p
 
 
 def test_a_snapshot_without_a_fault_leaves_no_file(tmp_path: Path) -> None:
-    run = rig(tmp_path / "out", snapshot=SnapshotRing(2.0, 1 << 28, runs.recorded_topics()))
+    run = rig(tmp_path / "out", snapshot_s=2.0)
     run.run(3.0)
     run.finish()
     assert not (tmp_path / "out").exists()
@@ -193,7 +190,7 @@ def test_a_snapshot_without_a_fault_leaves_no_file(tmp_path: Path) -> None:
 
 def test_a_long_snapshot_is_written_in_slices(tmp_path: Path) -> None:
     """So that the bus is emptied in between; its queue holds 13 s."""
-    run = rig(tmp_path, snapshot=SnapshotRing(600.0, 1 << 28, runs.recorded_topics()))
+    run = rig(tmp_path, snapshot_s=600.0)
     run.run(50.0)
     run.recording.trigger("asked", run.now_ns)
     run.run(0.02)

@@ -19,7 +19,7 @@ from shared.joints import JOINTS, MODULES
 from shared.robot import frames
 from shared.robot.frames import Quaternion
 from shared.robot.robot_urdf import cross_of
-from tests.ros2_gateway.messages import all_states, joint_state, planner_status, wrench
+from tests.messages import all_states, joint_state, planner_status, wrench
 from tests.ros2_gateway.others import read
 
 NS = 1_700_000_000_123_456_789

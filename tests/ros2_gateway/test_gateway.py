@@ -15,7 +15,7 @@ from shared.bus.messages import JointState
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.joints import JOINTS
-from tests.ros2_gateway.messages import all_states, planner_status, wrench
+from tests.messages import all_states, planner_status, wrench
 from tests.ros2_gateway.others import read
 
 TYPES = RosTypes("jazzy")

@@ -21,7 +21,7 @@ from shared.bus.messages import Mode
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import SCENARIO
 from shared.exceptions import FleetError
-from tests.ros2_gateway.messages import planner_status
+from tests.messages import planner_status
 
 T0 = 10**9
 ESTOP, INTENT = inbound_topics("")

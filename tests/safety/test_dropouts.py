@@ -11,7 +11,7 @@ from services.joint.failsafe import Event, Failsafe, Timing, timing_of
 from shared.bus.messages import Cause, Mode
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
-from shared.robot.dropouts import Dropouts
+from shared.robot.hold_rules import Dropouts
 from tests.joint.helpers import T0, command
 
 CYCLE_NS = 2 * NS_PER_MS

@@ -33,23 +33,12 @@ def test_what_interrupts_a_writer_leaves_what_was_there_and_nothing_else(
     path = tmp_path / "x"
     path.write_bytes(b"old")
     kind = error if isinstance(error, type) else type(error)
-    with pytest.raises(kind) as caught:
-        write_half_and_raise(path, error)
+    with pytest.raises(kind) as caught, atomic_file(path) as file:  # noqa: PT012
+        file.write(b"half")
+        raise error
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
     assert kind is not OSError or getattr(caught.value, "filename", "") == str(path)
-
-
-def write_half_and_raise(path: Path, error: BaseException) -> None:
-    with atomic_file(path) as file:
-        file.write(b"half")
-        raise error
-
-
-def write_beside_another(path: Path) -> None:
-    with atomic_file(path, exclusive=True) as file:
-        file.write(b"mine")
-        path.write_bytes(b"another's")
 
 
 def test_what_a_kill_left_is_in_nobodys_way(tmp_path: Path) -> None:
@@ -61,8 +50,9 @@ def test_what_a_kill_left_is_in_nobodys_way(tmp_path: Path) -> None:
 
 def test_an_exclusive_file_replaces_none_also_if_it_comes_meanwhile(tmp_path: Path) -> None:
     path = tmp_path / "x"
-    with pytest.raises(FileExistsError):
-        write_beside_another(path)
+    with pytest.raises(FileExistsError), atomic_file(path, exclusive=True) as file:  # noqa: PT012
+        file.write(b"mine")
+        path.write_bytes(b"another's")
     assert path.read_bytes() == b"another's"
     with pytest.raises(FileExistsError), atomic_file(path, exclusive=True):
         pytest.fail("is begun")
@@ -81,14 +71,9 @@ def test_a_full_disk_is_one_line_with_the_files_name(tmp_path: Path) -> None:
     code = "from pathlib import Path; from shared.atomic_file import replace_file; "
     code += f"replace_file(Path({str(tmp_path / 'x')!r}), bytes({2 * FULL_AT}))"
     done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=ROOT,
-        preexec_fn=small_disk,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=60.0,
-    )
+        [sys.executable, "-c", code], cwd=ROOT, preexec_fn=small_disk, capture_output=True,
+        text=True, check=False, timeout=60.0,
+    )  # fmt: skip
     assert done.returncode == 1
     assert str(tmp_path / "x") in done.stderr.splitlines()[-1]
     assert list(tmp_path.iterdir()) == []

@@ -1,10 +1,10 @@
+"""The bus between processes: what arrives, what is refused, who is linked, what a stop costs."""
+
 import math
-import shutil
 import signal
 import socket
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -20,6 +20,8 @@ from shared.config import files as config_file
 from shared.exceptions import BusError
 from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
+from tests.messages import sample
+from tests.waiting import comes_true
 
 ROOT = Path(__file__).resolve().parents[2]
 ROBOT = config_file.load(DEFAULT_CONFIG)
@@ -55,10 +57,8 @@ Start = Callable[..., "subprocess.Popen[str]"]
 
 
 @pytest.fixture
-def run_dir() -> Iterator[Path]:
-    directory = Path(tempfile.mkdtemp(prefix="xrl-bus-", dir="/tmp"))
-    yield directory
-    shutil.rmtree(directory)
+def run_dir(short_dir: Path) -> Path:
+    return short_dir
 
 
 @pytest.fixture
@@ -83,33 +83,9 @@ def start(run_dir: Path) -> Iterator[Start]:
         process.communicate()
 
 
-def wait_until(condition: Callable[[], object], timeout_s: float = 20.0) -> bool:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.002)
-    return True
-
-
 def command(seq: int, q_phi: float = 0.1) -> JointCommand:
-    pair = (0.25, -1e-300)
-    return JointCommand(
-        t_ns=time.monotonic_ns(),
-        seq=seq,
-        session=1,
-        echo_t_ns=0,
-        hold=False,
-        q_ref=(q_phi, 1 / 3),
-        v_ref=pair,
-        tau_ff=pair,
-        dtau_ff=pair,
-        tau_coupled=pair,
-        k_p=pair,
-        k_d=pair,
-        margin=1.0,
-        margin_onboard=0.5,
-    )
+    pair, k_p = (q_phi, 1 / 3), (0.25, -1e-300)
+    return sample(JointCommand, t_ns=time.monotonic_ns(), seq=seq, session=1, q_ref=pair, k_p=k_p)
 
 
 def estop(seq: int) -> Estop:
@@ -125,42 +101,34 @@ class Link:
         )
         self.events: Latest[JointEvent] = session.latest(topics.JOINT_EVENT, JointEvent, module)
         self.seq = 0
-        self.answered = -1
+        self.newest: JointEvent | None = None
+
+    @property
+    def answered(self) -> int:
+        return -1 if self.newest is None else self.newest.seq
 
     def send(self) -> bool:
         self.seq += 1
         return self.commands.put(command(self.seq))
 
     def listen(self) -> int:
-        event = self.events.take()
-        if event is not None:
-            self.answered = event.seq
+        self.newest = self.events.take() or self.newest
         return self.answered
 
     def reaches(self) -> bool:
         """True once a command sent from now on is answered."""
         first = self.seq + 1
-
-        def answered() -> bool:
-            return self.send() and self.listen() >= first
-
-        return wait_until(answered)
+        return comes_true(lambda: self.send() and self.listen() >= first)
 
 
 def test_message_goes_there_and_back_between_processes(run_dir: Path, start: Start) -> None:
     start(ECHO, "ankle_right")
     with open_session(ROBOT, "planner", run_dir) as session:
         link = Link(session, "ankle_right")
-        answers: list[JointEvent] = []
-
-        def answered() -> bool:
-            link.send()
-            answers.extend(event for event in [link.events.take()] if event is not None)
-            return bool(answers)
-
-        assert wait_until(answered)
-        assert answers[0].tau_before == (0.1, 1 / 3)
-        assert answers[0].tau_after == (0.25, -1e-300)
+        assert link.reaches()
+        answer = link.newest
+        assert answer is not None
+        assert (answer.tau_before, answer.tau_after) == ((0.1, 1 / 3), (0.25, -1e-300))
         assert link.commands.failed == link.events.refused == 0
 
 
@@ -172,21 +140,15 @@ def test_only_the_newest_message_is_kept(run_dir: Path) -> None:
         commands = joint.latest(topics.JOINT_COMMAND, JointCommand, "ankle_right")
         every = joint.stream([topics.JOINT_COMMAND.key(ROBOT.name, "ankle_right")])
         publisher = planner.publisher(topics.JOINT_COMMAND, JointCommand, "ankle_right")
-        assert wait_until(lambda: publisher.put(command(0)) and commands.take())
+        assert comes_true(lambda: publisher.put(command(0)) and commands.take())
         time.sleep(0.2)  # what was under way has come
-        while every.take():
-            pass
+        assert list(iter(every.take, None))
         commands.take()
         for seq in range(1, 11):
             publisher.put(command(seq))
             time.sleep(0.002)
         seen: list[tuple[str, bytes, int]] = []
-
-        def all_came() -> bool:
-            seen.extend(iter(every.take, None))
-            return len(seen) == 10
-
-        assert wait_until(all_came)
+        assert comes_true(lambda: seen.extend(iter(every.take, None)) or len(seen) == 10)  # type: ignore[func-returns-value]
         newest = commands.take()
         assert newest is not None
         assert newest.seq == 10
@@ -211,7 +173,7 @@ def test_stream_gives_every_sample_undecoded_with_its_key(run_dir: Path) -> None
         def both_heard() -> bool:
             return stops.put(estop(-1)) and commands.put(command(-1)) and len(keys_heard()) == 2
 
-        assert wait_until(both_heard)
+        assert comes_true(both_heard)
         for seq in range(50):
             stops.put(estop(seq))
             commands.put(command(seq))
@@ -223,12 +185,26 @@ def test_stream_gives_every_sample_undecoded_with_its_key(run_dir: Path) -> None
         def complete() -> bool:
             return all(numbers(key)[-1] == 49 for key in keys_heard())
 
-        assert wait_until(complete)
+        assert comes_true(complete)
         robot = f"xrl/{ROBOT.name}"
         assert keys_heard() == {f"{robot}/joint/hip_left/command", f"{robot}/estop"}
         for key in keys_heard():
             assert numbers(key)[-50:] == list(range(50))
         assert all(before < t_ns <= time.monotonic_ns() for _, _, t_ns in samples)
+
+
+def longest_put_s(deaf: Link, other: Link) -> float:
+    """Send to both, 1 MB in all: several times what the deaf one's socket and queue can take."""
+    heard_before, longest_s = other.listen(), 0.0
+    for _ in range(2000):
+        begin = time.monotonic()
+        assert deaf.send()
+        assert other.send()
+        longest_s = max(longest_s, time.monotonic() - begin)
+        other.listen()
+        time.sleep(0.0002)
+    assert other.answered > heard_before + 100
+    return longest_s
 
 
 def test_put_does_not_stall_while_a_subscriber_is_stopped(run_dir: Path, start: Start) -> None:
@@ -239,17 +215,7 @@ def test_put_does_not_stall_while_a_subscriber_is_stopped(run_dir: Path, start: 
         assert deaf.reaches()
         assert other.reaches()
         stopped.send_signal(signal.SIGSTOP)
-        heard_before, longest_s = other.listen(), 0.0
-        # 1 MB in all: several times what the stopped process's socket and queue can take
-        for _ in range(2000):
-            begin = time.monotonic()
-            assert deaf.send()
-            assert other.send()
-            longest_s = max(longest_s, time.monotonic() - begin)
-            other.listen()
-            time.sleep(0.0002)
-        assert longest_s < 2.0  # a blocking put waits 5 s for the queue
-        assert other.answered > heard_before + 100
+        assert longest_put_s(deaf, other) < 2.0  # a blocking put waits 5 s for the queue
         assert other.reaches()
         stopped.send_signal(signal.SIGCONT)
         assert deaf.reaches()
@@ -280,14 +246,8 @@ def test_messages_flow_again_after_subscriber_is_killed_and_restarted(
         killed.kill()
         killed.wait()
         assert (run_dir / "ankle_right.zenoh").exists()  # nobody cleaned up
-        heard_before = other.listen()
-        for _ in range(2000):
-            assert lost.send()
-            assert other.send()
-            other.listen()
-            time.sleep(0.0002)
-        assert other.answered > heard_before + 100
-        assert wait_until(lambda: session.alive() == {"planner", "knee_right"})
+        assert longest_put_s(lost, other) < 2.0
+        assert comes_true(lambda: session.alive() == {"planner", "knee_right"})
         again = start(ECHO, "ankle_right")
         assert lost.reaches()
         assert again.poll() is None
@@ -313,13 +273,16 @@ with open_session(robot, "planner", run_dir) as session:
 
         for life in (1, 2):
             process = start(planner, str(life))
-            assert wait_until(lambda life=life: heard(life))  # type: ignore[misc]
+            assert comes_true(lambda life=life: heard(life))  # type: ignore[misc]
             process.kill()
             process.wait()
 
 
+Ankle = tuple[Session, Publisher[JointCommand], Latest[JointCommand]]
+
+
 @pytest.fixture
-def ankle(run_dir: Path) -> Iterator[tuple[Session, Publisher[JointCommand], Latest[JointCommand]]]:
+def ankle(run_dir: Path) -> Iterator[Ankle]:
     """Return the planner's session, its publisher and the ankle's subscriber, linked."""
     with (
         open_session(ROBOT, "ankle_right", run_dir) as joint,
@@ -327,38 +290,29 @@ def ankle(run_dir: Path) -> Iterator[tuple[Session, Publisher[JointCommand], Lat
     ):
         commands = joint.latest(topics.JOINT_COMMAND, JointCommand, "ankle_right")
         publisher = planner.publisher(topics.JOINT_COMMAND, JointCommand, "ankle_right")
-        assert wait_until(lambda: publisher.put(command(0)) and commands.take())
+        assert comes_true(lambda: publisher.put(command(0)) and commands.take())
         yield planner, publisher, commands
 
 
-def test_number_that_is_not_finite_is_refused_and_counted_by_the_sender(
-    ankle: tuple[Session, Publisher[JointCommand], Latest[JointCommand]],
-) -> None:
+def test_number_that_is_not_finite_is_refused_and_counted_by_the_sender(ankle: Ankle) -> None:
     _, publisher, commands = ankle
     assert publisher.failed == 0
     for bad in (math.nan, math.inf, -math.inf):
         assert not publisher.put(command(1, q_phi=bad))
     assert publisher.failed == 3
     assert publisher.put(command(2))
-    later: list[int] = []
-
-    def good_one_came() -> bool:
-        later.extend(m.seq for m in [commands.take()] if m is not None)
-        return 2 in later
-
-    assert wait_until(good_one_came)
-    assert 1 not in later
+    assert comes_true(lambda: (came := commands.take()) is not None and came.seq == 2)
     assert commands.refused == 0
 
 
 @pytest.mark.parametrize("bad", [b'{"t_ns":0,"seq":1,"q_ref":[null,0.0]}', b"no json", b""])
 def test_message_that_is_none_is_refused_and_counted_by_the_receiver(
-    ankle: tuple[Session, Publisher[JointCommand], Latest[JointCommand]], bad: bytes
+    ankle: Ankle, bad: bytes
 ) -> None:
     planner, publisher, commands = ankle
     planner._session.put(topics.JOINT_COMMAND.key(ROBOT.name, "ankle_right"), bad)
-    assert wait_until(lambda: commands.take() is None and commands.refused == 1)
-    assert wait_until(lambda: publisher.put(command(2)) and commands.take())
+    assert comes_true(lambda: commands.take() is None and commands.refused == 1)
+    assert comes_true(lambda: publisher.put(command(2)) and commands.take())
 
 
 @pytest.mark.parametrize(("arguments", "code"), [((), 0), (("raise",), 7)])
@@ -404,10 +358,7 @@ except BusError as error:
 
 
 SESSIONS_REFUSED = {
-    "": ("", "no name for a process"),
-    "a/b": ("", "no name for a process"),
-    "*": ("", "no name for a process"),
-    "a b": ("", "no name for a process"),
+    **dict.fromkeys(("", "a/b", "*", "a b"), ("", "no name for a process")),
     "planner": ("x" * 100, r"unixsock-stream/.*/planner\.zenoh.*shorter run directory"),
     "ankle_right": ("x" * 100, r"unixsock-stream/.*/ankle_right\.zenoh.*shorter run directory"),
     TOOL: ("x" * 100, r"unixsock-stream/.*shorter run directory"),
@@ -441,9 +392,7 @@ def test_a_tool_listens_at_no_endpoint_that_there_cannot_be(
 
 
 USES_REFUSED: dict[str, Callable[[Session], object]] = {
-    "harness/wrench: Estop is not its type; use Wrench": lambda s: s.publisher(
-        topics.WRENCH, Estop
-    ),
+    "harness/wrench: Estop is not its type; use W": lambda s: s.publisher(topics.WRENCH, Estop),
     r"joint/\*/command: '' is no module": lambda s: s.latest(topics.JOINT_COMMAND, JointCommand),
     "leave the module out": lambda s: s.latest(topics.WRENCH, Wrench, "ankle_right"),
     "xrl//estop": lambda s: s.stream(["xrl//estop"]),
@@ -475,7 +424,7 @@ def test_fleet_opened_dialling_side_first_is_linked_pair_by_pair(run_dir: Path) 
         for name, session in sessions.items():
             expected = set(names) - (set(MODULES) - {name} if name in MODULES else set())
             shown = expected - {TOOL}
-            assert wait_until(lambda s=session, e=shown: s.alive() == e), name  # type: ignore[misc]
+            assert comes_true(lambda s=session, e=shown: s.alive() == e), name  # type: ignore[misc]
             assert len(session._session.info.peers_zid()) == len(expected) - 1
             assert len(session._session.info.links()) == len(expected) - 1
 
@@ -503,8 +452,8 @@ def test_tools_that_link_are_named_with_their_place_and_are_gone_when_they_end_o
         def found() -> set[tuple[str, str]]:
             return {(n.split(".")[0], n.rsplit(".")[-1]) for n in tools.names()}
 
-        assert wait_until(lambda: found() == expected)
+        assert comes_true(lambda: found() == expected)
         viewer.kill()
-        assert wait_until(lambda: found() == {("lead", str(leader.pid))})
+        assert comes_true(lambda: found() == {("lead", str(leader.pid))})
         leader.terminate()
-        assert wait_until(lambda: tools.names() == ())
+        assert comes_true(lambda: tools.names() == ())

@@ -1,6 +1,8 @@
+import itertools
 import math
 import re
 import struct
+from collections.abc import Callable
 from typing import Any, get_args, get_origin, get_type_hints
 
 import msgspec
@@ -13,6 +15,7 @@ from shared.bus.messages import JointCommand, Message
 from shared.bus.topics import JOINT_STATE, TOPICS, WRENCH, Topic, all_keys, keys
 from shared.exceptions import NonFiniteError
 from shared.joints import MODULES
+from tests.messages import filled
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 NOT_FINITE = (math.nan, math.inf, -math.inf)
@@ -20,79 +23,57 @@ INT64 = st.integers(min_value=-(2**63), max_value=2**63 - 1)
 WORDS = st.text(alphabet=st.characters(categories=["L", "N", "Zs"]))
 
 
-def strategy(hint: Any) -> st.SearchStrategy[Any]:
-    """Return a strategy for one field of a message."""
-    if get_origin(hint) is tuple:
-        items = get_args(hint)
-        if items[-1] is Ellipsis:
-            return st.lists(strategy(items[0]), max_size=3).map(tuple)
-        return st.tuples(*(strategy(item) for item in items))
-    if is_struct(hint):
-        return messages_of(hint)
-    return {float: FINITE, int: INT64, bool: st.booleans(), str: WORDS}[hint]
-
-
-def is_struct(hint: Any) -> bool:
-    return isinstance(hint, type) and issubclass(hint, msgspec.Struct)
-
-
 def messages_of(message_type: type[msgspec.Struct]) -> st.SearchStrategy[Any]:
     """Return a strategy for messages whose numbers are all finite."""
-    hints = get_type_hints(message_type)
-    return st.builds(
-        message_type,
-        **{name: strategy(hints[name]) for name in message_type.__struct_fields__},
-    )
 
-
-def plain(message_type: type[Any], number: float = 1.5) -> Any:
-    """Return a message of a type with every float the same."""
-
-    def fill(hint: Any) -> Any:
+    def strategy(hint: Any) -> st.SearchStrategy[Any]:
         if get_origin(hint) is tuple:
             items = get_args(hint)
-            return tuple(fill(item) for item in (items[:1] if items[-1] is Ellipsis else items))
-        if is_struct(hint):
-            return plain(hint, number)
-        return {float: number, int: 7, bool: True, str: "a null word"}[hint]
+            if items[-1] is Ellipsis:
+                return st.lists(strategy(items[0]), max_size=3).map(tuple)
+            return st.tuples(*(strategy(item) for item in items))
+        if issubclass(hint, msgspec.Struct):
+            return messages_of(hint)
+        return {float: FINITE, int: INT64, bool: st.booleans(), str: WORDS}[hint]
 
     hints = get_type_hints(message_type)
-    return message_type(**{name: fill(hints[name]) for name in message_type.__struct_fields__})
+    fields = {name: strategy(hints[name]) for name in message_type.__struct_fields__}
+    return st.builds(message_type, **fields)
+
+
+def plain(message_type: type[Any]) -> Any:
+    """Return a message of a type with every float, and every integer, the same."""
+    return filled(message_type, {float: 1.5, int: 7, bool: True, str: "a null word"})
+
+
+def with_floats(value: Any, change: Callable[[float], float]) -> Any:
+    """Return a copy of a message whose floats went through a function, in their order."""
+    if isinstance(value, tuple):
+        return tuple(with_floats(item, change) for item in value)
+    if isinstance(value, msgspec.Struct):
+        fields = msgspec.structs.asdict(value)
+        return type(value)(**{name: with_floats(item, change) for name, item in fields.items()})
+    return change(value) if isinstance(value, float) else value
 
 
 def floats_of(message: Message) -> list[float]:
-    def within(value: Any) -> list[float]:
-        if isinstance(value, msgspec.Struct):
-            value = msgspec.structs.astuple(value)
-        if isinstance(value, tuple):
-            return [number for item in value for number in within(item)]
-        return [value] if isinstance(value, float) else []
-
-    return within(message)
+    found: list[float] = []
+    with_floats(message, lambda number: found.append(number) or number)  # type: ignore[func-returns-value]
+    return found
 
 
 def with_float(message: Message, place: int, number: float) -> Message:
     """Return a copy whose float number `place` is replaced."""
-    count = 0
-
-    def swap(value: Any) -> Any:
-        nonlocal count
-        if isinstance(value, tuple):
-            return tuple(swap(item) for item in value)
-        if isinstance(value, msgspec.Struct):
-            fields = msgspec.structs.asdict(value)
-            return type(value)(**{name: swap(item) for name, item in fields.items()})
-        if not isinstance(value, float):
-            return value
-        count += 1
-        return number if count == place + 1 else value
-
-    return swap(message)
+    met = itertools.count()
+    return with_floats(message, lambda value: number if next(met) == place else value)
 
 
 def bits(message: Message) -> bytes:
     numbers = floats_of(message)
     return struct.pack(f"{len(numbers)}d", *numbers)
+
+
+each_topic = pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
 
 
 @given(messages_of(JointCommand))
@@ -103,7 +84,7 @@ def test_joint_command_round_trips_bit_exactly(command: Message) -> None:
     assert bits(decoded) == bits(command)
 
 
-@pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
+@each_topic
 def test_every_message_type_round_trips(topic: Topic) -> None:
     @given(messages_of(topic.type))
     def round_trips(message: Message) -> None:
@@ -112,7 +93,7 @@ def test_every_message_type_round_trips(topic: Topic) -> None:
     round_trips()
 
 
-@pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
+@each_topic
 def test_a_number_that_is_not_finite_is_refused_wherever_it_stands(topic: Topic) -> None:
     message = plain(topic.type)
     assert encode(message)
@@ -135,16 +116,9 @@ def test_what_is_no_finite_number_is_refused_and_counted_by_the_receiver(word: b
 def test_payloads_of_another_type_or_of_no_type_are_refused_and_counted() -> None:
     decoder = Decoder(JointCommand)
     good = encode(plain(JointCommand))
-    bad = (
-        b"",
-        b"\xff\xfe",
-        b"{}",
-        b"[]",
-        good[:-1],
-        good + b"x",
-        good.replace(b'{"', b'{"extra":1,"', 1),
-        encode(plain(JOINT_STATE.type)),
-    )
+    extra = good.replace(b'{"', b'{"extra":1,"', 1)
+    other = encode(plain(JOINT_STATE.type))
+    bad = (b"", b"\xff\xfe", b"{}", b"[]", good[:-1], good + b"x", extra, other)
     assert [decoder.decode(payload) for payload in bad] == [None] * len(bad)
     assert decoder.refused == len(bad)
 

@@ -241,6 +241,7 @@ def test_an_entry_of_a_free_table_is_named_in_full(
         ("law.jacobian", "mean", "load_sharing"),
         ("law.split", "paper", "certified, diagonal"),
         ("joint_service.driver", "usb", "odrive_can"),
+        ("simulation.can_dialect", "0.7", "0.5, 0.6"),
     ],
 )
 def test_a_choice_that_does_not_exist_is_refused_with_the_choices(
@@ -292,6 +293,7 @@ def test_payload_may_be_all_that_is_allowed_and_nothing(tmp_path: Path) -> None:
         ("drive.zero_mark_turns", 0.0),
         ("can.harness.interface", "socketcan"),
         ("can.harness.interface", "slcan"),
+        ("simulation.can_dialect", "0.6"),
     ],
 )
 def test_what_the_drives_can_do_and_python_can_knows_is_taken(
@@ -390,6 +392,10 @@ def test_text_is_read_as_a_file_is_without_a_schedule(robot: RobotConfig) -> Non
     assert parsed == msgspec.structs.replace(robot, gain_schedule=None)
     with pytest.raises(ConfigError, match=r"robot\.toml of a log"):
         config_file.parse("name = 3", "robot.toml of a log")
+
+
+def test_the_emulated_drives_use_0_5_by_default(robot: RobotConfig) -> None:
+    assert robot.simulation.can_dialect == "0.5"
 
 
 def test_a_frozen_robot_cannot_be_changed(robot: RobotConfig) -> None:

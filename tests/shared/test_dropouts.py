@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shared.robot.dropouts import Dropouts
+from shared.robot.hold_rules import Dropouts
 
 COUNT_MAX, FORGET_NS, T0 = 3, 1000, 50_000
 

@@ -10,7 +10,15 @@ import pytest
 
 from shared import extras
 from shared.exceptions import MissingPackageError
-from shared.extras import EXTRAS, ON_ROBOTS, UNLOCKED, is_installed, late, require
+from shared.extras import (
+    EXTRAS,
+    ON_ROBOTS,
+    UNLOCKED,
+    is_installed,
+    late,
+    libusb_fix,
+    require,
+)  # fmt: skip
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -154,3 +162,20 @@ def test_a_package_that_lacks_another_one_is_not_said_to_be_absent(
     monkeypatch.delitem(sys.modules, "rosbags", raising=False)
     with pytest.raises(ModuleNotFoundError, match="there_is_no_such_package"):
         _ = late("rosbags").typesys
+
+
+@pytest.mark.parametrize(
+    ("manager", "said"),
+    [
+        ("apt-get", "`sudo apt-get install libusb-1.0-0`"),
+        ("dnf", "`sudo dnf install libusb1`"),
+        ("", "your package manager (Debian: libusb-1.0-0, Fedora: libusb1)"),
+    ],
+)
+def test_the_command_is_that_of_the_systems_manager(
+    manager: str, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    if manager:
+        (tmp_path / manager).touch(mode=0o755)
+    assert libusb_fix() == said

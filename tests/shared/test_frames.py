@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 import pinocchio as pin
 import pytest
 
 from services.planner.law.kinematics import Kinematics, Measured
 from services.planner.law.model import load_pinocchio, q_tree
+from shared.bus.messages import Vector6
 from shared.config.robot_config import RobotConfig
 from shared.joints import JOINTS, MODULES
 from shared.robot import frames
@@ -92,17 +95,21 @@ def test_the_torso_is_where_the_planners_kinematics_has_it(
     robot: RobotConfig, height: float, stance: tuple[float, ...]
 ) -> None:
     """Where the legs do not agree, either takes a mean of its own."""
-    q = list(stand_pose(robot, height))
-    shifted = (stance[0], stance[1], stance[2], stance[3], stance[4], stance[5])
+    check_torso(robot, list(stand_pose(robot, height)), stance)
+
+
+def check_torso(robot: RobotConfig, q: list[float], stance: tuple[float, ...]) -> float:
+    """Compare the torso's pose with the planner's; return how far the legs disagree."""
     kinematics = Kinematics(robot)
     kinematics.stance[:] = stance
     kinematics.update(np.array(q))
-    apart = np.abs(kinematics.closure).max()
-    position, rotation = frames.torso_pose(robot.geometry, q, shifted)
+    apart = float(np.abs(kinematics.closure).max())
+    position, rotation = frames.torso_pose(robot.geometry, q, cast("Vector6", stance))
     np.testing.assert_allclose(position, kinematics.r_torso, atol=1e-9 + apart)
     roll, pitch, yaw = kinematics.p[3:]
     wanted = frames.torso_rotation((roll, pitch, yaw))
-    assert abs(np.dot(rotation, wanted)) == pytest.approx(1.0, abs=1e-9 + apart**2)
+    assert abs(np.dot(rotation, wanted)) == pytest.approx(1.0, abs=1e-12 + apart**2)
+    return apart
 
 
 def test_with_legs_that_agree_it_is_there_to_rounding_whatever_the_stance(
@@ -110,15 +117,6 @@ def test_with_legs_that_agree_it_is_there_to_rounding_whatever_the_stance(
 ) -> None:
     """The stance in which the legs agree at drawn angles is found by the planner's own graph."""
     q = [angle + 0.02 * (-1) ** i for i, angle in enumerate(stand_pose(robot, 1.0))]
-    measured = Measured(robot)
-    s = measured.stance_at(np.array(q)).tolist()
-    kinematics = Kinematics(robot)
-    kinematics.stance[:] = s
-    kinematics.update(np.array(q))
-    assert np.abs(kinematics.closure).max() < 1e-9
-    assert max(map(abs, s)) > 1e-3
-    position, rotation = frames.torso_pose(robot.geometry, q, (s[0], s[1], s[2], s[3], s[4], s[5]))
-    np.testing.assert_allclose(position, kinematics.r_torso, atol=1e-9)
-    roll, pitch, yaw = kinematics.p[3:]
-    wanted = frames.torso_rotation((roll, pitch, yaw))
-    assert abs(np.dot(rotation, wanted)) == pytest.approx(1.0, abs=1e-12)
+    stance = tuple(Measured(robot).stance_at(np.array(q)).tolist())
+    assert max(map(abs, stance)) > 1e-3
+    assert check_torso(robot, q, stance) < 1e-9

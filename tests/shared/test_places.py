@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -42,18 +41,14 @@ def options(parser: argparse.ArgumentParser, *words: str) -> Iterator[tuple[tupl
             yield words, action.default
 
 
-def test_a_robot_file_of_the_working_directory_is_taken_and_named(
+def test_a_robot_file_of_the_working_directory_is_taken_and_named_but_one_that_is_named_wins(
     here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     here.write_text("")
+    assert service_parser("A service.", "example").parse_args([]).config == here
+    assert capsys.readouterr().err == SAID
     assert places.robot_file() == here
     assert capsys.readouterr().err == SAID
-
-
-def test_a_robot_file_that_is_named_wins_and_nothing_is_said(
-    here: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    here.write_text("")
     assert places.robot_file(Path("lab.toml")) == Path("lab.toml")
     assert capsys.readouterr().err == ""
 
@@ -83,11 +78,6 @@ def test_another_users_robot_file_is_not_taken_unasked(
         monkeypatch.setattr(os, "getuid", lambda: here.stat().st_uid + 1)
     with pytest.raises(ConfigError, match="belongs to another user"):
         places.robot_file()
-
-
-def test_a_service_finds_the_robot_file_too(here: Path) -> None:
-    here.write_text("")
-    assert service_parser("A service.", "example").parse_args([]).config == here
 
 
 def test_every_verb_that_takes_a_robot_file_looks_for_one() -> None:
@@ -141,20 +131,14 @@ def test_a_stop_from_afar_takes_the_robot_file_of_the_working_directory(here: Pa
     assert estop._robot(args).name == "xrl"
 
 
-def test_what_needs_a_checkout_says_so_in_a_wheel(
+def test_a_wheel_says_what_needs_a_checkout_and_its_files_are_not_written_to(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     places.need_checkout("--against")
-    monkeypatch.setattr(places, "IS_CHECKOUT", False)
-    with pytest.raises(RunError, match=re.escape("--against needs a checkout")):
-        places.need_checkout("--against")
-
-
-def test_the_shipped_files_of_a_wheel_are_not_written_to(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
     places.refuse_shipped(DEFAULT_CONFIG)
     monkeypatch.setattr(places, "IS_CHECKOUT", False)
     monkeypatch.setattr(places, "FILES", tmp_path)
+    with pytest.raises(RunError, match="--against needs a checkout"):
+        places.need_checkout("--against")
     with pytest.raises(RunError, match="xrl new DIR"):
         places.refuse_shipped(tmp_path / "robot.gains.json")

@@ -23,31 +23,24 @@ def checkout(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_clean_checkout_has_a_commit_and_is_not_dirty(checkout: Path) -> None:
+def test_a_checkout_has_a_commit_and_is_dirty_once_a_file_is_changed(checkout: Path) -> None:
     found = revision.code(checkout)
-    assert len(found["git_commit"]) == 40
-    assert found["git_dirty"] == "false"
-
-
-def test_a_changed_file_makes_the_checkout_dirty(checkout: Path) -> None:
+    assert (len(found["git_commit"]), found["git_dirty"]) == (40, "false")
     (checkout / "file").write_text("two")
     assert revision.code(checkout)["git_dirty"] == "true"
 
 
-def test_a_directory_inside_another_checkout_is_unknown(checkout: Path) -> None:
-    installed = checkout / "site-packages"
+def test_inside_another_checkout_without_a_commit_or_without_git_it_is_unknown(
+    checkout: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    installed, empty = checkout / "site-packages", tmp_path_factory.mktemp("empty")
     installed.mkdir()
-    assert revision.code(installed) == {"git_commit": "unknown", "git_dirty": "unknown"}
-
-
-def test_a_checkout_without_a_commit_is_unknown(tmp_path: Path) -> None:
-    git(tmp_path, "init", "--quiet")
-    assert revision.code(tmp_path)["git_commit"] == "unknown"
-
-
-def test_without_git_the_code_is_unknown(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    git(empty, "init", "--quiet")
+    unknown = {"git_commit": "unknown", "git_dirty": "unknown"}
+    assert revision.code(installed) == revision.code(empty) == unknown
+    assert revision.in_words(unknown) == "commit unknown"
     monkeypatch.setenv("PATH", "")
-    assert revision.code(checkout)["git_commit"] == "unknown"
+    assert revision.code(checkout) == unknown
 
 
 def test_a_wheel_says_what_it_was_built_from_wherever_it_is_installed(checkout: Path) -> None:
@@ -57,7 +50,3 @@ def test_a_wheel_says_what_it_was_built_from_wherever_it_is_installed(checkout: 
     note.write_text(json.dumps(found))
     assert revision.code(checkout) == found
     assert revision.in_words(found) == "commit aaaaaaaaaaaa with changes"
-
-
-def test_a_wheel_of_no_known_origin_says_so(tmp_path: Path) -> None:
-    assert revision.in_words(revision.code(tmp_path)) == "commit unknown"

@@ -18,11 +18,12 @@ from shared.config.scenarios import (
     Fault,
     FaultKind,
     Keyframe,
+    Kill,
     Push,
     Scenario,
     lead,
     push_at,
-)
+)  # fmt: skip
 from shared.exceptions import ConfigError
 from tests.conftest import ROBOT_FILE
 
@@ -111,18 +112,18 @@ def test_a_refusal_names_file_key_value_and_what_would_be_right(
         assert part in str(error)
 
 
-def test_the_scenario_that_the_refusals_start_from_is_itself_taken(tmp_path: Path) -> None:
-    assert load_changed(tmp_path, dict.copy).name == "two"
+PLAIN_FAULT = {"module": "hip_left", "kind": "watchdog", "at": 1}
 
 
-def test_a_scenario_comes_back_from_its_own_toml(tmp_path: Path) -> None:
-    first = load_changed(tmp_path, dict.copy)
+@pytest.mark.parametrize("change", [dict.copy, lambda raw: raw.update(fault=[PLAIN_FAULT])])
+def test_a_scenario_is_taken_and_comes_back_from_its_own_toml(
+    tmp_path: Path, change: Callable[[Table], object]
+) -> None:
+    first = load_changed(tmp_path, change)
     path = tmp_path / "again.toml"
     path.write_text(scenarios.to_toml(first), encoding="utf-8")
     assert scenarios.load(path) == first
-
-
-# ---- faults
+    assert first.name == "two"
 
 
 def test_a_fault_is_of_the_first_axis_and_lasts_as_its_kind_does_by_default() -> None:
@@ -134,21 +135,8 @@ def test_a_fault_is_of_the_first_axis_and_lasts_as_its_kind_does_by_default() ->
     assert given.lasts_s == 3.0
 
 
-def test_a_fault_that_leaves_things_out_comes_back_from_its_own_toml(tmp_path: Path) -> None:
-    plain = load_changed(
-        tmp_path,
-        lambda raw: raw.update(fault=[{"module": "hip_left", "kind": "watchdog", "at": 1}]),
-    )
-    path = tmp_path / "again.toml"
-    path.write_text(scenarios.to_toml(plain), encoding="utf-8")
-    assert scenarios.load(path) == plain
-
-
 def test_every_kind_in_the_type_is_in_the_table() -> None:
     assert set(get_args(FaultKind)) == set(FAULT_KINDS)
-
-
-# ---- the hand
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
@@ -189,16 +177,12 @@ def test_squat_is_the_cosine_of_the_reference_scenario() -> None:
 
 def test_squat_kills_the_planner_and_pushes_as_in_the_reference_scenario() -> None:
     squat = scenarios.load(SQUAT)
-    assert [(kill.service, kill.at, kill.signal) for kill in squat.kill] == [
-        ("planner", 10.0, "KILL")
-    ]
-    assert [(push.at, push.duration, push.force) for push in squat.push] == [
-        (12.0, 0.3, (40.0, 0.0, 0.0)),
-        (14.0, 0.3, (0.0, 40.0, 0.0)),
-        (16.0, 0.3, (-40.0, 0.0, 0.0)),
-    ]
-    assert squat.duration == 20.0
-    assert squat.hand
+    assert squat.kill == (Kill(service="planner", at=10.0, signal="KILL"),)
+    assert squat.push == tuple(
+        Push(at=at, duration=0.3, force=(x, y, 0.0))
+        for at, x, y in ((12.0, 40.0, 0.0), (14.0, 0.0, 40.0), (16.0, -40.0, 0.0))
+    )
+    assert (squat.duration, squat.hand) == (20.0, True)
 
 
 def test_crawl_is_the_reference_scenarios() -> None:
@@ -215,14 +199,8 @@ def test_lead_waits_at_the_first_keyframe_and_stays_at_the_last() -> None:
         assert lead(two, t)[:5] == (1.1, 0.0, 0.0, 0.0, 0.0)
     for t in (3.0, 100.0):
         assert lead(two, t)[:5] == (0.9, 0.0, 0.4, 0.0, 0.0)
-
-
-def test_one_keyframe_is_a_stand() -> None:
-    one = Scenario(name="one", about="", duration=1.0, keyframe=(Keyframe(at=0.0, height=1.0),))
-    assert {lead(one, t).height for t in (-1.0, 0.0, 0.5, 2.0)} == {1.0}
-
-
-# ---- pushes
+    stand = Scenario(name="one", about="", duration=1.0, keyframe=frames[:1])
+    assert {lead(stand, t).height for t in (-1.0, 0.0, 1.5, 2.0)} == {1.1}
 
 
 def test_a_push_acts_from_its_start_up_to_its_end() -> None:
@@ -234,20 +212,12 @@ def test_a_push_acts_from_its_start_up_to_its_end() -> None:
 
 
 def test_pushes_at_one_time_add_up() -> None:
-    pushes = (
-        Push(at=0.0, duration=2.0, force=(1.0, 2.0, 3.0)),
-        Push(at=1.0, duration=2.0, force=(10.0, 0.0, -3.0)),
-    )
+    one = Push(at=0.0, duration=2.0, force=(1.0, 2.0, 3.0))
+    other = Push(at=1.0, duration=2.0, force=(10.0, 0.0, -3.0))
     frames = (Keyframe(at=0.0, height=1.0),)
-    both = Scenario(name="both", about="", duration=5.0, keyframe=frames, push=pushes)
-    assert [push_at(both, t) for t in (0.5, 1.5, 2.5)] == [
-        (1.0, 2.0, 3.0),
-        (11.0, 2.0, 0.0),
-        (10.0, 0.0, -3.0),
-    ]
-
-
-# ---- what is shipped
+    both = Scenario(name="both", about="", duration=5.0, keyframe=frames, push=(one, other))
+    found = [push_at(both, t) for t in (0.5, 1.5, 2.5)]
+    assert found == [one.force, (11.0, 2.0, 0.0), other.force]
 
 
 def test_the_reference_scenarios_are_shipped() -> None:

@@ -20,15 +20,18 @@ from pathlib import Path
 from shared.scheduling import short_slice
 print(short_slice())
 print(Path("/proc/self/timerslack_ns").read_text().strip())
-print([line.split(":")[1].strip() for line in Path("/proc/self/sched").read_text().splitlines()
-       if line.startswith("se.slice")])
 """
 
 
+def said(script: str, env: dict[str, str] | None = None) -> list[str]:
+    """Return the lines that a process of its own prints."""
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=env)
+    return done.stdout.splitlines()
+
+
 def test_a_short_slice_and_exact_timers_need_no_privilege() -> None:
-    granted, slack, _slice = subprocess.run(
-        [sys.executable, "-c", READ_BACK], capture_output=True, text=True, check=True
-    ).stdout.splitlines()
+    granted, slack = said(READ_BACK)
     assert slack == str(TIMER_SLACK_NS)
     assert f"timer slack {TIMER_SLACK_NS} ns" in granted
     if "slice" not in granted.replace("timer slack", ""):
@@ -51,10 +54,7 @@ def test_what_a_step_needs_first_has_the_higher_priority() -> None:
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 8])
 def test_the_halves_are_the_legs_and_no_processor_is_left_out(count: int) -> None:
     processors = list(range(10, 10 + count))
-    right, left = (
-        half_of(processors, "joint", "knee_right"),
-        half_of(processors, "joint", "hip_left"),
-    )
+    right, left = (half_of(processors, "joint", name) for name in ("knee_right", "hip_left"))
     assert right | left == set(processors)
     assert not right & left or count == 1
     assert abs(len(right) - len(left)) <= 1
@@ -74,13 +74,9 @@ def test_two_threads_of_a_core_stay_in_one_half(monkeypatch: pytest.MonkeyPatch)
 
 @pytest.mark.parametrize(
     ("limit", "capable", "may"),
-    [
-        (resource.RLIM_INFINITY, False, True),
-        (1 << 30, True, True),
-        (1 << 30, False, False),
-        (0, False, False),
-    ],
-)
+    [(resource.RLIM_INFINITY, False, True), (1 << 30, True, True), (1 << 30, False, False),
+     (0, False, False)],
+)  # fmt: skip
 def test_memory_is_locked_only_where_no_later_allocation_can_fail_for_it(
     monkeypatch: pytest.MonkeyPatch, limit: int, capable: bool, may: bool
 ) -> None:
@@ -101,15 +97,9 @@ block = bytearray(50_000_000)
 
 @pytest.mark.parametrize("pinned", ["0", "1"])
 def test_a_process_is_pinned_only_where_the_fleets_table_says_so(pinned: str) -> None:
-    said, row = subprocess.run(
-        [sys.executable, "-c", APPLY],
-        capture_output=True,
-        text=True,
-        check=True,
-        env=os.environ | {"XRL_PINNED": pinned},
-    ).stdout.splitlines()
+    granted, row = said(APPLY, os.environ | {"XRL_PINNED": pinned})
     same, count = row.split()
-    assert ("processors" in said) == (pinned == "1")
+    assert ("processors" in granted) == (pinned == "1")
     assert (same == "True") == (pinned == "1" or count == "1")
 
 
@@ -123,10 +113,7 @@ def test_linear_algebra_runs_in_one_thread_whatever_is_imported_first(first: str
         "import os; print(len(os.listdir('/proc/self/task')))"
     )
     bare = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True, env=bare
-    )
-    assert done.stdout.strip() == "1"
+    assert said(script, bare) == ["1"]
 
 
 @pytest.mark.parametrize(("may", "granted"), [(True, "SCHED_FIFO 20"), (False, "RLIMIT_RTTIME")])

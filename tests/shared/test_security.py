@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime as dt
 import fnmatch
 import json
 import os
@@ -11,7 +10,7 @@ import socket
 import stat
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,21 +19,18 @@ import pytest
 import zenoh
 
 from shared.bus import credentials, topics
-from shared.bus.access import PRINCIPALS, access_control, token_key
 from shared.bus.messages import Estop
-from shared.bus.same_host import services_here
+from shared.bus.security import access_control, services_here, token_key
 from shared.bus.session import open_session
-from shared.bus.topics import all_keys
+from shared.bus.topics import PRINCIPALS, all_keys
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
-from shared.config.sections import BusSecurityConfig
 from shared.exceptions import BusError, ConfigError
 from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
-from tests.certified import certified, install_all, opened
-from tools.keys import certificates
+from tests.certified import certified, give, install_all, opened, signer_of, with_keys
+from tests.waiting import comes_true
 from tools.keys.authority import Authority
-from tools.keys.certificates import Issued
 
 ROBOT = config_file.load(DEFAULT_CONFIG)
 TRIES_S = 8.0
@@ -47,17 +43,11 @@ PUTS = {
     "imu": ["imu/attitude"],
     "recorder": ["recorder/tools"],
     "simulator": ["sim/truth", "sim/state", "operator/intent"],
-    "operator": [
-        "estop",
-        "harness/tare",
-        "operator/intent",
-        "operator/hand",
-        "sim/control",
-        "run/event",
-    ],
+    "operator": ["estop", "harness/tare", "operator/intent", "operator/hand", "sim/control",
+                 "run/event"],
     "viewer": [],
     **{m: [f"joint/{m}/state", f"joint/{m}/event", f"joint/{m}/trace"] for m in MODULES},
-}
+}  # fmt: skip
 """What each may put, by hand: not from the topic table."""
 READS = {
     "planner": ["joint/*/state", "harness/wrench", "imu/attitude", "operator/intent"],
@@ -122,13 +112,13 @@ def identity(folder: Path, name: str, authority: Path | None = None) -> dict[str
     }
 
 
-def waits_for(condition: Callable[[], bool], limit_s: float = TRIES_S) -> bool:
-    deadline = time.monotonic() + limit_s
-    while time.monotonic() < deadline:
-        if condition():
-            return True
-        time.sleep(0.02)
-    return condition()
+def settles(step: Callable[[], Collection[object]], expected: Collection[object]) -> bool:
+    """Return True if what is heard becomes all that is expected, and stays so."""
+    assert comes_true(lambda: set(expected) <= set(step()), TRIES_S)
+    time.sleep(0.2)  # what is not to come would have come by now
+    step()
+    time.sleep(0.1)
+    return set(step()) == set(expected)
 
 
 def fits(key: str, patterns: list[str]) -> bool:
@@ -148,21 +138,16 @@ def test_a_peer_is_heard_on_its_own_keys_and_on_no_other(bus: Bus, name: str) ->
         stranger(bus.endpoint("recorder"), identity(bus.keys, name)) as peer,
     ):
         ear = recorder.stream([f"xrl/{ROBOT.name}/**"])
-        assert waits_for(lambda: linked(peer))
-        expected = {key for key in keys if fits(key, PUTS[name])}
+        assert comes_true(lambda: linked(peer))
         heard: set[str] = set()
 
-        def all_heard() -> bool:
+        def put_all() -> set[str]:
             for key in keys:
                 peer.put(key, b"{}")
-            while (sample := ear.take()) is not None:
-                heard.add(sample[0])
-            return heard >= expected
+            heard.update(key for key, _, _ in iter(ear.take, None))
+            return heard
 
-        assert waits_for(all_heard)
-        time.sleep(0.2)  # what is not to come would have come by now
-        all_heard()
-        assert heard == expected
+        assert settles(put_all, {key for key in keys if fits(key, PUTS[name])})
 
 
 @pytest.mark.parametrize("name", PRINCIPALS)
@@ -178,20 +163,15 @@ def test_a_peer_receives_what_its_row_of_the_table_says(bus: Bus, name: str) -> 
             peer.declare_subscriber(key, lambda sample: heard.add(str(sample.key_expr)))
             for key in (*keys, "**")
         ]
-        assert waits_for(lambda: linked(peer))
+        assert comes_true(lambda: linked(peer))
         publishers = [session.raw_publisher(key, patient=False) for key in keys]
-        expected = {key for key in keys if fits(key, READS[name])}
 
-        def all_heard() -> bool:
+        def put_all() -> set[str]:
             for publisher in publishers:
                 publisher.put(b"{}")
-            return heard >= expected
+            return heard
 
-        assert waits_for(all_heard)
-        time.sleep(0.2)
-        all_heard()
-        time.sleep(0.1)
-        assert heard == expected
+        assert settles(put_all, {key for key in keys if fits(key, READS[name])})
         assert len(ears) == len(keys) + 1
 
 
@@ -205,15 +185,11 @@ def test_services_show_themselves_by_their_own_name_only(bus: Bus) -> None:
             for name in ("planner", "a-tool")
         ]
         tools = recorder.linked_tools()
-        assert waits_for(lambda: linked(peer))
+        assert comes_true(lambda: linked(peer))
         time.sleep(0.5)
         assert recorder.alive() == {"recorder"}
         assert tools.names() == ("a-tool",)
         assert len(tokens) == 2
-
-
-def signer_of(authority: Authority) -> Issued:
-    return Issued(authority.certificate, (authority.folder / "authority.key").read_bytes())
 
 
 def _foreign(bus: Bus, folder: Path) -> dict[str, Any]:
@@ -223,41 +199,32 @@ def _foreign(bus: Bus, folder: Path) -> dict[str, Any]:
     return identity(folder, "planner", bus.keys / credentials.AUTHORITY)
 
 
-def _expired(bus: Bus, folder: Path) -> dict[str, Any]:
-    return _issued_then(bus, folder, dt.timedelta(days=-30), days=10)
-
-
-def _not_yet(bus: Bus, folder: Path) -> dict[str, Any]:
-    return _issued_then(bus, folder, dt.timedelta(days=30), days=10)
-
-
-def _issued_then(bus: Bus, folder: Path, when: dt.timedelta, days: int) -> dict[str, Any]:
-    signer = signer_of(bus.authority)
-    now = dt.datetime.now(dt.UTC) + when
-    issued = certificates.issue(signer, "planner.1", ("127.0.0.1",), now, days)
-    folder.mkdir()
-    (folder / "planner.pem").write_bytes(issued.certificate)
-    (folder / "planner.key").write_bytes(issued.key)
+def _issued(bus: Bus, folder: Path, from_day: int) -> dict[str, Any]:
+    give(signer_of(bus.authority), folder, "planner", from_day=from_day, days=10)
     return identity(folder, "planner", bus.keys / credentials.AUTHORITY)
 
 
 def _none(bus: Bus, _folder: Path) -> dict[str, Any]:
-    return {
-        "root_ca_certificate": str(bus.keys / credentials.AUTHORITY),
-        "verify_name_on_connect": False,
-    }
+    authority = str(bus.keys / credentials.AUTHORITY)
+    return {"root_ca_certificate": authority, "verify_name_on_connect": False}
 
 
-@pytest.mark.parametrize("kind", [_none, _foreign, _expired, _not_yet])
-def test_without_a_valid_certificate_there_is_no_link(
-    bus: Bus, tmp_path: Path, kind: Callable[[Bus, Path], dict[str, Any]]
-) -> None:
+ENEMIES: dict[str, Callable[[Bus, Path], dict[str, Any]]] = {
+    "none": _none,
+    "foreign": _foreign,
+    "expired": lambda bus, folder: _issued(bus, folder, -30),
+    "not yet valid": lambda bus, folder: _issued(bus, folder, 30),
+}
+
+
+@pytest.mark.parametrize("kind", ENEMIES)
+def test_without_a_valid_certificate_there_is_no_link(bus: Bus, tmp_path: Path, kind: str) -> None:
     with (
         open_session(bus.robot, "recorder", bus.folder),
         stranger(bus.endpoint("recorder"), identity(bus.keys, "planner")) as friend,
-        stranger(bus.endpoint("recorder"), kind(bus, tmp_path / "s")) as enemy,
+        stranger(bus.endpoint("recorder"), ENEMIES[kind](bus, tmp_path / "s")) as enemy,
     ):
-        assert waits_for(lambda: linked(friend)), "the same try with a valid one"
+        assert comes_true(lambda: linked(friend)), "the same try with a valid one"
         time.sleep(0.5)
         assert not linked(enemy)
 
@@ -275,39 +242,31 @@ def test_a_revoked_certificate_links_and_is_not_heard(bus: Bus, tmp_path: Path) 
         stranger(robot.bus.endpoints["recorder"], identity(tmp_path / "keys", "planner")) as now,
     ):
         ear = recorder.stream([f"xrl/{ROBOT.name}/**"])
-        assert waits_for(lambda: linked(lost) and linked(now))
-        heard: list[bytes] = []
+        assert comes_true(lambda: linked(lost) and linked(now))
+        heard: set[bytes] = set()
 
-        def is_heard() -> bool:
+        def put_both() -> set[bytes]:
             lost.put(f"xrl/{ROBOT.name}/planner/status", b"lost")
             now.put(f"xrl/{ROBOT.name}/planner/status", b"now")
-            while (sample := ear.take()) is not None:
-                heard.append(sample[1])
-            return b"now" in heard
+            heard.update(payload for _, payload, _ in iter(ear.take, None))
+            return heard
 
-        assert waits_for(is_heard)
-        time.sleep(0.2)
-        is_heard()
-        assert set(heard) == {b"now"}
+        assert settles(put_both, {b"now"})
 
 
 def test_a_service_is_dialled_only_where_its_certificate_says(bus: Bus, tmp_path: Path) -> None:
     """A peer with another host's certificate, at the planner's place, is not believed."""
     robot, authority = certified(bus.robot, tmp_path, bus.robot.bus.endpoints, LOOPBACK)
-    signer = signer_of(authority)
-    now = dt.datetime.now(dt.UTC)
-    elsewhere = certificates.issue(signer, "knee_left.1", ("10.9.9.9",), now, 10)
     other = tmp_path / "other"
     shutil.copytree(tmp_path / "keys", other)
-    (other / "knee_left.pem").write_bytes(elsewhere.certificate)
-    (other / "knee_left.key").write_bytes(elsewhere.key)
+    give(signer_of(authority), other, "knee_left", host="10.9.9.9")
     install_all(authority, tmp_path / "body", "planner")
     with (
-        open_session(_with_keys(robot, other), "knee_left", tmp_path),
+        open_session(with_keys(robot, other), "knee_left", tmp_path),
         open_session(robot, "knee_right", tmp_path),
-        open_session(_with_keys(robot, tmp_path / "body"), "planner", tmp_path) as planner,
+        open_session(with_keys(robot, tmp_path / "body"), "planner", tmp_path) as planner,
     ):
-        assert waits_for(lambda: "knee_right" in planner.alive())
+        assert comes_true(lambda: "knee_right" in planner.alive())
         time.sleep(0.5)
         assert "knee_left" not in planner.alive()
 
@@ -317,7 +276,7 @@ def test_a_tool_is_the_operator_where_the_host_has_that_key_and_else_a_viewer(
 ) -> None:
     assert credentials.read_credentials(bus.robot, "status").name == "operator"
     install_all(bus.authority, tmp_path / "keys", "viewer")
-    looks = _with_keys(bus.robot, tmp_path / "keys")
+    looks = with_keys(bus.robot, tmp_path / "keys")
     assert credentials.read_credentials(looks, "estop").name == "viewer"
 
 
@@ -325,33 +284,26 @@ def test_a_viewer_cannot_stop_the_robot_and_an_operator_can(bus: Bus, tmp_path: 
     install_all(bus.authority, tmp_path / "keys", "viewer")
     with (
         open_session(bus.robot, "knee_left", bus.folder) as knee,
-        open_session(_with_keys(bus.robot, tmp_path / "keys"), "estop", bus.folder) as viewer,
+        open_session(with_keys(bus.robot, tmp_path / "keys"), "estop", bus.folder) as viewer,
         open_session(bus.robot, "estop", bus.folder) as operator,
     ):
         stops = knee.latest(topics.ESTOP, Estop)
         calls = [s.publisher(topics.ESTOP, Estop) for s in (viewer, operator)]
         heard: set[str] = set()
 
-        def is_heard() -> bool:
+        def call_both() -> set[str]:
             for source, call in zip(("viewer", "operator"), calls, strict=True):
                 call.put(Estop(t_ns=1, seq=1, source=source))
                 time.sleep(0.02)
-                stop = stops.take()
-                if stop is not None:
-                    heard.add(stop.source)
-            return "operator" in heard
+                heard.update(stop.source for stop in [stops.take()] if stop is not None)
+            return heard
 
-        assert waits_for(is_heard)
-        for _ in range(5):
-            is_heard()
-        assert heard == {"operator"}
+        assert settles(call_both, {"operator"})
 
 
 def alone(robot: RobotConfig, folder: Path) -> tuple[RobotConfig, Authority]:
     """Return the robot with all of its services on this host, and no laptop allowed."""
-    robot, authority = certified(robot, folder, robot.bus.endpoints)
-    assert not robot.bus.security.allow
-    return robot, authority
+    return certified(robot, folder, robot.bus.endpoints)
 
 
 def listens(endpoint: str) -> bool:
@@ -367,8 +319,8 @@ def test_services_of_one_host_are_linked_without_a_port(bus: Bus, tmp_path: Path
         open_session(robot, "planner", bus.folder) as planner,
         open_session(robot, "status", bus.folder) as tool,
     ):
-        assert waits_for(lambda: planner.alive() == {"planner", "knee_left"})
-        assert waits_for(lambda: tool.alive() == {"planner", "knee_left"})
+        for session in (planner, tool):
+            assert comes_true(lambda s=session: s.alive() == {"planner", "knee_left"})  # type: ignore[misc]
         assert not any(listens(robot.bus.endpoints[name]) for name in ("planner", "knee_left"))
 
 
@@ -377,7 +329,7 @@ def test_a_service_listens_at_its_port_where_another_host_may_link_to_it(
 ) -> None:
     robot, authority = alone(bus.robot, tmp_path)
     install_all(authority, tmp_path / "leg", *LEG)
-    leg = _with_keys(robot, tmp_path / "leg")
+    leg = with_keys(robot, tmp_path / "leg")
     assert services_here(leg) == set(LEG)
     elsewhere = robot.bus.endpoints | {"planner": "tls/192.0.2.1:7447"}
     far = msgspec.structs.replace(robot.bus, endpoints=elsewhere)
@@ -392,7 +344,7 @@ def test_a_tool_by_socket_may_do_what_the_keys_of_its_host_allow(
 ) -> None:
     robot, authority = alone(bus.robot, tmp_path)
     install_all(authority, tmp_path / key, *LEG, key)
-    leg = _with_keys(robot, tmp_path / key)
+    leg = with_keys(robot, tmp_path / key)
     with (
         open_session(leg, "knee_left", bus.folder) as knee,
         open_session(leg, "estop", bus.folder) as tool,
@@ -404,13 +356,8 @@ def test_a_tool_by_socket_may_do_what_the_keys_of_its_host_allow(
             call.put(Estop(t_ns=1, seq=1, source="tool"))
             return stops.take() is not None
 
-        assert waits_for(lambda: "knee_left" in tool.alive())
-        assert waits_for(stopped, TRIES_S if heard else 0.5) is heard
-
-
-def _with_keys(robot: RobotConfig, folder: Path) -> RobotConfig:
-    security = msgspec.structs.replace(robot.bus.security, keys=str(folder))
-    return msgspec.structs.replace(robot, bus=msgspec.structs.replace(robot.bus, security=security))
+        assert comes_true(lambda: "knee_left" in tool.alive())
+        assert comes_true(stopped, TRIES_S if heard else 0.5) is heard
 
 
 def _remove(name: str) -> Callable[[Path], None]:
@@ -436,10 +383,7 @@ SPOILT: dict[str, tuple[Callable[[Path], object], str]] = {
     "no certificate": (_remove("planner.pem"), "planner.pem: missing"),
     "no key": (_remove("planner.key"), "planner.key: missing"),
     "no authority": (_remove("authority.pem"), "authority.pem: missing"),
-    "a key that others can read": (
-        lambda keys: (keys / "planner.key").chmod(0o640),
-        "chmod 600",
-    ),
+    "a key that others can read": (lambda keys: (keys / "planner.key").chmod(0o640), "chmod 600"),
     "a key that is none": (lambda keys: (keys / "planner.key").write_bytes(b"x"), "planner"),
 }
 
@@ -454,7 +398,7 @@ def test_a_service_whose_keys_are_not_right_does_not_start_and_says_why(
     spoil(keys)
     with (
         pytest.raises(BusError, match=words),
-        open_session(_with_keys(bus.robot, keys), "planner", tmp_path),
+        open_session(with_keys(bus.robot, keys), "planner", tmp_path),
     ):
         pass
 
@@ -468,46 +412,41 @@ def _file_with(tmp_path: Path, robot: RobotConfig) -> Path:
 PORT = {**ROBOT.bus.endpoints, "planner": "tcp/127.0.0.1:7447"}
 
 
+def secured(endpoint: str | None = None, **changes: object) -> RobotConfig:
+    """Return the robot with keys of `[bus.security]` changed, and the planner's endpoint."""
+    security = msgspec.structs.replace(ROBOT.bus.security, **changes)
+    endpoints = ROBOT.bus.endpoints | ({} if endpoint is None else {"planner": endpoint})
+    bus = msgspec.structs.replace(ROBOT.bus, endpoints=endpoints, security=security)
+    return msgspec.structs.replace(ROBOT, bus=bus)
+
+
+NO_ADDRESS = "an IP address, without a port"
+
+
 @pytest.mark.parametrize(
-    ("mode", "endpoint", "words"),
+    ("robot", "words"),
     [
-        ("local", "tcp/127.0.0.1:7447", 'mode = "open", and anyone'),
-        ("local", "tls/10.0.0.1:7447", 'mode = "mtls"'),
-        ("mtls", "tcp/10.0.0.1:7447", "tls/"),
-        ("mtls", "unixsock-stream/{run}/planner.zenoh", 'mode = "local"'),
-        ("open", "tls/10.0.0.1:7447", 'mode = "mtls"'),
+        (secured("tcp/127.0.0.1:7447"), 'mode = "open", and anyone'),
+        (secured("tls/10.0.0.1:7447"), 'mode = "mtls"'),
+        (secured("tcp/10.0.0.1:7447", mode="mtls"), "tls/"),
+        (secured("unixsock-stream/{run}/planner.zenoh", mode="mtls"), 'mode = "local"'),
+        (secured("tls/10.0.0.1:7447", mode="open"), 'mode = "mtls"'),
+        (secured(keys="keys"), "begins with / or ~"),
+        *((secured(allow=(text,)), NO_ADDRESS)
+          for text in ("laptop.local", "10.0.0.1:22", "", "10.0.0.0/8")),
     ],
-)
-def test_an_endpoint_that_is_none_of_the_mode_is_refused(
-    tmp_path: Path, mode: str, endpoint: str, words: str
+)  # fmt: skip
+def test_an_endpoint_path_or_address_that_the_mode_does_not_take_is_refused(
+    tmp_path: Path, robot: RobotConfig, words: str
 ) -> None:
-    robot = opened(ROBOT, {**ROBOT.bus.endpoints, "planner": endpoint})
-    security = BusSecurityConfig(mode=mode)  # type: ignore[arg-type]  # one of them
-    bus = msgspec.structs.replace(robot.bus, security=security)
     with pytest.raises(ConfigError, match=words):
-        config_file.load(_file_with(tmp_path, msgspec.structs.replace(robot, bus=bus)))
+        config_file.load(_file_with(tmp_path, robot))
 
 
 def test_a_port_opened_in_so_many_words_is_taken_and_a_log_of_one_is_read(tmp_path: Path) -> None:
-    robot = opened(ROBOT, PORT)
-    assert config_file.load(_file_with(tmp_path, robot)).bus.security.mode == "open"
-    silent = msgspec.structs.replace(
-        robot, bus=msgspec.structs.replace(robot.bus, security=BusSecurityConfig())
-    )
+    assert config_file.load(_file_with(tmp_path, opened(ROBOT, PORT))).bus.security.mode == "open"
+    silent = secured(PORT["planner"])
     assert config_file.parse(config_file.to_toml(silent), "log").bus.endpoints == PORT
-
-
-def test_keys_are_named_by_a_path_that_is_the_same_from_everywhere(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="begins with / or ~"):
-        config_file.load(_file_with(tmp_path, _with_keys(ROBOT, Path("keys"))))
-
-
-@pytest.mark.parametrize("allowed", ["laptop.local", "10.0.0.1:22", "", "10.0.0.0/8"])
-def test_only_addresses_are_allowed(tmp_path: Path, allowed: str) -> None:
-    security = msgspec.structs.replace(ROBOT.bus.security, allow=(allowed,))
-    bus = msgspec.structs.replace(ROBOT.bus, security=security)
-    with pytest.raises(ConfigError, match="an IP address, without a port"):
-        config_file.load(_file_with(tmp_path, msgspec.structs.replace(ROBOT, bus=bus)))
 
 
 def test_a_service_starts_though_another_hosts_name_is_not_known(
@@ -521,18 +460,16 @@ def test_a_service_starts_though_another_hosts_name_is_not_known(
 
 
 @pytest.mark.parametrize("umask", [0o000, 0o022])
-def test_a_local_socket_is_its_users_alone_whatever_the_umask(tmp_path: Path, umask: int) -> None:
-    folder = Path(tempfile.mkdtemp(prefix="xrl-t-", dir="/tmp"))
+def test_a_local_socket_is_its_users_alone_whatever_the_umask(short_dir: Path, umask: int) -> None:
     before = os.umask(umask)
     try:
-        with open_session(ROBOT, "planner", folder):
-            mode = stat.S_IMODE((folder / "planner.zenoh").stat().st_mode)
+        with open_session(ROBOT, "planner", short_dir):
+            mode = stat.S_IMODE((short_dir / "planner.zenoh").stat().st_mode)
             assert mode & 0o077 == 0
-            (folder / "after").touch()
-            assert stat.S_IMODE((folder / "after").stat().st_mode) == 0o666 & ~umask
+            (short_dir / "after").touch()
+            assert stat.S_IMODE((short_dir / "after").stat().st_mode) == 0o666 & ~umask
     finally:
         os.umask(before)
-        shutil.rmtree(folder)
 
 
 @pytest.mark.parametrize("own", PRINCIPALS)

@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import datetime as dt
-import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-import msgspec
 import pytest
 
 from shared.bus.credentials import Credentials, read_credentials
 from shared.bus.session import open_session
 from shared.bus.tls_probe import LinkWatch, own_fault, refusal
 from shared.config.robot_config import RobotConfig
-from tests.certified import certified, install_all
+from tests.certified import certified, give, install_all, signer_of, with_keys
+from tests.waiting import comes_true
 from tools.keys import certificates
 from tools.keys.authority import Authority
-from tools.keys.certificates import Issued
 
 
 class Pair(NamedTuple):
@@ -29,41 +27,32 @@ class Pair(NamedTuple):
     authority: Authority
     folder: Path
 
+    @property
+    def knee(self) -> str:
+        return self.robot.bus.endpoints["knee_left"]
+
     def host(self, name: str) -> RobotConfig:
-        security = msgspec.structs.replace(self.robot.bus.security, keys=str(self.folder / name))
-        bus = msgspec.structs.replace(self.robot.bus, security=security)
-        return msgspec.structs.replace(self.robot, bus=bus)
+        return with_keys(self.robot, self.folder / name)
 
     def own(self, name: str) -> Credentials:
         return read_credentials(self.host(name), name)
 
-    def replace(self, name: str, *, from_day: int = 0, days: int = 90, host: str = "") -> None:
-        """Give a host a certificate whose time begins a day before `from_day` from today."""
-        key = (self.authority.folder / "authority.key").read_bytes()
-        signer = Issued(self.authority.certificate, key)
-        self.write(name, signer, from_day, days, host or "127.0.0.1")
-
-    def write(self, name: str, signer: Issued, from_day: int, days: int, host: str) -> None:
-        now = dt.datetime.now(dt.UTC) + dt.timedelta(days=from_day)
-        made = certificates.issue(signer, f"{name}.1", (host,), now, days)
-        (self.folder / name / f"{name}.pem").write_bytes(made.certificate)
-        (self.folder / name / f"{name}.key").write_bytes(made.key)
+    def replace(self, name: str, *, foreign: bool = False, **when: int | str) -> None:
+        """Give a host another certificate."""
+        stranger = certificates.make_authority("xrl", dt.datetime.now(dt.UTC))
+        signer = stranger if foreign else signer_of(self.authority)
+        give(signer, self.folder / name, name, **when)  # type: ignore[arg-type]
 
 
 @pytest.fixture
-def pair(robot: RobotConfig) -> Iterator[Pair]:
-    with tempfile.TemporaryDirectory(prefix="xrl-t-", dir="/tmp") as text:
-        own, authority = certified(robot, Path(text))
-        for name in ("planner", "knee_left"):
-            install_all(authority, Path(text) / name, name)
-        yield Pair(own, authority, Path(text))
+def pair(robot: RobotConfig, short_dir: Path) -> Pair:
+    own, authority = certified(robot, short_dir)
+    for name in ("planner", "knee_left"):
+        install_all(authority, short_dir / name, name)
+    return Pair(own, authority, short_dir)
 
 
-def _foreign(pair: Pair, name: str) -> None:
-    signer = certificates.make_authority("xrl", dt.datetime.now(dt.UTC))
-    pair.write(name, signer, 0, 90, "127.0.0.1")
-
-
+OUR_TIME = "by its clock our certificate has expired, or is not valid yet"
 FAULTS: dict[str, tuple[Callable[[Pair], None], str]] = {
     "none": (lambda _: None, ""),
     "its clock, or ours": (
@@ -75,59 +64,44 @@ FAULTS: dict[str, tuple[Callable[[Pair], None], str]] = {
         "its certificate has expired, by this host's clock",
     ),
     "its authority": (
-        lambda p: _foreign(p, "knee_left"),
-        "its certificate is of another authority",
+        lambda p: p.replace("knee_left", foreign=True), "its certificate is of another authority",
     ),
     "its host": (lambda p: p.replace("knee_left", host="10.1.1.1"), "is another host's"),
-    "our certificate is old": (
-        lambda p: p.replace("planner", from_day=-40, days=20),
-        "by its clock our certificate has expired, or is not valid yet",
-    ),
-    "our clock, or its": (
-        lambda p: p.replace("planner", from_day=10),
-        "by its clock our certificate has expired, or is not valid yet",
-    ),
-    "our authority": (lambda p: _foreign(p, "planner"), "our certificate"),
-}
+    "our certificate is old": (lambda p: p.replace("planner", from_day=-40, days=20), OUR_TIME),
+    "our clock, or its": (lambda p: p.replace("planner", from_day=10), OUR_TIME),
+    "our authority": (lambda p: p.replace("planner", foreign=True), "our certificate"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_why_a_link_does_not_come_is_told_truly(pair: Pair, fault: str) -> None:
     spoil, words = FAULTS[fault]
     spoil(pair)
-    endpoint = pair.robot.bus.endpoints["knee_left"]
     with open_session(pair.host("knee_left"), "knee_left", pair.folder):
-        why = refusal(pair.own("planner"), endpoint)
+        why = refusal(pair.own("planner"), pair.knee)
     assert words in why
     assert bool(words) is bool(why)
-    assert refusal(pair.own("planner"), endpoint) == "Connection refused"
+    assert refusal(pair.own("planner"), pair.knee) == "Connection refused"
 
 
 @pytest.mark.parametrize(
-    ("from_day", "days", "words"),
-    [(0, 90, ""), (10, 90, "is not valid yet, by this host's clock"), (-40, 20, "has expired")],
+    ("when", "words"),
+    [
+        ({}, ""),
+        ({"from_day": 10}, "is not valid yet, by this host's clock"),
+        ({"from_day": -40, "days": 20}, "has expired"),
+        ({"foreign": True}, "is of another authority"),
+    ],
 )
-def test_a_certificate_that_this_hosts_clock_does_not_believe_is_told(
-    pair: Pair, from_day: int, days: int, words: str, caplog: pytest.LogCaptureFixture
+def test_a_certificate_that_this_host_does_not_believe_is_told(
+    pair: Pair, when: dict[str, int], words: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    pair.replace("planner", from_day=from_day, days=days)
+    pair.replace("planner", **when)  # type: ignore[arg-type]
     found = own_fault(pair.own("planner"))
-    assert words in found
+    assert found.startswith(words)
     assert bool(words) is bool(found)
     with open_session(pair.host("planner"), "planner", pair.folder):
         assert ("no link over TLS" in caplog.text) is bool(words)
-
-
-def test_a_certificate_of_another_authority_is_told(pair: Pair) -> None:
-    _foreign(pair, "planner")
-    assert own_fault(pair.own("planner")).startswith("is of another authority")
-
-
-def waits_for(condition: Callable[[], bool], limit_s: float = 8.0) -> bool:
-    deadline = time.monotonic() + limit_s
-    while not condition() and time.monotonic() < deadline:
-        time.sleep(0.02)
-    return condition()
 
 
 def test_a_service_logs_a_refused_link_once_and_that_it_came(
@@ -135,21 +109,19 @@ def test_a_service_logs_a_refused_link_once_and_that_it_came(
 ) -> None:
     caplog.set_level("INFO")
     linked: set[str] = set()
-    endpoint = pair.robot.bus.endpoints["knee_left"]
-    watch = LinkWatch(pair.own("planner"), {"knee_left": endpoint}, linked.__contains__, 0.02)
-    refused = f"no link with knee_left at {endpoint}: Connection refused"
-    assert waits_for(lambda: refused in caplog.text)
+    watch = LinkWatch(pair.own("planner"), {"knee_left": pair.knee}, linked.__contains__, 0.02)
+    refused = f"no link with knee_left at {pair.knee}: Connection refused"
+    assert comes_true(lambda: refused in caplog.text)
     time.sleep(0.2)
     assert caplog.text.count("Connection refused") == 1
-    linked.add(endpoint)
-    assert waits_for(lambda: "link with knee_left is there" in caplog.text)
+    linked.add(pair.knee)
+    assert comes_true(lambda: "link with knee_left is there" in caplog.text)
     watch.end()
 
 
 def test_a_session_knows_which_of_its_tls_links_are_there(pair: Pair) -> None:
-    endpoints = pair.robot.bus.endpoints
     with open_session(pair.host("planner"), "planner", pair.folder) as planner:
         with open_session(pair.host("knee_left"), "knee_left", pair.folder):
-            assert waits_for(lambda: planner.is_linked(endpoints["knee_left"]))
-            assert not planner.is_linked(endpoints["hip_left"])
-        assert waits_for(lambda: not planner.is_linked(endpoints["knee_left"]))
+            assert comes_true(lambda: planner.is_linked(pair.knee))
+            assert not planner.is_linked(pair.robot.bus.endpoints["hip_left"])
+        assert comes_true(lambda: not planner.is_linked(pair.knee))

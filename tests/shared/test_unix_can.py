@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
 import socket
-import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,11 +16,8 @@ from shared.exceptions import FleetError
 
 
 @pytest.fixture
-def path() -> Iterator[Path]:
-    """Return a socket path short enough for the kernel."""
-    directory = Path(tempfile.mkdtemp(dir="/tmp"))
-    yield directory / "bus.sock"
-    shutil.rmtree(directory)
+def path(short_dir: Path) -> Path:
+    return short_dir / "bus.sock"
 
 
 @pytest.fixture
@@ -44,16 +39,11 @@ def message(can_id: int, data: bytes) -> can.Message:
 
 
 def test_packet_has_the_layout_of_socketcan_frames() -> None:
-    packet = pack_frames([(0x02E, b"\x01\x02\x03\x04"), (0x7FF | REMOTE_FLAG, b"")])
-    assert packet == (
-        bytes.fromhex("2e000000 04000000 0102030400000000")
-        + bytes.fromhex("ff070040 00000000 0000000000000000")
-    )
-    assert unpack_frames(packet) == [(0x02E, b"\x01\x02\x03\x04"), (0x7FF | REMOTE_FLAG, b"")]
-
-
-def test_packet_that_is_no_row_of_whole_frames_holds_none() -> None:
-    assert unpack_frames(bytes(17)) == []
+    frames = [(0x02E, b"\x01\x02\x03\x04"), (0x7FF | REMOTE_FLAG, b"")]
+    packet = bytes.fromhex("2e000000 04000000 0102030400000000 ff070040 00000000 0000000000000000")
+    assert pack_frames(frames) == packet
+    assert unpack_frames(packet) == frames
+    assert unpack_frames(bytes(17)) == [], "no row of whole frames"
 
 
 def test_python_can_finds_the_interface_by_its_name(hub: UnixCanHub) -> None:
@@ -110,26 +100,21 @@ def test_hub_hands_frames_to_the_other_clients_and_not_back(hub: UnixCanHub) -> 
 
 def test_client_that_does_not_read_neither_blocks_the_hub_nor_the_others(hub: UnixCanHub) -> None:
     with connect(hub) as stopped, connect(hub) as reader:
-        sent = 5000
         received = 0
-        for _ in range(sent):
+        for _ in range(5000):
             hub.broadcast([(1, bytes(8))])
             received += len(reader.recv_many(0.0))
-        assert received == sent
+        assert received == 5000
         assert hub.dropped > 0
-        assert len(stopped.recv_many(0.0)) == sent - hub.dropped
+        assert len(stopped.recv_many(0.0)) == 5000 - hub.dropped
 
 
 def test_send_to_a_hub_that_does_not_read_drops_and_counts(hub: UnixCanHub) -> None:
     with connect(hub) as bus:
-        sent = 5000
-        for _ in range(sent):
+        for _ in range(5000):
             bus.send(message(1, bytes(8)))
         assert bus.dropped > 0
-        received = 0
-        while frames := hub.poll():
-            received += len(frames)
-        assert received == sent - bus.dropped
+        assert sum(map(len, iter(hub.poll, []))) == 5000 - bus.dropped
 
 
 def test_hub_parts_with_clients_that_leave(hub: UnixCanHub) -> None:
@@ -167,27 +152,22 @@ def test_client_learns_that_the_hub_has_closed(path: Path) -> None:
             bus.send(message(1, b""))
 
 
-def test_receiving_gives_up_after_the_timeout(hub: UnixCanHub) -> None:
-    with connect(hub) as bus:
+def test_receiving_gives_up_after_the_timeout_and_connecting_without_a_hub_at_once(
+    path: Path,
+) -> None:
+    with pytest.raises(can.CanInitializationError, match=r"bus\.sock"):
+        UnixCanBus(str(path))
+    with UnixCanHub(path) as hub, connect(hub) as bus:
         begin = time.monotonic()
         assert bus.recv_many(0.02) == []
         assert time.monotonic() - begin >= 0.015
 
 
-def test_connecting_without_a_hub_is_an_initialization_error(path: Path) -> None:
-    with pytest.raises(can.CanInitializationError, match=r"bus\.sock"):
-        UnixCanBus(str(path))
-
-
 def test_connecting_does_not_wait_for_a_hub_that_does_not_accept(hub: UnixCanHub) -> None:
     clients: list[UnixCanBus] = []
-
-    def connect_for_ever() -> None:
+    with pytest.raises(can.CanInitializationError):  # noqa: PT012
         while len(clients) < 100:
             clients.append(UnixCanBus(str(hub.path)))
-
-    with pytest.raises(can.CanInitializationError):
-        connect_for_ever()
     for client in clients:
         client.shutdown()
     assert clients

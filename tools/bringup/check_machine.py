@@ -14,9 +14,9 @@ from typing import Final
 
 from shared import scheduling
 from shared.config.robot_config import RobotConfig
+from shared.extras import libusb_fix
 from shared.places import FILES
 from shared.robot.compiled_graph import library_of
-from shared.system_packages import libusb_fix
 from tools.bringup.check_socketcan import query_ip, socketcan_rows
 from tools.bringup.rows import Finding, FindingKind, judged, ok, warning, wrong
 from tools.fleet.process_table import is_simulated

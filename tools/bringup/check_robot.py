@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-from shared.bus import same_host
+from shared.bus import security
 from shared.config import gain_schedule
 from shared.config.robot_config import RobotConfig, expand
 from shared.exceptions import FleetError
@@ -38,13 +38,11 @@ def robot_rows(robot: RobotConfig, path: Path) -> list[Finding]:
 
 def services_up(robot: RobotConfig, run_dir: Path) -> tuple[str, ...]:
     """Return the services that listen on their endpoints, whoever started them."""
-    here = same_host.services_here(robot)
+    here = security.services_here(robot)
     return tuple(
         service
         for service in robot.services
-        if process_table.is_listening(
-            expand(same_host.endpoint_here(robot, service, here), run_dir)
-        )
+        if process_table.is_listening(expand(security.endpoint_here(robot, service, here), run_dir))
     )
 
 
@@ -67,11 +65,11 @@ def endpoint_rows(robot: RobotConfig, run_dir: Path, *, fleet_is_up: bool) -> li
                 f"`xrl status` says why {', '.join(silent)} is not there",
             )
         ]  # fmt: skip
-    here = same_host.services_here(robot)
+    here = security.services_here(robot)
     listeners = [
         ListenPoint(service, f"bus.endpoints.{service}", expand(endpoint, run_dir))
         for service in robot.bus.endpoints
-        for endpoint in same_host.listening(robot, service, here)
+        for endpoint in security.listening(robot, service, here)
         if not process_table.is_elsewhere(expand(endpoint, run_dir))
     ]
     try:

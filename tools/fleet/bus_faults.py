@@ -6,12 +6,11 @@ from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Final
 
-from shared.bus import same_host
-from shared.bus.allow_list import resolved
-from shared.bus.arrivals import Arrivals
+from shared.bus import security
 from shared.bus.credentials import Credentials, read_credentials
 from shared.bus.security import TCP
 from shared.bus.session import Session, peers_of
+from shared.bus.sockets import Arrivals, resolved
 from shared.bus.tls_probe import own_fault, refusal
 from shared.clock import now_ns
 from shared.config.endpoints import host_and_port
@@ -28,8 +27,8 @@ class BusFaults:
     def __init__(self, robot: RobotConfig, session: Session) -> None:
         """Begin to count who comes to this host's ports."""
         self._robot, self._session = robot, session
-        self._here = same_host.services_here(robot)
-        self._arrivals = Arrivals(same_host.ports_here(robot))
+        self._here = security.services_here(robot)
+        self._arrivals = Arrivals(security.ports_here(robot))
         self.begin()
 
     def begin(self) -> None:
@@ -72,7 +71,7 @@ class BusFaults:
                 continue
             linked = set() if pid is None else procfs.connected(pid)
             for peer in peers_of(dials, self._robot.services):
-                endpoint = same_host.endpoint_here(self._robot, peer, self._here)
+                endpoint = security.endpoint_here(self._robot, peer, self._here)
                 there = _is_in(endpoint, linked) if pid is not None else peer in alive
                 if there or not endpoint.startswith(TCP):
                     continue

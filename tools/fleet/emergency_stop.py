@@ -12,9 +12,8 @@ from typing import Final
 from services.joint.neighbours import Neighbours
 from services.joint.rearm_guard import request_stop
 from shared.bus import topics
-from shared.bus.code_names import name_of
 from shared.bus.credentials import read_credentials
-from shared.bus.messages import Estop, JointState, Mode
+from shared.bus.messages import Estop, JointState, Mode, name_of
 from shared.bus.session import Session, open_session
 from shared.clock import now_ns
 from shared.config.robot_config import RobotConfig

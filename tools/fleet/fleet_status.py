@@ -11,7 +11,6 @@ import msgspec
 
 from services.joint.rearm_guard import stop_source
 from shared import scheduling
-from shared.bus.code_names import name_of
 from shared.bus.messages import (
     Cause,
     DriveStatus,
@@ -24,13 +23,14 @@ from shared.bus.messages import (
     PlannerStatus,
     Refusal,
     ToolRoster,
+    name_of,
 )
 from shared.bus.session import Latest, Session, place_of_tool
 from shared.bus.topics import JOINT_STATE, PLANNER_STATUS, TOOLS, TOPICS
 from shared.clock import NS_PER_S, now_ns, pace
 from shared.exceptions import FleetError
 from shared.joints import MODULES
-from shared.robot.remedies import reason_of, remedy_of
+from shared.robot.trip_table import reason_of, remedy_of
 from tools.fleet.bus_faults import BusFaults
 from tools.fleet.proxy_client import ProxyClient
 from tools.fleet.run_dir import SPACE_LOW_MIB, free_mib_at

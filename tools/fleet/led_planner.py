@@ -8,8 +8,14 @@ from typing import Final
 
 from services.planner.law.probe import NO_ROW
 from shared.bus import topics
-from shared.bus.code_names import name_of
-from shared.bus.messages import STRAIGHT, OperatorIntent, PlannerMode, PlannerStatus, Vector4
+from shared.bus.messages import (
+    STRAIGHT,
+    OperatorIntent,
+    PlannerMode,
+    PlannerStatus,
+    Vector4,
+    name_of,
+)
 from shared.bus.session import Session
 from shared.clock import NS_PER_S, now_ns
 from shared.config.scenarios import SCENARIO

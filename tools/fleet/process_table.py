@@ -15,7 +15,7 @@ from typing import Annotated, Literal, NamedTuple
 
 import msgspec
 
-from shared.bus import same_host
+from shared.bus import security
 from shared.bus.topics import TOPICS
 from shared.config.endpoints import RUN, filled, host_and_port, stray_braces
 from shared.config.files import load
@@ -280,12 +280,12 @@ def listeners_of(
 ) -> tuple[ListenPoint, ...]:
     """Return where these services will listen: on the bus, and the emulated drives' buses."""
     listeners = []
-    here = same_host.services_here(config)
+    here = security.services_here(config)
     for row in processes:
         if row.name in config.bus.endpoints:
             listeners += [
                 ListenPoint(row.name, f"bus.endpoints.{row.name}", expand(endpoint, run_dir))
-                for endpoint in same_host.listening(config, row.name, here)
+                for endpoint in security.listening(config, row.name, here)
             ]
         if row.kind == "network_proxy":
             endpoints = [expand(endpoint_through(pair), run_dir) for pair in PAIRS]
@@ -306,8 +306,8 @@ def check_run_dir(run_dir: Path, config: RobotConfig) -> None:
     Raises:
         FleetError: naming the longest socket path.
     """
-    here = same_host.services_here(config)
-    endpoints = [same_host.endpoint_here(config, name, here) for name in config.bus.endpoints]
+    here = security.services_here(config)
+    endpoints = [security.endpoint_here(config, name, here) for name in config.bus.endpoints]
     paths = [expand(at.removeprefix(UNIX), run_dir) for at in endpoints if at.startswith(UNIX)]
     paths += [
         expand(bus.channel, run_dir)

@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-from shared.bus.arrivals import established
+from shared.bus.sockets import established
 from shared.run_directory import FLEET_VARIABLE
 
 _POLL_S = 0.05

@@ -7,8 +7,7 @@ import re
 from pathlib import Path
 from typing import Annotated, Final
 
-from shared.bus.access import PRINCIPALS
-from shared.bus.topics import HOST_RECORDER, OPERATOR, RECORDER, VIEWER
+from shared.bus.topics import HOST_RECORDER, OPERATOR, PRINCIPALS, RECORDER, VIEWER
 from shared.config.robot_config import SERVICES, RobotConfig
 from shared.exceptions import ConfigError
 from shared.joints import MODULES, SIDES, side_of

@@ -15,8 +15,9 @@ from typing import Final
 
 from shared.atomic_file import replace_file
 from shared.bus import credentials
-from shared.bus.access import PRINCIPALS, common_name
 from shared.bus.credentials import Names, certificate_file, key_file
+from shared.bus.security import common_name
+from shared.bus.topics import PRINCIPALS
 from shared.config.robot_config import SERVICES, RobotConfig
 from shared.exceptions import BusError
 from shared.user import in_home

@@ -64,7 +64,7 @@ def issue(
 
     Args:
         authority: that signs it.
-        common_name: what the access rules go by (`shared.bus.access.common_name`).
+        common_name: what the access rules go by (`shared.bus.security.common_name`).
         hosts: names and addresses that the service is dialled by; the one who dials checks them.
         now: in UTC.
         days: until it expires.

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from shared.bus import credentials
-from shared.bus.access import common_name
 from shared.bus.credentials import Names, certificate_file, key_file
+from shared.bus.security import common_name
 from shared.config.robot_config import SERVICES, RobotConfig
 from shared.exceptions import BusError
 from tools.keys import certificates

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterable
 from typing import Final, NamedTuple
 
 from shared.bus import topics
-from shared.bus.code_names import name_of
 from shared.bus.messages import (
     JointState,
     Mode,
@@ -23,6 +22,7 @@ from shared.bus.messages import (
     RunEventKind,
     SimControl,
     SimTruth,
+    name_of,
 )
 from shared.bus.session import Latest, Session
 from shared.clock import NS_PER_S, machine_s, now_ns, pace

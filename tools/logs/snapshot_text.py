@@ -6,8 +6,7 @@ import bisect
 from collections.abc import Sequence
 
 from shared.bus import topics
-from shared.bus.code_names import name_of
-from shared.bus.messages import JointState, Mode
+from shared.bus.messages import JointState, Mode, name_of
 from shared.clock import NS_PER_MS
 from shared.joints import MODULES
 from tools.logs.impairment_intervals import impairments

@@ -26,11 +26,11 @@ from services.simulator.fronts.imu_front import ImuFront
 from services.simulator.physics.plant import ImuErrors
 from services.simulator.physics.world import World
 from shared.bus import topics
-from shared.bus.messages import Estop, TareRequest, Vector6
+from shared.bus.messages import Estop, TareRequest
 from shared.bus.traces import PlannerCheckpoint
-from shared.can.can_sensor import Assembler
+from shared.can.frame_group import FrameGroup
 from shared.can.imu_can import ImuAssembler
-from shared.can.loadcell_can import LegSample, SampleAssembler
+from shared.can.loadcell_can import SampleAssembler
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
@@ -274,7 +274,7 @@ class VirtualPlanner:
 class VirtualCan(Generic[S]):
     """A sensor's CAN bus: a frame is received as soon as it is sent."""
 
-    def __init__(self, assembler: Assembler[S]) -> None:
+    def __init__(self, assembler: FrameGroup[S]) -> None:
         """Take what makes samples of the sensor's frames."""
         self._assembler = assembler
         self._newest: S | None = None
@@ -291,21 +291,6 @@ class VirtualCan(Generic[S]):
         """Return the newest sample since the last call, or None."""
         sample, self._newest = self._newest, None
         return sample
-
-
-class Cells(VirtualCan[Vector6]):
-    """The load cells as the live loop has them."""
-
-    def __init__(self) -> None:
-        super().__init__(SampleAssembler())
-
-    def read(self, now_ns: int) -> LegSample | None:
-        """Return the newest sample since the last read, or None."""
-        forces = self.newest(now_ns)
-        return None if forces is None else LegSample(now_ns, forces)
-
-    def close(self) -> None:
-        """Do nothing: there is no link."""
 
 
 def whole_steps_ns(config: RobotConfig, rate_hz: float) -> int:
@@ -328,7 +313,7 @@ class VirtualHarness:
         clock: HostClock,
     ) -> None:
         """Draw the cells' zero offsets from `seed`, and their noise."""
-        cells = Cells()
+        cells = VirtualCan(SampleAssembler())
         self._front = HarnessFront(config, cells, seed)
         wrenches = RecordOutbox(record, topics.WRENCH, "", network.wrenches(), time)
         self._loop = HarnessLoop(cells, WrenchFilter(config.harness), wrenches, self)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from shared import places
-from shared.bus.operator_key import require_operator
+from shared.bus.credentials import require_operator
 from shared.bus.session import open_session
 from shared.config.files import load
 from shared.config.robot_config import RobotConfig

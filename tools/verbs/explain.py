@@ -19,7 +19,6 @@ from services.planner.law.inverse_kinematics import describe as in_words_of_reac
 from services.planner.law.kinematics import Kinematics
 from shared import places
 from shared.bus import topics
-from shared.bus.code_names import name_of
 from shared.bus.messages import (
     JointCommand,
     JointState,
@@ -27,6 +26,7 @@ from shared.bus.messages import (
     PlannerStatus,
     SplitSource,
     Trip,
+    name_of,
 )
 from shared.clock import NS_PER_MS
 from shared.config import files as config_file

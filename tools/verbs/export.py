@@ -13,8 +13,8 @@ from rich.progress import Progress
 from shared.clock import NS_PER_S
 from shared.exceptions import RunError
 from shared.extras import require
-from shared.mcap_log.extended_copy import write_extended
 from shared.mcap_log.files import SUFFIX
+from shared.mcap_log.log_copy import write_extended
 from shared.places import FILES
 from tools.export.folders import whole_folder
 from tools.export.parquet import ParquetFile

@@ -15,8 +15,8 @@ from rich.text import Text
 
 from shared import places
 from shared.bus import topics
+from shared.bus.credentials import require_operator
 from shared.bus.messages import PlannerStatus
-from shared.bus.operator_key import require_operator
 from shared.bus.session import open_session
 from shared.config import files as config_file
 from shared.config import scenarios

@@ -9,8 +9,8 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from shared.bus.access import PRINCIPALS
 from shared.bus.credentials import keys_folder
+from shared.bus.topics import PRINCIPALS
 from shared.config import files as config_file
 from shared.config.endpoints import ROBOT, filled
 from shared.config.robot_config import RobotConfig

@@ -14,8 +14,8 @@ from rich.live import Live
 from rich.text import Text
 
 from shared.bus import topics
+from shared.bus.credentials import require_operator
 from shared.bus.messages import HandLead, OperatorIntent, PlannerStatus, SimTruth
-from shared.bus.operator_key import require_operator
 from shared.bus.session import Session, open_session
 from shared.clock import now_ns
 from shared.config.files import load

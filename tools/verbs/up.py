@@ -11,8 +11,7 @@ from services.planner.controller_file import ATTACHED, absolute, controller_make
 from services.ros2_gateway.inbound import acceptable
 from services.ros2_gateway.rmw import domain
 from services.simulator.physics.plant import plant_from
-from shared.bus.credentials import keys_folder
-from shared.bus.operator_key import require_operator
+from shared.bus.credentials import keys_folder, require_operator
 from shared.bus.topics import HOST_RECORDER
 from shared.config import files as config_file
 from shared.config import gain_schedule

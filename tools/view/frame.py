@@ -11,7 +11,6 @@ import numpy as np
 from services.planner.law.kinematics import Kinematics
 from services.simulator.physics.soles import SoleLoad
 from shared.bus import topics
-from shared.bus.code_names import name_of
 from shared.bus.messages import (
     JointCommand,
     JointState,
@@ -23,12 +22,13 @@ from shared.bus.messages import (
     SimTruth,
     Vector3,
     Wrench,
+    name_of,
 )
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULE_INDEX, MODULES
-from shared.robot.capture_point import capture_point
+from shared.robot.frames import capture_point
 from tools.fleet.fleet_status import module_status
 from tools.judge.stalls import STALL_SHOWN_NS, stalls_of
 from tools.view.sole_estimate import SoleEstimate

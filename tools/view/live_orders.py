@@ -8,8 +8,8 @@ from collections.abc import Callable
 import msgspec
 
 from shared.bus import topics
+from shared.bus.credentials import require_operator
 from shared.bus.messages import HandLead, RunEvent, RunEventKind
-from shared.bus.operator_key import require_operator
 from shared.bus.session import Publisher, Session
 from shared.clock import now_ns
 from shared.config.robot_config import RobotConfig

@@ -35,7 +35,7 @@ from shared.clamp import clamp
 from shared.clock import NS_PER_MS, machine_s, now_ns
 from shared.config.sections import DriveConfig
 from shared.exceptions import DriveError
-from shared.system_packages import libusb_fix
+from shared.extras import libusb_fix
 
 EXCHANGE_HZ: Final = 200
 """Largest rate, Hz: a v3 board answers no faster over USB (docs/drives.md)."""

@@ -23,7 +23,7 @@ from shared.bus.messages import SplitSource
 from shared.clamp import clamp
 from shared.config.sections import GeometryConfig
 from shared.joints import N_JOINTS
-from shared.robot.capture_point import capture_point
+from shared.robot.frames import capture_point
 
 SUPPORT: Final = 0.5
 """Fraction of the soles within which the capture point and the rest in HOLD must be."""

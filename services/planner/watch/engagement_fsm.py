@@ -19,7 +19,7 @@ import msgspec
 
 from shared.bus.messages import Mode, PlannerMode
 from shared.clock import NS_PER_S
-from shared.robot.dropouts import Dropouts
+from shared.robot.hold_rules import Dropouts
 
 GRACE_NS = 150_000_000
 """ns; after `hold` is lifted, modules may take this long to report TRACK."""

@@ -14,7 +14,7 @@ import msgspec
 from shared.bus.messages import DriveStatus, JointState, Mode
 from shared.clock import NS_PER_MS
 from shared.joints import N_MODULES
-from shared.robot.limp_leg_support import SUPPORT_FOR, Support
+from shared.robot.hold_rules import SUPPORT_FOR, Support
 
 DISARMED_NS: Final = 200 * NS_PER_MS
 """ns; a module DISARMED for this long is not about to take its drive over."""

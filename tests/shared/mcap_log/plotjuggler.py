@@ -1,34 +1,25 @@
 """PlotJuggler's rules for an MCAP file with JSON in it, written down from its sources.
 
 PlotJuggler is C++ on Qt and comes as snap, AppImage or ROS package: the tests cannot install it.
-What it does with a file is followed here record by record, and
-tests/shared/mcap_log/test_plotjuggler.py holds our files against it. Two readers:
+What it does with a file is followed here record by record. Two readers:
 
-`opened_by_3`: PlotJuggler 3.9 to 3.17 (repository facontidavide/PlotJuggler), of
+`opened_by_3`: PlotJuggler 3.9 to 3.17 (facontidavide/PlotJuggler), of
 plotjuggler_plugins/DataLoadMCAP/dataload_mcap.cpp (db606ba) and
-plotjuggler_app/nlohmann_parsers.cpp (e02aceb):
-
-- The file needs its summary; there is no scan of a file without one.
-- Every channel's schema is looked up; one that is missing ends the load.
-- A parser is chosen by the channel's message encoding, else by its schema's encoding; the names
-  are `json`, `cbor`, `bson`, `msgpack` and those of ROS and protobuf. For JSON the schema is not
-  read.
-- Objects go down by `/`, arrays by `[i]`, and the last entry again as `[-1]`, whatever their
-  length: the limit for large arrays is not for JSON.
-- Numbers and booleans become doubles. Strings, null, and empty arrays and objects are dropped.
-- A message is at its publish time, a double of seconds. What is not finite is dropped.
+plotjuggler_app/nlohmann_parsers.cpp (e02aceb). The file needs its summary. Every channel's schema
+is looked up; one that is missing ends the load. A parser is chosen by the channel's message
+encoding, else by its schema's; for JSON the schema is not read. Objects go down by `/`, arrays by
+`[i]`, and the last entry again as `[-1]`, whatever their length. Numbers and booleans become
+doubles; strings, null, and empty arrays and objects are dropped. A message is at its publish time,
+a double of seconds. What is not finite is dropped.
 
 `opened_by_4`: PlotJuggler 4 (PlotJuggler/pj-official-plugins), of data_load_mcap/mcap_source.cpp
-and mcap_dialog.hpp (1.2) and parser_json/json_parser.cpp (1.1.1, the strictest after 1.1.0;
-later ones make doubles of all numbers):
-
-- Chosen from the start is each channel of which the statistics count a message.
-- A schema that is named and missing leaves its channel out; none at all is right.
-- Arrays are cut after 500 entries, as the dialog has it at first.
-- Strings of 100 bytes and more are dropped, shorter ones are kept; null is dropped.
-- A column has the type of its first value: bool, integer, float or string. A message with
-  another one is refused, all of it.
-- A message is at its publish time if that is within the file's log times, else at its log time.
+and mcap_dialog.hpp (1.2) and parser_json/json_parser.cpp (1.1.1, the strictest after 1.1.0; later
+ones make doubles of all numbers). Chosen from the start is each channel of which the statistics
+count a message. A schema that is named and missing leaves its channel out; none at all is right.
+Arrays are cut after 500 entries, as the dialog has it at first. Strings of 100 bytes and more are
+dropped, and null. A column has the type of its first value: bool, integer, float or string; a
+message with another one is refused, all of it. A message is at its publish time if that is within
+the file's log times, else at its log time.
 
 Only the rules for JSON are here. Messages in protobuf and CDR, such as those of a scene, are left
 to PlotJuggler's own parsers of these, by name (`Opened.left`).
@@ -90,11 +81,7 @@ class Opened:
 
 
 def opened_by_3(path: Path) -> Opened:
-    """Open a file as PlotJuggler 3 does.
-
-    Raises:
-        Refused: it would not be opened.
-    """
+    """Open a file as PlotJuggler 3 does, or raise Refused."""
     found = Opened()
     summary = _summary(path)
     for channel in summary.channels.values():
@@ -118,11 +105,7 @@ def opened_by_3(path: Path) -> Opened:
 
 
 def opened_by_4(path: Path) -> Opened:
-    """Open a file as PlotJuggler 4 does, if it has its summary.
-
-    Raises:
-        Refused: it has none, or a message is no JSON.
-    """
+    """Open a file as PlotJuggler 4 does, or raise Refused: it has no summary, or is no JSON."""
     found = Opened()
     summary = _summary(path)
     statistics = summary.statistics

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
-from msgspec import inspect
 
 from shared.bus import codec, topics
-from shared.bus.messages import JointState, Message
+from shared.bus.messages import JointState
 from shared.bus.topics import Topic
 from shared.mcap_log.writer import SCHEMA_VERSION, RunWriter
+from tests.messages import sample
 
 ROBOT = "lab"
 OFFSET_NS = 1_700_000_000_000_000_000
@@ -35,14 +35,6 @@ class Queue:
 
 def recorded_topics() -> dict[str, Topic]:
     return {key: topic for key, topic in topics.all_keys(ROBOT).items() if topic.recorded}
-
-
-def sample(message_type: type[Message], **fields: Any) -> Any:
-    """Return a message with a value of the right type in every field."""
-    info = inspect.type_info(message_type)
-    assert isinstance(info, inspect.StructType)
-    values = {field.name: _value(field.type) for field in info.fields}
-    return msgspec.convert(values | fields, message_type)
 
 
 def state(seq: int) -> JointState:
@@ -98,11 +90,7 @@ class Killed(NamedTuple):
 
 
 def killed_file(
-    directory: Path,
-    batches: int = 12,
-    size: int = 100,
-    *,
-    keys: Mapping[str, Topic] | None = None,
+    directory: Path, batches: int = 12, size: int = 100, *, keys: Mapping[str, Topic] | None = None
 ) -> Killed:
     """Write messages in batches, each flushed, and keep the file as it is before its end."""
     path = directory / "killed.mcap"
@@ -119,19 +107,3 @@ def killed_file(
 def few_topics() -> dict[str, Topic]:
     """Return a small table, for small files."""
     return {STATE_KEY: topics.JOINT_STATE, topics.WRENCH.key(ROBOT): topics.WRENCH}
-
-
-def _value(info: inspect.Type) -> Any:
-    if isinstance(info, inspect.TupleType):
-        return [_value(member) for member in info.item_types]
-    if isinstance(info, inspect.VarTupleType):
-        return [_value(info.item_type)]
-    if isinstance(info, inspect.StructType):
-        return {field.name: _value(field.type) for field in info.fields}
-    values = {
-        inspect.BoolType: True,
-        inspect.IntType: 1,
-        inspect.FloatType: 0.25,
-        inspect.StrType: "word",
-    }
-    return values[type(info)]

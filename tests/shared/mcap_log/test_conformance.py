@@ -14,9 +14,6 @@ from mcap.stream_reader import StreamReader
 
 from shared.mcap_log import recover
 from shared.mcap_log.reader import ChunkPlace, LogReader, LogRecord
-from shared.mcap_log.records import Attachment as ReadAttachment
-from shared.mcap_log.records import Channel as ReadChannel
-from shared.mcap_log.records import Metadata as ReadMetadata
 from tests.shared.mcap_log.conformance import (
     CONTENTS,
     MAGIC,
@@ -31,7 +28,7 @@ from tests.shared.mcap_log.conformance import (
     Schema,
     combinations,
     file_of,
-)
+)  # fmt: skip
 
 Found = Counter[tuple[object, ...]]
 
@@ -40,9 +37,7 @@ UNREAD_BY_THE_PACKAGE = frozenset({Feature.CHUNK, Feature.PAD})
 """The mcap package (1.6) does not skip further fields of schemas and channels inside a chunk."""
 
 
-@pytest.fixture(autouse=True)
-def no_wait_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("os.fsync", lambda _descriptor: None)
+pytestmark = pytest.mark.usefixtures("no_wait_for_the_disk")
 
 
 def wanted(records: Sequence[Record]) -> Found:
@@ -72,13 +67,7 @@ def found_by(records: Sequence[LogRecord]) -> Found:
     found: Found = Counter()
     for record in records:
         for value in record.values():
-            match value:
-                case ReadChannel(id=number, topic=topic):
-                    topics[number] = topic
-                case ReadMetadata(name=name, metadata=entries):
-                    found[name, tuple(entries.items())] += 1
-                case ReadAttachment(name=name, data=content):
-                    found[name, content] += 1
+            _learn(value, topics, found)
         for channel, seq, log_ns, publish_ns, start, end in record.rows:
             found[topics[channel], seq, log_ns, publish_ns, record.body[start:end]] += 1
     return found
@@ -89,18 +78,25 @@ def found_by_the_package(data: bytes) -> Found:
     found: Found = Counter()
     for record in StreamReader(io.BytesIO(data), validate_crcs=True).records:
         match record:
-            case package.Channel(id=number, topic=topic):
-                topics[number] = topic
             case package.Message() as m:
                 row = (m.sequence, m.log_time, m.publish_time, m.data)
                 found[topics[m.channel_id], *row] += 1
-            case package.Metadata(name=name, metadata=entries):
-                found[name, tuple(entries.items())] += 1
-            case package.Attachment(name=name, data=content):
-                found[name, content] += 1
             case package.DataEnd():
                 return found
+            case _:
+                _learn(record, topics, found)
     raise AssertionError("no end of the data")
+
+
+def _learn(value: object, topics: dict[int, str], found: Found) -> None:
+    """Take what both readers give as the same classes."""
+    match value:
+        case package.Channel(id=number, topic=topic):
+            topics[number] = topic
+        case package.Metadata(name=name, metadata=entries):
+            found[name, tuple(entries.items())] += 1
+        case package.Attachment(name=name, data=content):
+            found[name, content] += 1
 
 
 def skimmed(data: bytes) -> list[LogRecord]:

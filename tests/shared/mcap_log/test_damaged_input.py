@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import random
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -28,9 +29,7 @@ CUTS_BY_VERB = 40
 SENT = [runs.state(seq) for seq in range(120)]
 
 
-@pytest.fixture(autouse=True)
-def no_wait_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("os.fsync", lambda _descriptor: None)
+pytestmark = pytest.mark.usefixtures("no_wait_for_the_disk")
 
 
 @pytest.fixture(scope="module")
@@ -41,10 +40,8 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> Killed:
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    directory = tmp_path_factory.mktemp("small")
-    runs.killed_file(directory, batches=12, size=10, keys=runs.few_topics())
-    return (directory / "written" / "run.mcap").read_bytes()
+def finished(killed: Killed) -> bytes:
+    return (killed.path.parent / "written" / "run.mcap").read_bytes()
 
 
 def in_one_line(error: RunError) -> None:
@@ -158,17 +155,12 @@ def test_a_flip_in_one_chunk_costs_no_other(tmp_path: Path, killed: Killed) -> N
         assert found >= 110
 
 
-def sizes(data: bytes) -> list[int]:
-    dice = random.Random(3)
-    return sorted(dice.randrange(len(data) + 1) for _ in range(CUTS_BY_VERB))
-
-
 def test_the_verbs_answer_a_cut_file_with_a_good_end_or_one_line(
     tmp_path: Path, killed: Killed, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    data = killed.path.read_bytes()
+    data, dice = killed.path.read_bytes(), random.Random(3)
     path = tmp_path / "cut.mcap"
-    for size in [0, 1, 8, 9, *sizes(data)]:
+    for size in [0, 1, 8, 9, *(dice.randrange(len(data) + 1) for _ in range(CUTS_BY_VERB))]:
         path.write_bytes(data[:size])
         for verb in ("info", "recover"):
             flags = ["--force"] if verb == "recover" else []
@@ -202,10 +194,9 @@ def foreign(path: Path) -> None:
 
 @pytest.mark.parametrize("make", [old_version, foreign])
 def test_another_version_and_a_foreign_file_are_shown_recovered_and_refused_in_one_line(
-    tmp_path: Path, make: object, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, make: Callable[[Path], None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "x.mcap"
-    assert callable(make)
     make(path)
     assert cli.main(["info", str(path)]) == 0
     output = capsys.readouterr().out

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
+from mcap.summary import Summary
 
 from shared.exceptions import RunError
-from shared.mcap_log.extended_copy import NOTE, NewChannel, NewMessage, write_extended
+from shared.mcap_log.log_copy import NOTE, NewChannel, NewMessage, write_extended
 from tests.shared.mcap_log import runs
 from tests.shared.mcap_log.runs import ATTACHMENTS, OFFSET_NS, STATE_KEY, item
 from tools.logs.run_log import read_run
@@ -27,6 +28,13 @@ def everything(path: Path) -> list[tuple[str, int, int, bytes]]:
             (channel.topic, message.log_time, message.sequence, message.data)
             for _, channel, message in make_reader(file).iter_messages()
         ]
+
+
+def summary_of(path: Path) -> Summary:
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    return summary
 
 
 @pytest.fixture
@@ -56,9 +64,7 @@ def test_the_copy_is_a_log_like_any_other(record: Path, tmp_path: Path) -> None:
     assert (log.complete, log.damaged, log.attachments) == (True, 0, ATTACHMENTS)
     assert log.metadata[NOTE] == {"from": record.name}
     assert "recovered" not in log.metadata
-    with out.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None
+    summary = summary_of(out)
     channel = next(c for c in summary.channels.values() if c.topic == CHANNEL.topic)
     schema = summary.schemas[channel.schema_id]
     assert (schema.name, schema.encoding, schema.data) == ("x.Y", "protobuf", SCHEMA)
@@ -69,9 +75,7 @@ def test_what_was_added_stands_near_what_was_recorded_then(record: Path, tmp_pat
     """A viewer reads by chunks: one that spans the whole run would be read all the time."""
     out = tmp_path / "out.mcap"
     write_extended(record, out, [CHANNEL], added(*range(0, 3_000_000_000, 10_000_000)))
-    with out.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None
+    summary = summary_of(out)
     spans = [c.message_end_time - c.message_start_time for c in summary.chunk_indexes]
     assert len(spans) > 10
     assert max(spans) < 1e9

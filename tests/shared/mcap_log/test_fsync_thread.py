@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from shared.mcap_log import fsync_thread
-from shared.mcap_log.fsync_thread import FsyncThread
+from shared.mcap_log import files
+from shared.mcap_log.files import FsyncThread
 from tests.shared.mcap_log import runs
 from tests.shared.mcap_log.runs import Queue, item
 
@@ -19,7 +19,7 @@ class SlowDisk:
         self.let_go = threading.Event()
         self.asked = threading.Event()
         self.synced = 0
-        monkeypatch.setattr(fsync_thread.os, "fsync", self._sync)
+        monkeypatch.setattr(files.os, "fsync", self._sync)
 
     def _sync(self, descriptor: int) -> None:
         os.fstat(descriptor)  # still open
@@ -62,7 +62,7 @@ def test_an_error_of_the_disk_comes_with_the_next_request(
     def fail(_descriptor: int) -> None:
         raise OSError(5, "Input/output error")
 
-    monkeypatch.setattr(fsync_thread.os, "fsync", fail)
+    monkeypatch.setattr(files.os, "fsync", fail)
     failing = FsyncThread()
     with (tmp_path / "a").open("wb") as file:
         failing.request(file.fileno())

@@ -22,7 +22,7 @@ from shared.bus import topics
 from shared.joints import MODULES
 from shared.mcap_log import schema
 from tests.shared.mcap_log import runs, sample_logs
-from tests.shared.mcap_log.mcap_doctor import examined
+from tests.shared.mcap_log.mcap_doctor import Examined
 from tests.shared.mcap_log.plotjuggler import LAST, Opened, Refused, opened_by_3, opened_by_4
 from tests.shared.mcap_log.runs import OFFSET_NS, STATE_KEY, item
 from tests.shared.mcap_log.sample_logs import write_one
@@ -204,7 +204,7 @@ def test_what_is_cut_off_by_a_kill_needs_its_recovery(files: dict[str, Path]) ->
 @pytest.mark.parametrize("name", ["recorded", *MADE])
 def test_the_formats_own_doctor_finds_no_error(files: dict[str, Path], name: str) -> None:
     """What it warns of is meant: see the docstrings of `mcap_log` and `scene`."""
-    found = examined(files[name])
+    found = Examined(files[name])
     assert found.errors == []
     log = read_run(files[name])
     assert found.messages == sum(log.count(key) for key in log.keys())  # noqa: SIM118
@@ -219,11 +219,11 @@ def test_the_formats_own_doctor_finds_no_error(files: dict[str, Path], name: str
 
 
 def test_the_doctor_finds_what_is_wrong(files: dict[str, Path], tmp_path: Path) -> None:
-    assert any("no Footer" in error for error in examined(files["cut"]).errors)
+    assert any("no Footer" in error for error in Examined(files["cut"]).errors)
     bad = tmp_path / "bad.mcap"
     data = files["every"].read_bytes()
     bad.write_bytes(data.replace(b'"title":"Wrench"', b'"title":"Wrunch"', 1))
-    assert any("described in two ways" in error for error in examined(bad).errors)
+    assert any("described in two ways" in error for error in Examined(bad).errors)
 
 
 def test_the_rules_notice_what_would_be_lost(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import logging
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -23,9 +24,7 @@ from tools.logs.run_log import read_run
 LOGGER = logging.getLogger("test")
 
 
-@pytest.fixture(autouse=True)
-def no_wait_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("os.fsync", lambda _descriptor: None)
+pytestmark = pytest.mark.usefixtures("no_wait_for_the_disk")
 
 
 def by_the_package(path: Path) -> list[int]:
@@ -152,50 +151,43 @@ def test_a_damaged_original_stays_and_its_recovery_goes_beside_it_once(tmp_path:
     assert {p.name for p in tmp_path.glob("*.mcap")} == {"killed.mcap", beside.name}
 
 
-def test_a_file_that_a_recorder_is_writing_is_left_alone(tmp_path: Path) -> None:
-    path = runs.killed_file(tmp_path).path
-    before = path.read_bytes()
+def being_written(path: Path, _patch: pytest.MonkeyPatch) -> None:
     with path.open("rb") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
         auto_recover.recover_in_place(path, 0, LOGGER, lambda: False)
-    assert path.read_bytes() == before
 
 
-def test_without_space_for_a_copy_the_original_stays(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    path = runs.killed_file(tmp_path).path
-    before = path.read_bytes()
+def without_space(path: Path, _patch: pytest.MonkeyPatch) -> None:
     auto_recover.recover_in_place(path, 1 << 62, LOGGER, lambda: False)
-    assert path.read_bytes() == before
-    assert "no space to recover it" in caplog.text
 
 
-def test_a_recovery_that_is_stopped_leaves_the_original_and_nothing_else(tmp_path: Path) -> None:
-    path = runs.killed_file(tmp_path).path
-    before, there = path.read_bytes(), sorted(tmp_path.iterdir())
+def stopped(path: Path, _patch: pytest.MonkeyPatch) -> None:
     asked = iter([False] * 9 + [True])
     with pytest.raises(Interrupted):
         auto_recover.recover_in_place(path, 0, LOGGER, lambda: next(asked))
-    assert path.read_bytes() == before
-    assert sorted(tmp_path.iterdir()) == there
 
 
-def test_a_full_disk_while_recovering_leaves_the_original_and_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = runs.killed_file(tmp_path).path
-    before, there = path.read_bytes(), sorted(tmp_path.iterdir())
-
+def full_disk(path: Path, patch: pytest.MonkeyPatch) -> None:
     def full(*_arguments: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("os.fsync", full)
+    patch.setattr("os.fsync", full)
     with pytest.raises(RunError, match="cannot be written: No space left") as caught:
-        recover.recover(path, tmp_path / "out.mcap")
+        recover.recover(path, path.with_name("out.mcap"))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("tried", [being_written, without_space, stopped, full_disk])
+def test_what_keeps_a_recovery_from_its_end_leaves_the_original_and_nothing_else(
+    tmp_path: Path, tried: Callable[[Path, pytest.MonkeyPatch], None],
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture,
+) -> None:  # fmt: skip
+    path = runs.killed_file(tmp_path).path
+    before, there = path.read_bytes(), sorted(tmp_path.iterdir())
+    tried(path, monkeypatch)
     assert path.read_bytes() == before
     assert sorted(tmp_path.iterdir()) == there
+    assert ("no space to recover it" in caplog.text) is (tried is without_space)
 
 
 def test_the_rescue_of_a_directory_takes_what_is_unfinished_and_survives_the_rest(

@@ -1,7 +1,8 @@
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -9,14 +10,36 @@ from shared.bus import topics
 from shared.mcap_log.sequence_stats import KeyCount
 
 
-def test_numbers_of_several_senders_tell_nothing_of_losses() -> None:
-    count = KeyCount(several=True)
-    for number in (1, 2, 40, 3, 41):
-        count.feed(number)
+def fed(numbers: Iterable[int], *, several: bool = False) -> KeyCount:
+    count = KeyCount(several=several)
+    for seq in numbers:
+        count.feed(seq)
+    return count
+
+
+CASES = {
+    "a whole sequence has no gap": (range(100), 0, 0, 0),
+    "what was before the first received one is not lost": (range(7, 10), 0, 0, 0),
+    "a gap counts once and its messages each": ([0, 1, 5, 6, 8], 2, 4, 0),
+    "one that goes back is a restart and no gap": ([4, 5, 0, 1, 2], 0, 0, 1),
+    "a restart at the same number is seen": ([0, 0, 0], 0, 0, 2),
+    "a gap after a restart is counted": ([8, 9, 0, 3], 1, 2, 1),
+}
+
+
+@pytest.mark.parametrize(("numbers", "gaps", "missing", "restarts"), CASES.values(), ids=CASES)
+def test_losses_are_counted_by_the_numbers_of_one_sender(
+    numbers: Sequence[int], gaps: int, missing: int, restarts: int
+) -> None:
+    expected = KeyCount(
+        count=len(numbers), gaps=gaps, missing=missing, restarts=restarts, last_seq=numbers[-1]
+    )
+    assert fed(numbers) == expected
+
+
+def test_numbers_of_several_senders_tell_nothing_of_losses_and_only_tools_are_several() -> None:
+    count = fed((1, 2, 40, 3, 41), several=True)
     assert (count.count, count.gaps, count.missing, count.restarts) == (5, 0, 0, 0)
-
-
-def test_only_keys_of_tools_have_several_senders() -> None:
     several = {key for key in topics.all_keys("lab") if topics.several_may_write(key)}
     assert several == {
         f"xrl/lab/{name}"
@@ -24,40 +47,6 @@ def test_only_keys_of_tools_have_several_senders() -> None:
             "estop", "harness/tare", "operator/intent", "operator/hand", "sim/control", "run/event",
         )
     }  # fmt: skip
-
-
-def fed(numbers: Iterable[int]) -> KeyCount:
-    count = KeyCount()
-    for seq in numbers:
-        count.feed(seq)
-    return count
-
-
-def test_a_whole_sequence_has_no_gap() -> None:
-    assert fed(range(100)) == KeyCount(count=100, last_seq=99)
-
-
-def test_messages_before_the_first_received_one_are_not_lost() -> None:
-    assert fed(range(7, 10)).missing == 0
-
-
-def test_a_gap_counts_once_and_its_messages_each() -> None:
-    count = fed([0, 1, 5, 6, 8])
-    assert (count.gaps, count.missing, count.restarts) == (2, 4, 0)
-
-
-def test_a_sequence_that_goes_back_is_a_restart_and_no_gap() -> None:
-    count = fed([4, 5, 0, 1, 2])
-    assert (count.gaps, count.missing, count.restarts) == (0, 0, 1)
-
-
-def test_a_restart_at_the_same_number_is_seen() -> None:
-    assert fed([0, 0, 0]).restarts == 2
-
-
-def test_a_gap_after_a_restart_is_counted() -> None:
-    count = fed([8, 9, 0, 3])
-    assert (count.gaps, count.missing, count.restarts) == (1, 2, 1)
 
 
 @given(st.sets(st.integers(0, 300), min_size=1))

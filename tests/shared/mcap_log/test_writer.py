@@ -46,28 +46,32 @@ def test_metadata_and_attachments_come_before_the_first_chunk(tmp_path: Path) ->
     assert topics_described == set(runs.recorded_topics())
 
 
+def read_by_the_package(path: Path) -> list[bytes]:
+    with path.open("rb") as file:
+        return [m.data for _, _, m in make_reader(file, validate_crcs=True).iter_messages()]
+
+
 def test_a_finished_file_is_readable_by_the_ordinary_reader(tmp_path: Path) -> None:
     items = [item(seq) for seq in range(300)]
-    with runs.write(tmp_path, items).open("rb") as file:
-        found = list(make_reader(file, validate_crcs=True).iter_messages())
-    assert [message.data for _, _, message in found] == [payload for _, payload, _ in items]
+    found = read_by_the_package(runs.write(tmp_path, items))
+    assert found == [payload for _, payload, _ in items]
 
 
 def test_times_are_mapped_to_the_wall_clock_by_one_offset(tmp_path: Path) -> None:
     with runs.write(tmp_path, [item(7)]).open("rb") as file:
         ((_, channel, message),) = make_reader(file).iter_messages()
-    assert channel.topic == STATE_KEY
+    assert (channel.topic, message.sequence) == (STATE_KEY, 7)
     assert message.log_time == OFFSET_NS + 7_000_500
     assert message.publish_time == OFFSET_NS + 7_000_000
-    assert message.sequence == 7
 
 
 def test_an_existing_file_is_left_alone_and_the_next_number_is_taken(tmp_path: Path) -> None:
+    (tmp_path / "run-1_3.mcap").write_bytes(b"all that is left of an older run")
+    (tmp_path / "run-2.recovered.mcap").write_bytes(b"")
     first = runs.write(tmp_path, [item(0)])
     before = first.read_bytes()
-    second = runs.write(tmp_path, [item(1)])
-    third = runs.write(tmp_path, [item(2)])
-    assert [p.name for p in (first, second, third)] == ["run.mcap", "run-1.mcap", "run-2.mcap"]
+    names = [runs.write(tmp_path, [item(seq)]).name for seq in (1, 2)]
+    assert (first.name, *names) == ("run.mcap", "run-3.mcap", "run-4.mcap")
     assert first.read_bytes() == before
 
 
@@ -90,13 +94,6 @@ def test_counts_with_gaps_and_restarts_are_written_at_the_end(tmp_path: Path) ->
     assert (found["count"], found["gaps"], found["missing"], found["restarts"]) == (5, 1, 2, 1)
 
 
-def test_take_from_takes_no_more_than_it_was_asked_to(tmp_path: Path) -> None:
-    source = Queue(item(seq) for seq in range(10))
-    with runs.writer(tmp_path) as run:
-        assert run.take_from(source, 4) == 4
-        assert len(source.items) == 6
-
-
 def test_a_full_disk_is_one_run_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     full = Path("/dev/full")
     opened = []
@@ -117,25 +114,15 @@ def test_a_directory_that_cannot_be_made_is_one_run_error(tmp_path: Path) -> Non
         runs.writer(tmp_path / "file" / "out")
 
 
-def broken_off(directory: Path) -> None:
-    with runs.writer(directory) as run:
-        run.take_from(Queue([item(0)]), 10)
-        run.flush()
-        raise InterruptedError
-
-
 def test_a_block_left_by_an_exception_leaves_a_readable_file_without_summary(
     tmp_path: Path,
 ) -> None:
-    with pytest.raises(InterruptedError):
-        broken_off(tmp_path)
+    with pytest.raises(InterruptedError), runs.writer(tmp_path) as run:  # noqa: PT012
+        run.take_from(Queue([item(0)]), 10)
+        run.flush()
+        raise InterruptedError
     log = read_run(tmp_path / "run.mcap")
     assert (log.complete, log.count(STATE_KEY)) == (False, 1)
-
-
-def read_by_the_package(path: Path) -> list[bytes]:
-    with path.open("rb") as file:
-        return [m.data for _, _, m in make_reader(file, validate_crcs=True).iter_messages()]
 
 
 def test_a_split_run_is_one_file_after_the_other_and_each_stands_for_itself(tmp_path: Path) -> None:
@@ -175,12 +162,6 @@ def test_what_is_lost_between_two_files_is_counted_in_the_second(tmp_path: Path)
     assert [c["missing"] for c in counts] == [0, 3]
 
 
-def test_a_second_run_keeps_away_from_the_files_of_the_first(tmp_path: Path) -> None:
-    (tmp_path / "run_3.mcap").write_bytes(b"all that is left of an older run")
-    (tmp_path / "run-1.recovered.mcap").write_bytes(b"")
-    assert runs.write(tmp_path, [item(0)]).name == "run-2.mcap"
-
-
 def test_while_no_file_is_open_messages_are_counted_as_left_out(tmp_path: Path) -> None:
     with runs.writer(tmp_path / "out", begin=False) as run:
         run.take_from(Queue(item(seq) for seq in range(7)), 100)
@@ -188,9 +169,14 @@ def test_while_no_file_is_open_messages_are_counted_as_left_out(tmp_path: Path) 
     assert not (tmp_path / "out").exists()
 
 
-def test_a_file_is_locked_while_it_is_written(tmp_path: Path) -> None:
+def test_a_file_is_locked_while_it_is_written_and_no_more_is_taken_than_asked_for(
+    tmp_path: Path,
+) -> None:
+    source = Queue(item(seq) for seq in range(10))
     with runs.writer(tmp_path) as run:
         assert files.in_use(run.path)
+        assert run.take_from(source, 4) == 4
+        assert len(source.items) == 6
     assert not files.in_use(run.path)
 
 
@@ -200,6 +186,6 @@ def test_a_sync_that_fails_is_one_run_error(
     def fail(_descriptor: int) -> None:
         raise OSError(5, "Input/output error")
 
-    monkeypatch.setattr("shared.mcap_log.fsync_thread.os.fsync", fail)
+    monkeypatch.setattr("shared.mcap_log.files.os.fsync", fail)
     with pytest.raises(RunError, match=r"run\.mcap: cannot be .*Input/output error"):
         runs.write(tmp_path, [item(0)])

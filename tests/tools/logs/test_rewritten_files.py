@@ -12,7 +12,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from shared.bus import topics
 from shared.mcap_log import recover
-from shared.mcap_log.extended_copy import NewChannel, NewMessage, write_extended
+from shared.mcap_log.log_copy import NewChannel, NewMessage, write_extended
 from shared.mcap_log.writer import COUNTS
 from tests.shared.mcap_log import runs
 from tests.shared.mcap_log.runs import ATTACHMENTS, STATE_KEY, item

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shared.bus.code_names import name_of
+from shared.bus.messages import name_of
 from tools.judge.reports.signals import GAP_S, Array, Span, encode_signal, segments, thinned
 
 

@@ -20,7 +20,7 @@ from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.joints import MODULES, SIDES
-from shared.mcap_log.extended_copy import NewChannel, NewMessage
+from shared.mcap_log.log_copy import NewChannel, NewMessage
 from shared.robot.frames import (
     ORIGIN,
     UPRIGHT,

@@ -8,7 +8,6 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from shared.bus import topics
-from shared.bus.code_names import name_of
 from shared.bus.messages import (
     Cause,
     DriveStatus,
@@ -23,6 +22,7 @@ from shared.bus.messages import (
     Tare,
     Trip,
     Wrench,
+    name_of,
 )
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
-from shared.bus import same_host, topics
+from shared.bus import security, topics
 from shared.bus.messages import JointState
 from shared.bus.session import open_session
 from shared.bus.topics import Topic
@@ -83,9 +83,9 @@ class LiveRobotWatch:
         else:
             if set(fleet.manifest.services) & set(MODULES):
                 return f"the fleet in {fleet.run.path} has joint services"
-        here = same_host.services_here(self._robot)
+        here = security.services_here(self._robot)
         for module in MODULES:
-            at = same_host.endpoint_here(self._robot, module, here)
+            at = security.endpoint_here(self._robot, module, here)
             endpoint = expand(at, self._run_dir)
             if is_listening(endpoint):
                 return f"the joint service {module} listens on {endpoint}"

@@ -12,9 +12,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from services.network_proxy.commands import ASKED_MAX, CommandHandler
-from services.network_proxy.control import ASKERS_MAX, ControlSocket
-from services.network_proxy.event_loop import SocketWatch
+from services.network_proxy.control import ASKED_MAX, ASKERS_MAX, CommandHandler, ControlSocket
+from services.network_proxy.sockets import SocketWatch
 from shared.bus.traces import LinkEvent
 from shared.config.impairment import Direction
 from shared.config.scenarios import Inject
@@ -57,6 +56,9 @@ def test_an_impairment_with_a_duration_ends_by_itself_and_reports_its_counts(rig
     rig.commands.obey(Begin(LOSS))
     for number in range(100):
         rig.directions["knee_left->planner"].passes(number, 10)
+    (row,) = rig.commands.obey(List()).requested
+    assert (row.passed + row.lost, row.detail) == (100, "loss=50%")
+    assert 0.0 < (row.left_s or 0.0) <= 2.0
     end_ns = round(rig.impairments.next_due)
     assert not rig.impairments.advance(end_ns - 1, end_ns - 1)
     assert rig.impairments.advance(end_ns, end_ns)
@@ -72,16 +74,6 @@ def test_clearing_a_link_ends_what_touches_it_and_leaves_the_rest(rig: Rig) -> N
     reply = rig.commands.obey(Clear("planner->knee_left"))
     assert [row.link for row in reply.requested] == ["harness->planner"]
     assert rig.commands.obey(Clear()).requested == ()
-
-
-def test_counts_are_reported_while_it_lasts(rig: Rig) -> None:
-    rig.commands.obey(Begin(LOSS))
-    for number in range(50):
-        rig.directions["planner->knee_left"].passes(number, 10)
-    (row,) = rig.commands.obey(List()).requested
-    assert row.passed + row.lost == 50
-    assert row.detail == "loss=50%"
-    assert 0.0 < (row.left_s or 0.0) <= 2.0
 
 
 @pytest.mark.parametrize(
@@ -118,19 +110,24 @@ def test_what_is_asked_for_later_begins_and_ends_when_it_is_due(rig: Rig) -> Non
     assert rig.commands.obey(List()).requested[0].hidden == ()
 
 
-def test_a_hidden_impairment_is_reported(rig: Rig) -> None:
+def test_a_hidden_impairment_is_reported_and_there_is_a_bound_to_what_is_asked_for(
+    rig: Rig,
+) -> None:
     rig.commands.obey(Begin(LOSS))
     first, second = rig.commands.obey(Begin(DELAY)).requested
-    assert first.hidden == COMMANDS
-    assert second.hidden == ()
-
-
-def test_there_is_a_bound_to_what_is_asked_for_at_once(rig: Rig) -> None:
-    for _ in range(ASKED_MAX):
+    assert (first.hidden, second.hidden) == (COMMANDS, ())
+    for _ in range(ASKED_MAX - 2):
         assert rig.commands.obey(Begin(LOSS)).error == ""
     assert "clear some" in rig.commands.obey(Begin(LOSS)).error
     assert rig.commands.obey(Clear()).error == ""
     assert rig.commands.obey(Begin(LOSS)).error == ""
+
+
+def dialled(folder: Path, timeout_s: float = 5.0) -> socket.socket:
+    asking = socket.socket(socket.AF_UNIX)
+    asking.settimeout(timeout_s)
+    asking.connect(str(folder / SOCKET))
+    return asking
 
 
 @pytest.fixture
@@ -154,7 +151,11 @@ def served(rig: Rig, tmp_path: Path) -> Iterator[tuple[Rig, Path]]:
     assert not (tmp_path / SOCKET).exists()
 
 
-def test_the_client_asks_and_is_answered(served: tuple[Rig, Path]) -> None:
+def test_the_client_asks_and_is_answered_or_names_how_to_get_a_proxy(
+    served: tuple[Rig, Path],
+) -> None:
+    with pytest.raises(FleetError, match="xrl up --injectable"):
+        ProxyClient(served[1] / "elsewhere").list()
     client = ProxyClient(served[1])
     assert client.list() == ()
     assert [row.detail for row in client.begin(DELAY)] == ["delay=30ms"]
@@ -166,9 +167,7 @@ def test_the_client_asks_and_is_answered(served: tuple[Rig, Path]) -> None:
 def test_rubbish_is_answered_with_an_error_and_the_next_request_is_served(
     served: tuple[Rig, Path],
 ) -> None:
-    with socket.socket(socket.AF_UNIX) as asking:
-        asking.settimeout(5.0)
-        asking.connect(str(served[1] / SOCKET))
+    with dialled(served[1]) as asking:
         asking.sendall(b'nonsense\n{"type":"list"}\n')
         with asking.makefile("rb") as answers:
             first, second = (msgspec.json.decode(answers.readline(), type=Reply) for _ in range(2))
@@ -177,18 +176,11 @@ def test_rubbish_is_answered_with_an_error_and_the_next_request_is_served(
     assert ProxyClient(served[1]).list() == ()
 
 
-def test_without_an_injector_the_client_names_how_to_get_one(tmp_path: Path) -> None:
-    with pytest.raises(FleetError, match="xrl up --injectable"):
-        ProxyClient(tmp_path).list()
-
-
 def test_a_long_answer_comes_whole_to_one_who_reads_late(served: tuple[Rig, Path]) -> None:
     for _ in range(ASKED_MAX):
         served[0].commands.obey(Begin(LOSS))
     requested = 200
-    with socket.socket(socket.AF_UNIX) as asking:
-        asking.settimeout(5.0)
-        asking.connect(str(served[1] / SOCKET))
+    with dialled(served[1]) as asking:
         asking.sendall(requested * b'{"type":"list"}\n')
         time.sleep(0.1)
         assert len(ProxyClient(served[1]).list()) == ASKED_MAX, "nobody waits for it"
@@ -202,13 +194,10 @@ def test_who_asks_in_one_piece_too_long_or_leaves_in_the_middle_is_let_go(
     served: tuple[Rig, Path],
 ) -> None:
     for rubbish in (b"x" * (2 * LINE_MAX), b'{"type":'):
-        with socket.socket(socket.AF_UNIX) as asking:
-            asking.settimeout(5.0)
-            asking.connect(str(served[1] / SOCKET))
-            with contextlib.suppress(OSError):
-                asking.sendall(rubbish)
-                asking.shutdown(socket.SHUT_WR)
-                assert asking.recv(1) == b""
+        with dialled(served[1]) as asking, contextlib.suppress(OSError):
+            asking.sendall(rubbish)
+            asking.shutdown(socket.SHUT_WR)
+            assert asking.recv(1) == b""
     assert ProxyClient(served[1]).list() == ()
 
 
@@ -229,8 +218,7 @@ class Served:
                 call(events, 0)
 
     def ask(self, text: bytes = b"") -> socket.socket:
-        asking = socket.socket(socket.AF_UNIX)
-        asking.connect(str(self.path))
+        asking = dialled(self.path.parent)
         asking.sendall(text)
         asking.setblocking(False)
         self.turn()

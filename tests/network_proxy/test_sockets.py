@@ -1,17 +1,25 @@
-"""Where the network proxy dials to, and what it does when nothing is left to dial with."""
+"""Sockets that are waited for, dialled and listened on, also when no descriptor is left."""
 
 from __future__ import annotations
 
 import resource
 import socket
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from services.network_proxy.listener import SocketListener
-from services.network_proxy.proxy_endpoint import Address, ProxyEndpoint, address_of
+from services.network_proxy.sockets import (
+    READ,
+    WRITE,
+    Address,
+    ProxyEndpoint,
+    SocketListener,
+    SocketWatch,
+    address_of,
+)  # fmt: skip
 from shared.exceptions import BusError
 from tests.network_proxy.rig import MESSAGE, PAIR, WAIT_S, Rig, batch, heard, listening
 
@@ -36,16 +44,9 @@ def test_a_host_name_is_looked_up_once_before_any_link() -> None:
 
 @pytest.mark.parametrize(
     "endpoint",
-    [
-        "tcp/no-such-host.invalid:7447",
-        "tcp/127.0.0.1",
-        "tcp/127.0.0.1:http",
-        "tcp/127.0.0.1:0",
-        "tcp/127.0.0.1:65536",
-        "tcp/:7447",
-        "udp/127.0.0.1:7447",
-    ],
-)
+    ["tcp/no-such-host.invalid:7447", "tcp/127.0.0.1", "tcp/127.0.0.1:http", "tcp/127.0.0.1:0",
+     "tcp/127.0.0.1:65536", "tcp/:7447", "udp/127.0.0.1:7447"],
+)  # fmt: skip
 def test_an_endpoint_that_cannot_be_stood_before_is_refused_by_name(endpoint: str) -> None:
     with pytest.raises(BusError) as caught:
         address_of(endpoint)
@@ -74,7 +75,7 @@ def receive(rig: Rig, end: socket.socket, size: int) -> bytes:
     for _ in range(500):
         rig.turn()
         got += heard(end) or b""
-        if len(got) >= size:
+        if len(got) >= size or not rig.relay.links:
             break
     return got
 
@@ -95,21 +96,16 @@ def test_over_tcp_everything_passes_both_ways_to_the_end(tcp: Rig) -> None:
 def test_over_tcp_who_dials_one_that_is_not_there_sees_the_end(tcp: Rig) -> None:
     tcp.beyond.close()
     dialling = tcp.dial()
-    for _ in range(500):
-        tcp.turn()
-        if not tcp.relay.links:
-            break
+    receive(tcp, dialling, 1)
     dialling.settimeout(WAIT_S)
     assert dialling.recv(10) == b""
 
 
-def test_a_place_that_cannot_be_listened_on_is_refused_by_name(tmp_path: Path) -> None:
-    path = tmp_path / "not there" / "t"
+def test_a_place_is_refused_by_name_or_cleared_of_what_a_killed_proxy_left_and_left_clear(
+    tmp_path: Path,
+) -> None:
     with pytest.raises(BusError, match="not there/t"):
-        SocketListener(path)
-
-
-def test_what_a_killed_injector_left_is_removed_and_so_is_ones_own(tmp_path: Path) -> None:
+        SocketListener(tmp_path / "not there" / "t")
     path = tmp_path / "t"
     path.write_text("left")
     listener = SocketListener(path)
@@ -174,3 +170,52 @@ def test_a_place_dials_its_own_endpoint(tmp_path: Path) -> None:
             assert not end.getblocking()
             end.close()
         endpoint.listener.close()
+
+
+@pytest.fixture
+def pair() -> Iterator[tuple[socket.socket, socket.socket]]:
+    ends = socket.socketpair()
+    yield ends
+    for end in ends:
+        end.close()
+
+
+def test_each_socket_calls_its_own_function_for_its_own_events(
+    pair: tuple[socket.socket, socket.socket],
+) -> None:
+    near, far = pair
+    watch, heard = SocketWatch(), list[tuple[int, int]]()
+
+    def ready(events: int, now_ns: int) -> None:
+        heard.append((events, now_ns))
+
+    def turn() -> list[tuple[int, int]]:
+        heard.clear()
+        for call, events in watch.wait(0.0):
+            call(events, 7)
+        return list(heard)
+
+    watch.want(near, READ, ready)
+    assert turn() == []
+    far.send(b"x")
+    assert turn() == [(READ, 7)]
+    watch.want(near, READ | WRITE, ready)
+    assert turn() == [(READ | WRITE, 7)]
+    watch.want(near, WRITE, ready)
+    assert turn() == [(WRITE, 7)]
+    watch.want(near, 0, ready)
+    watch.want(near, 0, ready)
+    assert turn() == []
+    watch.close()
+
+
+def test_it_waits_by_parts_of_a_millisecond(pair: tuple[socket.socket, socket.socket]) -> None:
+    """What is asked to be late by 0.2 ms is not late by a whole one."""
+    watch, took_s = SocketWatch(), []
+    watch.want(pair[0], READ, lambda _events, _now_ns: None)
+    for _ in range(200):
+        begun = time.perf_counter()
+        assert watch.wait(0.0002) == []
+        took_s.append(time.perf_counter() - begun)
+    assert 0.0002 <= min(took_s) < 0.0009
+    watch.close()

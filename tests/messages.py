@@ -1,8 +1,12 @@
-"""Messages of the robot, for tests."""
+"""Messages for tests: one builder for each that has many fields, and one for any type."""
 
 from __future__ import annotations
 
 import random
+from collections.abc import Mapping
+from typing import Any, Final, get_args, get_origin, get_type_hints
+
+import msgspec
 
 from shared.bus.messages import (
     DriveStatus,
@@ -17,6 +21,26 @@ from shared.bus.messages import (
 from shared.joints import MODULES
 
 ZERO6: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+LEAVES: Final[Mapping[type, Any]] = {bool: True, int: 1, float: 0.25, str: "word"}
+
+
+def sample(message_type: type[Any], **fields: Any) -> Any:
+    """Return a message with a value of the right type in every field."""
+    plain = msgspec.to_builtins(filled(message_type, LEAVES))
+    return msgspec.convert(plain | fields, message_type)
+
+
+def filled(message_type: type[Any], leaves: Mapping[type, Any]) -> Any:
+    """Return a message whose booleans, numbers and texts are these; a sequence has one entry."""
+
+    def value(hint: Any) -> Any:
+        if get_origin(hint) is tuple:
+            items = get_args(hint)
+            return tuple(value(item) for item in (items[:1] if items[-1] is Ellipsis else items))
+        return filled(hint, leaves) if issubclass(hint, msgspec.Struct) else leaves[hint]
+
+    hints = get_type_hints(message_type)
+    return message_type(**{name: value(hints[name]) for name in message_type.__struct_fields__})
 
 
 def joint_state(seed: int = 0, **changes: object) -> JointState:

@@ -1,0 +1,192 @@
+"""Sockets of the network proxy: waited for, listened on, and dialled beyond."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import select
+import selectors
+import socket
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final, NamedTuple, TypeAlias
+
+from shared.config.endpoints import host_and_port
+from shared.exceptions import BusError
+from shared.links import Pair
+from shared.run_directory import private_files
+
+READ: Final = selectors.EVENT_READ
+WRITE: Final = selectors.EVENT_WRITE
+
+Ready: TypeAlias = Callable[[int, int], None]
+"""Called with a socket's readiness (READ, WRITE) and the time, ns."""
+
+
+class SocketWatch:
+    """Every socket of the loop; any number of them, with any descriptors."""
+
+    def __init__(self) -> None:
+        self._selector = selectors.DefaultSelector()
+        self._wanted: dict[socket.socket, int] = {}
+
+    def want(self, end: socket.socket, events: int, ready: Ready) -> None:
+        """Watch an open socket for `events` from now on, and no other; 0: not any more."""
+        watched = self._wanted.get(end, 0)
+        if events == watched:
+            return
+        if not events:
+            del self._wanted[end]
+            self._selector.unregister(end)
+            return
+        self._wanted[end] = events
+        if watched:
+            self._selector.modify(end, events, ready)
+        else:
+            self._selector.register(end, events, ready)
+
+    def wait(self, patience_s: float) -> list[tuple[Ready, int]]:
+        """Wait until a socket is ready; return callbacks and readiness, none after `patience_s`.
+
+        The selector itself would round the patience up to a whole millisecond, longer than some
+        requested delays. So its epoll is waited for, as one socket.
+        """
+        if not select.select([self._selector], [], [], patience_s)[0]:
+            return []
+        return [(key.data, events) for key, events in self._selector.select(0)]
+
+    def close(self) -> None:
+        """Watch none any more."""
+        self._wanted.clear()
+        self._selector.close()
+
+
+class SocketListener:
+    """Listens on a UNIX socket, also when the descriptors are used up, and accepts without waiting.
+
+    The file of a killed process is removed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Listen on a path; BusError if no socket can be made there."""
+        self.turned_away = 0
+        """Connections for which there was no descriptor."""
+        self._path = path
+        self.socket = socket.socket(socket.AF_UNIX)
+        try:
+            path.unlink(missing_ok=True)
+            with private_files():
+                self.socket.bind(str(path))
+            self.socket.listen()
+        except OSError as error:
+            self.socket.close()
+            text = f"{path}: {error.strerror or error}; an endpoint it may use is needed"
+            raise BusError(text) from None
+        self.socket.setblocking(False)
+        self._spare: int | None = None
+        self._keep_spare()
+
+    def accept(self) -> socket.socket | None:
+        """Return the end of who has dialled; it does not block. None: nobody, or turned away."""
+        try:
+            end, _ = self.socket.accept()
+        except OSError as error:
+            if error.errno in (errno.EMFILE, errno.ENFILE):
+                self._turn_away()
+            return None
+        end.setblocking(False)
+        return end
+
+    def close(self) -> None:
+        """Listen no more, and remove the path."""
+        self.socket.close()
+        self._path.unlink(missing_ok=True)
+        self._give_spare()
+
+    def _turn_away(self) -> None:
+        """Refuse who dials: the descriptor that is kept for this is lent to it.
+
+        Left in the queue it would be readable at once again, and the loop would never rest.
+        """
+        self.turned_away += 1
+        self._give_spare()
+        with contextlib.suppress(OSError):
+            self.socket.accept()[0].close()
+        self._keep_spare()
+
+    def _keep_spare(self) -> None:
+        with contextlib.suppress(OSError):
+            self._spare = os.open(os.devnull, os.O_RDONLY)
+
+    def _give_spare(self) -> None:
+        if self._spare is not None:
+            os.close(self._spare)
+            self._spare = None
+
+
+class Address(NamedTuple):
+    """A resolved endpoint of a process: dialling it needs no name lookup."""
+
+    family: socket.AddressFamily
+    where: Any
+    """What sockets of the family connect to: a path, or a numeric host with its port."""
+
+
+class ProxyEndpoint:
+    """Between the two processes of a pair: one dials it, and it dials the other."""
+
+    def __init__(self, pair: Pair, listener: SocketListener, beyond: Address) -> None:
+        self.pair, self.listener = pair, listener
+        self.missing = 0
+        """Connections to a process that was not there."""
+        self._beyond = beyond
+
+    def link(self) -> tuple[socket.socket, socket.socket] | None:
+        """Accept who dials, and dial the other; return both ends, which do not block.
+
+        None: not both are there. Who dialled sees the end of its connection and tries again.
+        """
+        dialling = self.listener.accept()
+        if dialling is None:
+            return None
+        try:
+            return dialling, self._dial()
+        except OSError:
+            self.missing += 1
+            dialling.close()
+            return None
+
+    def _dial(self) -> socket.socket:
+        beyond = socket.socket(self._beyond.family)
+        try:
+            beyond.setblocking(False)
+            failed = beyond.connect_ex(self._beyond.where)
+            if failed not in (0, errno.EINPROGRESS):
+                raise OSError(failed, os.strerror(failed))
+            if self._beyond.family != socket.AF_UNIX:
+                beyond.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        except OSError:
+            beyond.close()
+            raise
+        return beyond
+
+
+def address_of(endpoint: str) -> Address:
+    """Resolve a Zenoh endpoint; BusError if it is neither UNIX socket nor TCP, or unknown.
+
+    A name lookup may block: at the start only.
+    """
+    kind, _, rest = endpoint.partition("/")
+    if kind == "unixsock-stream":
+        return Address(socket.AF_UNIX, rest)
+    if kind != "tcp":
+        text = "cannot be stood before; unixsock-stream/PATH or tcp/HOST:PORT can"
+        raise BusError(f"{endpoint}: {text}")
+    host, port = host_and_port(endpoint)
+    try:
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+    except (OSError, UnicodeError) as error:
+        raise BusError(f"{endpoint}: {error}; a host that can be found is needed") from None
+    family, _, _, _, where = found[0]
+    return Address(family, where)

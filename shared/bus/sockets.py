@@ -1,0 +1,266 @@
+"""TCP sockets of this process and this host, by the kernel (Linux): Zenoh keeps its own to itself.
+
+Who may begin a link, and how many wait: a TLS listener of Zenoh sleeps for 100 ms after each failed
+handshake, so a stranger who can reach its port keeps new links off. It also takes in all that wait
+meanwhile, each with a descriptor: 640 connections a second that said nonsense left 4700 open in a
+minute. With a queue of one it takes in no more than it ends. The kernel drops the packets of
+addresses that are not allowed before there is a connection. A process may filter its own sockets
+without privilege (socket(7), SO_ATTACH_FILTER); links inherit the filter.
+
+Zenoh tells nobody of a handshake that fails. A flood shows in the connections that the kernel turns
+away because a listener's queue is full, and in who begins others (`Arrivals`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import ipaddress
+import re
+import socket
+import struct
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator
+from pathlib import Path
+from typing import Final, NamedTuple, TypeAlias
+
+from shared.clock import NS_PER_S
+from shared.exceptions import BusError
+
+IpAddress: TypeAlias = "ipaddress.IPv4Address | ipaddress.IPv6Address"
+Address = tuple[str, int]
+"""Numeric host and port."""
+
+ADDRESSES_MAX: Final = 64
+"""Of each family; the kernel takes programs of 4096 instructions."""
+
+_SO_ATTACH_FILTER: Final = 26
+# Classic BPF, <linux/bpf_common.h> and <linux/filter.h>
+_LOAD_WORD, _LOAD_BYTE, _AND, _JUMP, _JUMP_IF_EQUAL, _RETURN = 0x20, 0x30, 0x54, 0x05, 0x15, 0x06
+_SYN_COOKIES: Final = Path("/proc/sys/net/ipv4/tcp_syncookies")
+_NETWORK_HEADER: Final = 0xFFF00000
+"""SKF_NET_OFF: where an IP header begins, seen from any protocol."""
+_SOURCE_4, _SOURCE_6 = 12, 8
+_WHOLE: Final = 0xFFFFFFFF
+_INSTRUCTION: Final = struct.Struct("HBBI")
+_PROGRAM: Final = struct.Struct("HP")
+_RESET: Final = struct.pack("ii", 1, 0)
+
+
+class Instruction(NamedTuple):
+    """One instruction of classic BPF."""
+
+    code: int
+    if_true: int
+    if_false: int
+    value: int
+
+
+_KEEP: Final = Instruction(_RETURN, 0, 0, _WHOLE)
+_DROP: Final = Instruction(_RETURN, 0, 0, 0)
+
+
+def program(allowed: Collection[IpAddress]) -> list[Instruction]:
+    """Return a filter that keeps the packets of these source addresses and drops all others.
+
+    Raises BusError if there are more addresses than it takes.
+    """
+    four = [address for address in allowed if isinstance(address, ipaddress.IPv4Address)]
+    six = [address for address in allowed if isinstance(address, ipaddress.IPv6Address)]
+    if max(len(four), len(six)) > ADDRESSES_MAX:
+        raise BusError(f"bus.security.allow: over {ADDRESSES_MAX} addresses")
+    for_four = [Instruction(_LOAD_WORD, 0, 0, _NETWORK_HEADER + _SOURCE_4)]
+    for address in four:
+        for_four += [Instruction(_JUMP_IF_EQUAL, 0, 1, int(address)), _KEEP]
+    for_four.append(_DROP)
+    for_six: list[Instruction] = []
+    for each in six:
+        words = struct.unpack(">4I", each.packed)
+        for index, word in enumerate(words):
+            left = 2 * (len(words) - index - 1) + 1  # to the instruction after this address's
+            load = Instruction(_LOAD_WORD, 0, 0, _NETWORK_HEADER + _SOURCE_6 + 4 * index)
+            for_six += [load, Instruction(_JUMP_IF_EQUAL, 0, left, word)]
+        for_six.append(_KEEP)
+    for_six.append(_DROP)
+    return [
+        Instruction(_LOAD_BYTE, 0, 0, _NETWORK_HEADER),
+        Instruction(_AND, 0, 0, 0xF0),
+        Instruction(_JUMP_IF_EQUAL, 1, 0, 0x40),  # over the jump: IPv4
+        Instruction(_JUMP, 0, 0, len(for_four)),
+        *for_four,
+        *for_six,
+    ]
+
+
+def restrict(ports: Collection[int], allowed: Collection[IpAddress]) -> None:
+    """Have this process's listening sockets at these ports hear allowed addresses, one at a time.
+
+    Raises BusError if nothing listens at one of the ports, or the kernel takes no filter.
+    """
+    code, left = program(allowed), set(ports)
+    for own in _own_sockets():
+        port = _listening_port(own)
+        if port in ports:
+            _attach(own, code)
+            left.discard(port)
+    if left:
+        raise BusError(f"no filter of addresses for mtls: nothing listens at {sorted(left)}")
+
+
+def reset_on_close(local: Address, remote: Address) -> bool:
+    """Have this process's TCP connection between two addresses closed by a reset; False if none is.
+
+    With a linger time, `close` blocks its thread until the other side has received everything or
+    the time is over. Without any, the kernel goes on sending to a host that is cut off, and a TLS
+    link that is dialled again meanwhile was not led again within 30 s. A reset drops what is
+    unsent: it is older than what the next link brings.
+    """
+    for own in _own_sockets():
+        with contextlib.suppress(OSError):  # it has no peer
+            if (own.getsockname()[:2], own.getpeername()[:2]) == (local, remote):
+                own.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
+                return True
+    return False
+
+
+def resolved(hosts: Iterable[str]) -> tuple[set[IpAddress], list[str]]:
+    """Return the addresses of hosts, and the hosts that are not known.
+
+    A name lookup may block: at the start only.
+    """
+    found: set[IpAddress] = set()
+    unknown = []
+    for host in hosts:
+        try:
+            rows = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
+        except (OSError, UnicodeError):
+            unknown.append(host)
+        else:
+            found |= {ipaddress.ip_address(row[4][0]) for row in rows}
+    return found, unknown
+
+
+def _own_sockets() -> Iterator[socket.socket]:
+    """Yield each IP socket of this process; they are not ours to close."""
+    for entry in Path("/proc/self/fd").iterdir():
+        try:
+            if not str(entry.readlink()).startswith("socket:"):
+                continue
+            own = socket.socket(fileno=int(entry.name))
+        except OSError:  # another thread has closed it meanwhile
+            continue
+        try:
+            if own.family in (socket.AF_INET, socket.AF_INET6):
+                yield own
+        finally:
+            own.detach()
+
+
+def _listening_port(own: socket.socket) -> int | None:
+    with contextlib.suppress(OSError):
+        if own.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):
+            return int(own.getsockname()[1])
+    return None
+
+
+def _attach(listener: socket.socket, code: list[Instruction]) -> None:
+    text = ctypes.create_string_buffer(b"".join(_INSTRUCTION.pack(*row) for row in code))
+    packed = _PROGRAM.pack(len(code), ctypes.addressof(text))
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, packed)
+        listener.listen(_waiting_max())
+    except OSError as error:
+        raise BusError(f"no filter of addresses for mtls: {error.strerror}") from None
+
+
+def _waiting_max() -> int:
+    """Return the backlog for a queue of one; without SYN cookies the kernel then takes no call."""
+    return 0 if _SYN_COOKIES.exists() and _SYN_COOKIES.read_text().strip() != "0" else 1
+
+
+# ---- connections of this host, as /proc/net has them
+
+FLOOD_HZ: Final = 20.0
+"""Connections turned away per second from which it is a flood; a fleet that starts has a few."""
+
+_PROC_NET: Final = Path("/proc/net")
+_TCP: Final = ("tcp", "tcp6")
+_ROW: Final = re.compile(
+    rb"^ *\d+: [0-9A-F]+:([0-9A-F]{4}) ([0-9A-F]+):([0-9A-F]{4}) (?!0A)", re.MULTILINE
+)
+"""Own port, other address and port; 0A listens, and has none."""
+_ESTABLISHED: Final = re.compile(
+    rb"^ *\d+: \S+ ([0-9A-F]+):([0-9A-F]{4}) 01 (?:\S+ +){5}(\d+)", re.MULTILINE
+)
+"""Other address and port, and the socket's number."""
+
+
+class _Sample(NamedTuple):
+    t_ns: int
+    turned_away: int
+    connections: frozenset[tuple[bytes, bytes, bytes]]
+    """Own port, other address and its port, as /proc has them."""
+
+
+class Arrivals:
+    """Connections to some ports of this host, between two looks."""
+
+    def __init__(self, ports: Collection[int], proc_net: Path = _PROC_NET) -> None:
+        self._ports = {b"%04X" % port for port in ports}
+        self._proc_net = proc_net
+        self._last: _Sample | None = None
+
+    def flood(self, now_ns: int) -> str:
+        """Return who floods the ports since the last call, in words; empty if nobody does."""
+        if not self._ports:
+            return ""
+        last, now = self._last, self._sample(now_ns)
+        self._last = now
+        if last is None or now.t_ns <= last.t_ns:
+            return ""
+        turned_away = (now.turned_away - last.turned_away) * NS_PER_S / (now.t_ns - last.t_ns)
+        if turned_away < FLOOD_HZ:
+            return ""
+        begun = Counter(address for _, address, _ in now.connections - last.connections)
+        whom = ", ".join(f"{_address(text)} ({count})" for text, count in begun.most_common(3))
+        who = f"connections begun by {whom}" if whom else "nobody seen at the bus's ports"
+        return f"flood: {turned_away:.0f} connections/s to this host turned away; {who}"
+
+    def _sample(self, now_ns: int) -> _Sample:
+        rows = _ROW.findall(_tables(self._proc_net, *_TCP))
+        ours = frozenset(row for row in rows if row[0] in self._ports)
+        return _Sample(now_ns, self._turned_away(), ours)
+
+    def _turned_away(self) -> int:
+        rows = [line.split() for line in _tables(self._proc_net, "netstat").splitlines()]
+        for names, values in zip(rows[::2], rows[1::2], strict=False):
+            if names[0] == b"TcpExt:" and b"ListenDrops" in names:
+                return int(values[names.index(b"ListenDrops")])
+        return 0
+
+
+def established(inodes: Collection[int], proc_net: Path = _PROC_NET) -> set[Address]:
+    """Return the other ends, numeric address and port, of TCP connections by their sockets."""
+    return {
+        (str(_address(address)), int(port, 16))
+        for address, port, inode in _ESTABLISHED.findall(_tables(proc_net, *_TCP))
+        if int(inode) in inodes
+    }
+
+
+def _tables(proc_net: Path, *names: str) -> bytes:
+    """Return tables of the kernel, one after the other; a kernel without IPv6 lacks one."""
+    found = b""
+    for name in names:
+        with contextlib.suppress(OSError):
+            found += (proc_net / name).read_bytes()
+    return found
+
+
+def _address(text: bytes) -> IpAddress:
+    """Return an address of /proc/net/tcp: words of 32 bits in the order of this machine."""
+    words = bytes.fromhex(text.decode())
+    packed = b"".join(struct.pack(">I", word) for (word,) in struct.iter_unpack("=I", words))
+    address = ipaddress.ip_address(packed)
+    mapped = address.ipv4_mapped if isinstance(address, ipaddress.IPv6Address) else None
+    return mapped or address

@@ -1,0 +1,16 @@
+"""Waiting for what other processes and threads do."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+
+def comes_true(condition: Callable[[], object], limit_s: float = 20.0) -> bool:
+    """Return True once a condition holds; False if it does not within a time."""
+    deadline = time.monotonic() + limit_s
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.002)
+    return True
