@@ -25,8 +25,8 @@ import numpy as np
 from services.planner.law import certificate, symbolic
 from services.planner.law.model import leg_geometry
 from services.simulator.drives import axis_control
+from services.simulator.physics.actuation import step_graph
 from services.simulator.physics.body import body_of
-from services.simulator.physics.drivetrain import step_graph
 from services.simulator.physics.plant import PlantConfig
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig

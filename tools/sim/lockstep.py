@@ -24,7 +24,7 @@ from services.simulator.fault_injector import FaultInjector
 from services.simulator.physics.body import body_of
 from services.simulator.physics.plant import PlantConfig
 from services.simulator.physics.world import World
-from services.simulator.state import restored, taken
+from services.simulator.state import read_state, write_state
 from shared.bus import topics
 from shared.bus.messages import (
     HandLead,
@@ -200,7 +200,7 @@ class Lockstep:
         """Return what world and services are now, for `resume`; it shares what still changes."""
         planner = self.planner
         return FleetMoment(
-            taken(self.world, self.bank, self.now_ns, 0),
+            read_state(self.world, self.bank, self.now_ns, 0),
             {joint.name: joint.manager.snapshot() for joint in self.joints},
             None if planner is None else (planner.session, planner.snapshot()),
         )
@@ -209,7 +209,7 @@ class Lockstep:
         """Continue from a moment of another run, before the first step; links are empty then."""
         state, modules = moment.state, moment.modules
         self.now_ns = -(-state.t_ns // self._step_ns) * self._step_ns
-        restored(self.world, self.bank, state)
+        write_state(self.world, self.bank, state)
         for joint in self.joints:
             if joint.name in modules:
                 joint.manager.restore(modules[joint.name])
@@ -233,7 +233,7 @@ class Lockstep:
             self.advance()
             if self._traces and self.now_ns % self._sim_state_ns == 0:
                 self._sim_states += 1
-                state = taken(self.world, self.bank, self.now_ns, self._sim_states)
+                state = read_state(self.world, self.bank, self.now_ns, self._sim_states)
                 self._record(topics.SIM_STATE, "", state)
             if self.now_ns % self._truth_ns == 0:
                 truth = self.world.truth(self.now_ns, 1.0, 0.0)

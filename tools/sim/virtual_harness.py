@@ -69,7 +69,7 @@ class VirtualHarness:
         if now_ns % self._period_ns:
             return
         self._link.now_ns = now_ns
-        self._front.send(world.harness_force, world.harness_moment)
+        self._front.send(world.outside.harness_force, world.outside.harness_moment)
         self._loop.cycle(self._clock.read(now_ns))
 
     def assume_tared(self) -> None:

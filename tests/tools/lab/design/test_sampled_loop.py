@@ -215,13 +215,13 @@ def modes_of(values: np.ndarray) -> np.ndarray:
 def test_inertia_along_p_is_that_of_the_simulated_body(robot: RobotConfig) -> None:
     """Kinetic energy of a motion with both feet still, by MuJoCo's own mass matrix."""
     world = World(body_of(robot, changed(IDEAL, {"drivetrain.rotor_inertia": 0.01})), still(1.0))
-    q = world.data.qpos[world._q_index].copy()
+    q = world.data.qpos[world._joints.q_index].copy()
     stand = stand_at(robot, q)
     M = np.zeros((18, 18))
     mujoco.mj_fullM(world.model, world.data, M)
-    M[world._v_index, world._v_index] -= 0.01  # the rotors
+    M[world._joints.v_index, world._joints.v_index] -= 0.01  # the rotors
     rates = np.zeros((18, 6))
-    rates[world._v_index] = stand.T
+    rates[world._joints.v_index] = stand.T
     foot = np.zeros((6, 18))
     mujoco.mj_jacBody(world.model, world.data, foot[:3], foot[3:], world._placement.feet[0])
     rates[:6] = -np.linalg.solve(foot[:, :6], foot[:, 6:] @ rates[6:])
