@@ -11,8 +11,7 @@ from services.simulator.drives.axis_bank import AxisBank
 from services.simulator.fault_injector import FaultInjector
 from services.simulator.fronts.cansimple_front import CanSimpleFront
 from services.simulator.fronts.fibre_port import FibreHub
-from services.simulator.fronts.harness_front import HarnessFront
-from services.simulator.fronts.imu_front import ImuFront
+from services.simulator.fronts.sensor_fronts import HarnessFront, ImuFront
 from services.simulator.physics.world import World
 from services.simulator.state import read_state
 from shared.bus.messages import HandLead, OperatorIntent, SimControl, SimTruth, Vector4

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from services.simulator.drives.axis_bank import AXIS_NAMES, AxisBank
-from services.simulator.drives.axis_conditions import BOOT_S
+from services.simulator.drives.axis_faults import BOOT_S
 from services.simulator.drives.axis_faults import AxisErrors as Registers
 from services.simulator.fault_injector import FaultInjector
 from shared.can.cansimple import (

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from services.simulator.drives.axis_bank import AxisBank
 from services.simulator.fronts.cansimple_front import CanSimpleFront
-from services.simulator.fronts.harness_front import HarnessFront
+from services.simulator.fronts.sensor_fronts import HarnessFront
 from services.simulator.loop import SimulatorLoop, SimulatorPorts, granted
 from services.simulator.physics.body import body_of
 from services.simulator.physics.plant import IDEAL

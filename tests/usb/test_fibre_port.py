@@ -117,7 +117,7 @@ def test_a_dead_simulators_plug_is_taken_over_and_a_live_ones_is_not(
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as dead:
         dead.bind(str(path))
     port = FibrePort(front, path)
-    with pytest.raises(FleetError, match="no other simulator may hold it"):
+    with pytest.raises(FleetError, match="stop the simulator that holds it"):
         FibrePort(front, path)
     port.unplug()
     assert not path.exists()

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from services.harness.filter import WrenchFilter, tared_state
 from services.harness.loop import HarnessLoop
-from services.simulator.fronts.harness_front import HarnessFront
+from services.simulator.fronts.sensor_fronts import HarnessFront
 from services.simulator.physics.world import World
 from shared.bus.messages import Message, TareRequest, Vector6, Wrench
 from shared.bus.topics import WRENCH, Topic

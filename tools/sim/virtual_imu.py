@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from services.imu.attitude import AttitudeLaw
 from services.imu.loop import ImuLoop
-from services.simulator.fronts.imu_front import ImuFront
+from services.simulator.fronts.sensor_fronts import ImuFront
 from services.simulator.physics.plant import ImuErrors
 from services.simulator.physics.world import World
 from shared.bus.messages import Attitude, Message

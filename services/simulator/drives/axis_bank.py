@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.simulator.drives.axis_calibration import SEQUENCES, Calibration
-from services.simulator.drives.axis_conditions import Conditions
 from services.simulator.drives.axis_control import AxisControl
 from services.simulator.drives.axis_encoders import AxisEncoders
 from services.simulator.drives.axis_faults import (
@@ -27,6 +26,7 @@ from services.simulator.drives.axis_faults import (
     BUS_FAULTS,
     FAULTS,
     AxisErrors,
+    Conditions,
     controller_fault,
 )
 from services.simulator.drives.axis_settings import Settings, configured
@@ -86,16 +86,18 @@ class AxisBank:
         mark = round(drive.zero_mark_turns * encoder_counts_per_turn)
         self.counts_from = encoders.counts_from
         self.counts_from[:] = mark * np.array(motor_signs)
-        self.bus = DcBus(self.settings, control.power, control.mechanical)
+        law, column = control.results, self.settings.axis
+        self.bus = DcBus(self.settings, law.power, law.mechanical)
         self.state = [AxisState.IDLE] * n
         self.faults = [AxisErrors()] * n
-        self.control_mode = control.control_mode
-        self.input_mode = self.settings.axis("controller.config.input_mode")
+        self.control_mode = column("controller.config.control_mode")
         self.input_pos, self.input_vel = control.input_pos, control.input_vel
-        self.input_torque, self.torque = control.input_torque, control.torque
-        self.pos_gain, self.vel_gain = control.pos_gain, control.vel_gain
-        self.vel_integrator_gain = control.vel_integrator_gain
-        self.vel_limit, self.current_lim = control.vel_limit, control.current_lim
+        self.input_torque, self.torque = control.input_torque, law.torque
+        self.pos_gain = column("controller.config.pos_gain")
+        self.vel_gain = column("controller.config.vel_gain")
+        self.vel_integrator_gain = column("controller.config.vel_integrator_gain")
+        self.vel_limit = column("controller.config.vel_limit")
+        self.current_lim = column("motor.config.current_lim")
         self.pos_estimate, self.vel_estimate = encoders.pos_estimate, encoders.vel_estimate
         self.encoder_turns, self.connected = encoders.turns, control.connected
         self.now_s = -math.inf

@@ -30,7 +30,7 @@ from shared.joints import MODULE_INDEX, MODULES, N_JOINTS
 
 __all__ = [
     "AXIS_SETTINGS", "DRIVE_SETTINGS", "NAMES", "N_DRIVES", "PHASE_RESISTANCE", "Settings", "Value",
-    "configured", "plant",
+    "configured", "preset",
 ]  # fmt: skip
 
 Vector = NDArray[np.float64]
@@ -209,7 +209,7 @@ def configured(
     return settings
 
 
-def plant(settings: Settings, words: str) -> None:
+def preset(settings: Settings, words: str) -> None:
     """Set and save one setting of one drive, as a person may have left it.
 
     Args:

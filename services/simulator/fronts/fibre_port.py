@@ -7,7 +7,6 @@ together.
 
 from __future__ import annotations
 
-import errno
 import select
 import socket
 from collections.abc import Sequence
@@ -15,15 +14,13 @@ from pathlib import Path
 from typing import Final
 
 from services.simulator.fronts.fibre_front import FibreFront
-from shared.exceptions import FleetError
-from shared.run_directory import private_files
+from services.simulator.fronts.unix_can_hub import accept, listen
 
 PACKET_BYTES: Final = 64
 """A full-speed bulk transfer."""
 LOOK_EVERY: Final = 8
 """Polls from one look at the plugs themselves to the next: new clients, boards that went silent."""
 
-_BACKLOG = 16
 _PACKETS = 64  # a client that floods the link must not hold up the simulator
 
 
@@ -53,20 +50,7 @@ class FibrePort:
 
     def plug(self) -> None:
         """Put the plug in; clients find the drive when they next look."""
-        listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        listener.setblocking(False)
-        try:
-            self._clear_stale()
-            with private_files():
-                listener.bind(str(self.path))
-            listener.listen(_BACKLOG)
-        except OSError as error:
-            listener.close()
-            raise FleetError(
-                f"USB port: cannot listen on {self.path}: {error}; its directory must exist, be "
-                "writable and short enough, and no other simulator may hold it"
-            ) from error
-        self.listener = listener
+        self.listener = listen(self.path, "USB port")
 
     def unplug(self) -> None:
         """Pull the plug: every client loses the drive at once."""
@@ -81,14 +65,9 @@ class FibrePort:
 
     def admit(self) -> socket.socket | None:
         """Take one client from the queue, if there is one."""
-        if self.listener is None:
-            return None
-        try:
-            client, _ = self.listener.accept()
-        except OSError:
-            return None
-        client.setblocking(False)
-        self.clients[client.fileno()] = client
+        client = None if self.listener is None else accept(self.listener)
+        if client is not None:
+            self.clients[client.fileno()] = client
         return client
 
     def serve(self, client: socket.socket) -> bool:
@@ -107,13 +86,6 @@ class FibrePort:
         except OSError:
             return False
         return True
-
-    def _clear_stale(self) -> None:
-        """Remove a socket file that nobody listens on."""
-        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
-            probe.setblocking(False)
-            if probe.connect_ex(str(self.path)) == errno.ECONNREFUSED:
-                self.path.unlink(missing_ok=True)
 
 
 class FibreHub:
