@@ -35,7 +35,6 @@ from tools.lab.design.sampled_loop import (
     whole,
 )
 from tools.lab.design.split_program import design_of
-from tools.lab.design.stability_margins import stability_margins_of
 from tools.sim.lockstep import Lockstep
 
 
@@ -291,7 +290,7 @@ def test_what_is_in_hand_is_at_least_what_was_asked_for(
     wanted = robot.robustness
     softest = msgspec.structs.replace(wanted, stiffness=wanted.stiffness[:1])
     certificate = DynamicCertificate(msgspec.structs.replace(robot, robustness=softest), nodes[:2])
-    (room,) = stability_margins_of(certificate, design_of(robot.gain_schedule))
+    (room,) = certificate.margins(design_of(robot.gain_schedule))
     assert room.torque >= wanted.gain_margin
     assert room.coupling >= wanted.gain_margin
     assert room.delay_s >= wanted.delay_margin * wanted.delay_ms / 1e3
