@@ -51,32 +51,23 @@ def powers(world: World, torque: Array) -> tuple[float, float]:
     return float(at_joints), at_motors
 
 
-def test_at_the_start_the_soles_lie_flat_on_the_floor(robot: RobotConfig) -> None:
-    world = world_of(robot)
-    truth = seen(world)
-    assert max(truth.foot_right_tilt, truth.foot_left_tilt) < 2e-3
-    for side in SIDES:
-        foot = world.data.body(f"foot_{side}")
-        assert foot.xpos[2] == pytest.approx(0.0, abs=1e-3)
-        heading = foot.xmat.reshape(3, 3)[:, 0]
-        assert heading[1] == pytest.approx(0.0, abs=2e-3)  # toes forward
-
-
-def test_at_the_start_the_ankles_are_where_the_planner_takes_them_to_be(
+def test_at_the_start_it_stands_level_soles_flat_where_the_planner_takes_it_to_be(
     robot: RobotConfig,
 ) -> None:
     world = world_of(robot)
-    for side, sign in zip(SIDES, (-1.0, 1.0), strict=True):
-        wanted = (0.0, sign * robot.geometry.w_base / 2, 0.0)
-        np.testing.assert_allclose(world.data.body(f"foot_{side}").xpos, wanted, atol=2e-3)
-
-
-def test_at_the_start_the_torso_is_level_at_the_stand_height(robot: RobotConfig) -> None:
-    truth = seen(world_of(robot))
+    truth = seen(world)
     assert truth.torso[2] == pytest.approx(robot.simulation.stand_height, abs=5e-4)
     assert truth.angles == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
     assert truth.com[:2] == pytest.approx((0.0, 0.0), abs=1e-3)
+    assert max(truth.foot_right_tilt, truth.foot_left_tilt) < 2e-3
     assert not truth.fallen
+    for side, sign in zip(SIDES, (-1.0, 1.0), strict=True):
+        foot = world.data.body(f"foot_{side}")
+        wanted = (0.0, sign * robot.geometry.w_base / 2, 0.0)
+        np.testing.assert_allclose(foot.xpos, wanted, atol=2e-3)
+        assert foot.xpos[2] == pytest.approx(0.0, abs=1e-3)
+        heading = foot.xmat.reshape(3, 3)[:, 0]
+        assert heading[1] == pytest.approx(0.0, abs=2e-3)  # toes forward
 
 
 def test_motor_turns_obey_the_differential(robot: RobotConfig) -> None:

@@ -143,33 +143,30 @@ def test_an_exchange_returns_what_was_there_before(client: Client, bank: AxisBan
     assert bank.input_torque[2 * MODULE : 2 * MODULE + 2].tolist() == [0.0, 0.5]
 
 
-def test_the_answer_is_no_longer_than_asked_for(client: Client) -> None:
+def test_the_answer_is_no_longer_than_asked_for_and_than_a_packet_holds(client: Client) -> None:
     number = client.endpoints["vbus_voltage"]["id"]
     assert [len(client.operate(number, size)) for size in (0, 2, 4, 8)] == [0, 2, 4, 4]
-
-
-def test_the_answer_is_no_longer_than_a_packet_holds(client: Client) -> None:
     assert client.operate(0, 512, struct.pack("<I", 3)) == client.front.descriptor[3:65]
 
 
 def test_an_endpoint_that_does_not_exist_has_an_empty_answer(client: Client) -> None:
-    assert client.operate(1 + max(row["id"] for row in client.endpoints.values()), 4) == b""
-    assert client.operate(0x7FFF, 4) == b""
+    for number in (1 + max(row["id"] for row in client.endpoints.values()), 0x7FFF):
+        assert client.operate(number, 4) == b""
 
 
-def test_a_request_that_wants_no_answer_is_carried_out(client: Client, bank: AxisBank) -> None:
+@pytest.mark.parametrize(
+    ("flags", "wrong", "written"),
+    [(0, 0, 1.5), (ANSWER, 1, 0.0)],
+    ids=["wants no answer: carried out", "of another descriptor: ignored"],
+)
+def test_a_request_without_an_answer(
+    client: Client, bank: AxisBank, flags: int, wrong: int, written: float
+) -> None:
     number = client.endpoints["axis0.controller.input_vel"]["id"]
-    packet = struct.pack("<HHHfH", 0x81, number, 0, 1.5, client.trailer)
+    packet = struct.pack("<HHHfH", 0x81, number | flags, 0, 1.5, client.trailer ^ wrong)
     assert client.front.answer(packet) is None
-    assert bank.input_vel[2 * MODULE] == 1.5
-
-
-def test_a_request_made_for_another_descriptor_is_ignored(client: Client, bank: AxisBank) -> None:
-    number = client.endpoints["axis0.controller.input_vel"]["id"]
-    packet = struct.pack("<HHHfH", 0x81, number | ANSWER, 0, 1.5, client.trailer ^ 1)
-    assert client.front.answer(packet) is None
-    assert client.front.ignored == 1
-    assert bank.input_vel[2 * MODULE] == 0.0
+    assert client.front.ignored == wrong
+    assert bank.input_vel[2 * MODULE] == written
 
 
 @given(packet=st.binary(max_size=80))
@@ -207,22 +204,19 @@ def test_a_state_is_asked_for_and_reported(client: Client, bank: AxisBank) -> No
     assert client.exchange("axis1.motor.is_armed") is True
 
 
-def test_a_mode_that_is_not_there_is_an_error(client: Client, bank: AxisBank) -> None:
-    client.exchange("axis0.controller.config.control_mode", 1)
-    assert client.exchange("axis0.controller.config.control_mode") == 1
-    client.exchange("axis0.controller.config.input_mode", 5)
-    assert client.exchange("axis0.controller.error") == 2
-    assert client.exchange("axis0.controller.config.input_mode") == 1
-
-
-def test_position_mode_written_makes_where_the_motor_is_its_target(
+def test_a_mode_goes_to_the_controller_and_one_that_is_not_there_is_an_error(
     client: Client, bank: AxisBank
 ) -> None:
     bank.input_pos[:] = 3.0
     client.exchange("axis0.controller.config.input_mode", 1)
     assert client.exchange("axis0.controller.input_pos") == 3.0
     client.exchange("axis0.controller.config.control_mode", 3)
-    assert client.exchange("axis0.controller.input_pos") == 0.0
+    assert client.exchange("axis0.controller.input_pos") == 0.0, "the motor's place is its target"
+    client.exchange("axis0.controller.config.control_mode", 1)
+    assert client.exchange("axis0.controller.config.control_mode") == 1
+    client.exchange("axis0.controller.config.input_mode", 5)
+    assert client.exchange("axis0.controller.error") == 2
+    assert client.exchange("axis0.controller.config.input_mode") == 1
 
 
 def test_a_setting_that_is_no_number_is_not_taken(client: Client, bank: AxisBank) -> None:
