@@ -18,14 +18,7 @@ _COLUMNS: Final = ("input_pos", "input_vel", "input_torque", "pos_gain", "vel_ga
 
 
 def read_state(world: World, bank: AxisBank, t_ns: int, seq: int) -> SimState:
-    """Return the state of a world between two steps, and of its drives.
-
-    Args:
-        world: between two steps.
-        bank: its drives.
-        t_ns: monotonic time.
-        seq: number of the message.
-    """
+    """Return the state of a world between two steps, and of its drives."""
     data = world.data
     return SimState(
         t_ns=t_ns,
@@ -43,14 +36,9 @@ def read_state(world: World, bank: AxisBank, t_ns: int, seq: int) -> SimState:
 
 
 def write_state(world: World, bank: AxisBank, state: SimState) -> None:
-    """Continue from a state of the same robot and scenario.
+    """Make a new world and its drives continue from a state of the same robot and scenario.
 
     Errors and conditions of the drives are not in it: an axis that is not armed is idle.
-
-    Args:
-        world: new.
-        bank: new; not stepped yet.
-        state: of a run.
     """
     world.resume(state)
     bank.counts_from[:] = state.counts_from

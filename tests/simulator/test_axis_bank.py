@@ -157,24 +157,16 @@ def test_position_estimate_settles_on_the_count_below_the_true_position() -> Non
     assert bank.encoder_turns * CPR == pytest.approx(math.floor(0.70001 * CPR))
 
 
-@pytest.mark.parametrize(
-    ("turns", "mark", "zeroed", "counted"),
-    [(-3.25, 64.0, True, 60.75), (-9.3, 0.0, False, -0.3), (9.2, 0.0, False, 0.2)],
-    ids=["from its mark", "within a turn", "within a turn, above"],
-)
-def test_a_drive_counts_from_its_mark_or_once_it_got_power_within_a_turn(
-    turns: float, mark: float, zeroed: bool, counted: float
+@pytest.mark.parametrize(("turns", "within"), [(5.75, -0.25), (-9.3, -0.3), (9.2, 0.2)])
+def test_a_drive_counts_from_its_mark_and_after_a_restart_of_its_own_within_a_turn(
+    turns: float, within: float
 ) -> None:
-    bank = idle_bank(np.full(12, turns), mark, zeroed=zeroed)
-    np.testing.assert_allclose(bank.pos_estimate, counted, atol=1e-4)
-
-
-def test_a_restart_loses_the_whole_turns_and_only_of_its_own_drive() -> None:
-    bank = idle_bank(np.full(12, 5.75), mark=64.0)
+    bank = idle_bank(np.full(12, turns), mark=64.0)
+    np.testing.assert_allclose(bank.pos_estimate, 64.0 + turns, atol=1e-4)
     bank.reboot(4)
-    step_for(bank, DT, pos=np.full(12, 5.75))
-    assert bank.pos_estimate[[4, 5]] == pytest.approx([-0.25, -0.25])
-    assert np.delete(bank.pos_estimate, [4, 5]) == pytest.approx([69.75] * 10)
+    step_for(bank, DT, pos=np.full(12, turns))
+    assert bank.pos_estimate[[4, 5]] == pytest.approx([within] * 2, abs=1e-4)
+    assert np.delete(bank.pos_estimate, [4, 5]) == pytest.approx([64.0 + turns] * 10, abs=1e-4)
 
 
 def test_a_count_that_was_set_is_counted_on_from_without_a_jump_in_velocity() -> None:

@@ -29,7 +29,7 @@ from services.simulator.drives.axis_faults import (
     Conditions,
     controller_fault,
 )
-from services.simulator.drives.axis_settings import Settings, configured
+from services.simulator.drives.axis_settings import configured
 from services.simulator.drives.dc_bus import DEAD_VOLTAGE, DcBus
 from shared.can.cansimple import (
     AxisError,
@@ -61,28 +61,22 @@ class AxisBank:
         *,
         encoder_counts_per_turn: int,
         watchdog: bool = True,
-        settings: Settings | None = None,
-        zeroed: bool = True,
         motor_signs: Sequence[int] = (1,) * N_JOINTS,
     ) -> None:
-        """Power the drives up, calibrated, in IDLE.
+        """Power the drives up, calibrated, zeroed (`drive.zero_mark_turns`), in IDLE.
 
         Args:
             drive: the robot file's `[drive]`.
             encoder_counts_per_turn: of the encoders themselves.
             watchdog: True if the drives' watchdogs run.
-            settings: of the drives; None: as the services need them (`configured`).
-            zeroed: True if their zero was written (`drive.zero_mark_turns`). Else they know the
-                motor's angle within a turn only, as after any loss of power.
             motor_signs: sign of each motor's count and of its zero mark.
         """
-        self.settings = settings or configured(
+        self.settings = configured(
             drive, encoder_counts_per_turn=encoder_counts_per_turn, watchdog=watchdog
         )
         n = N_JOINTS
         self._encoders = encoders = AxisEncoders(self.settings, encoder_counts_per_turn)
         self._control = control = AxisControl(self.settings, encoders)
-        self._zeroed = zeroed
         mark = round(drive.zero_mark_turns * encoder_counts_per_turn)
         self.counts_from = encoders.counts_from
         self.counts_from[:] = mark * np.array(motor_signs)
@@ -124,9 +118,6 @@ class AxisBank:
             self.now_s = now_s
             self._fed_s = [now_s] * N_JOINTS
             self._encoders.start(pos_turns, vel_turns)
-            if not self._zeroed:
-                for axis in range(N_JOINTS):
-                    self._encoders.lose_turns(axis)
         else:
             dt_s = now_s - self.now_s
             self.now_s = now_s

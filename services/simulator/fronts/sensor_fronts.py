@@ -55,11 +55,9 @@ class HarnessFront:
         force_torso: Sequence[float] | npt.NDArray[np.float64],
         moment_torso: Sequence[float] | npt.NDArray[np.float64],
     ) -> None:
-        """Send one sample of the operator's force and moment on the torso.
+        """Send one sample of the operator's force on the torso (3,), N, torso axes, and moment.
 
-        Args:
-            force_torso: (3,) in N, torso axes.
-            moment_torso: (3,) in N m about the harness point, torso axes.
+        The moment (3,), N m, is about the harness point.
         """
         forces = self._G_inverse @ np.concatenate((force_torso, moment_torso))
         forces += self.bias

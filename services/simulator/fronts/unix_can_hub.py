@@ -135,10 +135,6 @@ class UnixCanHub:
 def listen(path: Path, what: str) -> socket.socket:
     """Listen on a path for packets; remove the file of a simulator that is gone.
 
-    Args:
-        path: of the socket.
-        what: listens, for errors.
-
     Raises:
         FleetError: the path is in use, too long, or cannot be made.
     """

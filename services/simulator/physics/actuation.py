@@ -70,12 +70,8 @@ class Actuation:
     def torque(self, motor_torque: Array, q: Array, v: Array) -> Array:
         """Advance by one step; return what acts on the joints (12,), N m.
 
-        Of a flexible drivetrain without `flexible.damping` times v.
-
-        Args:
-            motor_torque: that the drives want (12,), N m.
-            q: joint angles (12,), rad.
-            v: joint rates (12,), rad/s.
+        Of a flexible drivetrain without `flexible.damping` times v. `motor_torque` (12,), N m, is
+        what the drives want.
         """
         wanted = np.matmul(self.tau_from_motor, motor_torque, out=self._wanted)
         if len(self._waiting):
@@ -96,9 +92,7 @@ class Actuation:
     def encoders(self, q: Array, v: Array) -> tuple[Array, Array]:
         """Return the encoders' motor angles (12,), turns, and the true rates, turn/s.
 
-        Args:
-            q: angles of the rotors (12,), rad at the joints.
-            v: their rates (12,), rad/s.
+        From angles and rates of the rotors (12,), rad and rad/s at the joints.
         """
         turns = self._turns @ q
         turns += self._offset

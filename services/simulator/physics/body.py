@@ -79,12 +79,7 @@ class Body(NamedTuple):
 
 
 def body_of(config: RobotConfig, plant: PlantConfig) -> Body:
-    """Return the true robot.
-
-    Args:
-        config: the robot as its controllers know it.
-        plant: how the truth differs.
-    """
+    """Return the true robot: as its controllers know it, but for the plant."""
     spec = mujoco.MjSpec.from_string(mjcf(config))
     spec.option.timestep = config.simulation.timestep / plant.steps
     _set_gravity(spec, plant)

@@ -46,9 +46,7 @@ class FootPlacement:
     def stand_up(self, q: Array, lean: tuple[float, float]) -> None:
         """Place the robot with the torso along the floor and the COM over the ankles by gravity.
 
-        Args:
-            q: joint angles to start from (12,), rad.
-            lean: gravity's x and y over its z.
+        It starts from joint angles q (12,), rad; `lean` is gravity's x and y over its z.
         """
         data, model = self._data, self._model
         data.qpos[self.q_index] = q

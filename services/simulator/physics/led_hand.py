@@ -49,9 +49,7 @@ class LedHand(msgspec.Struct):
     def ask(self, asked: HandLead, now: Lead) -> None:
         """Accept a request, within the limits; a value that is not finite is ignored.
 
-        Args:
-            asked: where to lead and how to push.
-            now: where the hand is led now; the first request takes over from there.
+        The first one takes over from where the hand is led `now`.
         """
         if not all(map(math.isfinite, (asked.height, asked.pitch, *asked.push))):
             return

@@ -59,12 +59,9 @@ class Wearer(msgspec.Struct):
         return self.above + self.reach, self.rate - self.reach / REACH_S
 
     def step(self, dt: float, force_on_robot: float, assist: float) -> None:
-        """Advance by dt, s.
+        """Advance by dt, s, under the hand's force on the robot, N, up.
 
-        Args:
-            dt: step, s.
-            force_on_robot: of the hand, N, up.
-            assist: requested by the person, N; the person rests part of it, with a delay.
+        Of the assist that it requests, N, the person rests a part, with a delay.
         """
         person = self.person
         if person.mass > 0.0:
@@ -89,14 +86,9 @@ class Operator:
     def force(
         self, wanted: Lead, height: float, rate: float, pitch: float, pitch_rate: float
     ) -> HandForce:
-        """Return the hand's force.
+        """Return the hand's force, from where it leads and where the robot is.
 
-        Args:
-            wanted: where the hand leads: torso height and pitch.
-            height: of the harness point above the ankles, m.
-            rate: of the harness point, vertical, m/s.
-            pitch: of the torso, rad.
-            pitch_rate: rad/s.
+        `height` is the harness point's above the ankles, m, `pitch` the torso's, rad.
         """
         x, _, z = self._point
         sine, cosine = math.sin(wanted.pitch), math.cos(wanted.pitch)

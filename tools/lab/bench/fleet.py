@@ -165,13 +165,7 @@ def first_use_ms(log: RunLog) -> Array:
 
 
 def rows(here: Sequence[Turn], there: Sequence[Turn], pace: float) -> list[Row]:
-    """Return the table's rows; targets are those of pace 1.
-
-    Args:
-        here: turns of this tree; at least one.
-        there: of the other tree, in turn with them; empty: none.
-        pace: of all.
-    """
+    """Return the rows of this tree's turns, beside the other tree's; targets are of pace 1."""
     return [
         compared(
             figure.what,

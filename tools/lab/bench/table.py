@@ -57,15 +57,7 @@ def compared(
     there: Sequence[float | None],
     target: float | None,
 ) -> Row:
-    """Return a figure's row.
-
-    Args:
-        what: its name.
-        unit: of all values.
-        here: values of this tree, by turn; None: a turn does not have it.
-        there: of the other tree, in turn with them; empty: none.
-        target: in the same unit.
-    """
+    """Return a figure's row, from this tree's values by turn and the other tree's; None: none."""
     values = [value for value in here if value is not None]
     others = [value for value in there if value is not None]
     pairs = [(a, b) for a, b in zip(here, there, strict=False) if a is not None and b]

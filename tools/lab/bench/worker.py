@@ -108,14 +108,7 @@ class PartRow(NamedTuple):
 def row_of(
     request: Request, turns: Sequence[Answer], others: Sequence[Answer], target: float | None
 ) -> PartRow | None:
-    """Return a row; None if this tree does not have the part.
-
-    Args:
-        request: what was measured.
-        turns: of this tree.
-        others: of the other tree, in turn with them; empty: none.
-        target: us of CPU time, or times real time; None: none.
-    """
+    """Return the row of this tree's turns and the other tree's; None if this one lacks the part."""
     if any(turn.missing for turn in turns):
         return None
     walls = [turn.cost.wall.p50 for turn in turns if turn.cost is not None]

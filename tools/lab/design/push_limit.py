@@ -96,11 +96,8 @@ class LoadedStand:
     def __init__(self, config: RobotConfig, kinematics: Kinematics, T: Array, H: Array) -> None:
         """Compute the loads of the pose at which the kinematics was updated.
 
-        Args:
-            config: the robot.
-            kinematics: of the pose.
-            T: joint rates per unit of p along the closed chain (12, 6).
-            H: `Kinematics.hessian_times` of the weight (12, 12), N m/rad.
+        T (12, 6) are joint rates per unit of p along the closed chain, H (12, 12), N m/rad, is
+        `Kinematics.hessian_times` of the weight.
         """
         self._T, self._H = T.copy(), H.copy()
         self._K_geo: Array = self._T.T @ self._H @ self._T
@@ -242,12 +239,7 @@ def limits_along(
 ) -> PushLimits:
     """Return the limits along one direction, on rigid joints.
 
-    Args:
-        stand: the pose.
-        config: the robot, with its gain schedule.
-        D: local stiffnesses in TRACK (12,), N m/rad.
-        D_B: local damping in TRACK (12,), N m s/rad.
-        direction: world x and y, a unit vector.
+    D, N m/rad, and D_B, N m s/rad, (12,) are the local gains in TRACK.
     """
     law, schedule = config.law, config.gain_schedule
     damping = 0.0 if schedule is None else schedule.coupling_damping
