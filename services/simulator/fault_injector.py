@@ -58,7 +58,7 @@ class FaultInjector:
                 hot = float(limit) + OVER_TEMP_MARGIN + _ABOVE
                 bank.conditions.heat(axis, hot if begins else ROOM_TEMPERATURE)
             case "encoder":
-                bank.conditions.lose_encoder(axis, lost=begins)
+                bank.conditions.fail_encoder(axis, lost=begins)
             case "link_lost":
                 bank.conditions.link(drive, up=not begins)
             case "over_voltage":

@@ -179,10 +179,10 @@ def test_a_count_that_was_set_is_counted_on_from_without_a_jump_in_velocity() ->
 
 def test_a_lost_encoder_comes_back_where_it_was_set_since() -> None:
     bank = idle_bank(mark=64.0)
-    bank.conditions.lose_encoder(2, lost=True)
+    bank.conditions.fail_encoder(2, lost=True)
     step_for(bank, DT)
     assert bank.pos_estimate[2] == 64.0, "it reads what it did"
     bank.set_count(2, 0.0)
-    bank.conditions.lose_encoder(2, lost=False)
+    bank.conditions.fail_encoder(2, lost=False)
     step_for(bank, DT)
     assert bank.pos_estimate[2] == pytest.approx(0.0, abs=1e-3)

@@ -181,7 +181,7 @@ class AxisBank:
         below = f"axis{axis & 1}.controller.config"
         self.settings.set(axis >> 1, f"{below}.control_mode", control_mode)
         self.settings.set(axis >> 1, f"{below}.input_mode", input_mode)
-        self._control.stay(axis)
+        self._control.hold_here(axis)
 
     def set_count(self, axis: int, count: float) -> None:
         """Tell an axis that its encoder reads so many counts here; `input_pos` stays."""
@@ -215,7 +215,7 @@ class AxisBank:
         self.settings.restore(drive)
         for each in _both(axis):
             self.calibration.restart(each)
-            self._encoders.lose_turns(each)
+            self._encoders.forget_turns(each)
         self.conditions.boot(drive, self.now_s)
 
     def is_responding(self, axis: int) -> bool:
@@ -262,11 +262,11 @@ class AxisBank:
 
     def _apply_conditions(self) -> None:
         """Handle rare changes: drives that start, conditions, calibrations."""
-        for drive in self.conditions.come_up(self.now_s):
+        for drive in self.conditions.finish_boots(self.now_s):
             for axis in _both(2 * drive):
                 self.state[axis] = AxisState.IDLE
                 self._fed_s[axis] = self.now_s
-        for axis, fault in self.conditions.failing():
+        for axis, fault in self.conditions.disarming():
             self._fail(axis, fault)
         for axis in list(self.calibration.running):
             turns = float(self.encoder_turns[axis])

@@ -104,14 +104,14 @@ class AxisControl:
             self._regulates = (self._mode >= ControlMode.VELOCITY).astype(np.float64)
         return bool(np.dot(self._regulates, self.armed) > 0.0)
 
-    def stay(self, axis: int) -> None:
+    def hold_here(self, axis: int) -> None:
         """Make where the motor is its target, in position mode: `control_mode_updated`."""
         if self._mode[axis] >= ControlMode.POSITION:
             self.input_pos[axis] = self._encoders.pos_estimate[axis]
 
     def arm(self, axis: int) -> None:
         """Let an axis's torque through, from where it is; `input_torque` stays as it stands."""
-        self.stay(axis)
+        self.hold_here(axis)
         self.integrator[axis] = 0.0
         self.armed[axis] = self.connected[axis] = 1.0
 

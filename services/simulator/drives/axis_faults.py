@@ -125,40 +125,40 @@ class Conditions:
     def link(self, drive: int, *, up: bool) -> None:
         """Pull a drive's cable, or plug it in."""
         self._linked[drive] = up
-        self._hush()
+        self._update_silent()
 
     def boot(self, drive: int, now_s: float) -> None:
         """Let a drive start up from now on."""
         self.down.add(drive)
         self._up_s[drive] = now_s + BOOT_S
-        self._hush()
+        self._update_silent()
 
     def power_off(self, drive: int) -> None:
         """Keep a drive down until `boot`."""
         self.down.add(drive)
         self._up_s[drive] = math.inf
-        self._hush()
+        self._update_silent()
 
     def is_off(self, drive: int) -> bool:
         """Return True if a drive is without power."""
         return self._up_s[drive] == math.inf
 
-    def come_up(self, now_s: float) -> list[int]:
+    def finish_boots(self, now_s: float) -> list[int]:
         """Return the drives whose start-up is over by now; they are down no more."""
         up = [drive for drive in self.down if self._up_s[drive] <= now_s]
         if up:
             self.down.difference_update(up)
-            self._hush()
+            self._update_silent()
         return up
 
-    def lose_encoder(self, axis: int, *, lost: bool) -> None:
+    def fail_encoder(self, axis: int, *, lost: bool) -> None:
         """Take an axis's encoder away, or bring it back."""
         if lost:
             self.blind.add(axis)
-            self._encoders.blind(axis)  # it keeps its last reading
+            self._encoders.freeze(axis)  # it keeps its last reading
         elif axis in self.blind:
             self.blind.remove(axis)
-            self._encoders.see_again(axis)
+            self._encoders.recover(axis)
 
     def heat(self, axis: int, celsius: float) -> None:
         """Bring an axis's output stage to a temperature; near its limit the current is less."""
@@ -172,14 +172,14 @@ class Conditions:
         over = enabled and celsius >= high + OVER_TEMP_MARGIN
         (self._hot.add if over else self._hot.discard)(axis)
 
-    def failing(self) -> list[tuple[int, AxisErrors]]:
+    def disarming(self) -> list[tuple[int, AxisErrors]]:
         """Return the axes that a condition disarms, and with what; blind ones stand still."""
         for axis in self.blind:
-            self._encoders.blind(axis)
+            self._encoders.freeze(axis)
         failing = [(axis, FAULTS["ENCODER"]) for axis in sorted(self.blind)]
         return failing + [(axis, FAULTS["OVER_TEMP"]) for axis in sorted(self._hot)]
 
-    def _hush(self) -> None:
+    def _update_silent(self) -> None:
         """Work out who is silent."""
         self.silent.clear()
         for axis in range(N_JOINTS):

@@ -18,8 +18,8 @@ from services.simulator.fronts.unix_can_hub import accept, listen
 
 PACKET_BYTES: Final = 64
 """A full-speed bulk transfer."""
-LOOK_EVERY: Final = 8
-"""Polls from one look at the plugs themselves to the next: new clients, boards that went silent."""
+CHECK_EVERY: Final = 8
+"""Polls from one check of the plugs to the next: new clients, boards that went silent."""
 
 _PACKETS = 64  # a client that floods the link must not hold up the simulator
 
@@ -106,7 +106,7 @@ class FibreHub:
     def poll(self) -> None:
         """Answer all requests that have come; now and then look at the plugs. Never waits."""
         self._polls += 1
-        if self._polls % LOOK_EVERY == 0:
+        if self._polls % CHECK_EVERY == 0:
             for port in self.ports:
                 self._turn_if_wrong(port)
         elif not self.clients:

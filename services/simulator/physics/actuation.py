@@ -51,7 +51,7 @@ class Actuation:
         self._waiting: Array = np.zeros((round(drive.delay_s / dt), n))
         """Torques on their way, the oldest first."""
         self._tau: Array = np.zeros(n)
-        """Of the current loops, where these lag."""
+        """Torques of the current loops, where these lag."""
         self._wanted: Array = np.zeros(n)
         self._acting: Array = np.zeros(n)
         flexible = body.drivetrain.stiffness != RIGID

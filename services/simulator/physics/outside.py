@@ -44,13 +44,13 @@ class Hoist(msgspec.Struct):
     """A spring-damper on the torso that also carries weight, by a share that is let down."""
 
     weight: float
-    """Of the robot, N."""
+    """The robot's, N."""
     release_s: float
     """Time in which it lets go, s."""
     position: Array
     """Where it holds the torso, (3,) m, world."""
     share: float = 1.0
-    """Of its support: 1 hanging, 0 free."""
+    """Fraction of its support: 1 hanging, 0 free."""
     releasing: bool = False
 
     def advance(self, torso: Torso, dt: float) -> Array:

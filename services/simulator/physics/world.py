@@ -45,7 +45,7 @@ class Joints(NamedTuple):
     damping: Array
     """By place of the rate, N m s/rad."""
     damping_alone: Array
-    """Of the joints without their drivetrains (12,), N m s/rad."""
+    """Damping of the joints without their drivetrains (12,), N m s/rad."""
 
 
 class World:

@@ -171,7 +171,7 @@ class _Laws(NamedTuple):
     H: Array
     J_open: Array
     T_open: Array
-    """Of the coordinates that the planner takes as measured."""
+    """J and T of the coordinates that the planner takes as measured."""
     ease_p: Array
     ease_v: Array
     """Torques that ease the hand's force, per p and p'."""

@@ -13,7 +13,7 @@ import pytest
 from services.simulator.drives.axis_bank import AxisBank
 from services.simulator.fronts.fibre_endpoints import EmulatedBoard
 from services.simulator.fronts.fibre_front import FibreFront
-from services.simulator.fronts.fibre_port import LOOK_EVERY, FibreHub, FibrePort
+from services.simulator.fronts.fibre_port import CHECK_EVERY, FibreHub, FibrePort
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError
 
@@ -43,7 +43,7 @@ def client() -> Iterator[socket.socket]:
 
 
 def look(hub: FibreHub) -> None:
-    for _ in range(LOOK_EVERY):
+    for _ in range(CHECK_EVERY):
         hub.poll()
 
 
