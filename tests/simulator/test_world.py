@@ -47,7 +47,7 @@ def powers(world: World, torque: Array) -> tuple[float, float]:
     """Return power at the joints and at the motors, W, at the present rates."""
     _, turns_per_s = world.motor_turns()
     at_motors = float(torque @ turns_per_s) * 2 * math.pi
-    at_joints = world._actuation.tau_from_motor @ torque @ world.data.qvel[world._joints.v_index]
+    at_joints = world.actuation.tau_from_motor @ torque @ world.data.qvel[world.joints.v_index]
     return float(at_joints), at_motors
 
 
@@ -75,7 +75,7 @@ def test_motor_turns_obey_the_differential(robot: RobotConfig) -> None:
     world = world_of(robot)
     rng = np.random.default_rng(1)
     q, v = rng.uniform(-1, 1, 12), rng.uniform(-1, 1, 12)
-    world.data.qpos[world._joints.q_index] = q
+    world.data.qpos[world.joints.q_index] = q
     world.data.qvel[6:] = 0.0
     for index, name in enumerate(JOINTS):
         world.data.joint(name).qvel[0] = v[index]

@@ -53,6 +53,9 @@ class World:
 
     Attributes:
         outside: what acts on the torso.
+        joints: the joints in MuJoCo's memory.
+        actuation: drivetrains and encoders.
+        placement: where the feet stand.
         time: s since the world began.
     """
 
@@ -70,9 +73,9 @@ class World:
         self.timestep = body.timestep
         self._steps = body.steps
         self._dt: float = model.opt.timestep
-        self._placement = placement = FootPlacement(model, data, body)
-        self._actuation = Actuation(body, self._dt)
-        self._joints = Joints(
+        self.placement = placement = FootPlacement(model, data, body)
+        self.actuation = Actuation(body, self._dt)
+        self.joints = Joints(
             q_index=placement.q_index,
             v_index=placement.v_index,
             qpos=data.qpos,
@@ -92,7 +95,7 @@ class World:
         self._lean = (x / z, y / z)
         # the hoist hangs from above: on a slope it holds the torso aside of the floor's normal
         placement.stand_up(body.stand_q, self._lean)
-        self._actuation.settle(data.qpos[placement.q_index])
+        self.actuation.settle(data.qpos[placement.q_index])
         data.qpos[2] += lifted
         self._torso = Torso(
             position=data.qpos[:3],
@@ -110,14 +113,14 @@ class World:
 
         The two legs must agree on the torso, as `InverseKinematics` makes them.
         """
-        self._placement.stand_at(q)
-        self._actuation.settle(self.data.qpos[self._joints.q_index])
+        self.placement.stand_at(q)
+        self.actuation.settle(self.data.qpos[self.joints.q_index])
         self.remove_hoist()
 
     def hidden(self) -> tuple[float, ...]:
         """Return what MuJoCo does not hold: the person, the drivetrain, torques on their way."""
         wearer = self.outside.wearer
-        return (wearer.above, wearer.rate, wearer.load_n, *self._actuation.numbers())
+        return (wearer.above, wearer.rate, wearer.load_n, *self.actuation.numbers())
 
     def resume(self, state: SimState) -> None:
         """Continue from the state of another world of the same robot, plant and scenario."""
@@ -132,7 +135,7 @@ class World:
         wearer, numbers = outside.wearer, state.hidden
         wearer.above, wearer.rate, wearer.load_n = numbers[:3]
         wearer.holds = True
-        self._actuation.set_numbers(numbers[3:])
+        self.actuation.set_numbers(numbers[3:])
         outside.led_hand = None
         if any(state.hand):
             outside.led_hand = LedHand(bool(state.hand[0]), *state.hand[1:])
@@ -179,7 +182,7 @@ class World:
 
     def step(self, motor_torque: Array) -> None:
         """Move on by one time step under motor torques (12,) in N m."""
-        actuation, joints = self._actuation, self._joints
+        actuation, joints = self.actuation, self.joints
         q_index, v_index = joints.q_index, joints.v_index
         for _ in range(self._steps):
             q, v = joints.qpos.take(q_index), joints.qvel.take(v_index)
@@ -195,7 +198,7 @@ class World:
 
         Order: axis0, axis1 of each module in `MODULES` order.
         """
-        actuation, joints = self._actuation, self._joints
+        actuation, joints = self.actuation, self.joints
         if actuation.flexible is not None:
             return actuation.encoders(actuation.flexible.theta, actuation.flexible.rate)
         q, v = joints.qpos.take(joints.q_index), joints.qvel.take(joints.v_index)
@@ -204,7 +207,7 @@ class World:
     def torso_against_gravity(self) -> list[float]:
         """Return the quaternion (w, x, y, z) that turns torso axes into axes whose z is up."""
         measured = np.zeros(4)
-        mujoco.mju_mulQuat(measured, self._level, self._joints.qpos[3:7])
+        mujoco.mju_mulQuat(measured, self._level, self.joints.qpos[3:7])
         quaternion: list[float] = measured.tolist()
         return quaternion
 
@@ -215,7 +218,7 @@ class World:
 
     def truth(self, t_ns: int, real_time_factor: float, late_s: float) -> SimTruth:
         """Return the world as it is, for the log and the verdict."""
-        placement, outside = self._placement, self.outside
+        placement, outside = self.placement, self.outside
         posture = measure_posture(self.data, self._torso_id, placement.feet, placement.ankles)
         self._fallen |= posture.fallen
         moment = self._torso.rotation.reshape(3, 3)[:, 1] * outside.hand.moment_pitch

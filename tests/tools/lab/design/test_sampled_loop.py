@@ -129,7 +129,7 @@ def test_the_plant_has_the_simulated_world_s_modes(robot: RobotConfig) -> None:
         fleet.advance()
     world = fleet.world
     simulated = modes(simulated_transition(world, fleet._torque.copy()), world.model.opt.timestep)
-    stand = stand_at(robot, world._actuation.flexible.theta)
+    stand = stand_at(robot, world.actuation.flexible.theta)
     nothing = np.zeros((12, 12))
     drivetrain = DrivetrainModel(5000.0, 10.0, 0.15)
     loop = SampledLoop(
@@ -164,10 +164,10 @@ def stand_at(robot: RobotConfig, q: np.ndarray) -> Stand:
 
 def simulated_transition(world: World, torque: np.ndarray) -> np.ndarray:
     """Return d state+ / d state (60, 60) of one step: body and rotors, torque held."""
-    model, data, rotors = world.model, world.data, world._actuation.flexible
+    model, data, rotors = world.model, world.data, world.actuation.flexible
     assert rotors is not None
     world._steps = 1
-    tau, warm = world._actuation._tau.copy(), data.qacc_warmstart.copy()
+    tau, warm = world.actuation._tau.copy(), data.qacc_warmstart.copy()
     qpos, theta = data.qpos.copy(), rotors.theta.copy()
 
     def step(dx: np.ndarray) -> np.ndarray:
@@ -176,7 +176,7 @@ def simulated_transition(world: World, torque: np.ndarray) -> np.ndarray:
         data.qpos[:], data.qvel[:] = moved, dx[18:36]
         rotors.theta[:], rotors.rate[:] = theta + dx[36:48], dx[48:]
         data.qacc_warmstart[:] = warm
-        world._actuation._tau[:] = tau
+        world.actuation._tau[:] = tau
         world.step(torque)
         dq = np.zeros(18)
         mujoco.mj_differentiatePos(model, dq, 1.0, qpos, data.qpos)
@@ -201,15 +201,15 @@ def modes_of(values: np.ndarray) -> np.ndarray:
 def test_inertia_along_p_is_that_of_the_simulated_body(robot: RobotConfig) -> None:
     """Kinetic energy of a motion with both feet still, by MuJoCo's own mass matrix."""
     world = World(body_of(robot, changed(IDEAL, {"drivetrain.rotor_inertia": 0.01})), still(1.0))
-    q = world.data.qpos[world._joints.q_index].copy()
+    q = world.data.qpos[world.joints.q_index].copy()
     stand = stand_at(robot, q)
     M = np.zeros((18, 18))
     mujoco.mj_fullM(world.model, world.data, M)
-    M[world._joints.v_index, world._joints.v_index] -= 0.01  # the rotors
+    M[world.joints.v_index, world.joints.v_index] -= 0.01  # the rotors
     rates = np.zeros((18, 6))
-    rates[world._joints.v_index] = stand.T
+    rates[world.joints.v_index] = stand.T
     foot = np.zeros((6, 18))
-    mujoco.mj_jacBody(world.model, world.data, foot[:3], foot[3:], world._placement.feet[0])
+    mujoco.mj_jacBody(world.model, world.data, foot[:3], foot[3:], world.placement.feet[0])
     rates[:6] = -np.linalg.solve(foot[:, :6], foot[:, 6:] @ rates[6:])
     np.testing.assert_allclose(rates.T @ M @ rates, stand.M, rtol=2e-3, atol=2e-2)
 
