@@ -7,7 +7,6 @@ import math
 import struct
 from typing import Any
 
-import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,12 +16,11 @@ from services.simulator.drives.axis_settings import NAMES
 from services.simulator.fronts.fibre_endpoints import CODECS, EmulatedBoard
 from services.simulator.fronts.fibre_front import FibreFront, crc16
 from shared.can.cansimple import AxisError, AxisState
-from shared.config.robot_config import RobotConfig
+from tests.simulator.banks import DRIVE, ZERO, idle_bank
 
 MODULE = 1
 SERIAL = 0x365A335A3438
 ANSWER = 0x8000
-TIMEOUT_S = 0.1
 
 
 class Client:
@@ -76,11 +74,8 @@ def flat(prefix: str, members: list[dict[str, Any]]) -> list[tuple[str, dict[str
 
 
 @pytest.fixture
-def bank(robot: RobotConfig) -> AxisBank:
-    drive = msgspec.structs.replace(robot.drive, watchdog_timeout=TIMEOUT_S, zero_mark_turns=0.0)
-    bank = AxisBank(drive, encoder_counts_per_turn=8192)
-    step(bank, 0.0)
-    return bank
+def bank() -> AxisBank:
+    return idle_bank()
 
 
 @pytest.fixture
@@ -91,11 +86,6 @@ def front(bank: AxisBank) -> FibreFront:
 @pytest.fixture
 def client(front: FibreFront) -> Client:
     return Client(front)
-
-
-def step(bank: AxisBank, now_s: float) -> None:
-    still = bank.pos_estimate * 0.0
-    bank.step(now_s, still, still)
 
 
 @pytest.mark.parametrize(
@@ -170,9 +160,8 @@ def test_a_request_without_an_answer(
 
 
 @given(packet=st.binary(max_size=80))
-def test_no_packet_makes_the_front_fail(robot: RobotConfig, packet: bytes) -> None:
-    bank = AxisBank(robot.drive, encoder_counts_per_turn=8192)
-    front = FibreFront(EmulatedBoard(bank, MODULE, SERIAL))
+def test_no_packet_makes_the_front_fail(packet: bytes) -> None:
+    front = FibreFront(EmulatedBoard(idle_bank(), MODULE, SERIAL))
     front.answer(packet)
     (trailer,) = struct.unpack("<H", struct.pack("<H", crc16(1, front.descriptor)))
     front.answer(packet + struct.pack("<H", trailer))
@@ -182,17 +171,17 @@ def test_native_writes_feed_no_watchdog_but_its_function_does(
     client: Client, bank: AxisBank
 ) -> None:
     axis = 2 * MODULE
-    step(bank, 0.9 * TIMEOUT_S)
+    bank.step(0.9 * DRIVE.watchdog_timeout, ZERO, ZERO)
     client.call("axis0.watchdog_feed")
     client.exchange("axis1.controller.input_torque", 0.0)
-    step(bank, 1.1 * TIMEOUT_S)
+    bank.step(1.1 * DRIVE.watchdog_timeout, ZERO, ZERO)
     assert bank.faults[axis].axis == 0
     assert bank.faults[axis + 1].axis == AxisError.WATCHDOG_TIMER_EXPIRED
 
 
 def test_the_watchdog_is_a_setting_of_each_axis(client: Client, bank: AxisBank) -> None:
     client.exchange("axis0.config.enable_watchdog", False)
-    step(bank, 1e3)
+    bank.step(1e3, ZERO, ZERO)
     assert client.exchange("axis0.error") == 0
     assert client.exchange("axis1.error") == AxisError.WATCHDOG_TIMER_EXPIRED
 
@@ -237,7 +226,7 @@ def test_a_function_is_called_with_the_argument_written_before(
 
 
 def test_clearing_errors_clears_both_axes(client: Client, bank: AxisBank) -> None:
-    step(bank, 1e3)
+    bank.step(1e3, ZERO, ZERO)
     assert client.exchange("axis0.error") != 0
     client.call("clear_errors")
     assert [client.exchange(f"axis{i}.error") for i in (0, 1)] == [0, 0]

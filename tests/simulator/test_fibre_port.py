@@ -14,16 +14,16 @@ from services.simulator.drives.axis_bank import AxisBank
 from services.simulator.fronts.fibre_endpoints import EmulatedBoard
 from services.simulator.fronts.fibre_front import FibreFront
 from services.simulator.fronts.fibre_port import CHECK_EVERY, FibreHub, FibrePort
-from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError
+from tests.simulator.banks import idle_bank
 
 VERSION = struct.pack("<HHHIH", 0x81, 0x8000, 4, 0xFFFF_FFFF, 1)
 """Asks for the id of the descriptor."""
 
 
 @pytest.fixture
-def bank(robot: RobotConfig) -> AxisBank:
-    return AxisBank(robot.drive, encoder_counts_per_turn=8192)
+def bank() -> AxisBank:
+    return idle_bank()
 
 
 @pytest.fixture

@@ -18,9 +18,10 @@ from services.simulator.physics.body import body_of
 from services.simulator.physics.plant import IDEAL
 from services.simulator.physics.world import World
 from shared.bus.messages import OperatorIntent, Vector4
-from shared.can.cansimple import AxisState, ControlMode, InputMode
+from shared.can.cansimple import AxisState, ControlMode
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Fault, Keyframe, Scenario
+from tests.simulator.banks import close_loop
 
 
 class Silent:
@@ -78,9 +79,7 @@ def test_the_drives_step_with_the_world_only_where_they_have_their_own_loop(
 ) -> None:
     loop, _, bank = make_loop(robot)
     loop.step()
-    for axis in range(12):
-        bank.set_modes(axis, mode, InputMode.PASSTHROUGH)
-        bank.request_state(axis, AxisState.CLOSED_LOOP_CONTROL)
+    close_loop(bank, mode)
     steps = count_steps(loop, bank, monkeypatch)
     rates = robot.simulation.encoder_rate_hz * robot.simulation.timestep
     assert steps == (100 if every else pytest.approx(100 * rates, abs=1))

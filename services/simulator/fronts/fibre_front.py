@@ -124,34 +124,27 @@ class FibreFront:
 def _tree(rows: list[Endpoint]) -> list[dict[str, Any]]:
     """Return the JSON descriptor of endpoints with dotted names; ids count from 1."""
     root: list[dict[str, Any]] = [{"name": "", "id": 0, "type": "json", "access": "r"}]
+    objects = {"": root}
+
+    def members(path: str) -> list[dict[str, Any]]:
+        if path not in objects:
+            above, _, name = path.rpartition(".")
+            objects[path] = []
+            members(above).append({"name": name, "type": "object", "members": objects[path]})
+        return objects[path]
+
     for number, row in enumerate(rows, start=1):
-        if isinstance(row, Argument):
-            continue
-        members = root
-        *path, leaf = row.name.split(".")
-        for name in path:
-            members = _object(members, name)
-        members.append(_entry(leaf, number, row))
+        if not isinstance(row, Argument):
+            path, _, name = row.name.rpartition(".")
+            members(path).append({"name": name, "id": number, **_description(number, row)})
     return root
 
 
-def _object(members: list[dict[str, Any]], name: str) -> list[dict[str, Any]]:
-    """Return the members of a named object, which is added if it is not there."""
-    for member in members:
-        if member["name"] == name:
-            found: list[dict[str, Any]] = member["members"]
-            return found
-    added: list[dict[str, Any]] = []
-    members.append({"name": name, "type": "object", "members": added})
-    return added
-
-
-def _entry(name: str, number: int, row: Property | Function) -> dict[str, Any]:
+def _description(number: int, row: Property | Function) -> dict[str, Any]:
     if isinstance(row, Property):
-        access = "r" if row.write is None else "rw"
-        return {"name": name, "id": number, "type": row.type, "access": access}
+        return {"type": row.type, "access": "r" if row.write is None else "rw"}
     inputs = [
         {"name": each.name, "id": number + 1 + i, "type": each.type, "access": "rw"}
         for i, each in enumerate(row.arguments)
     ]
-    return {"name": name, "id": number, "type": "function", "inputs": inputs, "outputs": []}
+    return {"type": "function", "inputs": inputs, "outputs": []}
