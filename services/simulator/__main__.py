@@ -8,8 +8,7 @@ from pathlib import Path
 from services.simulator.drives.axis_bank import AxisBank
 from services.simulator.drives.axis_settings import preset
 from services.simulator.fronts.cansimple_front import CanSimpleFront
-from services.simulator.fronts.fibre_endpoints import EmulatedBoard
-from services.simulator.fronts.fibre_front import FibreFront
+from services.simulator.fronts.fibre_front import EmulatedBoard, FibreFront
 from services.simulator.fronts.fibre_port import FibreHub, FibrePort
 from services.simulator.fronts.sensor_fronts import HarnessFront, ImuFront
 from services.simulator.fronts.unix_can_hub import UnixCanHub

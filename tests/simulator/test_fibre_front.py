@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from services.simulator.drives.axis_bank import AxisBank
 from services.simulator.drives.axis_settings import NAMES
-from services.simulator.fronts.fibre_endpoints import CODECS, EmulatedBoard
-from services.simulator.fronts.fibre_front import FibreFront, crc16
+from services.simulator.fronts.fibre_front import CODECS, EmulatedBoard, FibreFront, crc16
 from shared.can.cansimple import AxisError, AxisState
 from tests.simulator.banks import DRIVE, ZERO, idle_bank
 
@@ -50,7 +49,7 @@ class Client:
     def exchange(self, name: str, *value: float) -> Any:
         """Read an endpoint, with a value: write it too; return what it held."""
         row = self.endpoints[name]
-        codec = struct.Struct("<" + CODECS[row["type"]])
+        codec = CODECS[row["type"]]
         payload = codec.pack(*value) if value else b""
         return codec.unpack(self.operate(row["id"], codec.size, payload))[0]
 

@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from services.simulator.drives.axis_bank import AxisBank
-from services.simulator.fronts.fibre_endpoints import EmulatedBoard
-from services.simulator.fronts.fibre_front import FibreFront
+from services.simulator.fronts.fibre_front import EmulatedBoard, FibreFront
 from services.simulator.fronts.fibre_port import CHECK_EVERY, FibreHub, FibrePort
 from shared.exceptions import FleetError
 from tests.simulator.banks import idle_bank
