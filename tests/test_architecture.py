@@ -62,7 +62,6 @@ VENDORS = {
     "mujoco": [
         "services/simulator/physics/world.py",
         "services/simulator/physics/body.py",
-        "services/simulator/physics/foot_placement.py",
         "services/simulator/physics/posture.py",
     ],
     "pinocchio": ["services/planner/law/model.py"],

@@ -57,7 +57,9 @@ def graphs_of(robot: RobotConfig) -> list[ca.Function]:
     graphs = [*symbolic.build(robot, leg_geometry(robot)), certificate.stiffness_graph()]
     if is_installed("sim"):
         body = body_of(robot, PlantConfig())
-        drivetrain = step_graph(body.drivetrain, body.motor_from_joint, body.model.opt.timestep)
+        drivetrain = step_graph(
+            body.plant.drivetrain, body.motor_from_joint, body.model.opt.timestep
+        )
         graphs += [drivetrain, axis_control.law_graph()]
     return graphs
 

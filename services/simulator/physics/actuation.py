@@ -42,7 +42,8 @@ class Actuation:
 
     def __init__(self, body: Body, dt: float) -> None:
         """Take the true robot and the step, s."""
-        n, drive, turns = N_JOINTS, body.drive, body.motor_from_joint
+        n, plant, turns = N_JOINTS, body.plant, body.motor_from_joint
+        drive = plant.drive
         self._turns = turns
         # power is the same on both sides: tau = (d motor angle / d joint angle)^T torque
         self.tau_from_motor: Array = 2.0 * math.pi * drive.torque_scale * turns.T.copy()
@@ -54,11 +55,11 @@ class Actuation:
         """Torques of the current loops, where these lag."""
         self._wanted: Array = np.zeros(n)
         self._acting: Array = np.zeros(n)
-        flexible = body.drivetrain.stiffness != RIGID
-        self.flexible = FlexibleDrivetrain(body.drivetrain, turns, dt) if flexible else None
-        self._offset: Array = turns @ np.array(body.encoder.zero_errors)
-        noise = body.encoder.noise_counts / body.counts_per_turn
-        rng = np.random.default_rng(body.seed)
+        flexible = plant.drivetrain.stiffness != RIGID
+        self.flexible = FlexibleDrivetrain(plant.drivetrain, turns, dt) if flexible else None
+        self._offset: Array = turns @ np.array(plant.encoder.zero_errors)
+        noise = plant.encoder.noise_counts / body.counts_per_turn
+        rng = np.random.default_rng(plant.seed)
         self._noise: Array = noise * rng.standard_normal((NOISE_ROWS if noise else 1, n))
         self._reads = 0
 

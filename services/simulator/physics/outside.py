@@ -99,7 +99,7 @@ class OutsideForces:
         self._torso = torso
         self._harness_point = body.harness_point
         self.operator = Operator(body.hand, body.harness_point)
-        self.wearer = Wearer(body.person)
+        self.wearer = Wearer(body.plant.person)
         self.hoist = Hoist(body.weight, body.hoist_s, torso.position.copy())
         self.asked: tuple[float, Vector4] | None = None
         self.led_hand: LedHand | None = None

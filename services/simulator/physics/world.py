@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.simulator.physics.actuation import Actuation
-from services.simulator.physics.body import Body
-from services.simulator.physics.foot_placement import FootPlacement
+from services.simulator.physics.body import Body, FootPlacement
 from services.simulator.physics.led_hand import LedHand
 from services.simulator.physics.outside import OutsideForces, Torso
 from services.simulator.physics.posture import as_vector, measure_posture, sole_loads
@@ -71,7 +70,7 @@ class World:
         self.model = model = body.model
         self.data = data = mujoco.MjData(model)
         self.timestep = body.timestep
-        self._steps = body.steps
+        self._steps = body.plant.steps
         self._dt: float = model.opt.timestep
         self.placement = placement = FootPlacement(model, data, body)
         self.actuation = Actuation(body, self._dt)
