@@ -27,7 +27,7 @@ from shared.process import StopFlag
 
 INTENT_RATE_HZ: Final = 50.0
 SILENT_INTENTS: Final = 250
-"""Intents of the scenario left out after somebody else's last: until his has faded out."""
+"""Intents of the scenario left out after somebody else's last: until that has faded out."""
 
 
 class SimulatorPorts(msgspec.Struct, frozen=True):

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Final
 
-import msgspec
-
 from services.simulator.drives.axis_bank import AxisBank
 from services.simulator.physics.led_hand import LedHand
 from services.simulator.physics.world import World
@@ -30,7 +28,7 @@ def read_state(world: World, bank: AxisBank, t_ns: int, seq: int) -> SimState:
         hoist=world.hoist,
         armed=tuple(int(state == AxisState.CLOSED_LOOP_CONTROL) for state in bank.state),
         hidden=world.hidden(),
-        hand=tuple(map(float, msgspec.structs.astuple(world.outside.led_hand or LedHand()))),
+        hand=(world.outside.led_hand or LedHand()).numbers(),
         **{name: tuple(getattr(bank, name).tolist()) for name in _COLUMNS},
     )
 

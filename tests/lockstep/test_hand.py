@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from pathlib import Path
 
-import msgspec
 import pytest
 
 from services.simulator.physics.led_hand import HEIGHT_MAX_RATE
@@ -73,7 +72,7 @@ def test_a_moment_of_it_has_the_hand_and_what_follows_is_led_on(
     fleet = Lockstep(robot, still(DURATION_S), BASE, hand=hand_path(log))
     fleet.resume(FleetMoment(state, {}, None))
     assert fleet.world.outside.led_hand is not None
-    assert msgspec.structs.astuple(fleet.world.outside.led_hand) == state.hand
+    assert fleet.world.outside.led_hand.numbers() == state.hand
     led = Lockstep(robot, still(DURATION_S), BASE, hand=hand_path(log))
     seen = [row for row in led.run() if row.scenario_s >= 1.0]
     moment = led.moment()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final
 
 import msgspec
@@ -86,6 +87,18 @@ class LedHand(msgspec.Struct):
             pitch=self.pitch,
             pitch_rate=self.pitch_rate,
         )
+
+    def numbers(self) -> tuple[float, ...]:
+        """Return the fields as the log has them."""
+        return tuple(map(float, msgspec.structs.astuple(self)))
+
+    @classmethod
+    def of_numbers(cls, numbers: Sequence[float]) -> LedHand:
+        """Return the hand that `numbers` were of."""
+        hand = cls()
+        for name, value in zip(cls.__struct_fields__, numbers, strict=True):
+            setattr(hand, name, value)
+        return hand
 
     @property
     def push(self) -> Vector3 | None:

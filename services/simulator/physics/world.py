@@ -135,9 +135,7 @@ class World:
         wearer.above, wearer.rate, wearer.load_n = numbers[:3]
         wearer.holds = True
         self.actuation.set_numbers(numbers[3:])
-        outside.led_hand = None
-        if any(state.hand):
-            outside.led_hand = LedHand(bool(state.hand[0]), *state.hand[1:])
+        outside.led_hand = LedHand.of_numbers(state.hand) if any(state.hand) else None
 
     # ---- the scenario, the operator, the hoist
 

@@ -224,7 +224,7 @@ class DynamicCertificate:
         else:
             feedback = self.held(c.node, design, onboard=c.mode == "drives alone")
             stand = stand._replace(S=np.zeros(6))
-        drivetrain, timing = self._drivetrain(c.stiffness), self._timing(c.delay_s)
+        drivetrain, timing = self.drivetrain(c.stiffness), self.timing(c.delay_s)
         return SampledLoop(stand, half, feedback, drivetrain, timing, c.hand)
 
     def conditions(
@@ -334,7 +334,8 @@ class DynamicCertificate:
             if margins:
                 yield case._replace(gains=Gains(torque=self._wanted.gain_margin))
 
-    def _drivetrain(self, stiffness: float) -> DrivetrainModel:
+    def drivetrain(self, stiffness: float) -> DrivetrainModel:
+        """Return the drivetrain of a stiffness, N m/rad."""
         joint, wanted = self._config.joint, self._wanted
         return DrivetrainModel(
             stiffness,
@@ -344,7 +345,8 @@ class DynamicCertificate:
             encoder_bandwidth=self._config.drive.encoder_bandwidth,
         )
 
-    def _timing(self, delay_s: float) -> LoopTiming:
+    def timing(self, delay_s: float) -> LoopTiming:
+        """Return the loop's periods, with a delay from sample to use."""
         service = self._config.joint_service
         return LoopTiming(
             1.0 / service.rate_hz, 1.0 / self._config.planner.rate_hz, delay_s, DRIVE_STEP_S

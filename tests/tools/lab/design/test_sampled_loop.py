@@ -69,8 +69,8 @@ def whole_loop(
     """Return both halves as one loop, and the same for the oracle."""
     stand, hand = condition.node.stand, condition.hand
     feedback = certificate.feedback(condition.node, design)
-    drive = certificate._drivetrain(condition.stiffness)
-    timing = certificate._timing(condition.delay_s)
+    drive = certificate.drivetrain(condition.stiffness)
+    timing = certificate.timing(condition.delay_s)
     oracle = loop_oracle.Loop(
         **stand._asdict(), **feedback._asdict(), **timing._asdict(), hand=tuple(hand),
         k=drive.stiffness, b=drive.damping, I=drive.rotor_inertia, d_motor=drive.motor_damping,
