@@ -35,7 +35,7 @@ def main() -> None:
     scenario = Scenario(name="gentle", about="down by 0.2 m", duration=3.5, keyframe=down)
     for name, hand in (("shipped", Operator), ("gentle", GentleHand)):
         fleet = Lockstep(robot, scenario, seed=1)
-        fleet.world.operator = hand(robot.simulation.operator, robot.geometry.harness_point)
+        fleet.world.outside.operator = hand(robot.simulation.operator, robot.geometry.harness_point)
         rows = [row for row in fleet.run() if row.scenario_s >= 0.0]
         peak = max(abs(row.operator_force[2]) for row in rows)
         print(f"{name:8} hand: {peak:5.1f} N at most, torso at {rows[-1].torso[2]:.3f} m")

@@ -62,8 +62,7 @@ VENDORS = {
     "mujoco": [
         "services/simulator/physics/world.py",
         "services/simulator/physics/body.py",
-        "services/simulator/physics/foot_placement.py",
-        "services/simulator/physics/soles.py",
+        "services/simulator/physics/posture.py",
     ],
     "pinocchio": ["services/planner/law/model.py"],
     "aiohttp": ["tools/view/server.py"],
@@ -80,7 +79,7 @@ VENDORS = {
         "services/planner/law/certificate.py",
         "services/planner/law/symbolic.py",
         "services/simulator/drives/axis_control.py",
-        "services/simulator/physics/drivetrain.py",
+        "services/simulator/physics/actuation.py",
         "shared/robot/compiled_graph.py",
         "tools/graph_libraries.py",
     ],
@@ -109,7 +108,6 @@ NEEDS_EXTRA = {
     "tools/judge/reports/canvas.py": "plot",
     "tools/judge/reports/moving_*.py": "plot",
     "tools/lab/learning/environment.py": "learn",
-    "tools/lab/bench/transports/over_*.py": "bench",
 }
 """Modules that cannot be imported without an extra. Whoever imports one, by a function, has called
 `require` there. All others can be imported with the packages of `dependencies` alone."""
@@ -333,8 +331,7 @@ def test_a_module_can_be_imported_without_the_packages_of_extras_but_those_liste
     assert all(package.split(".")[0] in hidden for package in failed.values()), failed
     files = {name.replace(".", "/") + ".py" for name in failed}
     listed = {file for file in SOURCES if any(fnmatch.fnmatch(file, row) for row in NEEDS_EXTRA)}
-    beside = {f"tools/lab/bench/transports/over_{name}.py" for name in ("zenoh", "datagrams")}
-    assert files == listed - beside
+    assert files == listed
 
 
 def extra_of(imported: Import) -> str:

@@ -25,8 +25,8 @@ import numpy as np
 from services.planner.law import certificate, symbolic
 from services.planner.law.model import leg_geometry
 from services.simulator.drives import axis_control
+from services.simulator.physics.actuation import step_graph
 from services.simulator.physics.body import body_of
-from services.simulator.physics.drivetrain import step_graph
 from services.simulator.physics.plant import PlantConfig
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
@@ -57,7 +57,9 @@ def graphs_of(robot: RobotConfig) -> list[ca.Function]:
     graphs = [*symbolic.build(robot, leg_geometry(robot)), certificate.stiffness_graph()]
     if is_installed("sim"):
         body = body_of(robot, PlantConfig())
-        drivetrain = step_graph(body.drivetrain, body.motor_from_joint, body.model.opt.timestep)
+        drivetrain = step_graph(
+            body.plant.drivetrain, body.motor_from_joint, body.model.opt.timestep
+        )
         graphs += [drivetrain, axis_control.law_graph()]
     return graphs
 

@@ -41,8 +41,8 @@ from shared.bus.messages import (
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES, N_JOINTS, N_MODULES
-from shared.state import copied
 from shared.robot.hold_rules import Support
+from shared.state import copied
 
 Array = NDArray[np.float64]
 

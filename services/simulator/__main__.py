@@ -6,13 +6,11 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from services.simulator.drives.axis_bank import AxisBank
-from services.simulator.drives.axis_settings import plant
+from services.simulator.drives.axis_settings import preset
 from services.simulator.fronts.cansimple_front import CanSimpleFront
-from services.simulator.fronts.fibre_endpoints import EmulatedBoard
-from services.simulator.fronts.fibre_front import FibreFront
+from services.simulator.fronts.fibre_front import EmulatedBoard, FibreFront
 from services.simulator.fronts.fibre_port import FibreHub, FibrePort
-from services.simulator.fronts.harness_front import HarnessFront
-from services.simulator.fronts.imu_front import ImuFront
+from services.simulator.fronts.sensor_fronts import HarnessFront, ImuFront
 from services.simulator.fronts.unix_can_hub import UnixCanHub
 from services.simulator.fronts.usb_standin import FOLDER
 from services.simulator.loop import SimulatorLoop, SimulatorPorts
@@ -102,7 +100,7 @@ def main() -> int:
             dialect=robot.simulation.can_dialect,
         )
         for words in arguments.drive_setting:
-            plant(bank.settings, words)
+            preset(bank.settings, words)
         for axis in range(N_JOINTS if arguments.drive_setting else 0):
             bank.calibration.restart(axis)
         usb = open_usb(robot, bank, arguments.run_dir, stack)

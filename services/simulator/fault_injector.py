@@ -6,8 +6,11 @@ from collections.abc import Sequence
 from typing import Final
 
 from services.simulator.drives.axis_bank import AxisBank
-from services.simulator.drives.axis_conditions import OVER_TEMP_MARGIN, ROOM_TEMPERATURE
-from services.simulator.drives.axis_faults import AXIS_NAMES
+from services.simulator.drives.axis_faults import (
+    AXIS_NAMES,
+    OVER_TEMP_MARGIN,
+    ROOM_TEMPERATURE,
+)
 from services.simulator.drives.dc_bus import SUPPLY_VOLTAGE
 from shared.config.scenarios import Fault
 from shared.exceptions import DriveError
@@ -55,7 +58,7 @@ class FaultInjector:
                 hot = float(limit) + OVER_TEMP_MARGIN + _ABOVE
                 bank.conditions.heat(axis, hot if begins else ROOM_TEMPERATURE)
             case "encoder":
-                bank.conditions.lose_encoder(axis, lost=begins)
+                bank.conditions.fail_encoder(axis, lost=begins)
             case "link_lost":
                 bank.conditions.link(drive, up=not begins)
             case "over_voltage":

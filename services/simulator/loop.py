@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final, NamedTuple
 
 import msgspec
 
@@ -10,10 +11,9 @@ from services.simulator.drives.axis_bank import AxisBank
 from services.simulator.fault_injector import FaultInjector
 from services.simulator.fronts.cansimple_front import CanSimpleFront
 from services.simulator.fronts.fibre_port import FibreHub
-from services.simulator.fronts.harness_front import HarnessFront
-from services.simulator.fronts.imu_front import ImuFront
+from services.simulator.fronts.sensor_fronts import HarnessFront, ImuFront
 from services.simulator.physics.world import World
-from services.simulator.state import taken
+from services.simulator.state import read_state
 from shared.bus.messages import HandLead, OperatorIntent, SimControl, SimTruth, Vector4
 from shared.bus.session import Latest, Publisher
 from shared.bus.topics import SIM_STATE
@@ -25,10 +25,9 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import SCENARIO
 from shared.process import StopFlag
 
-INTENT_RATE_HZ = 50.0
-SILENT_INTENTS = 250
-"""Intents of the scenario left out after somebody else's last: until his has faded out."""
-STATE_RATE_HZ = SIM_STATE.rate_hz
+INTENT_RATE_HZ: Final = 50.0
+SILENT_INTENTS: Final = 250
+"""Intents of the scenario left out after somebody else's last: until that has faded out."""
 
 
 class SimulatorPorts(msgspec.Struct, frozen=True):
@@ -40,6 +39,44 @@ class SimulatorPorts(msgspec.Struct, frozen=True):
     state: Publisher[SimState]
     asked: Latest[OperatorIntent]
     hand: Latest[HandLead]
+
+
+class Periods(NamedTuple):
+    """Steps of the world from one of each to the next."""
+
+    encoders: int
+    harness: int
+    imu: int
+    truth: int
+    intent: int
+    state: int
+
+
+def periods_of(config: RobotConfig) -> Periods:
+    """Return how often each is due."""
+    simulation = config.simulation
+
+    def steps(rate_hz: float) -> int:
+        return max(1, round(1.0 / simulation.timestep / rate_hz))
+
+    return Periods(
+        encoders=steps(simulation.encoder_rate_hz),
+        harness=steps(config.harness.rate_hz),
+        imu=steps(config.imu.rate_hz),
+        truth=steps(simulation.truth_rate_hz),
+        intent=steps(INTENT_RATE_HZ),
+        state=steps(SIM_STATE.rate_hz),
+    )
+
+
+class Pace(msgspec.Struct):
+    """What was skipped of the clock, and where all stood when the scenario started."""
+
+    lost_ns: int = 0
+    start_ns: int = 0
+    """0: it has not started."""
+    start_step: int = 0
+    lost_at_start_ns: int = 0
 
 
 def granted(asked: OperatorIntent, assist_max: float, shift_max: Vector4) -> tuple[float, Vector4]:
@@ -58,6 +95,9 @@ class SimulatorLoop:
 
     The drives receive and send at the rate of their encoder frames. In torque mode they hold their
     torque between frames; with a loop of their own they step with the world.
+
+    Attributes:
+        autostart_s: start the scenario by itself, so long after the hoist is down; None: do not.
     """
 
     def __init__(
@@ -70,33 +110,21 @@ class SimulatorLoop:
         sensors: tuple[HarnessFront, ImuFront | None],
         ports: SimulatorPorts,
     ) -> None:
+        self._config = config
         self._world, self._bank, self._front = world, bank, front
         (self._harness, self._imu), self._ports = sensors, ports
         self._usb = usb
         self._faults = FaultInjector(world.scenario.fault, bank)
-        simulation = config.simulation
-        rate = 1.0 / simulation.timestep
-        self._step_ns = round(simulation.timestep * NS_PER_S)
-        self._encoder_every = max(1, round(rate / simulation.encoder_rate_hz))
-        self._harness_every = max(1, round(rate / config.harness.rate_hz))
-        self._imu_every = max(1, round(rate / config.imu.rate_hz))
-        self._truth_every = max(1, round(rate / simulation.truth_rate_hz))
-        self._intent_every = max(1, round(rate / INTENT_RATE_HZ))
-        self._state_every = max(1, round(rate / STATE_RATE_HZ))
-        self._assist_max, self._shift_max = config.assist.force_max, config.law.shift_max
-        self._states = 0
-        self._slip_ns = round(simulation.late_slip_ms * NS_PER_MS)
+        self._every = periods_of(config)
+        self._step_ns = round(config.simulation.timestep * NS_PER_S)
+        self._slip_ns = round(config.simulation.late_slip_ms * NS_PER_MS)
         self.autostart_s: float | None = None
-        """Start the scenario by itself, so long after the hoist is down."""
-        self._hoisted_step = 0
         self._torque = bank.torque
         self._steps = 0
+        self._hoisted_step = 0
         self._intents = 0
         self._unasked = 0
-        self._lost_ns = 0
-        self._start_ns = 0
-        self._start_step = 0
-        self._lost_at_start_ns = 0
+        self._pace = Pace()
 
     def run(self, stop: StopFlag) -> None:
         """Run until stopped.
@@ -110,14 +138,14 @@ class SimulatorLoop:
             due += self._step_ns
             behind = now_ns() - due
             if behind > self._slip_ns:
-                self._lost_ns += behind
+                self._pace.lost_ns += behind
                 due += behind
             sleep_until(due)
 
     def step(self) -> None:
-        """Take the drives' frames, advance the world by one step, send what is due."""
-        world, front, ports = self._world, self._front, self._ports
-        if self._steps % self._encoder_every == 0:
+        """Apply the drives' frames, advance the world by one step, send what is due."""
+        world, front, every = self._world, self._front, self._every
+        if self._steps % every.encoders == 0:
             self._faults.advance(world.scenario_s)
             front.receive()
             self._torque = self._bank.step(world.time, *world.motor_turns())
@@ -130,16 +158,16 @@ class SimulatorLoop:
         world.step(self._torque)
         self._steps += 1
         steps = self._steps
-        if steps % self._harness_every == 0:
-            self._harness.send(world.harness_force, world.harness_moment)
-        if self._imu is not None and steps % self._imu_every == 0:
+        if steps % every.harness == 0:
+            self._harness.send(world.outside.harness_force, world.outside.harness_moment)
+        if self._imu is not None and steps % every.imu == 0:
             self._imu.send(world)
-        if steps % self._truth_every == 0:
+        if steps % every.truth == 0:
             self._publish_truth()
-        if steps % self._state_every == 0:
-            self._states += 1
-            ports.state.put(taken(world, self._bank, now_ns(), self._states))
-        if steps % self._intent_every == 0:
+        if steps % every.state == 0:
+            state = read_state(world, self._bank, now_ns(), steps // every.state)
+            self._ports.state.put(state)
+        if steps % every.intent == 0:
             self._ask()
 
     def _ask(self) -> None:
@@ -147,12 +175,13 @@ class SimulatorLoop:
         world, other = self._world, self._ports.asked.take()
         if other is not None and other.source != SCENARIO:
             self._unasked = 0
-            world.asked = granted(other, self._assist_max, self._shift_max)
+            most = self._config.assist.force_max, self._config.law.shift_max
+            world.outside.asked = granted(other, *most)
             return
         self._unasked += 1
-        if world.asked is not None and self._unasked < SILENT_INTENTS:
+        if world.outside.asked is not None and self._unasked < SILENT_INTENTS:
             return
-        world.asked = None
+        world.outside.asked = None
         self._intents += 1
         wanted = world.lead()
         intent = OperatorIntent(
@@ -166,7 +195,7 @@ class SimulatorLoop:
 
     def _publish_truth(self) -> None:
         """Publish the truth, and look at what needs no more than its rate."""
-        world, now = self._world, now_ns()
+        world, pace, now = self._world, self._pace, now_ns()
         control, hand = self._ports.control.take(), self._ports.hand.take()
         if hand is not None:
             world.take_hand(hand)
@@ -177,12 +206,11 @@ class SimulatorLoop:
         requested = control is not None and control.start
         if (requested or by_itself) and world.scenario_s < 0.0:
             world.start()
-            self._start_ns, self._start_step = now, self._steps
-            self._lost_at_start_ns = self._lost_ns
+            pace.start_ns, pace.start_step, pace.lost_at_start_ns = now, self._steps, pace.lost_ns
         if all(state == AxisState.CLOSED_LOOP_CONTROL for state in self._bank.state):
             world.release_hoist()
-        wall_ns = now - self._start_ns
-        simulated_ns = (self._steps - self._start_step) * self._step_ns
-        factor = simulated_ns / wall_ns if self._start_ns and wall_ns > 0 else 1.0
-        late_s = (self._lost_ns - self._lost_at_start_ns) / NS_PER_S
+        wall_ns = now - pace.start_ns
+        simulated_ns = (self._steps - pace.start_step) * self._step_ns
+        factor = simulated_ns / wall_ns if pace.start_ns and wall_ns > 0 else 1.0
+        late_s = (pace.lost_ns - pace.lost_at_start_ns) / NS_PER_S
         self._ports.truth.put(world.truth(now, factor, late_s))

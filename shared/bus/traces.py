@@ -101,8 +101,8 @@ class SimState(Message, frozen=True):
     """Hidden state of the plant: the person, the rotors and torques on their way, as
     `World.hidden`."""
     hand: tuple[float, ...] = (0.0,) * 11
-    """State of the hand that somebody leads in place of the scenario, as `LedHand.state`; all zero:
-    nobody does."""
+    """State of the hand that somebody leads in place of the scenario, as the fields of `LedHand`;
+    all zero: nobody does."""
 
 
 class LinkEvent(Message, frozen=True):

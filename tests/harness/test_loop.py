@@ -11,7 +11,7 @@ import pytest
 from services.harness.__main__ import make_sensor
 from services.harness.filter import WrenchFilter
 from services.harness.loop import HarnessLoop
-from services.simulator.fronts.harness_front import BIAS_MAX, HarnessFront
+from services.simulator.fronts.sensor_fronts import BIAS_MAX, HarnessFront
 from services.simulator.fronts.unix_can_hub import UnixCanHub
 from shared.bus.codec import Decoder
 from shared.bus.messages import Tare, Wrench

@@ -71,8 +71,8 @@ def test_a_moment_of_it_has_the_hand_and_what_follows_is_led_on(
     assert state.hand[0] == 1.0, "somebody leads"
     fleet = Lockstep(robot, still(DURATION_S), BASE, hand=hand_path(log))
     fleet.resume(FleetMoment(state, {}, None))
-    assert fleet.world.led_hand is not None
-    assert fleet.world.led_hand.state() == state.hand
+    assert fleet.world.outside.led_hand is not None
+    assert fleet.world.outside.led_hand.numbers() == state.hand
     led = Lockstep(robot, still(DURATION_S), BASE, hand=hand_path(log))
     seen = [row for row in led.run() if row.scenario_s >= 1.0]
     moment = led.moment()

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from services.simulator.fronts.harness_front import HarnessFront
+from services.simulator.fronts.sensor_fronts import HarnessFront
 from services.simulator.fronts.unix_can_hub import UnixCanHub
 from shared.bus import topics
 from shared.bus.messages import Attitude, Tare, TareRequest, Wrench

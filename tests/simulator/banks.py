@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,18 +26,31 @@ DRIVE = DriveConfig(
 CPR = 16384
 DT = 0.001
 ZERO = np.zeros(12)
+IDLE, CLOSED_LOOP = AxisState.IDLE, AxisState.CLOSED_LOOP_CONTROL
+
+
+def idle_bank(turns: NDArray[np.float64] = ZERO, mark: float = 0.0, **options: Any) -> AxisBank:
+    """Return a bank in IDLE at a position, at time 0."""
+    drive = msgspec.structs.replace(DRIVE, zero_mark_turns=mark)
+    bank = AxisBank(drive, encoder_counts_per_turn=CPR, **options)
+    bank.step(0.0, turns, ZERO)
+    return bank
+
+
+def close_loop(bank: AxisBank, mode: ControlMode, axes: range = range(12)) -> None:
+    """Set a mode and ask for closed loop."""
+    for axis in axes:
+        bank.set_modes(axis, mode, InputMode.PASSTHROUGH)
+        bank.request_state(axis, CLOSED_LOOP)
 
 
 def make_bank(
     mode: ControlMode = ControlMode.TORQUE, *, watchdog: bool = False, turns: float = 0.0
 ) -> AxisBank:
     """Return a bank with all axes in closed loop at a position, at time 0."""
-    bank = AxisBank(DRIVE, encoder_counts_per_turn=CPR, watchdog=watchdog)
-    bank.step(0.0, ZERO + turns, ZERO)
-    for axis in range(12):
-        bank.set_modes(axis, mode, InputMode.PASSTHROUGH)
-        bank.request_state(axis, AxisState.CLOSED_LOOP_CONTROL)
-    assert bank.state == [AxisState.CLOSED_LOOP_CONTROL] * 12
+    bank = idle_bank(ZERO + turns, watchdog=watchdog)
+    close_loop(bank, mode)
+    assert bank.state == [CLOSED_LOOP] * 12
     return bank
 
 

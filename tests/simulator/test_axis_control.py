@@ -1,4 +1,4 @@
-"""The control law between steps: the firmware's 8 kHz loop on a joint is the reference."""
+"""The law of the axes against the firmware at its own rate: settings, targets, motions, a joint."""
 
 from __future__ import annotations
 
@@ -6,10 +6,119 @@ import math
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from services.simulator.drives.axis_bank import AxisBank
 from shared.can.cansimple import AxisState, ControlMode, InputMode
-from tests.simulator.banks import DRIVE, ZERO, make_bank
+from tests.simulator.banks import CPR, DRIVE, DT, ZERO, close_loop, make_bank
+from tests.simulator.firmware import FirmwareAxis
+
+N = 12
+SHARED = ("pos_gain", "vel_gain", "vel_integrator_gain", "vel_limit")
+INPUTS = ("input_pos", "input_vel", "input_torque")
+SWITCHES = ("enable_vel_limit", "enable_torque_mode_vel_limit")
+
+
+class Motion:
+    """Twelve shafts that swing: two sines each, peaks of about `speed` turn/s."""
+
+    def __init__(self, rng: np.random.Generator, speed: float) -> None:
+        self._w = 2.0 * math.pi * rng.uniform(0.5, 5.0, (2, N))
+        self._a = 0.5 * speed * rng.uniform(0.2, 1.0, (2, N)) / self._w
+        self._phase = rng.uniform(0.0, 2.0 * math.pi, (2, N))
+        self._at = rng.uniform(-30.0, 30.0, N)
+
+    def pos(self, t: float) -> NDArray[np.float64]:
+        return np.asarray(self._at + (self._a * np.sin(self._w * t + self._phase)).sum(0))
+
+    def vel(self, t: float) -> NDArray[np.float64]:
+        return np.asarray((self._a * self._w * np.cos(self._w * t + self._phase)).sum(0))
+
+
+def drawn(
+    rng: np.random.Generator, motion: Motion, *, tight: bool
+) -> tuple[AxisBank, list[FirmwareAxis]]:
+    """Return a bank in closed loop and its twelve references, with the same random settings."""
+    bank = AxisBank(DRIVE, encoder_counts_per_turn=CPR, watchdog=False)
+    bank.settings.fill("config.dc_max_negative_current", -math.inf)
+    bank.settings.fill("config.dc_bus_overvoltage_trip_level", math.inf)
+    bank.settings.fill("config.dc_bus_undervoltage_trip_level", -math.inf)
+    bank.settings.fill("controller.config.enable_overspeed_error", value=False)
+    bank.step(0.0, motion.pos(0.0), motion.vel(0.0))
+    axes = []
+    for i in range(N):
+        axis = FirmwareAxis(motion.pos(0.0)[i], motion.vel(0.0)[i], counts_per_turn=CPR)
+        axis.control_mode = int(rng.integers(1, 4))
+        axis.pos_gain, axis.vel_gain = rng.uniform(5.0, 40.0), rng.uniform(0.05, 0.6)
+        axis.vel_integrator_gain = rng.choice([0.0, rng.uniform(0.1, 3.0)])
+        axis.vel_integrator_limit = rng.choice([math.inf, 0.2])
+        axis.vel_limit = rng.uniform(2.0, 12.0) if tight else 60.0
+        axis.enable_vel_limit, axis.enable_torque_mode_vel_limit = rng.integers(0, 2, 2) > 0
+        bank.current_lim[i] = rng.uniform(2.0, 12.0) if tight else 60.0
+        axis.torque_lim = float(bank.current_lim[i]) * DRIVE.torque_constant
+        bank.set_modes(i, axis.control_mode, InputMode.PASSTHROUGH)
+        bank.request_state(i, AxisState.CLOSED_LOOP_CONTROL)
+        below = f"axis{i & 1}.controller.config."
+        for name in (*SWITCHES, "vel_integrator_limit"):
+            bank.settings.set(i >> 1, below + name, getattr(axis, name))
+        for name in SHARED:
+            getattr(bank, name)[i] = getattr(axis, name)
+        axes.append(axis)
+    return bank, axes
+
+
+def aim(rng: np.random.Generator, bank: AxisBank, axes: list[FirmwareAxis], speed: float) -> None:
+    """Give both the same inputs, near where the shafts are, and now and then far beyond limits."""
+    for i, axis in enumerate(axes):
+        axis.input_pos = float(bank.pos_estimate[i]) + rng.normal(0.0, 0.02 * speed)
+        axis.input_vel = rng.normal(0.0, speed)
+        axis.input_torque = rng.normal(0.0, 1.0)
+        for name in INPUTS:
+            getattr(bank, name)[i] = getattr(axis, name)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_at_one_estimate_the_bank_gives_the_firmwares_torque(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    motion = Motion(rng, speed=30.0)
+    bank, axes = drawn(rng, motion, tight=bool(seed % 2))
+    for _ in range(20):
+        aim(rng, bank, axes, 30.0)
+        torque = bank.step(0.0, ZERO, ZERO)
+        expected = [
+            axis.control(float(bank.pos_estimate[i]), float(bank.vel_estimate[i]))
+            for i, axis in enumerate(axes)
+        ]
+        np.testing.assert_allclose(torque, expected, atol=1e-9)
+        for axis in axes:  # the bank's stands still with its clock
+            axis.integrator = 0.0
+
+
+@pytest.mark.parametrize("tight", [False, True], ids=["free", "limited"])
+@pytest.mark.parametrize(("speed", "bound"), [(0.0, 1e-6), (1.0, 0.02), (20.0, 0.06)])
+def test_stepped_at_a_millisecond_the_torque_is_that_of_the_firmwares_own_rate(
+    speed: float, bound: float, tight: bool
+) -> None:
+    """At the motor, N m: what is left is a sixteenth of a millisecond of the estimator's lag."""
+    rng = np.random.default_rng(7)
+    motion = Motion(rng, speed)
+    bank, axes = drawn(rng, motion, tight=tight)
+    worst, at_limit = 0.0, 0
+    for k in range(1, 401):
+        if k % 5 == 1:
+            aim(rng, bank, axes, speed)
+        torques = [0.0] * N
+        for j in range(1, 9):
+            pos = motion.pos((k - 1 + j / 8) * DT)
+            for i, axis in enumerate(axes):
+                axis.encoder(float(pos[i]))
+                torques[i] = axis.control(axis.pos_estimate, axis.vel_estimate)
+        torque = bank.step(k * DT, motion.pos(k * DT), motion.vel(k * DT))
+        worst = max(worst, float(np.abs(torque - torques).max()))
+        at_limit += sum(abs(t) == a.torque_lim for t, a in zip(torques, axes, strict=True))
+    assert worst < bound
+    assert not tight or at_limit > 200, "the limits were not reached"
+
 
 GEAR = 17.5
 INERTIA = 0.15 / (2.0 * GEAR**2)
@@ -25,18 +134,17 @@ def motor_gains(k_p: float, k_d: float) -> tuple[float, float]:
     return k_p / k_d, k_d / (2.0 * GEAR**2) * 2.0 * math.pi
 
 
-def scalar_firmware(pos_gain: float, vel_gain: float, seconds: float) -> list[float]:
-    """Return positions at 1 kHz: encoder PLL and law written out, one number at a time, 8 kHz."""
-    h = 1.0 / 8000.0
-    pos = vel = pos_hat = vel_hat = torque = 0.0
+def firmware(pos_gain: float, vel_gain: float, seconds: float) -> list[float]:
+    """Return positions at 1 kHz of a motor under the firmware at its own 8 kHz."""
+    axis = FirmwareAxis(0.0, 0.0, counts_per_turn=1 << 22)
+    axis.pos_gain, axis.vel_gain, axis.vel_integrator_gain = pos_gain, vel_gain, 0.0
+    axis.vel_limit, axis.torque_lim, axis.input_pos = 60.0, 60.0 * DRIVE.torque_constant, STEP
+    pos = vel = torque = 0.0
     track = []
     for k in range(round(seconds * FINE)):
         if k % (FINE // 8000) == 0:
-            pos_hat += h * vel_hat
-            error = pos - pos_hat
-            pos_hat += h * 2000.0 * error
-            vel_hat += h * 1e6 * error
-            torque = vel_gain * (pos_gain * (STEP - pos_hat) - vel_hat)
+            axis.encoder(pos)
+            torque = axis.control(axis.pos_estimate, axis.vel_estimate)
         vel += torque / (INERTIA * 2.0 * math.pi) / FINE
         pos += vel / FINE
         if k % (FINE // 1000) == 0:
@@ -48,8 +156,7 @@ def emulated(pos_gain: float, vel_gain: float, seconds: float, rate: int) -> lis
     """Return the same of the bank, stepped at a rate, its torque held between."""
     bank = AxisBank(DRIVE, encoder_counts_per_turn=1 << 22, watchdog=False)
     bank.step(0.0, ZERO, ZERO)
-    bank.set_modes(0, ControlMode.POSITION, InputMode.PASSTHROUGH)
-    bank.request_state(0, AxisState.CLOSED_LOOP_CONTROL)
+    close_loop(bank, ControlMode.POSITION, range(1))
     bank.pos_gain[0], bank.vel_gain[0] = pos_gain, vel_gain
     bank.input_pos[0] = STEP
     pos, vel = np.zeros(12), np.zeros(12)
@@ -70,7 +177,7 @@ def test_stepped_with_the_world_a_stiff_joint_moves_as_under_the_firmwares_own_r
     k_p: float, k_d: float
 ) -> None:
     gains = motor_gains(k_p, k_d)
-    reference = np.array(scalar_firmware(*gains, 0.3))
+    reference = np.array(firmware(*gains, 0.3))
     worst = {
         rate: float(np.abs(np.array(emulated(*gains, 0.3, rate)) - reference).max()) / STEP
         for rate in (1000, 500)
@@ -121,9 +228,7 @@ def test_axes_with_another_encoder_bandwidth_follow_by_their_own() -> None:
 def test_what_is_no_number_is_not_made_one(mode: ControlMode, column: str) -> None:
     """The firmware's clamp passes NaN on; made the limit's torque, it would push a motor."""
     bank = make_bank()
-    for axis in (0, 1):
-        bank.set_modes(axis, mode, InputMode.PASSTHROUGH)
-        bank.request_state(axis, AxisState.CLOSED_LOOP_CONTROL)
+    close_loop(bank, mode, range(2))
     bank.pos_gain[:], bank.vel_gain[:] = 20.0, 0.2
     getattr(bank, column)[0] = math.nan
     torque = bank.step(bank.now_s + 1e-3, ZERO, ZERO)

@@ -53,39 +53,37 @@ def test_with_the_limit_as_shipped_a_braking_leg_disarms_both_axes() -> None:
     assert bank.state[6] == AxisState.CLOSED_LOOP_CONTROL
 
 
-def test_as_configured_the_same_leg_may_brake() -> None:
+@pytest.mark.parametrize("resistor", [False, True], ids=["as configured", "with a brake resistor"])
+def test_a_leg_may_brake(resistor: bool) -> None:
     bank = make_bank()
+    if resistor:  # it takes what would be pushed back
+        bank.settings.set(2, "config.dc_max_negative_current", -0.01)
+        bank.settings.set(2, "config.enable_brake_resistor", value=True)
     bank.input_torque[4] = -1.0
     step_for(bank, 0.03, vel=FAST)
     assert bank.state[4] == AxisState.CLOSED_LOOP_CONTROL
+    assert (bank.bus.state(2)[1] == pytest.approx(0.0, abs=1e-9)) == resistor
 
 
-def test_a_brake_resistor_takes_what_would_be_pushed_back() -> None:
+@pytest.mark.parametrize(
+    ("resistance", "most", "torque", "error"),
+    [
+        (10.0, math.inf, -1.0, OdriveError.DC_BUS_OVER_VOLTAGE),
+        (SUPPLY_RESISTANCE, 5.0, 3.0, OdriveError.DC_BUS_OVER_CURRENT),
+    ],
+    ids=["a supply that takes no current back", "a limit on the current drawn"],
+)
+def test_beyond_the_bus_s_limits_both_axes_are_disarmed(
+    resistance: float, most: float, torque: float, error: OdriveError
+) -> None:
     bank = make_bank()
-    bank.settings.set(2, "config.dc_max_negative_current", -0.01)
-    bank.settings.set(2, "config.enable_brake_resistor", value=True)
-    bank.input_torque[4] = -1.0
-    step_for(bank, 0.03, vel=FAST)
-    assert bank.state[4] == AxisState.CLOSED_LOOP_CONTROL
-    assert bank.bus.state(2)[1] == pytest.approx(0.0, abs=1e-9)
-
-
-def test_a_supply_that_takes_no_current_lets_regeneration_raise_the_bus_until_it_trips() -> None:
-    bank = make_bank()
-    bank.bus.resistance[2] = 10.0
+    bank.bus.resistance[2] = resistance
     bank.bus.changed()
-    bank.input_torque[4] = -1.0
+    bank.settings.set(2, "config.dc_max_positive_current", most)
+    bank.input_torque[4] = torque
     step_for(bank, 0.03, vel=FAST)
     assert bank.state[4] == bank.state[5] == AxisState.IDLE
-    assert bank.faults[5].odrive == OdriveError.DC_BUS_OVER_VOLTAGE
-
-
-def test_a_limit_on_the_current_drawn_disarms_both_axes() -> None:
-    bank = make_bank()
-    bank.settings.set(2, "config.dc_max_positive_current", 5.0)
-    bank.input_torque[4] = 3.0
-    step_for(bank, 0.03, vel=FAST)
-    assert bank.faults[4].odrive == bank.faults[5].odrive == OdriveError.DC_BUS_OVER_CURRENT
+    assert bank.faults[4].odrive == bank.faults[5].odrive == error
 
 
 def test_a_sagging_supply_disarms_and_arms_again_only_when_it_is_back() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from services.simulator.drives.axis_bank import AXIS_NAMES, AxisBank
-from services.simulator.drives.axis_conditions import BOOT_S
+from services.simulator.drives.axis_faults import BOOT_S
 from services.simulator.drives.axis_faults import AxisErrors as Registers
 from services.simulator.fault_injector import FaultInjector
 from shared.can.cansimple import (
@@ -184,13 +184,13 @@ def test_a_lost_encoder_reads_what_it_did_and_is_back_without_the_turns_made_mea
     for k in range(1, 20):
         bank.step(k * DT, 64.5 + vel * k * DT, vel)
     before = bank.pos_estimate[5], bank.vel_estimate[5]
-    bank.conditions.lose_encoder(5, lost=True)
+    bank.conditions.fail_encoder(5, lost=True)
     there = np.full(12, 64.538 + moved)
     for k in range(20, 40):
         bank.step(k * DT, there, ZERO)
     assert (bank.pos_estimate[5], bank.vel_estimate[5]) == pytest.approx(before, abs=0.3)
     assert bank.vel_estimate[5] == pytest.approx(2.0, abs=0.2), "as if it still moved"
-    bank.conditions.lose_encoder(5, lost=False)
+    bank.conditions.fail_encoder(5, lost=False)
     bank.step(0.04, there, ZERO)
     assert bank.pos_estimate[5] == pytest.approx(64.538 + found, abs=1e-3)
     assert bank.pos_estimate[4] == pytest.approx(64.538 + moved, abs=1e-3)

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from services.imu.attitude import AttitudeLaw
-from services.simulator.fronts.imu_front import ImuFront
+from services.simulator.fronts.sensor_fronts import ImuFront
 from services.simulator.physics.body import body_of
 from services.simulator.physics.plant import ImuErrors, PlantConfig, changed
 from services.simulator.physics.world import World

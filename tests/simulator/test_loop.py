@@ -7,17 +7,21 @@ from typing import Any, cast
 import msgspec
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from services.simulator.drives.axis_bank import AxisBank
 from services.simulator.fronts.cansimple_front import CanSimpleFront
-from services.simulator.fronts.harness_front import HarnessFront
-from services.simulator.loop import SimulatorLoop, SimulatorPorts
+from services.simulator.fronts.sensor_fronts import HarnessFront
+from services.simulator.loop import SimulatorLoop, SimulatorPorts, granted
 from services.simulator.physics.body import body_of
 from services.simulator.physics.plant import IDEAL
 from services.simulator.physics.world import World
-from shared.can.cansimple import AxisState, ControlMode, InputMode
+from shared.bus.messages import OperatorIntent, Vector4
+from shared.can.cansimple import AxisState, ControlMode
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Fault, Keyframe, Scenario
+from tests.simulator.banks import close_loop
 
 
 class Silent:
@@ -75,9 +79,7 @@ def test_the_drives_step_with_the_world_only_where_they_have_their_own_loop(
 ) -> None:
     loop, _, bank = make_loop(robot)
     loop.step()
-    for axis in range(12):
-        bank.set_modes(axis, mode, InputMode.PASSTHROUGH)
-        bank.request_state(axis, AxisState.CLOSED_LOOP_CONTROL)
+    close_loop(bank, mode)
     steps = count_steps(loop, bank, monkeypatch)
     rates = robot.simulation.encoder_rate_hz * robot.simulation.timestep
     assert steps == (100 if every else pytest.approx(100 * rates, abs=1))
@@ -98,3 +100,16 @@ def test_a_fault_comes_at_its_time_in_the_scenario_and_not_before_that_begins(
         assert world.time < began + 0.2
     assert world.time - began == pytest.approx(0.1, abs=0.005)
     assert np.flatnonzero([s == AxisState.IDLE for s in bank.state]).tolist() == [8, 9]
+
+
+ANY = st.floats(-1e300, 1e300)
+
+
+@given(ANY, st.tuples(ANY, ANY, ANY, ANY))
+def test_the_person_rests_no_more_than_a_planner_grants(assist: float, shift: Vector4) -> None:
+    assist_max, shift_max = 200.0, (0.02, 0.03, 0.1, 0.2)
+    asked = OperatorIntent(t_ns=1, seq=1, assist_n=assist, shift=shift)
+    force, parts = granted(asked, assist_max, shift_max)
+    assert 0.0 <= force <= assist_max
+    assert force == assist or not 0.0 <= assist <= assist_max
+    assert all(abs(part) <= most for part, most in zip(parts, shift_max, strict=True))

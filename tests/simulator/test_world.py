@@ -47,36 +47,27 @@ def powers(world: World, torque: Array) -> tuple[float, float]:
     """Return power at the joints and at the motors, W, at the present rates."""
     _, turns_per_s = world.motor_turns()
     at_motors = float(torque @ turns_per_s) * 2 * math.pi
-    at_joints = world._actuation._tau_from_motor @ torque @ world.data.qvel[world._v_index]
+    at_joints = world.actuation.tau_from_motor @ torque @ world.data.qvel[world.joints.v_index]
     return float(at_joints), at_motors
 
 
-def test_at_the_start_the_soles_lie_flat_on_the_floor(robot: RobotConfig) -> None:
-    world = world_of(robot)
-    truth = seen(world)
-    assert max(truth.foot_right_tilt, truth.foot_left_tilt) < 2e-3
-    for side in SIDES:
-        foot = world.data.body(f"foot_{side}")
-        assert foot.xpos[2] == pytest.approx(0.0, abs=1e-3)
-        heading = foot.xmat.reshape(3, 3)[:, 0]
-        assert heading[1] == pytest.approx(0.0, abs=2e-3)  # toes forward
-
-
-def test_at_the_start_the_ankles_are_where_the_planner_takes_them_to_be(
+def test_at_the_start_it_stands_level_soles_flat_where_the_planner_takes_it_to_be(
     robot: RobotConfig,
 ) -> None:
     world = world_of(robot)
-    for side, sign in zip(SIDES, (-1.0, 1.0), strict=True):
-        wanted = (0.0, sign * robot.geometry.w_base / 2, 0.0)
-        np.testing.assert_allclose(world.data.body(f"foot_{side}").xpos, wanted, atol=2e-3)
-
-
-def test_at_the_start_the_torso_is_level_at_the_stand_height(robot: RobotConfig) -> None:
-    truth = seen(world_of(robot))
+    truth = seen(world)
     assert truth.torso[2] == pytest.approx(robot.simulation.stand_height, abs=5e-4)
     assert truth.angles == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
     assert truth.com[:2] == pytest.approx((0.0, 0.0), abs=1e-3)
+    assert max(truth.foot_right_tilt, truth.foot_left_tilt) < 2e-3
     assert not truth.fallen
+    for side, sign in zip(SIDES, (-1.0, 1.0), strict=True):
+        foot = world.data.body(f"foot_{side}")
+        wanted = (0.0, sign * robot.geometry.w_base / 2, 0.0)
+        np.testing.assert_allclose(foot.xpos, wanted, atol=2e-3)
+        assert foot.xpos[2] == pytest.approx(0.0, abs=1e-3)
+        heading = foot.xmat.reshape(3, 3)[:, 0]
+        assert heading[1] == pytest.approx(0.0, abs=2e-3)  # toes forward
 
 
 def test_motor_turns_obey_the_differential(robot: RobotConfig) -> None:
@@ -84,7 +75,7 @@ def test_motor_turns_obey_the_differential(robot: RobotConfig) -> None:
     world = world_of(robot)
     rng = np.random.default_rng(1)
     q, v = rng.uniform(-1, 1, 12), rng.uniform(-1, 1, 12)
-    world.data.qpos[world._q_index] = q
+    world.data.qpos[world.joints.q_index] = q
     world.data.qvel[6:] = 0.0
     for index, name in enumerate(JOINTS):
         world.data.joint(name).qvel[0] = v[index]
@@ -161,7 +152,7 @@ def test_a_push_gives_the_impulse_asked(robot: RobotConfig) -> None:
     impulse = np.zeros(3)
     for _ in range(600):
         world.step(IDLE)
-        impulse += np.array(world.push) * world.timestep
+        impulse += np.array(world.outside.push) * world.timestep
     tolerance = 40.0 * world.timestep  # one step's worth
     np.testing.assert_allclose(impulse, 0.3 * np.array(push.force), atol=1.01 * tolerance)
 
@@ -170,7 +161,7 @@ def test_a_push_moves_a_free_body_by_its_impulse(robot: RobotConfig) -> None:
     """In the air, hoist gone: the momentum gained is the impulse."""
     push = Push(at=0.0, duration=0.1, force=(40.0, 0.0, 0.0))
     world = world_of(robot, push=(push,))
-    world.let_off_hoist()
+    world.remove_hoist()
     world.data.qpos[2] += 5.0
     world.start()
     run(world, 0.1)
@@ -190,19 +181,19 @@ def test_nothing_pushes_before_the_scenario_starts(robot: RobotConfig) -> None:
     world = world_of(robot, push=(Push(at=0.0, duration=1.0, force=(500.0, 0.0, 0.0)),))
     run(world, 0.05)
     assert world.scenario_s < 0.0
-    assert world.push == (0.0, 0.0, 0.0)
+    assert world.outside.push == (0.0, 0.0, 0.0)
     assert seen(world).push == (0.0, 0.0, 0.0)
 
 
 def test_the_hand_waits_for_the_hoist_and_keeps_within_its_strength(robot: RobotConfig) -> None:
     world = world_of(robot, hand=True, keyframe=(Keyframe(at=0.0, height=2.0, pitch=1.5),))
     run(world, 0.01)
-    assert world.hand == (0.0, 0.0)
-    world.let_off_hoist()
+    assert world.outside.hand == (0.0, 0.0)
+    world.remove_hoist()
     hand, strongest = robot.simulation.operator, [0.0, 0.0]
     for _ in range(500):
         world.step(IDLE)
-        strongest = [max(s, abs(f)) for s, f in zip(strongest, world.hand, strict=True)]
+        strongest = [max(s, abs(f)) for s, f in zip(strongest, world.outside.hand, strict=True)]
     assert strongest == [hand.force_max, hand.moment_max]
 
 
@@ -211,34 +202,36 @@ def test_the_harness_feels_hand_and_load_in_torso_axes(robot: RobotConfig, pitch
     """Hand up, load down, along world z; turned into the torso, the hand's moment about its y."""
     lead = Keyframe(at=0.0, height=1.25, pitch=pitch + 0.1, assist=120.0)
     world = world_of(robot, hand=True, keyframe=(lead,))
-    world.let_off_hoist()
+    world.remove_hoist()
     world.data.qpos[3:7] = (math.cos(pitch / 2), 0.0, math.sin(pitch / 2), 0.0)
     run(world, 0.002)
     R = world.data.body("torso").xmat.reshape(3, 3)
     truth = seen(world)
     assert truth.load_n == 120.0
-    assert truth.harness_force_z == pytest.approx(120.0 - world.hand.force_z)
-    upward = R @ np.array(world.harness_force)
-    np.testing.assert_allclose(upward, (0.0, 0.0, world.hand.force_z - 120.0), atol=1.5)
-    assert world.harness_moment == (0.0, world.hand.moment_pitch, 0.0)
-    assert world.hand.moment_pitch != 0.0
-    np.testing.assert_allclose(truth.operator_moment, R[:, 1] * world.hand.moment_pitch, atol=1e-9)
-    assert truth.operator_force == (0.0, 0.0, world.hand.force_z)
+    assert truth.harness_force_z == pytest.approx(120.0 - world.outside.hand.force_z)
+    upward = R @ np.array(world.outside.harness_force)
+    np.testing.assert_allclose(upward, (0.0, 0.0, world.outside.hand.force_z - 120.0), atol=1.5)
+    assert world.outside.harness_moment == (0.0, world.outside.hand.moment_pitch, 0.0)
+    assert world.outside.hand.moment_pitch != 0.0
+    np.testing.assert_allclose(
+        truth.operator_moment, R[:, 1] * world.outside.hand.moment_pitch, atol=1e-9
+    )
+    assert truth.operator_force == (0.0, 0.0, world.outside.hand.force_z)
 
 
 def test_what_the_harness_feels_is_what_acts_on_the_torso(robot: RobotConfig) -> None:
     """Same wrench: at the harness point in torso axes, and at the torso's centre in world's."""
     lead = Keyframe(at=0.0, height=1.3, pitch=0.5, assist=80.0)
     world = world_of(robot, hand=True, keyframe=(lead,))
-    world.let_off_hoist()
+    world.remove_hoist()
     world.data.qpos[3:7] = (math.cos(0.3), math.sin(0.3) * 0.6, math.sin(0.3) * 0.8, 0.0)
     world.data.qvel[:] = 0.0
     world.step(IDLE)  # the pose set above is known to the world from its next step on
     R = world.data.body("torso").xmat.reshape(3, 3).copy()
     world.step(IDLE)
-    force = R @ np.array(world.harness_force)
+    force = R @ np.array(world.outside.harness_force)
     arm = R @ np.array(robot.geometry.harness_point)
-    moment = R @ np.array(world.harness_moment) + np.cross(arm, force)
+    moment = R @ np.array(world.outside.harness_moment) + np.cross(arm, force)
     applied = world.data.xfrc_applied[world.model.body("torso").id]
     assert np.abs(force).max() > 10.0
     np.testing.assert_allclose(applied, [*force, *moment], atol=1e-9)
@@ -282,7 +275,7 @@ def test_the_hand_acts_at_the_harness_point_wherever_the_payload_is(robot: Robot
         STAND, hand=True, keyframe=(Keyframe(at=0.0, height=1.25, assist=50.0),)
     )
     world = World(body_of(robot, plant), scenario)
-    world.let_off_hoist()
+    world.remove_hoist()
     world.start()
     world.step(IDLE)
     model, data = world.model, world.data
@@ -292,12 +285,12 @@ def test_the_hand_acts_at_the_harness_point_wherever_the_payload_is(robot: Robot
     jacobian = np.zeros((3, model.nv))
     mujoco.mj_jac(model, data, jacobian, None, at, torso)
     rotation = data.xmat[torso].reshape(3, 3)
-    force = rotation @ np.array(world.harness_force)
+    force = rotation @ np.array(world.outside.harness_force)
     assert np.linalg.norm(force) > 10.0
     by_hand = jacobian[:, :6].T @ force
     wrench = data.xfrc_applied[torso]
     com, turning = np.zeros((3, model.nv)), np.zeros((3, model.nv))
     mujoco.mj_jacBodyCom(model, data, com, turning, torso)
     applied = com[:, :6].T @ wrench[:3] + turning[:, :6].T @ wrench[3:]
-    applied[3:] -= rotation.T @ (rotation @ np.array(world.harness_moment))
+    applied[3:] -= rotation.T @ (rotation @ np.array(world.outside.harness_moment))
     np.testing.assert_allclose(applied, by_hand, atol=0.1)  # the step has turned it a little

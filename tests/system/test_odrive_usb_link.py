@@ -11,7 +11,7 @@ import pytest
 from services.joint.drivers.base import DriveStatus
 from services.joint.drivers.odrive_usb import OdriveUsb
 from services.simulator.fronts import fibre_front
-from services.simulator.fronts.fibre_endpoints import endpoints
+from services.simulator.fronts.fibre_front import endpoints
 from shared.can.cansimple import AxisState
 from shared.config.robot_config import RobotConfig
 from tests.usb.standin import MODULE, Control, UsbRobot, eventually, serial_number

@@ -14,8 +14,7 @@ import numpy as np
 
 from services.joint.drivers.base import Drive, DriveStatus, MotorTarget
 from services.simulator.drives.axis_bank import AxisBank
-from services.simulator.fronts.fibre_endpoints import EmulatedBoard
-from services.simulator.fronts.fibre_front import FibreFront
+from services.simulator.fronts.fibre_front import EmulatedBoard, FibreFront
 from services.simulator.fronts.fibre_port import FibreHub, FibrePort
 from services.simulator.fronts.usb_standin import build, load
 from shared.config.robot_config import RobotConfig

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-from services.simulator.drives.axis_settings import Settings, plant
+from services.simulator.drives.axis_settings import Settings, preset
 from services.simulator.fronts import usb_standin
 from shared.config.robot_config import RobotConfig, expand
 from shared.config.sections import CanConfig
@@ -66,7 +66,7 @@ def check_plants(robot: RobotConfig, run_dir: Path, plants: Sequence[str]) -> No
         )
     scratch = Settings()
     for words in plants:
-        plant(scratch, words)
+        preset(scratch, words)
 
 
 def refuse_half_emulated(robot: RobotConfig) -> None:

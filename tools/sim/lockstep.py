@@ -23,7 +23,7 @@ from services.simulator.fault_injector import FaultInjector
 from services.simulator.physics.body import body_of
 from services.simulator.physics.plant import PlantConfig
 from services.simulator.physics.world import World
-from services.simulator.state import restored, taken
+from services.simulator.state import read_state, write_state
 from shared.bus import topics
 from shared.bus.messages import (
     HandLead,
@@ -236,7 +236,7 @@ class Lockstep:
         """Return what world and services are now, for `resume`; it shares what still changes."""
         planner = self.planner
         return FleetMoment(
-            taken(self.world, self.bank, self.now_ns, 0),
+            read_state(self.world, self.bank, self.now_ns, 0),
             {joint.name: joint.manager.snapshot() for joint in self.joints},
             None if planner is None else (planner.session, planner.snapshot()),
         )
@@ -246,7 +246,7 @@ class Lockstep:
         state, modules = moment.state, moment.modules
         step_ns = self._periods.step
         self.time.now_ns = -(-state.t_ns // step_ns) * step_ns
-        restored(self.world, self.bank, state)
+        write_state(self.world, self.bank, state)
         for joint in self.joints:
             joint.resume(modules.get(joint.name))
         self._planner.resume(moment.planner)
@@ -267,7 +267,7 @@ class Lockstep:
             self.advance()
             if self._traces and self.now_ns % self._periods.sim_state == 0:
                 self._progress.sim_states += 1
-                state = taken(self.world, self.bank, self.now_ns, self._progress.sim_states)
+                state = read_state(self.world, self.bank, self.now_ns, self._progress.sim_states)
                 self._record(topics.SIM_STATE, "", state)
             if self.now_ns % self._periods.truth == 0:
                 truth = self.world.truth(self.now_ns, 1.0, 0.0)

@@ -21,8 +21,7 @@ from services.planner.intents import OperatorRequest
 from services.planner.loop import PlannerLoop, PlannerPorts
 from services.planner.planner import Planner, PlannerState
 from services.simulator.drives.axis_bank import AxisBank
-from services.simulator.fronts.harness_front import HarnessFront
-from services.simulator.fronts.imu_front import ImuFront
+from services.simulator.fronts.sensor_fronts import HarnessFront, ImuFront
 from services.simulator.physics.plant import ImuErrors
 from services.simulator.physics.world import World
 from shared.bus import topics
@@ -324,7 +323,7 @@ class VirtualHarness:
     def advance(self, world: World) -> None:
         """If it is time, sample what acts on the torso, and run one cycle of the service."""
         if not self._time.now_ns % self._period_ns:
-            self._front.send(world.harness_force, world.harness_moment)
+            self._front.send(world.outside.harness_force, world.outside.harness_moment)
             self._loop.cycle(self._clock())
 
     def assume_tared(self) -> None:

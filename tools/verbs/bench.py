@@ -11,9 +11,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
 
-from rich import box
 from rich.progress import track
-from rich.table import Table
 from rich.text import Text
 
 from shared.config import files as config_file
@@ -21,13 +19,12 @@ from shared.config import gain_schedule
 from shared.exceptions import FAULT_EXIT_CODE
 from shared.extras import require
 from shared.places import CHECKOUT
-from tools.lab.bench import bus_command, fleet_command, revisions, table
-from tools.lab.bench.flags import add_flags, write_rows
+from tools.lab.bench import bus, fleet, revisions
 from tools.lab.bench.parts import LOCKSTEP, LOCKSTEP_RECORDED, PARTS
 from tools.lab.bench.revisions import Worker, its_config
-from tools.lab.bench.table import Row
+from tools.lab.bench.table import add_flags, print_table, ratio_cell, write_rows
 from tools.lab.bench.timing import ASLEEP_S, SWEPT_BYTES, YARDSTICK_CALLS
-from tools.lab.bench.worker import READY, Request
+from tools.lab.bench.worker import READY, PartRow, Request, row_of
 from tools.terminal import Console, marked
 from tools.verb_table import Subparsers, add_config, add_verb
 
@@ -54,21 +51,10 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     parser.set_defaults(bench=run_parts)
     add_config(parser)
-    parser.add_argument(
-        "--against",
-        metavar="REV",
-        help="measure a git revision too, in turn with this tree, and print the ratios; both run "
-        "in this environment",
-    )
     add_flags(parser, ROUNDS)
-    parser.add_argument(
-        "--strict",
-        action="store_true",
-        help=f"exit code {FAULT_EXIT_CODE} if a target is missed",
-    )
     others = parser.add_subparsers(metavar="WHAT", title="something else to measure")
-    bus_command.add_parser(others)
-    fleet_command.add_parser(others)
+    bus.add_parser(others)
+    fleet.add_parser(others)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -83,22 +69,24 @@ def run_parts(args: argparse.Namespace) -> int:
     gain_schedule.require(config_file.load(args.config), args.config)
     console = Console()
     rows, missing = measure(args.config.resolve(), args.against, args.rounds or ROUNDS, console)
-    console.print(_table(rows, args.against))
-    for line in missing:
-        console.print(marked("[yellow]{}[/]", line))
-    console.print(
+    compare = ("wall", "/ yard") if args.against is None else (args.against, "ratio")
+    print_table(
+        console,
+        ("", "CPU", *compare, "target"),
+        [_cells(row, args.against) for row in rows],
         "Medians of the rounds' medians, us; CPU is the calling thread's. "
         f"Cold: {SWEPT_BYTES >> 20} MiB are swept and {1e3 * ASLEEP_S:g} ms slept before a call. "
         f"Yardstick: {YARDSTICK_CALLS} solutions of a 12 x 12 system in NumPy.",
-        style="dim",
     )
-    write_rows(args.json, [row._asdict() for row in rows])
-    return FAULT_EXIT_CODE if args.strict and not all(row.ok for row in rows) else 0
+    for line in missing:
+        console.print(marked("[yellow]{}[/]", line))
+    write_rows(args.json, [row.as_dict() for row in rows])
+    return FAULT_EXIT_CODE if args.strict and not all(part.row.ok for part in rows) else 0
 
 
 def measure(
     config: Path, against: str | None, rounds: int, console: Console
-) -> tuple[list[Row], list[str]]:
+) -> tuple[list[PartRow], list[str]]:
     """Return the table's rows, and what could not be measured.
 
     Args:
@@ -124,7 +112,7 @@ def measure(
         for request, target in track(plan, "measuring", console=console, transient=True):
             turns = [[worker.ask(request) for worker in workers] for _ in range(rounds)]
             here, *there = zip(*turns, strict=True)
-            row = table.row_of(request, here, there[0] if there else (), target)
+            row = row_of(request, here, there[0] if there else (), target)
             rows += [] if row is None else [row]
             for tree, answer in zip(("here", f"in {against}"), turns[0], strict=False):
                 if answer.missing and not request.cold:
@@ -132,22 +120,14 @@ def measure(
     return rows, missing
 
 
-def _table(rows: list[Row], against: str | None) -> Table:
-    shown = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    compared = ["wall", "/ yard"] if against is None else [against, "ratio"]
-    for column in ("", "CPU", *compared, "target"):
-        shown.add_column(column, justify="right" if column else "left", no_wrap=True)
-    for row in rows:
-        cells = [row.what, f"{_number(row.value)} {row.unit}"]
-        if against is None:
-            cells += [_number(row.wall), _number(row.to_yardstick)]
-        else:
-            cells += [_number(row.other), "" if row.ratio is None else f"{row.ratio:.2f}"]
-        sign = ">=" if row.unit == "x" else "<="
-        mark = Text("ok", "green") if row.ok else Text("missed", "yellow")
-        target = "" if row.target is None else marked("{} {:g} {}", sign, row.target, mark)
-        shown.add_row(*cells, target)
-    return shown
+def _cells(part: PartRow, against: str | None) -> list[Text | str]:
+    row = part.row
+    cells: list[Text | str] = [row.what, f"{_number(row.value)} {row.unit}"]
+    if against is None:
+        cells += [_number(part.wall), _number(part.to_yardstick)]
+    else:
+        cells += [_number(row.other), ratio_cell(row)]
+    return [*cells, row.marked_target()]
 
 
 def _number(value: float | None) -> str:

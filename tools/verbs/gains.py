@@ -20,7 +20,6 @@ from shared.places import refuse_shipped
 from tools.lab.design import damping_picture, split_program
 from tools.lab.design.dynamic_certificate import DynamicCertificate
 from tools.lab.design.push_limit import DIRECTIONS, equivalent_slope
-from tools.lab.design.stability_margins import stability_margins_of
 from tools.terminal import Console
 from tools.verb_table import Subparsers, add_config, add_verb
 
@@ -182,7 +181,7 @@ def _show_damping(robot: RobotConfig, schedule: GainSchedule, console: Console) 
     table = Table(title="In hand before any motion grows (TRACK, HOLD, drives alone)")
     for heading in ("drivetrain N m/rad", "all feedback", "tau_coupled", "delay ms"):
         table.add_column(heading, justify="right")
-    for room in stability_margins_of(certificate, design):
+    for room in certificate.margins(design):
         name = "rigid" if room.stiffness >= RIGID_FROM else f"{room.stiffness:g}"
         table.add_row(
             name, _decibels(room.torque), _decibels(room.coupling), f">= {1e3 * room.delay_s:.0f}"

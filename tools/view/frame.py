@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from services.planner.law.kinematics import Kinematics
-from services.simulator.physics.soles import SoleLoad
+from services.simulator.physics.posture import SoleLoad
 from shared.bus import topics
 from shared.bus.messages import (
     JointCommand,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from services.planner.law.kinematics import DETERMINANT_MIN
 from services.planner.law.model import LegGeometry, leg_geometry
-from services.simulator.physics.soles import SoleLoad
+from services.simulator.physics.posture import SoleLoad
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.joints import N_LEG
 

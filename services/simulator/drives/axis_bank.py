@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.simulator.drives.axis_calibration import SEQUENCES, Calibration
-from services.simulator.drives.axis_conditions import Conditions
 from services.simulator.drives.axis_control import AxisControl
 from services.simulator.drives.axis_encoders import AxisEncoders
 from services.simulator.drives.axis_faults import (
@@ -27,9 +26,10 @@ from services.simulator.drives.axis_faults import (
     BUS_FAULTS,
     FAULTS,
     AxisErrors,
+    Conditions,
     controller_fault,
 )
-from services.simulator.drives.axis_settings import Settings, configured
+from services.simulator.drives.axis_settings import configured
 from services.simulator.drives.dc_bus import DEAD_VOLTAGE, DcBus
 from shared.can.cansimple import (
     AxisError,
@@ -61,41 +61,37 @@ class AxisBank:
         *,
         encoder_counts_per_turn: int,
         watchdog: bool = True,
-        settings: Settings | None = None,
-        zeroed: bool = True,
         motor_signs: Sequence[int] = (1,) * N_JOINTS,
     ) -> None:
-        """Power the drives up, calibrated, in IDLE.
+        """Power the drives up, calibrated, zeroed (`drive.zero_mark_turns`), in IDLE.
 
         Args:
             drive: the robot file's `[drive]`.
             encoder_counts_per_turn: of the encoders themselves.
             watchdog: True if the drives' watchdogs run.
-            settings: of the drives; None: as the services need them (`configured`).
-            zeroed: True if their zero was written (`drive.zero_mark_turns`). Else they know the
-                motor's angle within a turn only, as after any loss of power.
             motor_signs: sign of each motor's count and of its zero mark.
         """
-        self.settings = settings or configured(
+        self.settings = configured(
             drive, encoder_counts_per_turn=encoder_counts_per_turn, watchdog=watchdog
         )
         n = N_JOINTS
         self._encoders = encoders = AxisEncoders(self.settings, encoder_counts_per_turn)
         self._control = control = AxisControl(self.settings, encoders)
-        self._zeroed = zeroed
         mark = round(drive.zero_mark_turns * encoder_counts_per_turn)
         self.counts_from = encoders.counts_from
         self.counts_from[:] = mark * np.array(motor_signs)
-        self.bus = DcBus(self.settings, control.power, control.mechanical)
+        law, column = control.results, self.settings.axis
+        self.bus = DcBus(self.settings, law.power, law.mechanical)
         self.state = [AxisState.IDLE] * n
         self.faults = [AxisErrors()] * n
-        self.control_mode = control.control_mode
-        self.input_mode = self.settings.axis("controller.config.input_mode")
+        self.control_mode = column("controller.config.control_mode")
         self.input_pos, self.input_vel = control.input_pos, control.input_vel
-        self.input_torque, self.torque = control.input_torque, control.torque
-        self.pos_gain, self.vel_gain = control.pos_gain, control.vel_gain
-        self.vel_integrator_gain = control.vel_integrator_gain
-        self.vel_limit, self.current_lim = control.vel_limit, control.current_lim
+        self.input_torque, self.torque = control.input_torque, law.torque
+        self.pos_gain = column("controller.config.pos_gain")
+        self.vel_gain = column("controller.config.vel_gain")
+        self.vel_integrator_gain = column("controller.config.vel_integrator_gain")
+        self.vel_limit = column("controller.config.vel_limit")
+        self.current_lim = column("motor.config.current_lim")
         self.pos_estimate, self.vel_estimate = encoders.pos_estimate, encoders.vel_estimate
         self.encoder_turns, self.connected = encoders.turns, control.connected
         self.now_s = -math.inf
@@ -122,9 +118,6 @@ class AxisBank:
             self.now_s = now_s
             self._fed_s = [now_s] * N_JOINTS
             self._encoders.start(pos_turns, vel_turns)
-            if not self._zeroed:
-                for axis in range(N_JOINTS):
-                    self._encoders.lose_turns(axis)
         else:
             dt_s = now_s - self.now_s
             self.now_s = now_s
@@ -188,7 +181,7 @@ class AxisBank:
         below = f"axis{axis & 1}.controller.config"
         self.settings.set(axis >> 1, f"{below}.control_mode", control_mode)
         self.settings.set(axis >> 1, f"{below}.input_mode", input_mode)
-        self._control.stay(axis)
+        self._control.hold_here(axis)
 
     def set_count(self, axis: int, count: float) -> None:
         """Tell an axis that its encoder reads so many counts here; `input_pos` stays."""
@@ -222,7 +215,7 @@ class AxisBank:
         self.settings.restore(drive)
         for each in _both(axis):
             self.calibration.restart(each)
-            self._encoders.lose_turns(each)
+            self._encoders.forget_turns(each)
         self.conditions.boot(drive, self.now_s)
 
     def is_responding(self, axis: int) -> bool:
@@ -269,11 +262,11 @@ class AxisBank:
 
     def _apply_conditions(self) -> None:
         """Handle rare changes: drives that start, conditions, calibrations."""
-        for drive in self.conditions.come_up(self.now_s):
+        for drive in self.conditions.finish_boots(self.now_s):
             for axis in _both(2 * drive):
                 self.state[axis] = AxisState.IDLE
                 self._fed_s[axis] = self.now_s
-        for axis, fault in self.conditions.failing():
+        for axis, fault in self.conditions.disarming():
             self._fail(axis, fault)
         for axis in list(self.calibration.running):
             turns = float(self.encoder_turns[axis])

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Final
+from typing import Final, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -52,6 +52,21 @@ _SETTINGS: Final = (
 """The axis settings that the law reads."""
 
 
+class LawResults(NamedTuple):
+    """What the law computes in a step; arrays (12,) but for the last."""
+
+    torque: Vector
+    integrator: Vector
+    too_fast: Vector
+    """1 beyond the OVERSPEED limit."""
+    power: Vector
+    """Electrical power of each motor, W."""
+    mechanical: Vector
+    """Mechanical power of each motor, W."""
+    extremes: Vector
+    """(3,): how many axes are too fast, the least and the most power."""
+
+
 class AxisControl:
     """Inputs and torque of all axes; no state machine, no errors.
 
@@ -60,26 +75,16 @@ class AxisControl:
         connected: 1.0 once in closed loop since it started up: from then on the controller sees the
             encoder, in IDLE as well.
         derating: fraction of current_lim that heat leaves.
-        power: electrical power of each motor, W.
-        mechanical: mechanical power of each motor, W.
     """
 
     def __init__(self, settings: Settings, encoders: AxisEncoders) -> None:
-        """Take the settings, and the estimates that the law uses."""
-        n = N_JOINTS
+        """Bind the settings, and the estimates that the law uses."""
         self._settings, self._encoders = settings, encoders
         self._seen = -1
-        self._pos = encoders.pos_estimate
-        self.control_mode = settings.axis("controller.config.control_mode")
-        self.pos_gain = settings.axis("controller.config.pos_gain")
-        self.vel_gain = settings.axis("controller.config.vel_gain")
-        self.vel_integrator_gain = settings.axis("controller.config.vel_integrator_gain")
-        self.vel_limit = settings.axis("controller.config.vel_limit")
-        self.current_lim = settings.axis("motor.config.current_lim")
-        self.input_pos, self.input_vel, self.input_torque = np.zeros(n), np.zeros(n), np.zeros(n)
-        self.armed, self.connected = np.zeros(n), np.zeros(n)
-        self.derating = np.ones(n)
-        self.integrator = np.zeros(n)
+        self._mode = settings.axis("controller.config.control_mode")
+        self.input_pos, self.input_vel, self.input_torque = np.zeros((3, N_JOINTS))
+        self.armed, self.connected, self.integrator = np.zeros((3, N_JOINTS))
+        self.derating = np.ones(N_JOINTS)
         self._dt_s = 0.0
         self._graph = graph = CompiledGraph(law_graph())
         columns = [settings.axis(name) for name in _SETTINGS]
@@ -90,26 +95,23 @@ class AxisControl:
         for index, array in enumerate((*columns, *live)):
             graph.bind(index, array)
         self._step = graph.arguments[-1]
-        (
-            self.torque, self._integrated, self._overspeed, self.power, self.mechanical,
-            self._extremes,
-        ) = graph.results  # fmt: skip
+        self.results = LawResults(*graph.results)
 
     def regulates(self) -> bool:
         """Return True if any axis in closed loop has a position or velocity loop."""
         if self._seen != self._settings.version:
             self._seen = self._settings.version
-            self._regulates = (self.control_mode >= ControlMode.VELOCITY).astype(np.float64)
+            self._regulates = (self._mode >= ControlMode.VELOCITY).astype(np.float64)
         return bool(np.dot(self._regulates, self.armed) > 0.0)
 
-    def stay(self, axis: int) -> None:
+    def hold_here(self, axis: int) -> None:
         """Make where the motor is its target, in position mode: `control_mode_updated`."""
-        if self.control_mode[axis] >= ControlMode.POSITION:
-            self.input_pos[axis] = self._pos[axis]
+        if self._mode[axis] >= ControlMode.POSITION:
+            self.input_pos[axis] = self._encoders.pos_estimate[axis]
 
     def arm(self, axis: int) -> None:
         """Let an axis's torque through, from where it is; `input_torque` stays as it stands."""
-        self.stay(axis)
+        self.hold_here(axis)
         self.integrator[axis] = 0.0
         self.armed[axis] = self.connected[axis] = 1.0
 
@@ -124,25 +126,21 @@ class AxisControl:
             self._dt_s = self._encoders.dt_s
             self._step[:] = self._dt_s, INTEGRATOR_DECAY ** (FIRMWARE_RATE_HZ * self._dt_s)
         self._graph()
-        too_fast, least, most = self._extremes.tolist()
+        too_fast, least, most = self.results.extremes.tolist()
         return too_fast, least, most
 
     def integrate(self) -> None:
         """Take over the integrators that the last `control` arrived at."""
-        self.integrator[:] = self._integrated
+        self.integrator[:] = self.results.integrator
 
     def overspeed(self) -> list[int]:
         """Return the axes beyond their OVERSPEED limit; in IDLE it is checked all the same."""
-        return np.flatnonzero(self._overspeed).tolist()
+        return np.flatnonzero(self.results.too_fast).tolist()
 
 
 @functools.cache
 def law_graph() -> ca.Function:
-    """Return the law: settings, estimates, inputs and state of twelve axes -> one step.
-
-    Torque (zero where an axis is not in closed loop), integrator, 1 where it is too fast, power,
-    mechanical power, W; and over all axes how many are too fast, the least and the most power.
-    """
+    """Return the law: settings, estimates, inputs and state of twelve axes -> `LawResults`."""
     names = [name.rpartition(".")[2] for name in _SETTINGS]
     inputs = (
         "pos", "vel", "input_pos", "input_vel", "input_torque", "armed", "connected", "derating",

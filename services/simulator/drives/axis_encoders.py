@@ -75,7 +75,7 @@ class AxisEncoders:
         self.counts_from[axis] += round(count) - self._counted(axis)
         self._rows[2:, axis] = self._rows[0, axis] = round(count) / cpr
 
-    def lose_turns(self, axis: int) -> None:
+    def forget_turns(self, axis: int) -> None:
         """Make an axis's encoder know its angle within a turn only, as at power-up."""
         if self._seen != self._settings.version:
             self._derive()
@@ -85,7 +85,7 @@ class AxisEncoders:
         count = self._counted(axis) - round(self.counts_from[axis])
         self.set_count(axis, self._within_a_turn(count))
 
-    def blind(self, axis: int) -> None:
+    def freeze(self, axis: int) -> None:
         """Hold an axis's estimates: the firmware keeps reporting the last ones."""
         lost = self._lost.get(axis)
         if lost is None:
@@ -93,13 +93,13 @@ class AxisEncoders:
             self._lost[axis] = lost = _LostEncoder(at, at, pos, vel)
         self._rows[:2, axis] = lost.pos, lost.vel
 
-    def see_again(self, axis: int) -> None:
+    def recover(self, axis: int) -> None:
         """Restart an axis's estimates; turns made meanwhile are not counted."""
         lost = self._lost.pop(axis, None)
         if lost is None:
             return
         if lost.said is None:
-            self.lose_turns(axis)
+            self.forget_turns(axis)
         else:
             moved = self._counted(axis) - lost.at
             self.set_count(axis, lost.said + self._within_a_turn(moved))

@@ -30,7 +30,7 @@ from shared.joints import MODULE_INDEX, MODULES, N_JOINTS
 
 __all__ = [
     "AXIS_SETTINGS", "DRIVE_SETTINGS", "NAMES", "N_DRIVES", "PHASE_RESISTANCE", "Settings", "Value",
-    "configured", "plant",
+    "configured", "preset",
 ]  # fmt: skip
 
 Vector = NDArray[np.float64]
@@ -131,11 +131,7 @@ class Settings:
         self.version += 1
 
     def get(self, drive: int, name: str) -> Value:
-        """Return a setting of a drive (0 .. 5) by its name in `NAMES`, in its own type.
-
-        Raises:
-            DriveError: there is no such setting.
-        """
+        """Return a setting of a drive (0 .. 5) by its name in `NAMES`, in its own type."""
         column, row, default = self._find(drive, name)
         value = column[row]
         return type(default)(value)
@@ -193,10 +189,7 @@ def configured(
 ) -> Settings:
     """Return the settings that the services rely on, saved on every drive.
 
-    Args:
-        drive: the robot file's `[drive]`.
-        encoder_counts_per_turn: of the robot file's `[joint]`.
-        watchdog: whether the drives' watchdogs run, if they have a timeout.
+    Without `watchdog` the drives' watchdogs do not run, whatever their timeout.
     """
     settings = Settings()
     need = Need(drive, encoder_counts_per_turn, watchdog)
@@ -209,12 +202,10 @@ def configured(
     return settings
 
 
-def plant(settings: Settings, words: str) -> None:
+def preset(settings: Settings, words: str) -> None:
     """Set and save one setting of one drive, as a person may have left it.
 
-    Args:
-        settings: of all drives.
-        words: MODULE.NAME=VALUE, as "knee_left.axis0.controller.config.vel_limit=2".
+    The words are MODULE.NAME=VALUE, as "knee_left.axis0.controller.config.vel_limit=2".
 
     Raises:
         DriveError: there is no such module or setting, or it cannot have that value.

@@ -48,9 +48,7 @@ class DcBus:
     def check(self, least: float, most: float) -> dict[int, str]:
         """Return the drives (0 .. 5) that their limits disarm, each with a name in `BUS_FAULTS`.
 
-        Args:
-            least: power of the motor that takes the least now, W.
-            most: of the one that takes the most.
+        `least` and `most` are the least and the most power of a motor now, W.
         """
         if self._seen != self._settings.version:
             self._derive()

@@ -95,10 +95,6 @@ def errors_06(fault: AxisErrors) -> DriveError06:
     return errors
 
 
-def _heartbeat_05(bank: AxisBank, axis: int) -> bytes:
-    return cansimple.pack_heartbeat(bank.heartbeat(axis))
-
-
 def _heartbeat_06(bank: AxisBank, axis: int) -> bytes:
     fault = bank.faults[axis]
     result = ProcedureResult.SUCCESS
@@ -126,13 +122,12 @@ def _estimates_06(bank: AxisBank) -> tuple[Vector, Vector]:
     return bank.pos_estimate, bank.vel_estimate
 
 
-def _encoder_estimates_05(bank: AxisBank, axis: int) -> bytes:
-    pos, vel = _estimates_05(bank)
-    return cansimple.pack_two_floats(pos[axis], vel[axis])
+def _estimates_of_one(estimates: Callable[[AxisBank], tuple[Vector, Vector]]) -> Answer:
+    def answer(bank: AxisBank, axis: int) -> bytes:
+        pos, vel = estimates(bank)
+        return cansimple.pack_two_floats(pos[axis], vel[axis])
 
-
-def _encoder_estimates_06(bank: AxisBank, axis: int) -> bytes:
-    return cansimple.pack_two_floats(bank.pos_estimate[axis], bank.vel_estimate[axis])
+    return answer
 
 
 def _encoder_count(bank: AxisBank, axis: int) -> bytes:
@@ -141,48 +136,9 @@ def _encoder_count(bank: AxisBank, axis: int) -> bytes:
     return cansimple.pack_two_ints(count, count % per_turn)
 
 
-def _iq(bank: AxisBank, axis: int) -> bytes:
-    iq = bank.settings.current(axis, bank.torque[axis])
-    return cansimple.pack_two_floats(iq, iq)
-
-
-def _vbus(bank: AxisBank, axis: int) -> bytes:
-    return cansimple.pack_two_floats(*bank.bus.state(axis >> 1))
-
-
-def _motor_error(bank: AxisBank, axis: int) -> bytes:
-    return cansimple.pack_motor_error(bank.faults[axis].motor)
-
-
-def _encoder_error(bank: AxisBank, axis: int) -> bytes:
-    return cansimple.pack_u32(bank.faults[axis].encoder).ljust(8, b"\0")
-
-
-def _controller_error(bank: AxisBank, axis: int) -> bytes:
-    return cansimple.pack_u32(bank.faults[axis].controller).ljust(8, b"\0")
-
-
-def _version(_bank: AxisBank, _axis: int) -> bytes:
-    return cansimple_06.pack_version(VERSION_06)
-
-
-def _error(bank: AxisBank, axis: int) -> bytes:
-    errors = errors_06(bank.faults[axis])
-    return cansimple_06.pack_error(errors, errors)
-
-
-def _temperature(bank: AxisBank, axis: int) -> bytes:
-    celsius = bank.conditions.temperature[axis]
-    return cansimple.pack_two_floats(celsius, celsius)
-
-
-def _torques(bank: AxisBank, axis: int) -> bytes:
-    torque = bank.torque[axis]
-    return cansimple.pack_two_floats(torque, torque)
-
-
-def _powers(bank: AxisBank, axis: int) -> bytes:
-    return cansimple.pack_two_floats(*bank.bus.powers(axis))
+def _twice(value: float) -> bytes:
+    """Return a frame of two floats for what is set-point and measurement at once."""
+    return cansimple.pack_two_floats(value, value)
 
 
 def _sdo(bank: AxisBank, axis: int, data: bytes) -> bytes | None:
@@ -228,38 +184,38 @@ def sdo_layout(value: Value) -> str:
 
 
 _BOTH: Final[Mapping[int, Answer]] = {
-    Command.GET_IQ: _iq,
-    Command.GET_VBUS: _vbus,
+    Command.GET_IQ: lambda bank, axis: _twice(bank.settings.current(axis, bank.torque[axis])),
+    Command.GET_VBUS: lambda bank, axis: cansimple.pack_two_floats(*bank.bus.state(axis >> 1)),
+}
+_ANSWERS_05: Final[Mapping[int, Answer]] = {
+    Command.GET_ENCODER_ESTIMATES: _estimates_of_one(_estimates_05),
+    Command.GET_ENCODER_COUNT: _encoder_count,
+    Command.GET_MOTOR_ERROR: lambda b, axis: cansimple.pack_motor_error(b.faults[axis].motor),
+    Command.GET_ENCODER_ERROR: lambda b, axis: struct.pack("<II", b.faults[axis].encoder, 0),
+    Command.GET_CONTROLLER_ERROR: lambda b, axis: struct.pack("<II", b.faults[axis].controller, 0),
+}
+_ANSWERS_06: Final[Mapping[int, Answer]] = {
+    Command.GET_ENCODER_ESTIMATES: _estimates_of_one(_estimates_06),
+    Command06.GET_VERSION: lambda _bank, _axis: cansimple_06.pack_version(VERSION_06),
+    Command06.GET_ERROR: lambda b, axis: cansimple_06.pack_error(*[errors_06(b.faults[axis])] * 2),
+    Command06.GET_TEMPERATURE: lambda bank, axis: _twice(bank.conditions.temperature[axis]),
+    Command06.GET_TORQUES: lambda bank, axis: _twice(bank.torque[axis]),
+    Command06.GET_POWERS: lambda bank, axis: cansimple.pack_two_floats(*bank.bus.powers(axis)),
 }
 
 DIALECTS: Final[Mapping[DialectName, Dialect]] = {
     "0.5": Dialect(
-        _heartbeat_05,
-        _estimates_05,
-        {
-            **_BOTH,
-            Command.GET_ENCODER_ESTIMATES: _encoder_estimates_05,
-            Command.GET_MOTOR_ERROR: _motor_error,
-            Command.GET_ENCODER_ERROR: _encoder_error,
-            Command.GET_ENCODER_COUNT: _encoder_count,
-            Command.GET_CONTROLLER_ERROR: _controller_error,
-        },
-        None,
-        {},
+        heartbeat=lambda bank, axis: cansimple.pack_heartbeat(bank.heartbeat(axis)),
+        estimates=_estimates_05,
+        answers={**_BOTH, **_ANSWERS_05},
+        sdo=None,
+        setters={},
     ),
     "0.6": Dialect(
-        _heartbeat_06,
-        _estimates_06,
-        {
-            **_BOTH,
-            Command.GET_ENCODER_ESTIMATES: _encoder_estimates_06,
-            Command06.GET_VERSION: _version,
-            Command06.GET_ERROR: _error,
-            Command06.GET_TEMPERATURE: _temperature,
-            Command06.GET_TORQUES: _torques,
-            Command06.GET_POWERS: _powers,
-        },
-        _sdo,
-        {Command06.SET_ABSOLUTE_POSITION: _set_absolute_position},
+        heartbeat=_heartbeat_06,
+        estimates=_estimates_06,
+        answers={**_BOTH, **_ANSWERS_06},
+        sdo=_sdo,
+        setters={Command06.SET_ABSOLUTE_POSITION: _set_absolute_position},
     ),
 }

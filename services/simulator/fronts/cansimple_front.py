@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -24,7 +24,7 @@ _DATA_BYTES = 8
 _SDO_BYTES = 4
 _EARLY_S = 1e-6  # a period that is over but for rounding is over
 _S_PER_MS = 1e-3
-_TORQUE = struct.Struct("<f").unpack_from
+_FLOAT = struct.Struct("<f").unpack_from
 _FLAGGED_ID = REMOTE_FLAG | cansimple.NODE_MASK << cansimple.COMMAND_BITS | cansimple.COMMAND_MASK
 
 
@@ -188,68 +188,44 @@ class _Bus:
         self.encoder_packet = struct.Struct("<" + "IB3xff" * len(self.encoders)).pack
 
 
-def _set_state(bank: AxisBank, axis: int, data: bytes) -> None:
-    bank.request_state(axis, cansimple.unpack_u32(data))
+def _writer(columns: Sequence[str], unpack: Callable[[bytes], Sequence[float]]) -> Setter:
+    """Return how a frame's numbers are written to columns of the bank."""
 
+    def write(bank: AxisBank, axis: int, data: bytes) -> None:
+        for column, value in zip(columns, unpack(data), strict=True):
+            getattr(bank, column)[axis] = value
 
-def _set_modes(bank: AxisBank, axis: int, data: bytes) -> None:
-    bank.set_modes(axis, *cansimple.unpack_two_ints(data))
+    return write
 
 
 def _set_input_pos(bank: AxisBank, axis: int, data: bytes) -> None:
+    """Write a target; it comes so often that `_writer` would take too long."""
     pos, vel, torque = cansimple.unpack_input_pos(data)
     bank.input_pos[axis] = pos
     bank.input_vel[axis] = vel
     bank.input_torque[axis] = torque
 
 
-def _set_input_vel(bank: AxisBank, axis: int, data: bytes) -> None:
-    bank.input_vel[axis], bank.input_torque[axis] = cansimple.unpack_two_floats(data)
-
-
 def _set_input_torque(bank: AxisBank, axis: int, data: bytes) -> None:
-    bank.input_torque[axis] = _TORQUE(data)[0]
+    bank.input_torque[axis] = _FLOAT(data)[0]
 
 
-def _set_limits(bank: AxisBank, axis: int, data: bytes) -> None:
-    bank.vel_limit[axis], bank.current_lim[axis] = cansimple.unpack_two_floats(data)
-
-
-def _set_pos_gain(bank: AxisBank, axis: int, data: bytes) -> None:
-    bank.pos_gain[axis] = cansimple.unpack_float(data)
-
-
-def _set_vel_gains(bank: AxisBank, axis: int, data: bytes) -> None:
-    bank.vel_gain[axis], bank.vel_integrator_gain[axis] = cansimple.unpack_two_floats(data)
-
-
-def _set_count(bank: AxisBank, axis: int, data: bytes) -> None:
-    bank.set_count(axis, cansimple.unpack_two_ints(data)[0])
-
-
-def _estop(bank: AxisBank, axis: int, _data: bytes) -> None:
-    bank.estop(axis)
-
-
-def _clear_errors(bank: AxisBank, axis: int, _data: bytes) -> None:
-    bank.clear_errors(axis)
-
-
-def _reboot(bank: AxisBank, axis: int, _data: bytes) -> None:
-    bank.reboot(axis)
-
-
+_TWO: Final = cansimple.unpack_two_floats
 _SETTERS: Final[dict[int, Setter]] = {
-    Command.ESTOP: _estop,
-    Command.SET_AXIS_STATE: _set_state,
-    Command.SET_CONTROLLER_MODE: _set_modes,
+    Command.ESTOP: lambda bank, axis, _: bank.estop(axis),
+    Command.SET_AXIS_STATE: lambda b, axis, data: b.request_state(axis, cansimple.unpack_u32(data)),
+    Command.SET_CONTROLLER_MODE: lambda bank, axis, data: bank.set_modes(
+        axis, *cansimple.unpack_two_ints(data)
+    ),
     Command.SET_INPUT_POS: _set_input_pos,
-    Command.SET_INPUT_VEL: _set_input_vel,
+    Command.SET_INPUT_VEL: _writer(("input_vel", "input_torque"), _TWO),
     Command.SET_INPUT_TORQUE: _set_input_torque,
-    Command.SET_LIMITS: _set_limits,
-    Command.REBOOT: _reboot,
-    Command.SET_LINEAR_COUNT: _set_count,
-    Command.CLEAR_ERRORS: _clear_errors,
-    Command.SET_POS_GAIN: _set_pos_gain,
-    Command.SET_VEL_GAINS: _set_vel_gains,
+    Command.SET_LIMITS: _writer(("vel_limit", "current_lim"), _TWO),
+    Command.REBOOT: lambda bank, axis, _: bank.reboot(axis),
+    Command.SET_LINEAR_COUNT: lambda bank, axis, data: bank.set_count(
+        axis, cansimple.unpack_two_ints(data)[0]
+    ),
+    Command.CLEAR_ERRORS: lambda bank, axis, _: bank.clear_errors(axis),
+    Command.SET_POS_GAIN: _writer(("pos_gain",), _FLOAT),
+    Command.SET_VEL_GAINS: _writer(("vel_gain", "vel_integrator_gain"), _TWO),
 }

@@ -7,7 +7,6 @@ together.
 
 from __future__ import annotations
 
-import errno
 import select
 import socket
 from collections.abc import Sequence
@@ -15,15 +14,13 @@ from pathlib import Path
 from typing import Final
 
 from services.simulator.fronts.fibre_front import FibreFront
-from shared.exceptions import FleetError
-from shared.run_directory import private_files
+from services.simulator.fronts.unix_can_hub import accept, listen
 
 PACKET_BYTES: Final = 64
 """A full-speed bulk transfer."""
-LOOK_EVERY: Final = 8
-"""Polls from one look at the plugs themselves to the next: new clients, boards that went silent."""
+CHECK_EVERY: Final = 8
+"""Polls from one check of the plugs to the next: new clients, boards that went silent."""
 
-_BACKLOG = 16
 _PACKETS = 64  # a client that floods the link must not hold up the simulator
 
 
@@ -53,20 +50,7 @@ class FibrePort:
 
     def plug(self) -> None:
         """Put the plug in; clients find the drive when they next look."""
-        listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        listener.setblocking(False)
-        try:
-            self._clear_stale()
-            with private_files():
-                listener.bind(str(self.path))
-            listener.listen(_BACKLOG)
-        except OSError as error:
-            listener.close()
-            raise FleetError(
-                f"USB port: cannot listen on {self.path}: {error}; its directory must exist, be "
-                "writable and short enough, and no other simulator may hold it"
-            ) from error
-        self.listener = listener
+        self.listener = listen(self.path, "USB port")
 
     def unplug(self) -> None:
         """Pull the plug: every client loses the drive at once."""
@@ -78,18 +62,6 @@ class FibrePort:
         for client in self.clients.values():
             client.close()
         self.clients.clear()
-
-    def admit(self) -> socket.socket | None:
-        """Take one client from the queue, if there is one."""
-        if self.listener is None:
-            return None
-        try:
-            client, _ = self.listener.accept()
-        except OSError:
-            return None
-        client.setblocking(False)
-        self.clients[client.fileno()] = client
-        return client
 
     def serve(self, client: socket.socket) -> bool:
         """Answer the client's packets that have arrived; return False if the client is gone."""
@@ -108,13 +80,6 @@ class FibrePort:
             return False
         return True
 
-    def _clear_stale(self) -> None:
-        """Remove a socket file that nobody listens on."""
-        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
-            probe.setblocking(False)
-            if probe.connect_ex(str(self.path)) == errno.ECONNREFUSED:
-                self.path.unlink(missing_ok=True)
-
 
 class FibreHub:
     """All USB plugs of one simulator.
@@ -125,15 +90,14 @@ class FibreHub:
     def __init__(self, ports: Sequence[FibrePort]) -> None:
         self.ports = tuple(ports)
         self._epoll = select.epoll()
-        self._talking: dict[int, tuple[FibrePort, socket.socket]] = {}  # by descriptor
         self._polls = 0
         for port in self.ports:
-            self._listen(port)
+            self._watch(port.listener)
 
     @property
     def clients(self) -> int:
         """How many connections there are, over all drives."""
-        return len(self._talking)
+        return sum(len(port.clients) for port in self.ports)
 
     def fileno(self) -> int:
         """Return the descriptor that is readable when there is something for `poll`."""
@@ -142,53 +106,47 @@ class FibreHub:
     def poll(self) -> None:
         """Answer all requests that have come; now and then look at the plugs. Never waits."""
         self._polls += 1
-        if self._polls % LOOK_EVERY == 0:
+        if self._polls % CHECK_EVERY == 0:
             for port in self.ports:
-                if not port.right:
-                    self._turn(port)
-        elif not self._talking:
+                self._turn_if_wrong(port)
+        elif not self.clients:
             return
         for descriptor, _event in self._epoll.poll(0):
-            talk = self._talking.get(descriptor)
-            if talk is None:
-                self._admit(descriptor)
-            else:
-                self._serve(descriptor, *talk)
+            for port in self.ports:
+                if descriptor in port.clients:
+                    self._serve(port, descriptor)
+                elif port.listener is not None and port.listener.fileno() == descriptor:
+                    self._admit(port, port.listener)
 
     def close(self) -> None:
         """Pull all plugs for good."""
         for port in self.ports:
             port.unplug()
-        self._talking.clear()
         self._epoll.close()
 
-    def _turn(self, port: FibrePort) -> None:
-        """Put a plug in or pull it, as its board has it."""
+    def _watch(self, end: socket.socket | None) -> None:
+        if end is not None:
+            self._epoll.register(end, select.EPOLLIN)
+
+    def _turn_if_wrong(self, port: FibrePort) -> bool:
+        """Put a plug in or pull it, as its board has it; return True if that was to be done."""
+        if port.right:
+            return False
         if port.listener is None:
             port.plug()
-            self._listen(port)
-            return
-        for descriptor in port.clients:
-            self._talking.pop(descriptor, None)
-        port.unplug()  # a closed socket leaves the epoll by itself
+            self._watch(port.listener)
+        else:
+            port.unplug()  # a closed socket leaves the epoll by itself
+        return True
 
-    def _listen(self, port: FibrePort) -> None:
-        if port.listener is not None:
-            self._epoll.register(port.listener, select.EPOLLIN)
-
-    def _admit(self, descriptor: int) -> None:
+    def _admit(self, port: FibrePort, listener: socket.socket) -> None:
         """Admit a client where one has come."""
-        for port in self.ports:
-            if port.listener is not None and port.listener.fileno() == descriptor:
-                client = port.admit()
-                if client is not None:
-                    self._talking[client.fileno()] = (port, client)
-                    self._epoll.register(client, select.EPOLLIN)
+        client = accept(listener)
+        if client is not None:
+            port.clients[client.fileno()] = client
+            self._watch(client)
 
-    def _serve(self, descriptor: int, port: FibrePort, client: socket.socket) -> None:
-        """Answer one packet; a board that has gone silent answers nothing more."""
-        if not port.right:
-            self._turn(port)
-        elif not port.serve(client):
-            del self._talking[descriptor], port.clients[descriptor]
-            client.close()
+    def _serve(self, port: FibrePort, descriptor: int) -> None:
+        """Answer a client; a board that has gone silent answers nothing more."""
+        if not self._turn_if_wrong(port) and not port.serve(port.clients[descriptor]):
+            port.clients.pop(descriptor).close()

@@ -9,7 +9,6 @@ import socket
 import stat
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Protocol
 
 from shared.can.unix_can import PACKET_BYTES, Frame, pack_frames, unpack_frames
 from shared.exceptions import FleetError
@@ -18,16 +17,6 @@ from shared.run_directory import private_files
 _PATH_BYTES = 107  # sun_path less its closing zero
 _BACKLOG = 16
 _ROUNDS = 64  # a client that floods the bus must not hold up the simulator
-
-
-class FrameHub(Protocol):
-    """What a simulated sensor needs of its CAN bus."""
-
-    def poll(self) -> object:
-        """Admit new clients and take the frames that they sent; never waits."""
-
-    def broadcast(self, frames: list[tuple[int, bytes]]) -> None:
-        """Send frames (id, data) to every client, as one packet."""
 
 
 class UnixCanHub:
@@ -44,7 +33,7 @@ class UnixCanHub:
         self.path = path
         self.dropped = 0
         self._clients: dict[int, socket.socket] = {}
-        self._listener = _listen(path)
+        self._listener = listen(path, "CAN hub")
         self._inode = path.stat().st_ino
         self._epoll = select.epoll()
         self._epoll.register(self._listener, select.EPOLLIN)
@@ -67,7 +56,7 @@ class UnixCanHub:
                 if client is None:
                     self._admit()
                 else:
-                    frames += self._take(client)
+                    frames += self._receive(client)
         return frames
 
     def broadcast(self, frames: Iterable[Frame]) -> None:
@@ -77,7 +66,7 @@ class UnixCanHub:
     def broadcast_packet(self, packet: bytes) -> None:
         """Send a packet made by `pack_frames` or alike to every client."""
         for client in tuple(self._clients.values()):
-            self._hand(client, packet)
+            self._send(client, packet)
 
     def close(self) -> None:
         """Leave all clients and remove the socket file, unless another hub has replaced it."""
@@ -100,16 +89,12 @@ class UnixCanHub:
         self.close()
 
     def _admit(self) -> None:
-        """Take one client from the queue, if it is still there."""
-        try:
-            client, _ = self._listener.accept()
-        except OSError:
-            return
-        client.setblocking(False)
-        self._clients[client.fileno()] = client
-        self._epoll.register(client, select.EPOLLIN)
+        client = accept(self._listener)
+        if client is not None:
+            self._clients[client.fileno()] = client
+            self._epoll.register(client, select.EPOLLIN)
 
-    def _take(self, client: socket.socket) -> list[Frame]:
+    def _receive(self, client: socket.socket) -> list[Frame]:
         """Read one packet of a ready client and hand it on; part with a client that has gone."""
         try:
             packet = client.recv(PACKET_BYTES)
@@ -125,13 +110,13 @@ class UnixCanHub:
         if len(self._clients) > 1:
             for other in tuple(self._clients.values()):
                 if other is not client:
-                    self._hand(other, packet)
+                    self._send(other, packet)
         return unpack_frames(packet)
 
-    def _hand(self, client: socket.socket, packet: bytes) -> None:
+    def _send(self, client: socket.socket, packet: bytes) -> None:
         """Send without waiting; drop packets for which a slow client has no room.
 
-        A client that is gone is removed in `_take`, after its last frames have been read.
+        A client that is gone is removed in `_receive`, after its last frames have been read.
         """
         try:
             client.send(packet)
@@ -147,14 +132,18 @@ class UnixCanHub:
             client.close()
 
 
-def _listen(path: Path) -> socket.socket:
-    """Listen on a path; remove the file of a hub that is gone."""
+def listen(path: Path, what: str) -> socket.socket:
+    """Listen on a path for packets; remove the file of a simulator that is gone.
+
+    Raises:
+        FleetError: the path is in use, too long, or cannot be made.
+    """
     if len(os.fsencode(path)) > _PATH_BYTES:
         raise FleetError(
-            f"CAN hub: {path} is longer than the {_PATH_BYTES} bytes of a UNIX socket's path; "
+            f"{what}: {path} is longer than the {_PATH_BYTES} bytes of a UNIX socket's path; "
             "choose a shorter run directory"
         )
-    _clear_stale(path)
+    _clear_stale(path, what)
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     listener.setblocking(False)
     try:
@@ -164,21 +153,31 @@ def _listen(path: Path) -> socket.socket:
     except OSError as error:
         listener.close()
         raise FleetError(
-            f"CAN hub: cannot listen on {path}: {error}; its directory must exist and be writable"
+            f"{what}: cannot listen on {path}: {error}; its directory must exist and be writable"
         ) from error
     return listener
 
 
-def _clear_stale(path: Path) -> None:
+def accept(listener: socket.socket) -> socket.socket | None:
+    """Return one client from the queue, if it is still there; it never blocks."""
+    try:
+        client, _ = listener.accept()
+    except OSError:
+        return None
+    client.setblocking(False)
+    return client
+
+
+def _clear_stale(path: Path, what: str) -> None:
     """Remove a socket file that nobody listens on; refuse one in use or no socket at all."""
     try:
         mode = path.lstat().st_mode
     except FileNotFoundError:
         return
     if not stat.S_ISSOCK(mode):
-        raise FleetError(f"CAN hub: {path} is there and is no socket; remove it")
+        raise FleetError(f"{what}: {path} is there and is no socket; remove it")
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
         probe.setblocking(False)
         if probe.connect_ex(str(path)) != errno.ECONNREFUSED:
-            raise FleetError(f"CAN hub: {path} is in use; stop the simulator that holds it")
+            raise FleetError(f"{what}: {path} is in use; stop the simulator that holds it")
     path.unlink(missing_ok=True)

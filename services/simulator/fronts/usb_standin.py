@@ -68,13 +68,9 @@ def load(library: Path) -> None:
 
 
 def prepare(run_dir: Path) -> dict[str, str]:
-    """Return what lets the `odrive` package of another process find the emulated drives.
+    """Return environment variables by which `odrive` in another process finds the drives.
 
-    Environment variables; the stand-in is built in the run directory of the fleet whose
-    simulator has the drives.
-
-    Raises:
-        FleetError: see `build`.
+    The stand-in is built in the run directory of the fleet whose simulator has them.
     """
     library = build(run_dir / BUILT)
     paths = [str(library.parent), os.environ.get("LD_LIBRARY_PATH", "")]

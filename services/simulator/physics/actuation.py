@@ -1,4 +1,15 @@
-"""From the drives' torques to the joints, and from the joints to the encoders. Pure."""
+"""From the drives' torques to the joints, and from the joints to the encoders. Pure.
+
+Each of the 12 joint axes has a rotor of its own behind a spring with damping and play:
+
+    I w' = tau_motor - tau_spring - d_m w - cogging - dry friction
+    tau_spring = k dead(theta - q) + b (w - q')        where the play is taken up
+    dead(x) = x - clip(x, -play/2, play/2)
+
+theta, w: the rotor's angle and rate at the joint; both motors of a module are equal, so rotor
+inertia is diagonal in the joints' (phi, theta) too. The joint's share of the damping, b q', is left
+to the body's own integrator, which is implicit in it. The encoders see theta.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +17,14 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from services.simulator.physics.body import Body
-from services.simulator.physics.drivetrain import FlexibleDrivetrain
-from services.simulator.physics.plant import RIGID
+from services.simulator.physics.plant import RIGID, Drivetrain
 from shared.joints import N_JOINTS
+from shared.robot.compiled_graph import CompiledGraph
 
 Array = NDArray[np.float64]
 
@@ -21,28 +33,33 @@ NOISE_ROWS: Final = 4093
 
 
 class Actuation:
-    """Torque lag and delay, drivetrain and encoders of the 12 axes."""
+    """Torque lag and delay, drivetrain and encoders of the 12 axes.
+
+    Attributes:
+        flexible: the rotors; None: the joints are the motors.
+        tau_from_motor: joint torques per motor torque (12, 12).
+    """
 
     def __init__(self, body: Body, dt: float) -> None:
         """Take the true robot and the step, s."""
-        n, drive = N_JOINTS, body.drive
-        turns = body.motor_from_joint
+        n, plant, turns = N_JOINTS, body.plant, body.motor_from_joint
+        drive = plant.drive
         self._turns = turns
         # power is the same on both sides: tau = (d motor angle / d joint angle)^T torque
-        self._tau_from_motor: Array = 2.0 * math.pi * drive.torque_scale * turns.T.copy()
+        self.tau_from_motor: Array = 2.0 * math.pi * drive.torque_scale * turns.T.copy()
         self._lags = drive.lag_s > 0.0
         self._follow = 1.0 - math.exp(-dt / drive.lag_s) if self._lags else 1.0
         self._waiting: Array = np.zeros((round(drive.delay_s / dt), n))
-        self._oldest = 0
+        """Torques on their way, the oldest first."""
         self._tau: Array = np.zeros(n)
+        """Torques of the current loops, where these lag."""
         self._wanted: Array = np.zeros(n)
         self._acting: Array = np.zeros(n)
-        flexible = body.drivetrain.stiffness != RIGID
-        self.flexible = FlexibleDrivetrain(body.drivetrain, turns, dt) if flexible else None
-        """None: the joints are the motors."""
-        self._offset: Array = turns @ np.array(body.encoder.zero_errors)
-        noise = body.encoder.noise_counts / body.counts_per_turn
-        rng = np.random.default_rng(body.seed)
+        flexible = plant.drivetrain.stiffness != RIGID
+        self.flexible = FlexibleDrivetrain(plant.drivetrain, turns, dt) if flexible else None
+        self._offset: Array = turns @ np.array(plant.encoder.zero_errors)
+        noise = plant.encoder.noise_counts / body.counts_per_turn
+        rng = np.random.default_rng(plant.seed)
         self._noise: Array = noise * rng.standard_normal((NOISE_ROWS if noise else 1, n))
         self._reads = 0
 
@@ -52,21 +69,16 @@ class Actuation:
             self.flexible.settle(q)
 
     def torque(self, motor_torque: Array, q: Array, v: Array) -> Array:
-        """Move on by one step; return what acts on the joints (12,), N m.
+        """Advance by one step; return what acts on the joints (12,), N m.
 
-        Of a flexible drivetrain without `flexible.damping` times v.
-
-        Args:
-            motor_torque: that the drives want (12,), N m.
-            q: joint angles (12,), rad.
-            v: joint rates (12,), rad/s.
+        Of a flexible drivetrain without `flexible.damping` times v. `motor_torque` (12,), N m, is
+        what the drives want.
         """
-        wanted = np.matmul(self._tau_from_motor, motor_torque, out=self._wanted)
+        wanted = np.matmul(self.tau_from_motor, motor_torque, out=self._wanted)
         if len(self._waiting):
-            row = self._waiting[self._oldest]
-            late = row.copy()
-            row[:] = wanted
-            self._oldest = (self._oldest + 1) % len(self._waiting)
+            late = self._waiting[0].copy()
+            self._waiting[:-1] = self._waiting[1:]
+            self._waiting[-1] = wanted
             wanted[:] = late
         acting = self._acting
         if self._lags:  # at the step's begin: positions are then right to second order in dt
@@ -81,9 +93,7 @@ class Actuation:
     def encoders(self, q: Array, v: Array) -> tuple[Array, Array]:
         """Return the encoders' motor angles (12,), turns, and the true rates, turn/s.
 
-        Args:
-            q: angles of the rotors (12,), rad at the joints.
-            v: their rates (12,), rad/s.
+        From angles and rates of the rotors (12,), rad and rad/s at the joints.
         """
         turns = self._turns @ q
         turns += self._offset
@@ -91,17 +101,77 @@ class Actuation:
         self._reads += 1
         return turns, self._turns @ v
 
-    def state(self) -> list[float]:
-        """Return everything that `restore` goes on from."""
-        rotors = [] if self.flexible is None else [*self.flexible.theta, *self.flexible.rate]
-        waiting = np.roll(self._waiting, -self._oldest, axis=0).ravel()
-        return [float(x) for x in (self._reads, *self._tau, *waiting, *rotors)]
+    def numbers(self) -> list[float]:
+        """Return all that changes from step to step, one number after the other."""
+        columns = (column.ravel() for column in self._columns())
+        return [float(self._reads), *np.concatenate([*columns]).tolist()]
 
-    def restore(self, state: Sequence[float]) -> None:
-        """Go on from a state of the same plant."""
-        values, n = np.array(state), N_JOINTS
-        self._reads, self._oldest = int(values[0]), 0
-        end = 1 + n + self._waiting.size
-        self._tau[:], self._waiting[:] = values[1 : 1 + n], values[1 + n : end].reshape(-1, n)
-        if self.flexible is not None:
-            self.flexible.theta[:], self.flexible.rate[:] = values[end : end + n], values[end + n :]
+    def set_numbers(self, numbers: Sequence[float]) -> None:
+        """Continue from what `numbers` returned of the same plant."""
+        self._reads, rest = int(numbers[0]), np.array(numbers[1:])
+        for column in self._columns():
+            column[:] = rest[: column.size].reshape(column.shape)
+            rest = rest[column.size :]
+
+    def _columns(self) -> tuple[Array, ...]:
+        rotors = () if self.flexible is None else (self.flexible.theta, self.flexible.rate)
+        return (self._tau, self._waiting, *rotors)
+
+
+class FlexibleDrivetrain:
+    """The 12 rotors.
+
+    Attributes:
+        theta: rotor angles at the joint (12,), rad.
+        rate: rad/s.
+        damping: of the spring on the joint in this step (12,), N m s/rad: 0 within the play.
+    """
+
+    def __init__(self, config: Drivetrain, motor_from_joint: Array, dt: float) -> None:
+        """Take finite stiffness, motor turns per joint angle (12, 12), and the step dt, s."""
+        self._graph = CompiledGraph(step_graph(config, motor_from_joint, dt))
+        self.theta, self.rate, *self._arguments = self._graph.arguments
+        self._theta_next, self._rate_next, self._tau, self.damping = self._graph.results
+
+    def settle(self, q: Array) -> None:
+        """Put the rotors where the joints (12,), rad, are, at rest."""
+        self.theta[:] = q
+        self.rate[:] = 0.0
+
+    def step(self, tau_motor: Array, q: Array, v: Array) -> Array:
+        """Advance the rotors by one step; return the springs' torques on the joints (12,), N m.
+
+        `damping` times v is left to the body's integrator. The next call overwrites the result.
+        Motor torques (12,), N m, are those at the joints.
+        """
+        tau_now, q_now, v_now = self._arguments
+        tau_now[:], q_now[:], v_now[:] = tau_motor, q, v
+        self._graph()
+        self.theta[:], self.rate[:] = self._theta_next, self._rate_next
+        return self._tau
+
+
+def step_graph(config: Drivetrain, motor_from_joint: Array, dt: float) -> ca.Function:
+    """Return (theta, w, tau_motor, q, q') -> (theta, w, tau_spring + b w, b): one step."""
+    theta, rate, tau_motor, q, v = (ca.SX.sym(name, N_JOINTS) for name in "trmqv")
+    k, b = config.stiffness, config.damping_s * config.stiffness
+    half = 0.5 * config.play
+    inside = ca.fmin(ca.fmax(theta - q, -half), half)
+    stretch = theta - q - inside
+    damping = b * (ca.fabs(theta - q) > half) if config.play > 0.0 else b * ca.SX.ones(N_JOINTS)
+    angle = 2.0 * math.pi * config.cogging_periods * (ca.DM(motor_from_joint) @ theta)
+    cogging = config.cogging * (ca.DM(np.sign(motor_from_joint.T)) @ ca.sin(angle))
+    per_inertia = dt / config.rotor_inertia
+    # backward Euler in the dampers: (1 + dt b / I + dt d / I) w_new = w + dt / I (...)
+    driven = rate + per_inertia * (tau_motor - k * stretch - cogging + damping * v)
+    free = driven / (1.0 + per_inertia * (damping + config.motor_damping))
+    # dry friction can stop a rotor but not reverse it
+    most = config.motor_friction * per_inertia
+    rate_next = free - ca.fmin(ca.fmax(free, -most), most)
+    tau = k * stretch + damping * rate_next
+    return ca.Function(
+        "drivetrain",
+        [theta, rate, tau_motor, q, v],
+        [ca.densify(x) for x in (theta + dt * rate_next, rate_next, tau, damping)],
+        {"cse": True},
+    )

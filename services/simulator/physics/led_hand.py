@@ -6,11 +6,14 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-from services.simulator.physics.follower import Follower
+import msgspec
+
 from shared.bus.messages import HandLead, Vector3
 from shared.clamp import clamp
 from shared.config.scenarios import Lead
 
+BANDWIDTH: Final = 8.0
+"""rad/s, of the critically damped system with which the hand follows what is asked for."""
 HEIGHT_MAX_RATE: Final = 0.25
 """m/s: the hand then pulls with up to 70 N; at 0.5 m/s with 150 N, where the planner lets go."""
 PITCH_MAX_RATE: Final = 1.0
@@ -25,73 +28,101 @@ PUSH_EXPIRES_S: Final = 0.3
 """After the last message: somebody who is gone does not go on pushing."""
 
 
-class LedHand:
+class LedHand(msgspec.Struct):
     """Follows what is asked for; while nobody asks it stays where it was led, and pushes no more.
 
-    Attributes:
-        leads: somebody leads; False: somebody pushes only, and the scenario leads.
+    Its fields, in this order, are `SimState.hand`.
     """
 
-    def __init__(self) -> None:
-        self.leads = False
-        self._height, self._pitch = Follower(0.0, HEIGHT_MAX_RATE), Follower(0.0, PITCH_MAX_RATE)
-        self._wanted = (0.0, 0.0)
-        self._force: Vector3 = (0.0, 0.0, 0.0)
-        self._push_left_s = 0.0
+    leads: bool = False
+    """Somebody leads; False: somebody pushes only, and the scenario leads."""
+    height: float = 0.0
+    height_rate: float = 0.0
+    pitch: float = 0.0
+    pitch_rate: float = 0.0
+    wanted_height: float = 0.0
+    wanted_pitch: float = 0.0
+    force_x: float = 0.0
+    force_y: float = 0.0
+    force_z: float = 0.0
+    push_left_s: float = 0.0
 
-    def take(self, asked: HandLead, now: Lead) -> None:
-        """Take a request, within the limits; a value that is not finite is ignored.
+    def ask(self, asked: HandLead, now: Lead) -> None:
+        """Accept a request, within the limits; a value that is not finite is ignored.
 
-        Args:
-            asked: where to lead and how to push.
-            now: where the hand is led now; the first request takes over from there.
+        The first one takes over from where the hand is led `now`.
         """
         if not all(map(math.isfinite, (asked.height, asked.pitch, *asked.push))):
             return
         if asked.leads and not self.leads:
             self.leads = True
-            self._height.at, self._pitch.at = now.height, now.pitch
-            self._height.rate, self._pitch.rate = now.height_rate, now.pitch_rate
+            self.height, self.height_rate = now.height, now.height_rate
+            self.pitch, self.pitch_rate = now.pitch, now.pitch_rate
         if asked.leads:
-            self._wanted = (clamp(asked.height, *HEIGHTS), clamp(asked.pitch, *PITCHES))
-        x, y, z = (clamp(part, -PUSH_MAX, PUSH_MAX) for part in asked.push)
-        self._force = (x, y, z)
-        self._push_left_s = PUSH_EXPIRES_S if any(self._force) else 0.0
+            self.wanted_height = clamp(asked.height, *HEIGHTS)
+            self.wanted_pitch = clamp(asked.pitch, *PITCHES)
+        self.force_x, self.force_y, self.force_z = (
+            clamp(part, -PUSH_MAX, PUSH_MAX) for part in asked.push
+        )
+        self.push_left_s = PUSH_EXPIRES_S if self.force_x or self.force_y or self.force_z else 0.0
 
     def advance(self, dt: float) -> None:
-        """Go on by dt, s."""
+        """Advance by dt, s."""
         if self.leads:
-            self._height.advance(self._wanted[0], dt)
-            self._pitch.advance(self._wanted[1], dt)
-        self._push_left_s = max(0.0, self._push_left_s - dt)
+            self.height, self.height_rate = follow(
+                self.wanted_height, self.height, self.height_rate, HEIGHT_MAX_RATE, dt
+            )
+            self.pitch, self.pitch_rate = follow(
+                self.wanted_pitch, self.pitch, self.pitch_rate, PITCH_MAX_RATE, dt
+            )
+        self.push_left_s = max(0.0, self.push_left_s - dt)
 
     def over(self, wanted: Lead) -> Lead:
         """Return the scenario's request, with this hand's height and pitch if it leads."""
         if not self.leads:
             return wanted
-        height, pitch = self._height, self._pitch
         return wanted._replace(
-            height=height.at, height_rate=height.rate, pitch=pitch.at, pitch_rate=pitch.rate
+            height=self.height,
+            height_rate=self.height_rate,
+            pitch=self.pitch,
+            pitch_rate=self.pitch_rate,
         )
+
+    def numbers(self) -> tuple[float, ...]:
+        """Return the fields as the log has them."""
+        return tuple(map(float, msgspec.structs.astuple(self)))
+
+    @classmethod
+    def of_numbers(cls, numbers: Sequence[float]) -> LedHand:
+        """Return the hand that `numbers` were of."""
+        hand = cls()
+        for name, value in zip(cls.__struct_fields__, numbers, strict=True):
+            setattr(hand, name, value)
+        return hand
 
     @property
     def push(self) -> Vector3 | None:
         """Push on the torso, N, world; None: the scenario's own."""
-        return self._force if self._push_left_s > 0.0 else None
+        if self.push_left_s <= 0.0:
+            return None
+        return (self.force_x, self.force_y, self.force_z)
 
-    def state(self) -> tuple[float, ...]:
-        """Return everything that `restored` goes on from."""
-        height, pitch = self._height, self._pitch
-        places = (height.at, height.rate, pitch.at, pitch.rate, *self._wanted)
-        return (float(self.leads), *places, *self._force, self._push_left_s)
 
-    @classmethod
-    def restored(cls, state: Sequence[float]) -> LedHand:
-        """Return the hand of a state."""
-        made = cls()
-        made.leads = state[0] > 0.0
-        made._height.at, made._height.rate, made._pitch.at, made._pitch.rate = state[1:5]
-        made._wanted = (state[5], state[6])
-        made._force = (state[7], state[8], state[9])
-        made._push_left_s = state[10]
-        return made
+def follow(
+    wanted: float, at: float, rate: float, rate_max: float, dt: float
+) -> tuple[float, float]:
+    """Return place and rate of a coordinate dt s later, on its way to where it is wanted.
+
+    A critically damped second-order system with a limit on its rate; in closed form, so it is
+    stable whatever dt is.
+    """
+    # x'' = w^2 (wanted - x) - 2 w x', whose error is (a + b t) exp(-w t)
+    error, w = at - wanted, BANDWIDTH
+    slope = rate + w * error
+    decay = math.exp(-w * dt)
+    then = wanted + (error + slope * dt) * decay
+    rate = (slope - w * (error + slope * dt)) * decay
+    if abs(rate) > rate_max or abs(then - at) > rate_max * dt:
+        rate = math.copysign(rate_max, wanted - at)
+        then = at + rate * dt
+    return then, rate

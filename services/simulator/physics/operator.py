@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from typing import Final, NamedTuple
 
+import msgspec
+
 from services.simulator.physics.plant import Person
 from shared.bus.messages import Vector3
 from shared.clamp import clamp
@@ -29,58 +31,47 @@ REACH_S: Final = 0.4
 """Time constant with which a hand that grips the robot joins the path."""
 
 
-class Wearer:
+class Wearer(msgspec.Struct):
     """The person's own mass behind the hand, which yields to the robot's force.
 
     It grips the robot where that is and joins the path. From then on d is its height above the
-    path:  m d'' = -m w^2 d - 2 zeta m w d' - f
+    path:  m d'' = -m w^2 d - 2 zeta m w d' - f. Without a mass it follows the path exactly.
     """
 
-    def __init__(self, person: Person) -> None:
-        """Take the person; without a mass the path is followed exactly."""
-        w = 2.0 * math.pi * person.leg_frequency_hz
-        self._per_mass = 1.0 / person.mass if person.mass > 0.0 else 0.0
-        self._k, self._b = w * w, 2.0 * person.leg_damping_ratio * w
-        self._load_scale, self._load_lag_s = person.load_scale, person.load_lag_s
-        self.above = 0.0
-        """m"""
-        self.reach = 0.0
-        """m, the path is so far off still, since it took hold: gone before a scenario starts."""
-        self._holds = False
-        self.rate = 0.0
-        """m/s"""
-        self.load_n = 0.0
-        """What rests on the harness, N."""
+    person: Person
+    above: float = 0.0
+    """m"""
+    rate: float = 0.0
+    """m/s"""
+    load_n: float = 0.0
+    """What rests on the harness, N."""
+    reach: float = 0.0
+    """m, the path is so far off still, since it took hold: gone before a scenario starts."""
+    holds: bool = False
 
-    def take_hold(self, above: float) -> None:
+    def grip(self, above: float) -> None:
         """Grip the robot where it is, `above` the path, m, unless the hand grips already."""
-        if not self._holds:
-            self._holds, self.reach = True, above
-
-    def go_on(self, above: float, rate: float, load_n: float) -> None:
-        """Go on as somebody who has hold of it; m, m/s, N."""
-        self._holds = True
-        self.above, self.rate, self.load_n = above, rate, load_n
+        if not self.holds:
+            self.holds, self.reach = True, above
 
     def motion(self) -> tuple[float, float]:
         """Return how far the hand is above its path, m, and its rate, m/s."""
         return self.above + self.reach, self.rate - self.reach / REACH_S
 
     def step(self, dt: float, force_on_robot: float, assist: float) -> None:
-        """Advance by one step.
+        """Advance by dt, s, under the hand's force on the robot, N, up.
 
-        Args:
-            dt: step, s.
-            force_on_robot: of the hand, N, up.
-            assist: requested by the person, N; the person rests part of it, with a delay.
+        Of the assist that it requests, N, the person rests a part, with a delay.
         """
-        if self._per_mass:
-            acceleration = -self._per_mass * force_on_robot - self._k * self.above
-            self.rate = (self.rate + dt * acceleration) / (1.0 + dt * self._b)
+        person = self.person
+        if person.mass > 0.0:
+            w = 2.0 * math.pi * person.leg_frequency_hz
+            b = 2.0 * person.leg_damping_ratio * w
+            acceleration = -(1.0 / person.mass) * force_on_robot - w * w * self.above
+            self.rate = (self.rate + dt * acceleration) / (1.0 + dt * b)
             self.above += dt * self.rate
         self.reach -= self.reach * dt / REACH_S
-        wanted = self._load_scale * assist
-        lag = self._load_lag_s
+        wanted, lag = person.load_scale * assist, person.load_lag_s
         self.load_n += (wanted - self.load_n) * (min(1.0, dt / lag) if lag > 0.0 else 1.0)
 
 
@@ -95,14 +86,9 @@ class Operator:
     def force(
         self, wanted: Lead, height: float, rate: float, pitch: float, pitch_rate: float
     ) -> HandForce:
-        """Return the hand's force.
+        """Return the hand's force, from where it leads and where the robot is.
 
-        Args:
-            wanted: where the hand leads: torso height and pitch.
-            height: of the harness point above the ankles, m.
-            rate: of the harness point, vertical, m/s.
-            pitch: of the torso, rad.
-            pitch_rate: rad/s.
+        `height` is the harness point's above the ankles, m, `pitch` the torso's, rad.
         """
         x, _, z = self._point
         sine, cosine = math.sin(wanted.pitch), math.cos(wanted.pitch)

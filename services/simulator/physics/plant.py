@@ -169,11 +169,7 @@ NAMED: Final[Mapping[str, PlantConfig]] = {"realistic": PlantConfig(), "ideal": 
 
 
 def load(path: Path) -> PlantConfig:
-    """Read a plant file; a key that it lacks keeps its default.
-
-    Raises:
-        ConfigError: a key is unknown, or a value out of range.
-    """
+    """Read a plant file; a key that it lacks keeps its default."""
     plant = read_toml(path, PlantConfig)
     _check(str(path), plant)
     return plant
@@ -185,9 +181,6 @@ def plant_from(words: Iterable[str]) -> PlantConfig:
     Args:
         words: each a name (`ideal`), a file, or KEY=VALUE such as `drivetrain.play=0.01`; each is
             laid over those before it.
-
-    Raises:
-        ConfigError: a word names no plant, or a value is not as it should be.
     """
     plant = PlantConfig()
     for word in words:
@@ -205,26 +198,19 @@ def plant_from(words: Iterable[str]) -> PlantConfig:
 
 
 def changed(plant: PlantConfig, values: Mapping[str, Any]) -> PlantConfig:
-    """Return a plant with values set by dotted key; text is parsed as TOML.
-
-    Raises:
-        ConfigError: there is no such key, or it cannot have that value.
-    """
+    """Return a plant with values set by dotted key; text is parsed as TOML."""
     table = msgspec.to_builtins(plant)
     for key, value in values.items():
         section, _, name = key.rpartition(".")
         target = table.get(section) if section else table
         if not isinstance(target, dict) or name not in target:
-            known = [
-                f"{section}.{name}" for section, rows in table.items() if isinstance(rows, dict)
-                for name in rows
-            ]  # fmt: skip
+            sections = {name: rows for name, rows in table.items() if isinstance(rows, dict)}
+            known = [f"{section}.{name}" for section, rows in sections.items() for name in rows]
             raise ConfigError("--plant", key, "unknown key", f"one of {', '.join(known)}")
-        if isinstance(value, str):
-            read = parse_toml(f"value = {value}", f"--plant {key}", _Any).value
-            target[name] = read
-        else:
-            target[name] = value
+        is_text = isinstance(value, str)
+        target[name] = (
+            parse_toml(f"value = {value}", f"--plant {key}", _Any).value if is_text else value
+        )
     new = parse_toml(tomli_w.dumps(table), "--plant", PlantConfig)
     _check("--plant", new)
     return new

@@ -1,16 +1,22 @@
-"""Measures the simulated robot's posture, and whether it has fallen."""
+"""Measures how the simulated robot stands, what its soles bear, and whether it has fallen."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.bus.messages import Vector3
+from shared.bus.messages import Pair, Vector3
 from shared.clamp import clamp
+from shared.extras import late
+
+if TYPE_CHECKING:
+    import mujoco
+else:
+    mujoco = late("mujoco")
 
 Array = NDArray[np.float64]
 
@@ -20,10 +26,12 @@ FALLEN_ANGLE: Final = 0.6
 """rad of roll or yaw."""
 FALLEN_TILT: Final = 0.6
 """rad of a sole against the floor."""
+LEAST_N: Final = 1e-3
+"""A sole that bears less has no centre of pressure."""
 
 
 class MeasuredPosture(NamedTuple):
-    """MeasuredPosture of the robot, world axes."""
+    """Posture of the robot, world axes."""
 
     com: Vector3
     """m"""
@@ -48,15 +56,17 @@ class MeasuredPosture(NamedTuple):
         )
 
 
-def measure_posture(data: Any, torso: int, feet: Sequence[int], ankles: Array) -> MeasuredPosture:
-    """Return the posture.
+class SoleLoad(NamedTuple):
+    """What the floor does to one sole."""
 
-    Args:
-        data: MuJoCo's, after a step.
-        torso: id of the body.
-        feet: ids of the bodies, by side.
-        ankles: where the feet were placed (2, 3), m.
-    """
+    force: Vector3
+    """N, world."""
+    cop: Pair
+    """Centre of pressure, x and y, m, world; (0, 0) if it bears nothing."""
+
+
+def measure_posture(data: Any, torso: int, feet: Sequence[int], ankles: Array) -> MeasuredPosture:
+    """Return the posture after a step; `ankles` (2, 3), m, is where the feet were placed."""
     rotation = data.xmat[torso].reshape(3, 3)
     roll = math.asin(clamp(rotation[2, 1], -1.0, 1.0))
     pitch = math.atan2(-rotation[2, 0], rotation[2, 2])
@@ -69,6 +79,25 @@ def measure_posture(data: Any, torso: int, feet: Sequence[int], ankles: Array) -
         tilts=[math.acos(min(1.0, data.xmat[foot][8])) for foot in feet],
         slip=float(np.linalg.norm(positions - ankles, axis=1).max()),
     )
+
+
+def sole_loads(model: Any, data: Any, feet: Sequence[int]) -> list[SoleLoad]:
+    """Return each foot's load, from the contacts of the last step."""
+    count = data.ncon
+    contact, local = data.contact, np.zeros(6)
+    forces = np.zeros((count, 3))
+    for index in range(count):
+        mujoco.mj_contactForce(model, data, index, local)
+        forces[index] = local[:3] @ contact.frame[index].reshape(3, 3)  # of geom1 on geom2
+    bodies = model.geom_bodyid[contact.geom] if count else np.zeros((0, 2), int)
+    loads = []
+    for foot in feet:
+        on = forces * ((bodies[:, 1] == foot) * 1.0 - (bodies[:, 0] == foot))[:, None]
+        force = on.sum(axis=0)
+        bears = abs(force[2]) > LEAST_N
+        x, y = (on[:, 2] @ contact.pos[:, :2] / force[2]).tolist() if bears else (0.0, 0.0)
+        loads.append(SoleLoad(as_vector(force), (x, y)))
+    return loads
 
 
 def as_vector(values: Array) -> Vector3:

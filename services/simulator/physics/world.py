@@ -1,4 +1,4 @@
-"""The physical world in MuJoCo: the robot on free feet, the operator, pushes, the hoist.
+"""The physical world in MuJoCo: the robot on free feet, and what acts on it.
 
 Steps the true robot (`services.simulator.physics.body`), and knows no robot file, bus or clock:
 `step` takes motor torques and moves on by one time step.
@@ -7,22 +7,19 @@ Steps the true robot (`services.simulator.physics.body`), and knows no robot fil
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.simulator.physics.actuation import Actuation
-from services.simulator.physics.body import Body
-from services.simulator.physics.foot_placement import FootPlacement
-from services.simulator.physics.hoist import Hoist
+from services.simulator.physics.body import Body, FootPlacement
 from services.simulator.physics.led_hand import LedHand
-from services.simulator.physics.operator import HandForce, Operator, Wearer
-from services.simulator.physics.posture import as_vector, measure_posture
-from services.simulator.physics.soles import sole_loads
-from shared.bus.messages import HandLead, SimTruth, Vector3, Vector4
-from shared.config.scenarios import Lead, Scenario, lead, push_at
+from services.simulator.physics.outside import OutsideForces, Torso
+from services.simulator.physics.posture import as_vector, measure_posture, sole_loads
+from shared.bus.messages import HandLead, SimTruth
+from shared.bus.traces import SimState
+from shared.config.scenarios import Lead, Scenario
 from shared.extras import late
 
 if TYPE_CHECKING:
@@ -33,8 +30,33 @@ else:
 Array = NDArray[np.float64]
 
 
+class Joints(NamedTuple):
+    """The 12 joints in MuJoCo's memory: views, because asking it costs a microsecond."""
+
+    q_index: NDArray[np.intp]
+    """Places of the joint angles in qpos."""
+    v_index: NDArray[np.intp]
+    """Places of their rates in qvel."""
+    qpos: Array
+    qvel: Array
+    applied: Array
+    """Torques by place of the rate, N m."""
+    damping: Array
+    """By place of the rate, N m s/rad."""
+    damping_alone: Array
+    """Damping of the joints without their drivetrains (12,), N m s/rad."""
+
+
 class World:
-    """The simulated robot and what acts on it."""
+    """The simulated robot and what acts on it.
+
+    Attributes:
+        outside: what acts on the torso.
+        joints: the joints in MuJoCo's memory.
+        actuation: drivetrains and encoders.
+        placement: where the feet stand.
+        time: s since the world began.
+    """
 
     def __init__(self, body: Body, scenario: Scenario, lifted: float = 0.0) -> None:
         """Put the robot at its stand height, held by the hoist.
@@ -44,104 +66,78 @@ class World:
             scenario: what happens.
             lifted: the hoist holds it this much higher, m; 0: the soles rest on the floor.
         """
-        self._scenario = scenario
-        self.model = body.model
-        self.data = mujoco.MjData(self.model)
+        self.scenario = scenario
+        self.model = model = body.model
+        self.data = data = mujoco.MjData(model)
         self.timestep = body.timestep
-        self._steps = body.steps
-        self.operator = Operator(body.hand, body.harness_point)
-        self._wearer = Wearer(body.person)
-        self._placement = FootPlacement(self.model, self.data, body)
-        self._q_index, self._v_index = self._placement.q_index, self._placement.v_index
-        self._actuation = Actuation(body, self.model.opt.timestep)
-        self._joint_damping = self.model.dof_damping[self._v_index].copy()
-        self._torso = self.model.body("torso").id
-        data = self.data  # views of its memory: to ask it for an array costs a microsecond
-        self._qpos, self._qvel, self._applied = data.qpos, data.qvel, data.qfrc_applied
-        self._torso_rotation, self._torso_wrench = (
-            data.xmat[self._torso],
-            data.xfrc_applied[self._torso],
+        self._steps = body.plant.steps
+        self._dt: float = model.opt.timestep
+        self.placement = placement = FootPlacement(model, data, body)
+        self.actuation = Actuation(body, self._dt)
+        self.joints = Joints(
+            q_index=placement.q_index,
+            v_index=placement.v_index,
+            qpos=data.qpos,
+            qvel=data.qvel,
+            applied=data.qfrc_applied,
+            damping=model.dof_damping,
+            damping_alone=model.dof_damping[placement.v_index].copy(),
         )
-        self._torso_rates = data.qvel[:6]
-        self._damping = self.model.dof_damping
-        self._dt: float = self.model.opt.timestep
-        self._harness_point = body.harness_point
-        self._torso_com: list[float] = self.model.body_ipos[self._torso].tolist()
-        self._hoist = Hoist(body.weight, body.hoist_s)
+        self._torso_id = torso = model.body("torso").id
         self.time = 0.0
         self._start_time = math.inf
         self._fallen = False
-        self._hand_on = scenario.hand
-        self.hand = HandForce(0.0, 0.0)
-        self.load_n = 0.0
-        self.asked: tuple[float, Vector4] | None = None
-        """Assist, N, and shift that somebody asks for in place of the scenario."""
-        self.led_hand: LedHand | None = None
-        """The hand that somebody leads in place of the scenario."""
-        self.push: Vector3 = (0.0, 0.0, 0.0)
-        self.harness_force: Vector3 = (0.0, 0.0, 0.0)
-        """The operator's force on the torso at the harness point, N, torso axes."""
-        self.harness_moment: Vector3 = (0.0, 0.0, 0.0)
-        """N m, torso axes."""
         self._truths = 0
-        self._level = _turn_between(-self.model.opt.gravity, np.array((0.0, 0.0, 1.0)))
+        self._level = _turn_between(-model.opt.gravity, np.array((0.0, 0.0, 1.0)))
         """Quaternion: turns the floor's axes into axes whose z is up."""
-        x, y, z = self.model.opt.gravity.tolist()
+        x, y, z = model.opt.gravity.tolist()
         self._lean = (x / z, y / z)
         # the hoist hangs from above: on a slope it holds the torso aside of the floor's normal
-        self._placement.stand_up(body.stand_q, self._lean)
-        self._actuation.settle(self.data.qpos[self._q_index])
-        self.data.qpos[2] += lifted
-        self._hoist.position = self.data.qpos[:3].copy()
+        placement.stand_up(body.stand_q, self._lean)
+        self.actuation.settle(data.qpos[placement.q_index])
+        data.qpos[2] += lifted
+        self._torso = Torso(
+            position=data.qpos[:3],
+            rotation=data.xmat[torso],
+            rates=data.qvel[:6],
+            wrench=data.xfrc_applied[torso],
+            com=model.body_ipos[torso].tolist(),
+        )
+        self.outside = OutsideForces(body, scenario, self._torso)
+
+    # ---- its start, and how it goes on
 
     def stand_at(self, q: Array) -> None:
         """Stand the robot still, soles flat, at joint angles q (12,), rad; no hoist.
 
         The two legs must agree on the torso, as `InverseKinematics` makes them.
         """
-        self._placement.stand_at(q)
-        self._actuation.settle(self.data.qpos[self._q_index])
-        self.let_off_hoist()
-
-    def go_on(
-        self,
-        qpos: Sequence[float],
-        qvel: Sequence[float],
-        warmstart: Sequence[float],
-        scenario_s: float,
-        hoist: float,
-        hidden: Sequence[float],
-    ) -> None:
-        """Continue from the state of another world of the same robot, plant and scenario.
-
-        Args:
-            qpos: MuJoCo's position.
-            qvel: its velocity.
-            warmstart: its qacc_warmstart.
-            scenario_s: scenario time; negative: it has not started.
-            hoist: fraction of its support.
-            hidden: as `hidden` returned it.
-        """
-        data = self.data
-        data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = qpos, qvel, warmstart
-        if scenario_s >= 0.0:
-            self._start_time = self.time - scenario_s
-        self._hoist.go_on(hoist)
-        kept = data.qacc_warmstart.copy()
-        mujoco.mj_forward(self.model, data)
-        data.qacc_warmstart[:] = kept
-        self._wearer.go_on(*hidden[:3])
-        self._actuation.restore(hidden[3:])
+        self.placement.stand_at(q)
+        self.actuation.settle(self.data.qpos[self.joints.q_index])
+        self.remove_hoist()
 
     def hidden(self) -> tuple[float, ...]:
         """Return what MuJoCo does not hold: the person, the drivetrain, torques on their way."""
-        wearer = self._wearer
-        return (wearer.above, wearer.rate, wearer.load_n, *self._actuation.state())
+        wearer = self.outside.wearer
+        return (wearer.above, wearer.rate, wearer.load_n, *self.actuation.numbers())
 
-    @property
-    def scenario(self) -> Scenario:
-        """What happens."""
-        return self._scenario
+    def resume(self, state: SimState) -> None:
+        """Continue from the state of another world of the same robot, plant and scenario."""
+        data, outside = self.data, self.outside
+        data.qpos[:], data.qvel[:] = state.qpos, state.qvel
+        data.qacc_warmstart[:] = state.warmstart
+        mujoco.mj_forward(self.model, data)
+        data.qacc_warmstart[:] = state.warmstart
+        if state.scenario_s >= 0.0:
+            self._start_time = self.time - state.scenario_s
+        outside.hoist.share, outside.hoist.releasing = state.hoist, state.hoist < 1.0
+        wearer, numbers = outside.wearer, state.hidden
+        wearer.above, wearer.rate, wearer.load_n = numbers[:3]
+        wearer.holds = True
+        self.actuation.set_numbers(numbers[3:])
+        outside.led_hand = LedHand.of_numbers(state.hand) if any(state.hand) else None
+
+    # ---- the scenario, the operator, the hoist
 
     @property
     def scenario_s(self) -> float:
@@ -152,130 +148,77 @@ class World:
         """Let the scenario begin now."""
         self._start_time = self.time
 
+    def lead(self) -> Lead:
+        """Return the operator's present request."""
+        return self.outside.lead(self.scenario_s)
+
+    def take_hand(self, asked: HandLead) -> None:
+        """Let somebody lead the hand from where it is, or push."""
+        if self.outside.led_hand is None:
+            self.outside.led_hand = LedHand()
+        self.outside.led_hand.ask(asked, self.lead())
+
     def let_go(self) -> None:
         """Let the operator take the hand off."""
-        self._hand_on = False
+        self.outside.holds = False
 
     @property
     def hoist(self) -> float:
         """Share of the hoist's support: 1 hanging, 0 free."""
-        return self._hoist.share
-
-    def let_off_hoist(self) -> None:
-        """Take the hoist away at once."""
-        self._hoist.share = 0.0
+        return self.outside.hoist.share
 
     def release_hoist(self) -> None:
         """Let the hoist down."""
-        self._hoist.releasing = True
+        self.outside.hoist.releasing = True
+
+    def remove_hoist(self) -> None:
+        """Take the hoist away at once."""
+        self.outside.hoist.share = 0.0
+
+    # ---- a step, and what can be seen between two
+
+    def step(self, motor_torque: Array) -> None:
+        """Move on by one time step under motor torques (12,) in N m."""
+        actuation, joints = self.actuation, self.joints
+        q_index, v_index = joints.q_index, joints.v_index
+        for _ in range(self._steps):
+            q, v = joints.qpos.take(q_index), joints.qvel.take(v_index)
+            joints.applied[v_index] = actuation.torque(motor_torque, q, v)
+            if actuation.flexible is not None:
+                joints.damping[v_index] = joints.damping_alone + actuation.flexible.damping
+            self.outside.apply(self.scenario_s, self._dt)
+            mujoco.mj_step(self.model, self.data)
+            self.time += self._dt
 
     def motor_turns(self) -> tuple[Array, Array]:
         """Return motor positions (12,) in turns and rates (12,) in turn/s.
 
         Order: axis0, axis1 of each module in `MODULES` order.
         """
-        actuation = self._actuation
+        actuation, joints = self.actuation, self.joints
         if actuation.flexible is not None:
             return actuation.encoders(actuation.flexible.theta, actuation.flexible.rate)
-        return actuation.encoders(self._qpos.take(self._q_index), self._qvel.take(self._v_index))
+        q, v = joints.qpos.take(joints.q_index), joints.qvel.take(joints.v_index)
+        return actuation.encoders(q, v)
 
     def torso_against_gravity(self) -> list[float]:
         """Return the quaternion (w, x, y, z) that turns torso axes into axes whose z is up."""
         measured = np.zeros(4)
-        mujoco.mju_mulQuat(measured, self._level, self._qpos[3:7])
+        mujoco.mju_mulQuat(measured, self._level, self.joints.qpos[3:7])
         quaternion: list[float] = measured.tolist()
         return quaternion
 
     def torso_rates(self) -> list[float]:
         """Return the torso's angular velocity (3,), rad/s, torso axes."""
-        rates: list[float] = self._torso_rates[3:].tolist()
+        rates: list[float] = self._torso.rates[3:].tolist()
         return rates
-
-    def step(self, motor_torque: Array) -> None:
-        """Move on by one time step under motor torques (12,) in N m."""
-        actuation, v_index = self._actuation, self._v_index
-        for _ in range(self._steps):
-            q, v = self._qpos.take(self._q_index), self._qvel.take(v_index)
-            self._applied[v_index] = actuation.torque(motor_torque, q, v)
-            if actuation.flexible is not None:
-                self._damping[v_index] = self._joint_damping + actuation.flexible.damping
-            self._apply_outside_forces()
-            mujoco.mj_step(self.model, self.data)
-            self.time += self._dt
-
-    def lead(self) -> Lead:
-        """Return the operator's present request."""
-        wanted = lead(self._scenario, self.scenario_s)
-        if self.led_hand is not None:
-            wanted = self.led_hand.over(wanted)
-        return wanted if self.asked is None else Lead(*wanted[:4], *self.asked)
-
-    def take_hand(self, asked: HandLead) -> None:
-        """Let somebody lead the hand from where it is, or push."""
-        if self.led_hand is None:
-            self.led_hand = LedHand()
-        self.led_hand.take(asked, self.lead())
-
-    def _apply_outside_forces(self) -> None:
-        """Set the wrench on the torso: hand, load, push and hoist.
-
-        In plain numbers: this runs at every step, and numpy's calls on three numbers
-        would cost more than the physics.
-        """
-        t = self.scenario_s
-        if self.led_hand is not None:
-            self.led_hand.advance(self._dt)
-        wanted = self.lead()
-        r = self._torso_rotation.tolist()  # row by row
-        x, y, z = self._harness_point
-        arm_x = r[0] * x + r[1] * y + r[2] * z
-        arm_y = r[3] * x + r[4] * y + r[5] * z
-        # MuJoCo applies outside forces at the body's centre of mass, which a plant may move
-        x, y, z = self._torso_com
-        com_x = r[0] * x + r[1] * y + r[2] * z
-        com_y = r[3] * x + r[4] * y + r[5] * z
-        x, y, z = self._harness_point
-        self.hand = HandForce(0.0, 0.0)
-        if self._hand_on and self._hoist.share == 0.0:
-            height = float(self._qpos[2]) + r[6] * x + r[7] * y + r[8] * z
-            _, _, v_z, w_x, w_y, w_z = self._torso_rates.tolist()  # omega in torso axes
-            omega_x = r[0] * w_x + r[1] * w_y + r[2] * w_z
-            omega_y = r[3] * w_x + r[4] * w_y + r[5] * w_z
-            rate = v_z + omega_x * arm_y - omega_y * arm_x
-            self._wearer.take_hold(height - wanted.height - z)
-            above, rising = self._wearer.motion()
-            height, rate = height - above, rate - rising
-            self.hand = self.operator.force(wanted, height, rate, math.atan2(-r[6], r[8]), w_y)
-        self._wearer.step(self._dt, self.hand.force_z, wanted.assist)
-        self.load_n = self._wearer.load_n
-        self.push = push_at(self._scenario, t) if t >= 0.0 else (0.0, 0.0, 0.0)
-        if self.led_hand is not None:
-            self.push = self.led_hand.push or self.push
-        f, m = self.hand.force_z - self.load_n, self.hand.moment_pitch
-        # in torso axes, as the harness sensor feels it: f along world z, m about torso y
-        self.harness_force = (r[6] * f, r[7] * f, r[8] * f)
-        self.harness_moment = (0.0, m, 0.0)
-        wrench = self._torso_wrench
-        wrench[:] = (
-            self.push[0],
-            self.push[1],
-            self.push[2] + f,
-            r[1] * m + (arm_y - com_y) * f,
-            r[4] * m - (arm_x - com_x) * f,
-            r[7] * m,
-        )
-        if self._hoist.share > 0.0:
-            rotation = self.data.xmat[self._torso].reshape(3, 3)
-            hoist = self._hoist.advance(self._qpos[:3], rotation, self._torso_rates, self._dt)
-            hoist[3:] -= np.cross(rotation @ self._torso_com, hoist[:3])
-            wrench += hoist
 
     def truth(self, t_ns: int, real_time_factor: float, late_s: float) -> SimTruth:
         """Return the world as it is, for the log and the verdict."""
-        placement = self._placement
-        posture = measure_posture(self.data, self._torso, placement.feet, placement.ankles)
+        placement, outside = self.placement, self.outside
+        posture = measure_posture(self.data, self._torso_id, placement.feet, placement.ankles)
         self._fallen |= posture.fallen
-        moment = self.data.xmat[self._torso].reshape(3, 3)[:, 1] * self.hand.moment_pitch
+        moment = self._torso.rotation.reshape(3, 3)[:, 1] * outside.hand.moment_pitch
         right, left = sole_loads(self.model, self.data, placement.feet)
         self._truths += 1
         return SimTruth(
@@ -285,15 +228,15 @@ class World:
             com=posture.com,
             torso=posture.torso,
             angles=posture.angles,
-            operator_force=(0.0, 0.0, self.hand.force_z),
+            operator_force=(0.0, 0.0, outside.hand.force_z),
             operator_moment=as_vector(moment),
-            load_n=self.load_n,
-            harness_force_z=self.load_n - self.hand.force_z,
-            push=self.push,
+            load_n=outside.wearer.load_n,
+            harness_force_z=outside.wearer.load_n - outside.hand.force_z,
+            push=outside.push,
             foot_right_tilt=posture.tilts[0],
             foot_left_tilt=posture.tilts[1],
             feet_slip=posture.slip,
-            hoist=self._hoist.share,
+            hoist=outside.hoist.share,
             fallen=self._fallen,
             real_time_factor=real_time_factor,
             late_s=late_s,

@@ -13,7 +13,7 @@ from services.simulator.drives.axis_settings import (
     PHASE_RESISTANCE,
     Settings,
     configured,
-    plant,
+    preset,
 )
 from shared.can.drive_settings import (
     AXIS_TABLE,
@@ -150,9 +150,9 @@ def test_true_is_one_to_a_drive_and_infinity_is_itself() -> None:
 
 def test_a_planted_setting_is_kept_by_that_drive_alone() -> None:
     settings = Settings()
-    plant(settings, "knee_left.axis0.config.can.encoder_rate_ms=7")
-    plant(settings, "knee_left.axis1.config.enable_watchdog=TRUE")
-    plant(settings, "hip_left.config.dc_max_positive_current=inf")
+    preset(settings, "knee_left.axis0.config.can.encoder_rate_ms=7")
+    preset(settings, "knee_left.axis1.config.enable_watchdog=TRUE")
+    preset(settings, "hip_left.config.dc_max_positive_current=inf")
     index = MODULES.index("knee_left")
     settings.restore(index)
     assert settings.get(index, "axis0.config.can.encoder_rate_ms") == 7
@@ -177,4 +177,4 @@ def test_a_plant_that_makes_no_sense_is_refused_with_what_would_be_right(
     words: str, says: str
 ) -> None:
     with pytest.raises(DriveError, match=says):
-        plant(Settings(), words)
+        preset(Settings(), words)

@@ -1,7 +1,11 @@
-"""Runs the fleet's pattern over a transport: six modules and a planner, each its own process."""
+"""`xrl bench bus`: the fleet's pattern of messages over every transport that is installed.
+
+Six modules and a planner, each a process of its own (`bus_process.py`).
+"""
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 import sys
 import tempfile
@@ -12,12 +16,20 @@ from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
+from rich.progress import track
 
 from shared.exceptions import RunError
+from shared.extras import missing_package
 from shared.joints import MODULES
 from shared.places import CHECKOUT
 from tools.lab.bench.bus_process import PLANNER, WARM_UP_S, BusReport
+from tools.lab.bench.table import add_flags, print_table, write_rows
+from tools.lab.bench.transports import TRANSPORTS, installed
+from tools.number_arguments import finite
+from tools.terminal import Console
+from tools.verb_table import Subparsers
 
+ROUNDS: Final = 3
 PATIENCE_S: Final = 20.0
 """Beyond its time, a process that has not ended by then failed."""
 
@@ -39,15 +51,7 @@ class BusFigures(NamedTuple):
 
 
 def measure(transport: str, seconds: float) -> BusFigures:
-    """Run the pattern once.
-
-    Args:
-        transport: name of an installed one.
-        seconds: measured, after the warm-up.
-
-    Raises:
-        RunError: a process failed, or no command arrived.
-    """
+    """Run the pattern once, for so many seconds after the warm-up."""
     with tempfile.TemporaryDirectory(prefix="xrl-bus-") as folder:
         processes: list[subprocess.Popen[str]] = []
         try:
@@ -62,11 +66,7 @@ def measure(transport: str, seconds: float) -> BusFigures:
 
 
 def figures(transport: str, reports: Sequence[BusReport]) -> BusFigures:
-    """Return a transport's figures from its seven processes' reports.
-
-    Raises:
-        RunError: no command arrived.
-    """
+    """Return a transport's figures from its seven processes' reports."""
     latencies = np.concatenate([report.latency_us for report in reports])
     if not latencies.size:
         raise RunError(f"{transport}: no command arrived")
@@ -106,3 +106,63 @@ def _report(transport: str, process: subprocess.Popen[str], seconds: float) -> B
         last = (errors.strip().splitlines() or ["it said nothing"])[-1]
         raise RunError(f"{transport}: a process ended with {process.returncode}: {last}")
     return msgspec.json.decode(out.strip().splitlines()[-1], type=BusReport)
+
+
+def add_parser(others: Subparsers) -> None:
+    """Add the command."""
+    parser = others.add_parser(
+        "bus",
+        help="the fleet's pattern of messages over Zenoh and over other transports",
+        description="Run six modules at 500 Hz and a planner at 250 Hz, as processes that only "
+        "send and\nreceive, over each transport that is installed. Those beyond Zenoh and "
+        "datagrams come with\nthe extra `bench`.",
+        epilog="examples:\n  xrl bench bus\n"
+        "  xrl bench bus --transport zenoh --transport datagrams --seconds 30",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "--transport",
+        action="append",
+        choices=[row.name for row in TRANSPORTS],
+        help="one of them; repeat it for several (default: all that are installed)",
+    )
+    parser.add_argument(
+        "--seconds", type=finite, default=10.0, metavar="S", help="of each run, s (10)"
+    )
+    add_flags(parser, ROUNDS, nested=True, compares=False)
+    parser.set_defaults(bench=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure the transports in turn and print their medians."""
+    if not args.seconds > 0.0:
+        raise RunError(f"--seconds {args.seconds:g}: above 0")
+    present = installed()
+    names = args.transport or list(present)
+    for name in names:
+        if name not in present:
+            raise missing_package("bench", [name])
+    console = Console()
+    rounds = [
+        [measure(name, args.seconds) for name in names]
+        for _ in track(range(args.rounds or ROUNDS), "measuring", console=console, transient=True)
+    ]
+    rows = [median_of(column) for column in zip(*rounds, strict=True)]
+    print_table(
+        console,
+        ("", "p50", "p99", "p99.9", "missed", "lost", "CPU"),
+        [
+            (
+                row.transport,
+                *(f"{us * 1e-3:.2f} ms" for us in (row.p50_us, row.p99_us, row.p999_us)),
+                *(f"{100.0 * fraction:.2f} %" for fraction in (row.missed, row.lost)),
+                f"{100.0 * row.cpu:.0f} %",
+            )
+            for row in rows
+        ],
+        "From the planner's put to a module's cycle, every 2 ms; medians of the rounds. "
+        "Missed: a command came a cycle later than it could have. CPU: of all seven processes, in "
+        "percent of one core.",
+    )
+    write_rows(args.json, [row._asdict() for row in rows])
+    return 0

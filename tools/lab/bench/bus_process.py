@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import gc
-import resource
 import sys
 import time
 from pathlib import Path
@@ -22,7 +21,7 @@ from shared.bus.codec import Decoder, encode
 from shared.bus.messages import JointCommand, JointState
 from shared.clock import NS_PER_S, NS_PER_US
 from shared.joints import MODULES
-from tools.lab.bench.transports.base import Transport, open_transport
+from tools.lab.bench.transports import Transport, installed
 
 CYCLE_HZ: Final = 500.0
 TICK_HZ: Final = 250.0
@@ -37,18 +36,16 @@ PLANNER: Final = "planner"
 
 
 class BusReport(msgspec.Struct):
-    """What one process saw."""
+    """What one process saw after the warm-up."""
 
     name: str
     cpu_s: float = 0.0
-    """CPU time of all its threads while it was measured."""
+    """CPU time of all its threads."""
     wall_s: float = 0.0
     latency_us: list[float] = []
     """Time of each command from the planner's put to the module's take."""
-    cycles: int = 0
     missed: int = 0
     """Commands that one cycle could have taken, and a later one took."""
-    sent: int = 0
     lost: int = 0
     """Commands whose numbers were skipped."""
 
@@ -61,18 +58,17 @@ class _Measured:
         self.end_ns = self.begin_ns + round(seconds * NS_PER_S)
         self._cpu_s: float | None = None
 
-    def counts(self, now_ns: int) -> bool:
+    def has_begun(self, now_ns: int) -> bool:
         """Return True after the warm-up."""
-        if now_ns < self.begin_ns:
-            return False
-        if self._cpu_s is None:
-            self._cpu_s = _cpu_s()
-        return True
+        if now_ns >= self.begin_ns and self._cpu_s is None:
+            self._cpu_s = time.process_time()
+        return self._cpu_s is not None
 
-    def finish(self, report: BusReport) -> None:
-        """Write the times into a report."""
-        report.cpu_s = _cpu_s() - (self._cpu_s or 0.0)
+    def finish(self, report: BusReport) -> BusReport:
+        """Return a report with the times."""
+        report.cpu_s = time.process_time() - (self._cpu_s or 0.0)
         report.wall_s = (time.monotonic_ns() - self.begin_ns) / NS_PER_S
+        return report
 
 
 def run_module(transport: Transport, name: str, seconds: float) -> BusReport:
@@ -80,52 +76,49 @@ def run_module(transport: Transport, name: str, seconds: float) -> BusReport:
     put, take = transport.publisher(f"state/{name}"), transport.latest(f"command/{name}")
     decoder, report, times = Decoder(JointCommand), BusReport(name), _Measured(seconds)
     period_ns = round(NS_PER_S / CYCLE_HZ)
-    state, due, before_ns, seq, last_seq = _state(), time.monotonic_ns(), 0, 0, -1
+    due, before_ns, cycles, seq, last_seq = time.monotonic_ns(), 0, 0, 0, -1
     while due < times.end_ns:
         now = time.monotonic_ns()
         payload = take()
         command = decoder.decode(payload) if payload is not None else None
-        counts = times.counts(now)
+        counts = times.has_begun(now)
         if command is not None:
             if counts:
                 report.latency_us.append((now - command.t_ns) * 1e-3)
                 report.missed += command.t_ns < before_ns
                 report.lost += command.seq - last_seq - 1 if last_seq >= 0 else 0
             last_seq = command.seq
-        report.cycles += counts
-        if report.cycles % STATE_EVERY == 0 or not counts:
+        cycles += counts
+        if cycles % STATE_EVERY == 0 or not counts:
             seq += 1
-            put(encode(msgspec.structs.replace(state, t_ns=now, seq=seq)))
+            put(encode(msgspec.structs.replace(_STATE, t_ns=now, seq=seq)))
         before_ns = now
         due = _sleep_until(due + period_ns)
-    times.finish(report)
-    return report
+    return times.finish(report)
 
 
-def run_planner(transport: Transport, seconds: float) -> BusReport:
+def run_planner(transport: Transport, name: str, seconds: float) -> BusReport:
     """Run the planner's ticks."""
-    takes = [transport.latest(f"state/{name}") for name in MODULES]
-    puts = [transport.publisher(f"command/{name}") for name in MODULES]
-    decoder, report, times = Decoder(JointState), BusReport(PLANNER), _Measured(seconds)
+    takes = [transport.latest(f"state/{module}") for module in MODULES]
+    puts = [transport.publisher(f"command/{module}") for module in MODULES]
+    decoder, times = Decoder(JointState), _Measured(seconds)
     period_ns = round(NS_PER_S / TICK_HZ)
-    command, fresh, last_ns, seq = _command(), [False] * len(MODULES), 0, 0
+    fresh, last_ns, seq = [False] * len(MODULES), 0, 0
     while (now := time.monotonic_ns()) < times.end_ns:
         for index, take in enumerate(takes):
             payload = take()
             if payload is not None and decoder.decode(payload) is not None:
                 fresh[index] = True
-        counts = times.counts(now)
+        times.has_begun(now)
         if not all(fresh) and now - last_ns < 1.25 * period_ns:
             _sleep_until(now + POLL_NS)
             continue
         seq += 1
         for put in puts:
-            put(encode(msgspec.structs.replace(command, t_ns=time.monotonic_ns(), seq=seq)))
-        report.sent += counts
+            put(encode(msgspec.structs.replace(_COMMAND, t_ns=time.monotonic_ns(), seq=seq)))
         fresh, last_ns = [False] * len(MODULES), now
         _sleep_until(now + round(REST_FRACTION * period_ns))
-    times.finish(report)
-    return report
+    return times.finish(BusReport(name))
 
 
 def _sleep_until(due_ns: int) -> int:
@@ -137,27 +130,19 @@ def _sleep_until(due_ns: int) -> int:
     return due_ns - left_ns if -left_ns > NS_PER_S / CYCLE_HZ else due_ns
 
 
-def _cpu_s() -> float:
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    return used.ru_utime + used.ru_stime
-
-
-def _state() -> JointState:
-    return JointState(
-        t_ns=0, seq=0, q=(0.012345678901, -0.61234567890123), v=(0.0012345678901, 0.31234567890123),
-        tau=(12.3456789012345, -45.678901234567), mode=2, cause=9, ready=True, age_ns=4_123_456,
-        session=123_456_789, command_seq=12_345, cycle=123_456, late=3, dropouts=0, refused=0,
-        drive=3, drive_error=0, stiffened=False, outside=0,
-    )  # fmt: skip
-
-
-def _command() -> JointCommand:
-    pair = (123.45678901234567, -0.61234567890123456)
-    return JointCommand(
-        t_ns=0, seq=0, session=123_456_789, echo_t_ns=123_456_789_012_345, hold=False, q_ref=pair,
-        v_ref=pair, tau_ff=pair, dtau_ff=pair, tau_coupled=pair, k_p=pair, k_d=pair, margin=0.25,
-        margin_onboard=0.125,
-    )  # fmt: skip
+_STATE: Final = JointState(
+    t_ns=0, seq=0, q=(0.012345678901, -0.61234567890123), v=(0.0012345678901, 0.31234567890123),
+    tau=(12.3456789012345, -45.678901234567), mode=2, cause=9, ready=True, age_ns=4_123_456,
+    session=123_456_789, command_seq=12_345, cycle=123_456, late=3, dropouts=0, refused=0,
+    drive=3, drive_error=0, stiffened=False, outside=0,
+)  # fmt: skip
+_PAIR: Final = (123.45678901234567, -0.61234567890123456)
+_COMMAND: Final = JointCommand(
+    t_ns=0, seq=0, session=123_456_789, echo_t_ns=123_456_789_012_345, hold=False, q_ref=_PAIR,
+    v_ref=_PAIR, tau_ff=_PAIR, dtau_ff=_PAIR, tau_coupled=_PAIR, k_p=_PAIR, k_d=_PAIR, margin=0.25,
+    margin_onboard=0.125,
+)  # fmt: skip
+"""Messages as long as the fleet's."""
 
 
 def main() -> int:
@@ -169,13 +154,11 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=10.0)
     arguments = parser.parse_args()
     scheduling.raise_priority(_PRIORITY)
-    transport = open_transport(arguments.transport, arguments.name, arguments.folder)
+    transport = installed()[arguments.transport].join(arguments.name, arguments.folder)
     gc.freeze()
     gc.disable()
-    if arguments.name == PLANNER:
-        report = run_planner(transport, arguments.seconds)
-    else:
-        report = run_module(transport, arguments.name, arguments.seconds)
+    run = run_planner if arguments.name == PLANNER else run_module
+    report = run(transport, arguments.name, arguments.seconds)
     transport.close()
     sys.stdout.write(msgspec.json.encode(report).decode() + "\n")
     return 0

@@ -1,31 +1,56 @@
-"""Leads the fleet of a source tree live, and reads from its record what it costs and achieves."""
+"""`xrl bench fleet`: the whole fleet, led live; one revision beside another.
+
+Its record tells what it costs and achieves.
+"""
 
 from __future__ import annotations
 
+import argparse
 import signal
 import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from statistics import median
 from typing import Any, Final, NamedTuple, TypeAlias
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+from rich.progress import track
+from rich.text import Text
 
 from shared.bus import topics
 from shared.bus.messages import JointCommand
 from shared.bus.traces import JointTrace
 from shared.clock import NS_PER_MS
-from shared.exceptions import RunError
+from shared.config import files as config_file
+from shared.config import gain_schedule
+from shared.exceptions import FAULT_EXIT_CODE, RunError
+from shared.extras import require
 from shared.joints import MODULES
-from tools.lab.bench.revisions import environment
+from shared.places import CHECKOUT
+from tools.fleet.others import warn_of_others
+from tools.fleet.pace import check_pace
+from tools.judge.verdict_table import digits
+from tools.lab.bench.revisions import environment, its_config, unpacked
+from tools.lab.bench.table import (
+    Row,
+    add_flags,
+    compared,
+    print_table,
+    ratio_cell,
+    write_rows,
+)
 from tools.logs.run_log import RunLog, read_run
+from tools.number_arguments import finite
+from tools.terminal import Console
+from tools.verb_table import Subparsers
 
 Array = NDArray[np.float64]
 
+ROUNDS: Final = 3
 PATIENCE_S: Final = 600.0
 """A run that has not ended by then is ended."""
 ENDING_S: Final = 30.0
@@ -61,38 +86,8 @@ FIGURES: Final = (
 )
 
 
-class FleetRow(NamedTuple):
-    """One figure over all turns."""
-
-    figure: Figure
-    value: float | None
-    """Median of the turns."""
-    spread: tuple[float, float] | None
-    """Least and most of the turns."""
-    other: float | None
-    """The other revision's median."""
-    ratio: float | None
-    """This tree's value over the other's, turn by turn, in the median."""
-    target: float | None
-
-    @property
-    def ok(self) -> bool:
-        """True unless the target is missed."""
-        return self.target is None or self.value is None or self.value <= self.target
-
-    def as_dict(self) -> dict[str, object]:
-        """Return it for a file."""
-        return {**self._asdict(), "figure": self.figure.what, "unit": self.figure.unit}
-
-
 def measure(tree: Path, config: Path, scenario: str, pace: float) -> Turn:
-    """Lead a tree's fleet through a scenario, live.
-
-    Args:
-        tree: source tree to run; its record is read by this one.
-        config: robot file.
-        scenario: name or file, as of `xrl demo`.
-        pace: of the fleet's clock; it is kept, however full the cores are.
+    """Lead a tree's fleet through a scenario, live; this tree reads its record.
 
     Raises:
         RunError: the robot fell, or there was no run.
@@ -132,12 +127,7 @@ def _lead(tree: Path, words: Sequence[str]) -> tuple[int, str]:
 
 
 def figures(summary: Mapping[str, Any], first_use: Array) -> Turn:
-    """Return a run's figures.
-
-    Args:
-        summary: the run's summary.json.
-        first_use: ages of commands, ms (`first_use_ms`).
-    """
+    """Return a run's figures, from its summary.json and `first_use_ms`."""
     tick = summary.get("planner_tick_us") or {}
     found: Turn = {
         "tick_us": tick.get("median"),
@@ -174,33 +164,93 @@ def first_use_ms(log: RunLog) -> Array:
     return np.array(ages)
 
 
-def rows(here: Sequence[Turn], there: Sequence[Turn], pace: float) -> list[FleetRow]:
-    """Return the table's rows.
+def rows(here: Sequence[Turn], there: Sequence[Turn], pace: float) -> list[Row]:
+    """Return the rows of this tree's turns, beside the other tree's; targets are of pace 1."""
+    return [
+        compared(
+            figure.what,
+            figure.unit,
+            [turn[figure.name] for turn in here],
+            [turn[figure.name] for turn in there],
+            figure.most if pace == 1.0 else None,
+        )
+        for figure in FIGURES
+    ]
 
-    Args:
-        here: turns of this tree; at least one.
-        there: of the other tree, in turn with them; empty: none.
-        pace: of all; targets are those of pace 1.
-    """
-    return [_row(figure, here, there, pace) for figure in FIGURES]
 
-
-def _row(figure: Figure, here: Sequence[Turn], there: Sequence[Turn], pace: float) -> FleetRow:
-    values, others = _known(figure, here), _known(figure, there)
-    pairs = [(a[figure.name], b[figure.name]) for a, b in zip(here, there, strict=False)]
-    return FleetRow(
-        figure,
-        _middle(values),
-        (min(values), max(values)) if values else None,
-        _middle(others),
-        _middle([a / b for a, b in pairs if a is not None and b]),
-        figure.most if pace == 1.0 else None,
+def add_parser(others: Subparsers) -> None:
+    """Add the command."""
+    parser = others.add_parser(
+        "fleet",
+        help="the whole fleet, led live through the paper's experiment",
+        description="Run `xrl demo`, half a minute a turn, and print what the fleet costs, how old "
+        "commands\nare when they are used, and what the hand meets. With --against another git "
+        "revision is\nrun in turn with this tree: a shared machine may be twice as slow from one "
+        "minute to the\nnext, so the ratio of two that ran side by side says more than a time.",
+        epilog="examples:\n  xrl bench fleet\n"
+        "  xrl bench fleet --against HEAD~1 --rounds 5 --json fleet.json",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    parser.add_argument(
+        "--scenario",
+        default="squat",
+        metavar="NAME|FILE",
+        help="what happens, as of `xrl demo` (squat, the paper's Fig. 7)",
+    )
+    parser.add_argument(
+        "--pace",
+        type=finite,
+        default=1.0,
+        metavar="X",
+        help="clock rate of the fleet (1); it is not lowered on full cores, and the targets are "
+        "those of 1",
+    )
+    add_flags(parser, ROUNDS, nested=True)
+    parser.set_defaults(bench=run)
 
 
-def _known(figure: Figure, turns: Sequence[Turn]) -> list[float]:
-    return [value for turn in turns if (value := turn[figure.name]) is not None]
+def run(args: argparse.Namespace) -> int:
+    """Lead each tree in turn and print the medians; with --strict a missed target is a fault."""
+    require("sim")
+    robot = config_file.load(args.config)
+    gain_schedule.require(robot, args.config)
+    check_pace(args.pace, simulated=True)
+    console = Console()
+    warn_of_others(console)
+    config = args.config.resolve()
+    turns: list[list[Turn]] = []
+    with ExitStack() as stack:
+        trees = [(CHECKOUT, config)]
+        if args.against is not None:
+            other = stack.enter_context(unpacked(args.against))
+            trees.append((other, its_config(config, other)))
+        runs = [tree for _ in range(args.rounds or ROUNDS) for tree in trees]
+        led = [
+            measure(tree, its, args.scenario, args.pace)
+            for tree, its in track(runs, "leading", console=console, transient=True)
+        ]
+        turns = [led[number :: len(trees)] for number in range(len(trees))]
+    found = rows(turns[0], turns[1] if len(turns) > 1 else (), args.pace)
+    compare = ("least .. most",) if args.against is None else (args.against, "ratio")
+    print_table(
+        console,
+        ("", "here", *compare, "target"),
+        [_cells(row, args.against) for row in found],
+        "Medians of the turns. CPU: in percent of one core. Late: later than two periods. "
+        "Age: of a command, from the module's state that it answers to the cycle that takes it.",
+    )
+    write_rows(args.json, [{**row._asdict(), "figure": row.what} for row in found])
+    return FAULT_EXIT_CODE if args.strict and not all(row.ok for row in found) else 0
 
 
-def _middle(values: Sequence[float]) -> float | None:
-    return median(values) if values else None
+def _cells(row: Row, against: str | None) -> list[Text | str]:
+    cells: list[Text | str] = [row.what, _number(row.value, row.unit)]
+    if against is None:
+        cells.append("" if row.spread is None else " .. ".join(map(digits, row.spread)))
+    else:
+        cells += [_number(row.other, row.unit), ratio_cell(row)]
+    return [*cells, row.marked_target()]
+
+
+def _number(value: float | None, unit: str) -> str:
+    return "" if value is None else f"{digits(value)} {unit}"

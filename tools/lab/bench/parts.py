@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import tempfile
 import time
@@ -105,23 +106,14 @@ class _KeptManager(DriveManager):
         return action
 
 
-def planner_tick(recorded: Recorded, _stack: ExitStack) -> Repeated:
+def planner_tick(recorded: Recorded, _stack: ExitStack, split: str = "certified") -> Repeated:
     """Six states in, six commands and a status out; the hand leads."""
-    return _tick(recorded, recorded.robot)
-
-
-def planner_tick_diagonal(recorded: Recorded, _stack: ExitStack) -> Repeated:
-    """Run the same with the paper's split: K_q and B_q of all the body."""
-    law = msgspec.structs.replace(recorded.robot.law, split="diagonal")
-    return _tick(recorded, msgspec.structs.replace(recorded.robot, law=law))
-
-
-def _tick(recorded: Recorded, robot: RobotConfig) -> Repeated:
-    planner, inputs = Planner(robot, session=1), itertools.cycle(recorded.ticks)
-    zero = (0.0, 0.0, 0.0)
+    law = msgspec.structs.replace(recorded.robot.law, split=split)
+    planner = Planner(msgspec.structs.replace(recorded.robot, law=law), session=1)
+    inputs = itertools.cycle(recorded.ticks)
     wrench = Wrench(
-        t_ns=0, seq=0, force=(0.0, 0.0, -20.0), moment=zero, valid=True, saturated=False,
-        tare=int(Tare.DONE), age_ns=0,
+        t_ns=0, seq=0, force=(0.0, 0.0, -20.0), moment=(0.0, 0.0, 0.0), valid=True,
+        saturated=False, tare=int(Tare.DONE), age_ns=0,
     )  # fmt: skip
 
     def once() -> None:
@@ -138,7 +130,9 @@ def _tick(recorded: Recorded, robot: RobotConfig) -> Repeated:
 def joint_cycle(recorded: Recorded, _stack: ExitStack) -> Repeated:
     """A command's JSON and a sample in, a target and every other cycle a state's JSON out."""
     manager, decoder = DriveManager(recorded.robot, MODULE), Decoder(JointCommand)
-    inputs = itertools.cycle([(_encoded(one), one.arguments) for one in recorded.cycles])
+    arguments = [one.arguments for one in recorded.cycles]
+    payloads = [b"" if command is None else encode(command) for _, _, command, *_ in arguments]
+    inputs = itertools.cycle(zip(payloads, arguments, strict=True))
     count = itertools.count()
 
     def once() -> None:
@@ -149,11 +143,6 @@ def joint_cycle(recorded: Recorded, _stack: ExitStack) -> Repeated:
             encode(manager.controller.state(now_ns))
 
     return Repeated(once)
-
-
-def _encoded(inputs: JointInputs) -> bytes:
-    command = inputs.arguments[2]
-    return b"" if command is None else encode(command)
 
 
 def drive_exchange(recorded: Recorded, stack: ExitStack) -> Repeated:
@@ -218,7 +207,7 @@ class Part(NamedTuple):
 
 PARTS: Final = (
     Part("planner tick", planner_tick, warm_us=110.0, cold_us=300.0),
-    Part("tick, the paper's split", planner_tick_diagonal),
+    Part("tick, the paper's split", functools.partial(planner_tick, split="diagonal")),
     Part("joint cycle", joint_cycle),
     Part("joint's drive over CAN", drive_exchange),
     Part("simulator step", simulator_step),

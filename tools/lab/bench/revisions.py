@@ -78,12 +78,7 @@ class Worker:
     """A tree's bench in a process of its own. Use it in a `with` statement."""
 
     def __init__(self, tree: Path, config: Path) -> None:
-        """Start it.
-
-        Args:
-            tree: source tree to import from.
-            config: robot file.
-        """
+        """Start it in a source tree."""
         self.tree = tree
         self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - closed in __exit__
         self._process = subprocess.Popen(
@@ -106,11 +101,7 @@ class Worker:
         self._errors.close()
 
     def ask(self, request: Request) -> Answer:
-        """Have it measure; the others wait meanwhile.
-
-        Raises:
-            RunError: the process ended.
-        """
+        """Have it measure; the others wait meanwhile."""
         assert self._process.stdin is not None  # noqa: S101 - both are pipes
         assert self._process.stdout is not None  # noqa: S101
         try:

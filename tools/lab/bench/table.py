@@ -1,29 +1,36 @@
-"""Rows of `xrl bench` from its answers: medians, and the ratio to another revision. Pure."""
+"""Tables of `xrl bench`: medians of turns, ratios to another revision, targets; and their flags."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import argparse
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from statistics import median
 from typing import NamedTuple
 
-from tools.lab.bench.worker import Answer, Request
+from rich import box
+from rich.table import Table
+from rich.text import Text
+
+from shared.atomic_file import replace_file
+from shared.exceptions import FAULT_EXIT_CODE
+from tools.number_arguments import count
+from tools.terminal import Console, marked
 
 
 class Row(NamedTuple):
-    """One figure of the bench."""
+    """One figure over all turns."""
 
     what: str
     unit: str
-    value: float
-    """Median of the turns' medians: CPU time in us, or times real time."""
-    wall: float | None
-    """The same by the wall's clock; None: CPU time only."""
-    spread: tuple[float, float]
+    """`x`: a speed, which is to be high; anything else is to be low."""
+    value: float | None
+    """Median of the turns; None: no turn has it."""
+    spread: tuple[float, float] | None
     """Least and most of the turns."""
-    to_yardstick: float
-    """Time in units of the yardstick that ran right before it; a speed's is its inverse."""
     other: float | None = None
-    """The other revision's."""
+    """The other revision's median."""
     ratio: float | None = None
     """This time over the other's, turn by turn, in the median; below 1 this tree is faster."""
     target: float | None = None
@@ -31,48 +38,106 @@ class Row(NamedTuple):
     @property
     def ok(self) -> bool:
         """True unless the target is missed."""
-        if self.target is None:
+        if self.target is None or self.value is None:
             return True
         return self.value >= self.target if self.unit == "x" else self.value <= self.target
 
+    def marked_target(self) -> Text | str:
+        """Return the target and whether it is met, for a cell."""
+        if self.target is None:
+            return ""
+        mark = Text("ok", "green") if self.ok else Text("missed", "yellow")
+        return marked("{} {:g} {}", ">=" if self.unit == "x" else "<=", self.target, mark)
 
-def row_of(
-    request: Request, turns: Sequence[Answer], others: Sequence[Answer], target: float | None
-) -> Row | None:
-    """Return a row; None if this tree does not have the part.
 
-    Args:
-        request: what was measured.
-        turns: of this tree.
-        others: of the other tree, in turn with them; empty: none.
-        target: us of CPU time, or times real time; None: none.
-    """
-    if any(turn.missing for turn in turns):
-        return None
-    values = [_value(turn) for turn in turns]
-    times = [_time_us(turn) for turn in turns]
-    present = [other for other in others if not other.missing]
-    walls = [turn.cost.wall.p50 for turn in turns if turn.cost is not None]
-    what = f"{request.name}, {'cold' if request.cold else 'warm'}" if walls else request.name
+def compared(
+    what: str,
+    unit: str,
+    here: Sequence[float | None],
+    there: Sequence[float | None],
+    target: float | None,
+) -> Row:
+    """Return a figure's row, from this tree's values by turn and the other tree's; None: none."""
+    values = [value for value in here if value is not None]
+    others = [value for value in there if value is not None]
+    pairs = [(a, b) for a, b in zip(here, there, strict=False) if a is not None and b]
+    ratios = [b / a if unit == "x" else a / b for a, b in pairs]
     return Row(
         what,
-        "us" if walls else "x",
-        median(values),
-        median(walls) if walls else None,
-        (min(values), max(values)),
-        median(us / turn.yardstick_us for us, turn in zip(times, turns, strict=True)),
-        median(map(_value, present)) if present else None,
-        median(us / _time_us(other) for us, other in zip(times, present, strict=True))
-        if present
-        else None,
-        target,
+        unit,
+        value=median(values) if values else None,
+        spread=(min(values), max(values)) if values else None,
+        other=median(others) if others else None,
+        ratio=median(ratios) if ratios else None,
+        target=target,
     )
 
 
-def _value(turn: Answer) -> float:
-    return turn.cost.cpu.p50 if turn.cost is not None else turn.speed or 0.0
+def print_table(
+    console: Console, columns: Sequence[str], rows: Iterable[Sequence[Text | str]], note: str
+) -> None:
+    """Print a table, its first column to the left, and what its columns mean below it."""
+    shown = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for column in columns:
+        shown.add_column(column, justify="right" if column else "left", no_wrap=True)
+    for row in rows:
+        shown.add_row(*row)
+    console.print(shown)
+    console.print(note, style="dim")
 
 
-def _time_us(turn: Answer) -> float:
-    """Return CPU time, us: of a speed, that of a millisecond."""
-    return turn.cost.cpu.p50 if turn.cost is not None else 1e3 / (turn.speed or 1.0)
+def ratio_cell(row: Row) -> str:
+    """Return a row's ratio to the other revision."""
+    return "" if row.ratio is None else f"{row.ratio:.2f}"
+
+
+def add_flags(
+    parser: argparse.ArgumentParser, rounds: int, *, nested: bool = False, compares: bool = True
+) -> None:
+    """Add the flags of every command.
+
+    Args:
+        parser: of the verb, or of a command below it.
+        rounds: what the help calls the default; without the flag the argument is None.
+        nested: the command is below the verb, whose flags may stand before it too.
+        compares: it has targets, and compares this tree with another revision.
+    """
+    default = argparse.SUPPRESS if nested else None
+    if compares:
+        parser.add_argument(
+            "--against",
+            default=default,
+            metavar="REV",
+            help="measure a git revision too, in turn with this tree, and print the ratios; both "
+            "run in this environment",
+        )
+        parser.add_argument(
+            "--strict",
+            action="store_true",
+            default=argparse.SUPPRESS if nested else False,
+            help=f"exit code {FAULT_EXIT_CODE} if a target is missed",
+        )
+    parser.add_argument(
+        "--rounds", type=count, default=default, metavar="N", help=f"turns of each ({rounds})"
+    )
+    parser.add_argument(
+        "--json",
+        type=_writable,
+        default=default,
+        metavar="FILE",
+        help="write the figures there too",
+    )
+
+
+def write_rows(file: Path | None, rows: Sequence[Mapping[str, object]]) -> None:
+    """Write a table's rows to the file of `--json`, if there is one."""
+    if file is not None:
+        replace_file(file, json.dumps(rows, indent=2).encode() + b"\n")
+
+
+def _writable(text: str) -> Path:
+    """Return a file's path; refused before minutes of measuring are lost to it."""
+    file = Path(text)
+    if file.is_dir() or not file.parent.is_dir():
+        raise argparse.ArgumentTypeError(f"{text[:200]!r}: name a file in a folder that exists")
+    return file

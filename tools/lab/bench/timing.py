@@ -48,13 +48,7 @@ class Cost(msgspec.Struct, frozen=True):
 
 
 def measure(repeated: Repeated, calls: int, *, cold: bool) -> Cost:
-    """Return the cost of a call.
-
-    Args:
-        repeated: what is called.
-        calls: how often.
-        cold: sweep the cache and sleep before each call.
-    """
+    """Return the cost of a call; `cold`: sweep the cache and sleep before each."""
     once, before = repeated.once, repeated.before
     swept = np.zeros(SWEPT_BYTES, dtype=np.uint8)
     cpu, wall = np.empty(calls), np.empty(calls)

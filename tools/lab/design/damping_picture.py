@@ -34,11 +34,7 @@ FREQUENCY_HZ: Final = (0.1, 125.0)
 def draw(robot: RobotConfig, nodes: list[StiffnessNode], design: Design, path: Path) -> None:
     """Draw decay over frequency of every motion while the planner leads, into a PNG file.
 
-    Args:
-        robot: the robot.
-        nodes: poses; the first, the middle and the last are drawn.
-        design: its damping and coupling.
-        path: of the picture.
+    The first, the middle and the last of the poses are drawn.
     """
     certificate = DynamicCertificate(robot, nodes)
     figure = new_figure(13, 6)

@@ -21,7 +21,13 @@ import numpy as np
 from services.planner.law.split import CouplingGains
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from tools.lab.design.dynamic_certificate import Design, DynamicCertificate, StiffnessNode
+from tools.lab.design.dynamic_certificate import (
+    HELD,
+    TRACK,
+    Design,
+    DynamicCertificate,
+    StiffnessNode,
+)
 
 Progress = Callable[[str], None]
 
@@ -43,20 +49,15 @@ SWAY_WEIGHT: Final = 40.0
 def choose(
     config: RobotConfig, nodes: list[StiffnessNode], progress: Progress = lambda _text: None
 ) -> Design:
-    """Return the design of a robot.
-
-    Args:
-        config: the robot.
-        nodes: poses of its schedule, with local stiffness.
-        progress: called with text on the best design so far.
+    """Return the design of a robot, from the poses of its schedule.
 
     Raises:
         RunError: the robot cannot meet the certificate; names the failing condition.
     """
     full = DynamicCertificate(config, nodes)
     for verdict, lower in (
-        (full.worst_in_hold(START), "the k_d of [stand]"),
-        (full.worst_in_track(START), "law.lead_easing or the requirements of [robustness]"),
+        (full.worst(START, HELD), "the k_d of [stand]"),
+        (full.worst(START, TRACK), "law.lead_easing or the requirements of [robustness]"),
     ):
         if not verdict.stable:
             raise RunError(f"no stable gains found: {verdict.words()}; lower {lower}")
@@ -65,7 +66,7 @@ def choose(
         reduced = DynamicCertificate(_with_few_drivetrains(config), checked)
         found = _descend(reduced, START, progress)
         progress("checking every pose and drivetrain")
-        verdict = full.worst_in_track(found, stop_above=0.0)
+        verdict = full.worst(found, TRACK, stop_above=0.0)
         if verdict.stable:
             return found
         if any(node is verdict.condition.node for node in checked):
@@ -101,7 +102,7 @@ def _descend(reduced: DynamicCertificate, design: Design, progress: Progress) ->
             candidate_cost = _cost(reduced, candidate)
             if (
                 candidate_cost < cost - 0.01
-                and reduced.worst_in_track(candidate, stop_above=0.0).stable
+                and reduced.worst(candidate, TRACK, stop_above=0.0).stable
             ):
                 design, cost = candidate, candidate_cost
                 progress(f"damping, round {round_index + 1}: hand and sway cost {cost:.1f} N")

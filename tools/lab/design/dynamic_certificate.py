@@ -11,7 +11,8 @@ every drivetrain (`robustness.stiffness`), hand and delay of the robot file:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -48,6 +49,14 @@ critical."""
 DRIFT_HZ: Final = 0.05
 """A slower motion is no oscillation but a drift: the leading operator is part of that loop."""
 HALF_NAMES: Final = ("fore and aft", "sideways")
+TRACK: Final = ("TRACK",)
+HELD: Final = ("HOLD", "drives alone")
+"""Modes: with the services, and with the drives alone."""
+
+LADDER: Final = (1.0, 1.41, 2.0, 2.82, 4.0, 5.64, 8.0)
+"""Factors tried on gains, in ascending order."""
+DELAYS: Final = (1.0, 5.0, 10.0, 15.0, 20.0, 24.0)
+"""Multiples of `DELAY_MIN_S`, up to the age at which a command is refused."""
 
 
 class Design(NamedTuple):
@@ -116,6 +125,19 @@ class DynamicVerdict(NamedTuple):
         return f"{self.condition.words()}: {what} by {abs(g.rate):.2f}/s at {g.frequency_hz:.1f} Hz"
 
 
+class StabilityMargins(NamedTuple):
+    """Largest factors that keep one drivetrain stable in every condition; 0 if not even 1 does."""
+
+    stiffness: float
+    """N m/rad"""
+    torque: float
+    """On every feedback torque."""
+    coupling: float
+    """On tau_coupled."""
+    delay_s: float
+    """From a sample to the use of its command, s."""
+
+
 def nodes_of(
     config: RobotConfig, D_at: Callable[[float, float], Array], heights: Array, pitches: Array
 ) -> list[StiffnessNode]:
@@ -130,27 +152,23 @@ def nodes_of(
     poses, inertia = Poses(config), BodyInertia(config)
     S = np.array(config.law.S, float)
     nodes = []
-    for z in heights:
-        for pitch in pitches:
-            node = poses.node(float(z), float(pitch))
-            if node is None:
-                continue
-            M = inertia.at(poses.q, node.T)
-            kinematics = poses.kinematics
-            for hessian in node.hessians:
-                K_geo = node.T.T @ hessian @ node.T
-                stand = Stand(
-                    M,
-                    0.5 * (K_geo + K_geo.T),
-                    node.T,
-                    kinematics.J.copy(),
-                    kinematics.J_harness.copy(),
-                    hessian,
-                    S,
-                )
-                nodes.append(
-                    StiffnessNode(float(z), float(pitch), stand, D_at(float(z), float(pitch)))
-                )
+    for z, pitch in itertools.product(heights.tolist(), pitches.tolist()):
+        node = poses.node(z, pitch)
+        if node is None:
+            continue
+        M, kinematics = inertia.at(poses.q, node.T), poses.kinematics
+        for hessian in node.hessians:
+            K_geo = node.T.T @ hessian @ node.T
+            stand = Stand(
+                M=M,
+                K_geo=0.5 * (K_geo + K_geo.T),
+                T=node.T,
+                J=kinematics.J.copy(),
+                J_harness=kinematics.J_harness.copy(),
+                H=hessian,
+                S=S,
+            )
+            nodes.append(StiffnessNode(z, pitch, stand, D_at(z, pitch)))
     return nodes
 
 
@@ -206,27 +224,38 @@ class DynamicCertificate:
         else:
             feedback = self.held(c.node, design, onboard=c.mode == "drives alone")
             stand = stand._replace(S=np.zeros(6))
-        drivetrain, timing = self._drivetrain(c.stiffness), self._timing(c.delay_s)
+        drivetrain, timing = self.drivetrain(c.stiffness), self.timing(c.delay_s)
         return SampledLoop(stand, half, feedback, drivetrain, timing, c.hand)
 
-    def conditions(self, *, margins: bool = True) -> Iterator[Condition]:
+    def conditions(
+        self, modes: Sequence[str] = TRACK + HELD, *, margins: bool = True
+    ) -> Iterator[Condition]:
         """Yield every condition; without `margins`, nominal gains and delays only."""
-        yield from self._cases(self._in_track, margins=margins)
-        yield from self._cases(self._in_hold, margins=margins)
+        for cases_of, own in ((self._in_track, TRACK), (self._in_hold, HELD)):
+            if not set(own) <= set(modes):
+                continue
+            halves_of = range(len(self._halves))
+            for case in itertools.product(self._nodes, self._wanted.stiffness, halves_of):
+                yield from cases_of(*case, margins=margins)
 
-    def worst(self, design: Design, *, margins: bool = True) -> DynamicVerdict:
-        """Return the condition with the slowest decay."""
-        return self._worst(self.conditions(margins=margins), design, np.inf)
-
-    def worst_in_track(
-        self, design: Design, *, margins: bool = True, stop_above: float = np.inf
+    def worst(
+        self,
+        design: Design,
+        modes: Sequence[str] = TRACK + HELD,
+        *,
+        margins: bool = True,
+        stop_above: float = np.inf,
     ) -> DynamicVerdict:
-        """Return the worst condition in TRACK; stop at the first excess above `stop_above`, 1/s."""
-        return self._worst(self._cases(self._in_track, margins=margins), design, stop_above)
-
-    def worst_in_hold(self, design: Design, *, margins: bool = True) -> DynamicVerdict:
-        """Return the worst condition in HOLD, with the services and with the drives alone."""
-        return self._worst(self._cases(self._in_hold, margins=margins), design, np.inf)
+        """Return the condition with the slowest decay, or the first excess above so much, 1/s."""
+        worst: DynamicVerdict | None = None
+        for condition in self.conditions(modes, margins=margins):
+            verdict = self.judge(condition, design)
+            if worst is None or verdict.excess > worst.excess:
+                worst = verdict
+                if verdict.excess > stop_above:
+                    break
+        assert worst is not None  # noqa: S101 - there is always a pose
+        return worst
 
     def led(self, stiffness: float) -> Iterator[Condition]:
         """Yield upright TRACK conditions without a hand, at the minimum and the designed delay."""
@@ -237,13 +266,41 @@ class DynamicCertificate:
 
     def sway(self, design: Design) -> float:
         """Return the rate (1/s, negative) of the TRACK oscillation with the slowest decay."""
-        cases = self._cases(self._in_track, margins=False)
+        cases = self.conditions(TRACK, margins=False)
         return max(self.loop(c, design).growth(c.gains, DRIFT_HZ).rate for c in cases)
 
-    @property
-    def stiffnesses(self) -> tuple[float, ...]:
-        """Drivetrain stiffnesses that the certificate covers, N m/rad."""
-        return self._wanted.stiffness
+    def margins(self, design: Design) -> list[StabilityMargins]:
+        """Return the room that each drivetrain leaves, over all poses, hands and modes."""
+
+        def highest_stable(
+            cases: Sequence[Condition],
+            ladder: Sequence[float],
+            scaled: Callable[[Condition, float], Condition],
+        ) -> float:
+            highest = 0.0
+            for factor in ladder:
+                if not all(self.judge(scaled(case, factor), design).stable for case in cases):
+                    break
+                highest = factor
+            return highest
+
+        rooms = []
+        for stiffness in self._wanted.stiffness:
+            nominal = [c for c in self.conditions(margins=False) if c.stiffness == stiffness]
+            led = [c for c in nominal if c.mode == "TRACK"]
+            prompt = [c for c in led if c.delay_s == DELAY_MIN_S]
+            rooms.append(
+                StabilityMargins(
+                    stiffness,
+                    highest_stable(nominal, LADDER, lambda c, f: c._replace(gains=Gains(torque=f))),
+                    highest_stable(led, LADDER, lambda c, f: c._replace(gains=Gains(coupling=f))),
+                    DELAY_MIN_S
+                    * highest_stable(
+                        prompt, DELAYS, lambda c, f: c._replace(delay_s=DELAY_MIN_S * f)
+                    ),
+                )
+            )
+        return rooms
 
     def judge(self, condition: Condition, design: Design) -> DynamicVerdict:
         """Return the growth of the loop in a condition, and its excess."""
@@ -251,27 +308,6 @@ class DynamicCertificate:
         drifts = condition.half == 0 and growth.frequency_hz < DRIFT_HZ
         allowed = self._wanted.drift_max if drifts and condition.mode == "TRACK" else 0.0
         return DynamicVerdict(growth, condition, growth.rate - allowed)
-
-    def _worst(
-        self, conditions: Iterable[Condition], design: Design, stop_above: float
-    ) -> DynamicVerdict:
-        worst: DynamicVerdict | None = None
-        for condition in conditions:
-            verdict = self.judge(condition, design)
-            if worst is None or verdict.excess > worst.excess:
-                worst = verdict
-                if verdict.excess > stop_above:
-                    break
-        assert worst is not None  # noqa: S101 - there is always a pose
-        return worst
-
-    def _cases(
-        self, cases_of: Callable[..., Iterator[Condition]], *, margins: bool
-    ) -> Iterator[Condition]:
-        for node in self._nodes:
-            for stiffness in self._wanted.stiffness:
-                for half in range(len(self._halves)):
-                    yield from cases_of(node, stiffness, half, margins=margins)
 
     def _in_track(
         self, node: StiffnessNode, stiffness: float, half: int, *, margins: bool
@@ -292,13 +328,14 @@ class DynamicCertificate:
     def _in_hold(
         self, node: StiffnessNode, stiffness: float, half: int, *, margins: bool
     ) -> Iterator[Condition]:
-        for mode in ("HOLD", "drives alone"):
+        for mode in HELD:
             case = Condition(mode, node, half, stiffness, DELAY_MIN_S, NO_HAND, NOMINAL)
             yield case
             if margins:
                 yield case._replace(gains=Gains(torque=self._wanted.gain_margin))
 
-    def _drivetrain(self, stiffness: float) -> DrivetrainModel:
+    def drivetrain(self, stiffness: float) -> DrivetrainModel:
+        """Return the drivetrain of a stiffness, N m/rad."""
         joint, wanted = self._config.joint, self._wanted
         return DrivetrainModel(
             stiffness,
@@ -308,7 +345,8 @@ class DynamicCertificate:
             encoder_bandwidth=self._config.drive.encoder_bandwidth,
         )
 
-    def _timing(self, delay_s: float) -> LoopTiming:
+    def timing(self, delay_s: float) -> LoopTiming:
+        """Return the loop's periods, with a delay from sample to use."""
         service = self._config.joint_service
         return LoopTiming(
             1.0 / service.rate_hz, 1.0 / self._config.planner.rate_hz, delay_s, DRIVE_STEP_S

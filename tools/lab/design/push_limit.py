@@ -94,13 +94,10 @@ class LoadedStand:
     """Torques and wrenches of one pose under its own weight, and their change with a push."""
 
     def __init__(self, config: RobotConfig, kinematics: Kinematics, T: Array, H: Array) -> None:
-        """Compute the loads of the pose.
+        """Compute the loads of the pose at which the kinematics was updated.
 
-        Args:
-            config: the robot.
-            kinematics: updated at the pose.
-            T: joint rates per unit of p along the closed chain (12, 6).
-            H: `Kinematics.hessian_times` of the weight (12, 12), N m/rad.
+        T (12, 6) are joint rates per unit of p along the closed chain, H (12, 12), N m/rad, is
+        `Kinematics.hessian_times` of the weight.
         """
         self._T, self._H = T.copy(), H.copy()
         self._K_geo: Array = self._T.T @ self._H @ self._T
@@ -187,11 +184,7 @@ class LoadedStand:
         return hardest
 
     def limit_of_body(self, direction: tuple[float, float]) -> PushLimit:
-        """Return the hardest push that soles and motors bear at this pose under any control.
-
-        Args:
-            direction: world x and y, a unit vector.
-        """
+        """Return the hardest push that soles and motors bear at this pose under any control."""
         total, unit = self._W[0] + self._W[1], _horizontal(direction)
 
         def loads(x: Array) -> Array:
@@ -246,12 +239,7 @@ def limits_along(
 ) -> PushLimits:
     """Return the limits along one direction, on rigid joints.
 
-    Args:
-        stand: the pose.
-        config: the robot, with its gain schedule.
-        D: local stiffnesses in TRACK (12,), N m/rad.
-        D_B: local damping in TRACK (12,), N m s/rad.
-        direction: world x and y, a unit vector.
+    D, N m/rad, and D_B, N m s/rad, (12,) are the local gains in TRACK.
     """
     law, schedule = config.law, config.gain_schedule
     damping = 0.0 if schedule is None else schedule.coupling_damping
@@ -282,9 +270,7 @@ def _horizontal(direction: tuple[float, float]) -> Array:
 def _torso_com(config: RobotConfig, angles: Array) -> Array:
     """Return the torso's centre of mass from its origin (3,), m, world.
 
-    Args:
-        config: the robot.
-        angles: roll, pitch and yaw of the torso (3,), rad; R = Rz(yaw) Rx(roll) Ry(pitch).
+    R = Rz(yaw) Rx(roll) Ry(pitch) of its angles (3,), rad.
     """
     (s_x, s_y, s_z), (c_x, c_y, c_z) = np.sin(angles), np.cos(angles)
     R_z = np.array([[c_z, -s_z, 0.0], [s_z, c_z, 0.0], [0.0, 0.0, 1.0]])
@@ -295,30 +281,33 @@ def _torso_com(config: RobotConfig, angles: Array) -> Array:
 
 def _limits(config: RobotConfig) -> list[_Limit]:
     """Return the limits of every motor pair, sole edge and sole friction."""
-    limits = []
+    limits: list[_Limit] = []
+
+    def add(part: str, bound: float, *entries: tuple[int, float]) -> None:
+        row = np.zeros(24)
+        for column, value in entries:
+            row[column] = value
+        limits.append(_Limit(part, row, bound))
+
     for index, module in enumerate(MODULES):
         for phi in (-1.0, 1.0):
             for theta in (-1.0, 1.0):
-                row = np.zeros(24)
-                row[2 * index : 2 * index + 2] = phi, theta
-                limits.append(_Limit(f"torque of {module}", row, config.joint.tau_module_max))
+                most = config.joint.tau_module_max
+                add(f"torque of {module}", most, (2 * index, phi), (2 * index + 1, theta))
     geometry = config.geometry
     l_x, l_y, h = geometry.l_foot / 2, geometry.w_foot / 2, geometry.foot_height
     for leg, side in enumerate(SIDES):
         f_x, f_y, f_z, m_x, m_y = (N_JOINTS + 6 * leg + part for part in range(5))
         outer = -1.0 if side == "right" else 1.0
         for sign, edge in ((1.0, "toe"), (-1.0, "heel")):
-            row = np.zeros(24)  # centre of pressure: x = (-m_y - h f_x) / f_z
-            row[m_y], row[f_x], row[f_z] = -sign, -sign * h, -l_x
-            limits.append(_Limit(f"{side} sole's {edge}", row, 0.0))
-        for sign in (outer, -outer):
-            row = np.zeros(24)  # centre of pressure: y = (m_x - h f_y) / f_z
-            row[m_x], row[f_y], row[f_z] = sign, -sign * h, -l_y
-            edge = "outer edge" if sign == outer else "inner edge"
-            limits.append(_Limit(f"{side} sole's {edge}", row, 0.0))
+            # centre of pressure: x = (-m_y - h f_x) / f_z
+            add(f"{side} sole's {edge}", 0.0, (m_y, -sign), (f_x, -sign * h), (f_z, -l_x))
+        for sign, edge in ((outer, "outer edge"), (-outer, "inner edge")):
+            # centre of pressure: y = (m_x - h f_y) / f_z
+            add(f"{side} sole's {edge}", 0.0, (m_x, sign), (f_y, -sign * h), (f_z, -l_y))
         for axis in (f_x, f_y):
             for sign in (1.0, -1.0):
-                row = np.zeros(24)  # a square inside the friction cone
-                row[axis], row[f_z] = sign, -FRICTION / math.sqrt(2.0)
-                limits.append(_Limit(f"{side} sole's friction", row, 0.0))
+                # a square inside the friction cone
+                least = -FRICTION / math.sqrt(2.0)
+                add(f"{side} sole's friction", 0.0, (axis, sign), (f_z, least))
     return limits

@@ -30,6 +30,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
+from services.planner.law.certificate import motor_mean
 from services.planner.law.coupling import pole_gain
 from shared.joints import N_JOINTS, N_LEG
 
@@ -157,8 +158,63 @@ def whole() -> Half:
     return Half(np.eye(6), np.eye(N_JOINTS))
 
 
+class _Laws(NamedTuple):
+    """What services, planner and hand do, in the coordinates of a half."""
+
+    D: Array
+    D_B: Array
+    D_m: Array
+    D_Bm: Array
+    """Means over the motors of a module, as in the drives' law."""
+    C_q: Array
+    C_v: Array
+    H: Array
+    J_open: Array
+    T_open: Array
+    """J and T of the coordinates that the planner takes as measured."""
+    ease_p: Array
+    ease_v: Array
+    """Torques that ease the hand's force, per p and p'."""
+
+
+class _State(NamedTuple):
+    """Places of plant and estimator in the state."""
+
+    p: slice
+    pd: slice
+    theta: slice
+    omega: slice
+    tau: slice
+    q: slice
+    v: slice
+
+
+class _Step(NamedTuple):
+    """One step with constant inputs: x+ = F x + G u + G_f f, f a force on p."""
+
+    F: Array
+    G: Array
+    G_f: Array
+
+    def repeated(self, times: int) -> _Step:
+        """Return the map of so many steps."""
+        total, by_u, by_f = np.eye(len(self.F)), np.zeros_like(self.G), np.zeros_like(self.G_f)
+        for _ in range(times):
+            total, by_u, by_f = (
+                self.F @ total,
+                self.F @ by_u + self.G,
+                self.F @ by_f + self.G_f,
+            )
+        return _Step(total, by_u, by_f)
+
+
 class SampledLoop:
-    """One half of the loop at one pose, with one drivetrain, hand and timing."""
+    """One half of the loop at one pose, with one drivetrain, hand and timing.
+
+    Attributes:
+        A: of plant and estimator, x' = A x + B (u, f).
+        n_z: (n_p,), rise of the harness point along p.
+    """
 
     def __init__(
         self,
@@ -168,66 +224,40 @@ class SampledLoop:
         drivetrain: DrivetrainModel,
         timing: LoopTiming,
         hand: HandModel = NO_HAND,
-        served: Array | None = None,
     ) -> None:
-        """Discretise the plant over one step of the drives.
-
-        Args:
-            stand: the pose.
-            half: part of the loop to analyse.
-            feedback: of services and planner.
-            drivetrain: of every joint.
-            timing: periods and delays of the loop.
-            hand: at the harness.
-            served: (12,), 0 for joints whose service is dead: their drives keep their last target.
-                Only with the whole loop. None if all services run.
-        """
+        """Discretise the plant over one step of the drives."""
         self._timing, self._feedback = timing, feedback
         P, V = half.P, half.V
-        self._n_p, self._n_q = P.shape[1], V.shape[1]
-        n = self._n_q
-        self._T = V.T @ stand.T @ P
-        self._J = P.T @ stand.J @ V
-        S = P.T @ stand.S
-        self._open = np.flatnonzero(S > 0.0)
-        self._T_open = self._T[:, self._open]
-        self._J_open = self._J[self._open]
-        self._H = V.T @ stand.H @ V
-        self._D, self._D_B = (V.T @ np.diag(gain) @ V for gain in (feedback.D, feedback.D_B))
-        mean = [np.repeat(g.reshape(-1, 2).mean(axis=1), 2) for g in (feedback.D, feedback.D_B)]
-        self._D_m, self._D_Bm = (V.T @ np.diag(gain) @ V for gain in mean)
-        self._served = V.T @ np.diag(np.ones(N_JOINTS) if served is None else served) @ V
-        self._C_q, self._C_v = V.T @ feedback.C_q @ V, V.T @ feedback.C_v @ V
-        n_z = P.T @ (stand.J_harness[2] @ stand.T)
+        self._n_p, self._n_q = n_p, n = P.shape[1], V.shape[1]
+        at = np.cumsum([0, n_p, n_p, n, n, n, n, n])
+        self._at = _State(*(slice(a, b) for a, b in pairwise(at)))
+        self.n_z = n_z = P.T @ (stand.J_harness[2] @ stand.T)
         n_pitch = P.T @ np.eye(6)[4]
-        self._K_hand = hand.k_z * np.outer(n_z, n_z) + hand.k_pitch * np.outer(n_pitch, n_pitch)
-        self._B_hand = hand.b_z * np.outer(n_z, n_z) + hand.b_pitch * np.outer(n_pitch, n_pitch)
-        easing = np.outer(V.T @ stand.J_harness[2], n_z), np.outer(V.T @ stand.J[4], n_pitch)
-        alpha = feedback.lead_easing
-        self._ease_p = -alpha * (hand.k_z * easing[0] + hand.k_pitch * easing[1])
-        self._ease_v = -alpha * (hand.b_z * easing[0] + hand.b_pitch * easing[1])
-        self.n_z = n_z
-        """(n_p,): rise of the harness point along p."""
-        self._plant(P.T @ stand.M @ P, P.T @ stand.K_geo @ P, drivetrain)
-        self._n_x = 2 * self._n_p + 5 * n
+        self._laws = _laws(stand, half, feedback, hand, n_z, n_pitch)
+        along_z, along_pitch = np.outer(n_z, n_z), np.outer(n_pitch, n_pitch)
+        K = P.T @ stand.K_geo @ P + (hand.k_z * along_z + hand.k_pitch * along_pitch)
+        B_hand = hand.b_z * along_z + hand.b_pitch * along_pitch
+        T, M = V.T @ stand.T @ P, P.T @ stand.M @ P
+        self.A, B = self._plant(T, M, K, B_hand, drivetrain)
+        n_x = len(self.A)
+        block = np.zeros((n_x + B.shape[1],) * 2)
+        block[:n_x, :n_x], block[:n_x, n_x:] = self.A, B
+        exact = scipy.linalg.expm(block * timing.drive_step)[:n_x]
+        self._drive_step = _Step(exact[:, :n_x], exact[:, n_x : n_x + n], exact[:, n_x + n :])
 
-    def _plant(self, M: Array, K_geo: Array, drivetrain: DrivetrainModel) -> None:
-        """Build the step of plant and estimator: x+ = E x + G u + G_f f, f a force on p."""
-        n_p, n, T, d = self._n_p, self._n_q, self._T, drivetrain
+    def _plant(
+        self, T: Array, M: Array, K: Array, B_hand: Array, d: DrivetrainModel
+    ) -> tuple[Array, Array]:
+        """Return A and B of plant and estimator."""
+        n_p, n = self._n_p, self._n_q
         n_x = 2 * n_p + 5 * n
         A, B = np.zeros((n_x, n_x)), np.zeros((n_x, n + n_p))
-        at = np.cumsum([0, n_p, n_p, n, n, n, n, n])
-        self._p, self._pd, self._theta, self._omega, self._tau, self._q, self._v = (
-            slice(a, b) for a, b in pairwise(at)
-        )
-        p, pd, theta, omega, tau, q, v = (
-            self._p, self._pd, self._theta, self._omega, self._tau, self._q, self._v,
-        )  # fmt: skip
+        p, pd, theta, omega, tau, q, v = self._at
         inverse, eye = np.linalg.inv(M), np.eye(n)
         k, b = d.stiffness, d.damping
         A[p, pd] = np.eye(n_p)
-        A[pd, p] = -inverse @ (k * T.T @ T + K_geo + self._K_hand)
-        A[pd, pd] = -inverse @ ((b + d.joint_damping) * T.T @ T + self._B_hand)
+        A[pd, p] = -inverse @ (k * T.T @ T + K)
+        A[pd, pd] = -inverse @ ((b + d.joint_damping) * T.T @ T + B_hand)
         A[pd, theta], A[pd, omega] = k * inverse @ T.T, b * inverse @ T.T
         A[theta, omega] = eye
         A[omega, theta] = -k / d.rotor_inertia * eye
@@ -239,52 +269,36 @@ class SampledLoop:
         A[q, v], A[q, theta], A[q, q] = eye, 2.0 * w * eye, -2.0 * w * eye
         A[v, theta], A[v, q] = w * w * eye, -w * w * eye
         B[pd, n:] = inverse
-        self.A, self.B = A, B
-        block = np.zeros((n_x + B.shape[1],) * 2)
-        block[:n_x, :n_x], block[:n_x, n_x:] = A, B
-        exact = scipy.linalg.expm(block * self._timing.drive_step)[:n_x]
-        self._E, self._G, self._G_f = exact[:, :n_x], exact[:, n_x : n_x + n], exact[:, n_x + n :]
+        return A, B
 
-    def period_map(
-        self, gains: Gains = NOMINAL, delay: float | None = None, slots: int = 0
-    ) -> tuple[Array, Array]:
+    def period_map(self, gains: Gains = NOMINAL) -> tuple[Array, Array]:
         """Return (Phi, Gamma): X+ = Phi X + Gamma f over one planner period.
 
         X holds plant and estimator, the drives' targets, the filters, and the commands in transit.
-        f is a force along p, constant over the period.
-
-        Args:
-            gains: on parts of the loop, for its margins.
-            delay: s; None uses the delay of the timing.
-            slots: least number of slots for commands in transit, so that maps of different delays
-                have the same size.
+        f is a force along p, constant over the period; `gains` scale parts of the loop.
         """
-        t, n, n_open, n_x = self._timing, self._n_q, len(self._open), self._n_x
-        delay = t.delay if delay is None else delay
-        torque = gains.torque
+        t, n, laws, at = self._timing, self._n_q, self._laws, self._at
         cycles = round(t.planner_period / t.joint_period)
         steps = round(t.joint_period / t.drive_step)
         late = round(t.write_delay / t.drive_step)
-        slots = max(slots, math.ceil(delay / t.planner_period - 1e-9))
-        entry = 2 * n_open + n
-        width = n_x + 4 * n + slots * entry
+        slots = max(0, math.ceil(t.delay / t.planner_period - 1e-9))
+        sizes = [len(self.A), n, n, n, n, *[2 * len(laws.J_open) + n] * slots]
+        ends = np.cumsum(sizes)
+        width = int(ends[-1])
         X = np.eye(width, width + self._n_p)
-        at = n_x
-        x, force = X[:n_x].copy(), np.eye(width + self._n_p)[width:]
-        W, f_1, f_2, eased = (X[at + i * n : at + (i + 1) * n].copy() for i in range(4))
-        at += 4 * n
-        queue = [X[at + i * entry : at + (i + 1) * entry].copy() for i in range(slots)]
+        force = np.eye(width + self._n_p)[width:]
+        x, W, f_1, f_2, eased, *queue = (part.copy() for part in np.split(X, ends[:-1]))
         f_1, f_2, eased, newest = self._tick(x, f_1, f_2, eased)
         queue.insert(0, newest)
-        feedback = self._D_m, self._D_Bm
-        closed = self._E.copy()
-        closed[:, self._q] -= torque * self._G @ feedback[0]
-        closed[:, self._v] -= torque * self._G @ feedback[1]
-        before = _repeated(closed, torque * self._G, self._G_f, late)
-        after = _repeated(closed, torque * self._G, self._G_f, steps - late)
+        step, torque = self._drive_step, gains.torque
+        closed = step.F.copy()
+        closed[:, at.q] -= torque * step.G @ laws.D_m
+        closed[:, at.v] -= torque * step.G @ laws.D_Bm
+        driven = _Step(closed, torque * step.G, step.G_f)
+        before, after = driven.repeated(late), driven.repeated(steps - late)
         for cycle in range(cycles):
             since = cycle * t.joint_period
-            slot = max(0, math.ceil((delay - since) / t.planner_period - 1e-9))
+            slot = max(0, math.ceil((t.delay - since) / t.planner_period - 1e-9))
             age = slot * t.planner_period + since
             old, W = W, self._target(x, queue[slot], age, gains)
             for (F, G, G_f), w in ((before, old), (after, W)):
@@ -297,18 +311,12 @@ class SampledLoop:
         return np.asarray(np.linalg.eigvals(self.period_map(gains)[0]), complex)
 
     def growth(self, gains: Gains = NOMINAL, above_hz: float = 0.0) -> Growth:
-        """Return the growth rate of the loop's slowest decay, and its frequency.
-
-        Args:
-            gains: on parts of the loop.
-            above_hz: ignore slower motions.
-        """
+        """Return the growth of the loop's slowest decay; `above_hz`: ignore slower motions."""
+        period = self._timing.planner_period
         values = self.eigenvalues(gains)
         if above_hz > 0.0:
-            least = 2.0 * math.pi * above_hz * self._timing.planner_period
-            values = values[np.abs(np.angle(values)) >= least]
+            values = values[np.abs(np.angle(values)) >= 2.0 * math.pi * above_hz * period]
         worst = values[np.abs(values).argmax()]
-        period = self._timing.planner_period
         rate = math.log(max(abs(worst), 1e-12)) / period
         return Growth(rate, abs(np.angle(worst)) / (2.0 * math.pi * period))
 
@@ -320,38 +328,56 @@ class SampledLoop:
         Phi, Gamma = self.period_map()
         z = np.exp(1j * w * self._timing.planner_period)
         X = np.linalg.solve(z * np.eye(len(Phi)) - Phi, Gamma @ self.n_z)
-        return complex(1.0 / (self.n_z @ X[self._pd]))
+        return complex(1.0 / (self.n_z @ X[self._at.pd]))
 
     def _tick(
         self, x: Array, f_1: Array, f_2: Array, eased: Array
     ) -> tuple[Array, Array, Array, Array]:
         """Run the planner on the current samples; return its filter states and its command."""
-        q, v = x[self._q], x[self._v]
-        r, rate = self._J_open @ q, self._J_open @ v
-        e_q, e_v = self._T_open @ r - q, self._T_open @ rate - v
-        raw = self._C_q @ e_q + self._C_v @ e_v
-        gain = pole_gain(self._feedback.bandwidth_hz, self._timing.planner_period)
+        laws, at, period = self._laws, self._at, self._timing.planner_period
+        q, v = x[at.q], x[at.v]
+        r, rate = laws.J_open @ q, laws.J_open @ v
+        e_q, e_v = laws.T_open @ r - q, laws.T_open @ rate - v
+        raw = laws.C_q @ e_q + laws.C_v @ e_v
+        gain = pole_gain(self._feedback.bandwidth_hz, period)
         f_1 = f_1 + gain * (raw - f_1)
         f_2 = f_2 + gain * (f_1 - f_2)
-        gain = pole_gain(self._feedback.easing_bandwidth_hz, self._timing.planner_period)
-        felt = self._ease_p @ x[self._p] + self._ease_v @ x[self._pd]
+        gain = pole_gain(self._feedback.easing_bandwidth_hz, period)
+        felt = laws.ease_p @ x[at.p] + laws.ease_v @ x[at.pd]
         eased = eased + gain * (felt - eased)
         return f_1, f_2, eased, np.vstack((r, rate, f_2 + eased))
 
     def _target(self, x: Array, entry: Array, age: float, gains: Gains) -> Array:
         """Run the joint service on the current samples; return W of the drives' law."""
-        q, v, n_open = x[self._q], x[self._v], len(self._open)
-        r, rate, coupled = entry[:n_open], entry[n_open : 2 * n_open], entry[2 * n_open :]
-        q_ref, v_ref = self._T_open @ (r + age * rate), self._T_open @ rate
-        tau = self._D @ (q_ref - q) + self._D_B @ (v_ref - v) + gains.coupling * coupled
+        laws, n_open = self._laws, len(self._laws.J_open)
+        q, v = x[self._at.q], x[self._at.v]
+        r, rate, coupled = np.split(entry, (n_open, 2 * n_open))
+        q_ref, v_ref = laws.T_open @ (r + age * rate), laws.T_open @ rate
+        tau = laws.D @ (q_ref - q) + laws.D_B @ (v_ref - v) + gains.coupling * coupled
         # a gain on all feedback does not scale the weight's feedforward
-        tau = tau + self._H @ q_ref / gains.torque
-        return np.asarray(self._served @ (tau + self._D_m @ q + self._D_Bm @ v), float)
+        tau = tau + laws.H @ q_ref / gains.torque
+        return np.asarray(tau + laws.D_m @ q + laws.D_Bm @ v, float)
 
 
-def _repeated(F: Array, G: Array, G_f: Array, times: int) -> tuple[Array, Array, Array]:
-    """Return the map of `times` steps with constant inputs."""
-    total, by_w, by_f = np.eye(len(F)), np.zeros_like(G), np.zeros_like(G_f)
-    for _ in range(times):
-        total, by_w, by_f = F @ total, F @ by_w + G, F @ by_f + G_f
-    return total, by_w, by_f
+def _laws(
+    stand: Stand, half: Half, feedback: Feedback, hand: HandModel, n_z: Array, n_pitch: Array
+) -> _Laws:
+    P, V = half.P, half.V
+    opened = np.flatnonzero(P.T @ stand.S > 0.0)
+    gains = [feedback.D, feedback.D_B, motor_mean(feedback.D), motor_mean(feedback.D_B)]
+    D, D_B, D_m, D_Bm = (V.T @ np.diag(gain) @ V for gain in gains)
+    easing = np.outer(V.T @ stand.J_harness[2], n_z), np.outer(V.T @ stand.J[4], n_pitch)
+    alpha = feedback.lead_easing
+    return _Laws(
+        D=D,
+        D_B=D_B,
+        D_m=D_m,
+        D_Bm=D_Bm,
+        C_q=V.T @ feedback.C_q @ V,
+        C_v=V.T @ feedback.C_v @ V,
+        H=V.T @ stand.H @ V,
+        J_open=(P.T @ stand.J @ V)[opened],
+        T_open=(V.T @ stand.T @ P)[:, opened],
+        ease_p=-alpha * (hand.k_z * easing[0] + hand.k_pitch * easing[1]),
+        ease_v=-alpha * (hand.b_z * easing[0] + hand.b_pitch * easing[1]),
+    )

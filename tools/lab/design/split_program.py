@@ -31,10 +31,9 @@ from shared.exceptions import RunError
 from shared.extras import late
 from shared.joints import N_LEG
 from tools.lab.design import design_program
-from tools.lab.design.command_bounds import BoundsOverPoses
 from tools.lab.design.dynamic_certificate import Design, nodes_of
 from tools.lab.design.dynamic_certificate import StiffnessNode as DynamicNode
-from tools.lab.design.poses import PoseNode, Poses
+from tools.lab.design.poses import BoundsOverPoses, PoseNode, Poses
 from tools.lab.design.push_limit import PushLimits, limits_at
 
 if TYPE_CHECKING:
@@ -133,12 +132,7 @@ def design_of(schedule: GainSchedule) -> Design:
 
 
 def smallest_margins(config: RobotConfig, schedule: GainSchedule) -> Margins:
-    """Return the smallest margins at the nodes and half way between them.
-
-    Args:
-        config: the robot.
-        schedule: schedule to check.
-    """
+    """Return the smallest margins at the nodes and half way between them."""
     poses, certificate, scheduled = Poses(config), Certificate(config), ScheduledGains(schedule)
     service = onboard = np.inf
     z_nodes, pitches = np.array(schedule.z), np.array(schedule.pitch)
@@ -155,12 +149,7 @@ def smallest_margins(config: RobotConfig, schedule: GainSchedule) -> Margins:
 
 
 def push_limits(config: RobotConfig, heights: int) -> Iterator[tuple[float, dict[str, PushLimits]]]:
-    """Yield COM heights, m, and the push limits there, upright.
-
-    Args:
-        config: the robot, with its gain schedule.
-        heights: number of heights over the schedule's range.
-    """
+    """Yield COM heights, m, over the schedule's range, and the push limits there, upright."""
     schedule = config.gain_schedule
     assert schedule is not None  # noqa: S101 - the caller has just computed it
     poses, scheduled = Poses(config), ScheduledGains(schedule)
@@ -177,11 +166,7 @@ def _with_midpoints(nodes: Array) -> Array:
 
 
 def _program(config: RobotConfig, node: PoseNode, z: float, pitch: float) -> Array:
-    """Return D of one leg (6,), N m/rad, at a node.
-
-    Raises:
-        RunError: no D meets the constraints.
-    """
+    """Return D of one leg (6,), N m/rad, at a node."""
     K_required = np.array(config.certificate.K_required)
     T = node.T / np.sqrt(K_required)
     per_joint = [np.outer(T[i], T[i]) + np.outer(T[i + N_LEG], T[i + N_LEG]) for i in range(N_LEG)]

@@ -11,7 +11,7 @@ from tests.tools.exit_codes import exit_code
 from tools.lab.bench import bus
 from tools.lab.bench.bus import BusFigures
 from tools.lab.bench.bus_process import PLANNER, BusReport
-from tools.lab.bench.transports.base import TRANSPORTS, installed, open_transport
+from tools.lab.bench.transports import TRANSPORTS, installed, over_datagrams
 
 
 def report(name: str, latency_us: list[float], **changes: object) -> BusReport:
@@ -48,7 +48,7 @@ def test_what_needs_no_package_is_always_installed() -> None:
 
 
 def test_over_datagrams_the_newest_payload_is_taken_once(tmp_path: Path) -> None:
-    reader, writer = (open_transport("datagrams", name, tmp_path) for name in ("a", "b"))
+    reader, writer = (over_datagrams(name, tmp_path) for name in ("a", "b"))
     put = writer.publisher("state/a")
     put(b"nobody is there yet")
     take = reader.latest("state/a")

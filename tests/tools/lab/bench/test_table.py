@@ -1,12 +1,12 @@
-"""The table of `xrl bench`: medians, ratios and targets from turns."""
+"""The tables of `xrl bench`: medians, ratios and targets from turns."""
 
 from __future__ import annotations
 
 import pytest
 
-from tools.lab.bench.table import row_of
+from tools.lab.bench.table import Row
 from tools.lab.bench.timing import Cost, Spread
-from tools.lab.bench.worker import Answer, Request
+from tools.lab.bench.worker import Answer, PartRow, Request, row_of
 
 TICK = Request("tick", calls=9)
 
@@ -16,27 +16,30 @@ def timed(us: float, yard: float = 100.0) -> Answer:
     return Answer(yard, cost=Cost(spread, Spread(us, us + 5.0, us)))
 
 
+def rows(
+    here: list[Answer], there: list[Answer], target: float | None = None, request: Request = TICK
+) -> Row:
+    part = row_of(request, here, there, target)
+    assert part is not None
+    return part.row
+
+
 def test_a_time_is_the_median_of_the_turns_with_its_ratio_to_the_yardstick() -> None:
-    row = row_of(TICK, [timed(300.0, 150.0), timed(200.0), timed(900.0, 450.0)], [], 250.0)
-    assert row is not None
-    assert (row.what, row.value, row.wall) == ("tick, warm", 300.0, 305.0)
-    assert row.spread == (200.0, 900.0)
-    assert row.to_yardstick == 2.0
-    assert row.ratio is None
-    assert not row.ok
+    turns = [timed(300.0, 150.0), timed(200.0), timed(900.0, 450.0)]
+    assert row_of(TICK, turns, [], 250.0) == PartRow(
+        Row("tick, warm", "us", 300.0, (200.0, 900.0), target=250.0), wall=305.0, to_yardstick=2.0
+    )
+    assert not rows(turns, [], 250.0).ok
+    assert rows(turns, [], 300.0).ok
 
 
 def test_cold_calls_are_named_so() -> None:
-    row = row_of(Request("tick", cold=True, calls=9), [timed(100.0)], [], None)
-    assert row is not None
-    assert row.what == "tick, cold"
-    assert row.ok
+    assert rows([timed(1.0)], [], request=Request("tick", cold=True, calls=9)).what == "tick, cold"
 
 
 def test_two_revisions_are_compared_turn_by_turn() -> None:
     """The machine was half as fast in the second turn: the ratio does not see it."""
-    row = row_of(TICK, [timed(100.0), timed(200.0)], [timed(125.0), timed(250.0)], None)
-    assert row is not None
+    row = rows([timed(100.0), timed(200.0)], [timed(125.0), timed(250.0)])
     assert row.other == 187.5
     assert row.ratio == pytest.approx(0.8)
 
@@ -44,17 +47,12 @@ def test_two_revisions_are_compared_turn_by_turn() -> None:
 def test_a_part_that_a_tree_does_not_have_has_no_row_and_no_ratio() -> None:
     lacking = Answer(100.0, missing="ImportError")
     assert row_of(TICK, [lacking], [timed(1.0)], None) is None
-    row = row_of(TICK, [timed(1.0)], [lacking], None)
-    assert row is not None
-    assert (row.other, row.ratio) == (None, None)
+    assert rows([timed(1.0)], [lacking])[4:6] == (None, None)
 
 
 def test_a_faster_lockstep_has_a_ratio_below_one_and_meets_a_target_from_above() -> None:
     request, here, there = Request("lockstep"), Answer(100.0, speed=4.0), Answer(100.0, speed=2.0)
-    row = row_of(request, [here], [there], 4.0)
-    assert row is not None
-    assert (row.what, row.unit, row.value) == ("lockstep", "x", 4.0)
-    assert (row.other, row.ratio, row.ok) == (2.0, 0.5, True)
-    missed = row_of(request, [here], [], 4.1)
-    assert missed is not None
-    assert not missed.ok
+    row = rows([here], [there], 4.0, request)
+    assert row == Row("lockstep", "x", 4.0, (4.0, 4.0), other=2.0, ratio=0.5, target=4.0)
+    assert row.ok
+    assert not rows([here], [], 4.1, request).ok

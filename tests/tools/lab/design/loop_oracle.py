@@ -49,65 +49,35 @@ INSTANT = 1e-9  # s; times closer than this are the same instant
 
 @dataclass(frozen=True)
 class Loop:
-    """The constants of one loop.
+    """The constants of one loop."""
 
-    Attributes:
-        M: Mass matrix of the body, (6, 6).
-        K_geo: Geometric stiffness of the body, (6, 6).
-        T: Joint rates per body rate, (12, 6).
-        J: Body rate per joint rates, (6, 12).
-        J_harness: Harness point rate per joint rates, (3, 12); row 2 is vertical.
-        H: Feedforward stiffness, joint torque per joint reference in N m/rad, (12, 12).
-        S: 1 for each pose coordinate left open, to be taken as measured, else 0, (6,).
-        D: Joint stiffness gains in N m/rad, (12,).
-        D_B: Joint damping gains in N m s/rad, (12,).
-        C_q: Coupling gains on the joint errors in N m/rad, (12, 12).
-        C_v: Coupling gains on the joint rate errors in N m s/rad, (12, 12).
-        bandwidth_hz: Corner of each of the two coupling filters in Hz.
-        lead_easing: The share alpha of the hand's force that is eased, no unit.
-        easing_bandwidth_hz: Corner of the easing filter in Hz.
-        k: Drivetrain stiffness in N m/rad.
-        b: Drivetrain damping in N m s/rad.
-        I: Motor inertia, joint side, in kg m^2.
-        d_motor: Viscous friction at the motor in N m s/rad.
-        d_joint: Viscous friction at the joint in N m s/rad.
-        lag_s: Time constant of the motor torque in s, above 0.
-        encoder_bandwidth: Bandwidth w of the drive's estimator in rad/s.
-        hand: (k_z in N/m, b_z in N s/m, k_pitch in N m/rad, b_pitch in N m s/rad).
-        joint_period: Period of the joint service in s; divides the planner period.
-        planner_period: Period of the planner in s.
-        delay: Least age of a command when the joint service uses it, in s.
-        drive_step: Period of the drive law in s; divides the planner period.
-        write_delay: Time from a joint cycle until the drives use its target, in s.
-    """
-
-    M: Array
-    K_geo: Array
-    T: Array
-    J: Array
-    J_harness: Array
-    H: Array
-    S: Array
-    D: Array
-    D_B: Array
-    C_q: Array
-    C_v: Array
-    bandwidth_hz: float
-    lead_easing: float
+    M: Array  # (6, 6) mass matrix of the body
+    K_geo: Array  # (6, 6) geometric stiffness of the body
+    T: Array  # (12, 6) joint rates per body rate
+    J: Array  # (6, 12) body rate per joint rates
+    J_harness: Array  # (3, 12) harness point rate per joint rates; row 2 is vertical
+    H: Array  # (12, 12) feedforward torque per joint reference, N m/rad
+    S: Array  # (6,) 1 for each pose coordinate that is taken as measured
+    D: Array  # (12,) joint stiffness gains
+    D_B: Array  # (12,) joint damping gains
+    C_q: Array  # (12, 12) coupling gains on the joint errors
+    C_v: Array  # (12, 12) coupling gains on the joint rate errors
+    bandwidth_hz: float  # corner of each of the two coupling filters
+    lead_easing: float  # share of the hand's force that is eased
     easing_bandwidth_hz: float
-    k: float
-    b: float
-    I: float  # noqa: E741  (the paper's letter)
-    d_motor: float
-    d_joint: float
-    lag_s: float
-    encoder_bandwidth: float
-    hand: tuple[float, float, float, float]
-    joint_period: float
+    k: float  # drivetrain stiffness
+    b: float  # drivetrain damping
+    I: float  # noqa: E741  (the paper's letter) motor inertia, joint side
+    d_motor: float  # viscous friction at the motor
+    d_joint: float  # viscous friction at the joint
+    lag_s: float  # time constant of the motor torque, above 0
+    encoder_bandwidth: float  # of the drive's estimator, rad/s
+    hand: tuple[float, float, float, float]  # k_z, b_z, k_pitch, b_pitch
+    joint_period: float  # divides the planner period
     planner_period: float
-    delay: float
-    drive_step: float
-    write_delay: float
+    delay: float  # least age of a command when the joint service uses it
+    drive_step: float  # period of the drive law; divides the planner period
+    write_delay: float  # from a joint cycle until the drives use its target
 
 
 @dataclass(frozen=True)
@@ -231,14 +201,6 @@ def _pair_means(gains: Array) -> Array:
     return np.array(means)[:, None]
 
 
-def _whole(quotient: float, what: str) -> int:
-    """The quotient of two periods, which must be a whole number."""
-    count = round(quotient)
-    if count < 1 or abs(quotient - count) > 1e-6 * count:
-        raise ValueError(f"{what} must divide the planner period")
-    return count
-
-
 def _under_way(loop: Loop) -> tuple[int, int]:
     """How many commands and how many writes are under way at the start of a planner period."""
     commands = 0
@@ -260,8 +222,8 @@ def state_size(loop: Loop) -> int:
 
 def _times(loop: Loop) -> list[tuple[float, bool, bool]]:
     """The events of one planner period in order: time in s, joint service or not, drive or not."""
-    cycles = _whole(loop.planner_period / loop.joint_period, "joint_period")
-    drives = _whole(loop.planner_period / loop.drive_step, "drive_step")
+    cycles = round(loop.planner_period / loop.joint_period)
+    drives = round(loop.planner_period / loop.drive_step)
     joint_times = [loop.planner_period * i / cycles for i in range(cycles)]
     drive_times = [loop.planner_period * i / drives for i in range(drives)]
     events: list[tuple[float, bool, bool]] = []
@@ -302,23 +264,11 @@ def advance(
     torque: float = 1.0,
     micro_step: float = 25e-6,
 ) -> Array:
-    """Step discrete states through one planner period.
+    """Step discrete states, one per column, through one planner period.
 
-    Args:
-        loop: The constants of the loop.
-        states: One state per column, (state_size(loop), columns); rows as in the module's text.
-        coupling: Factor on the coupling torques c, no unit.
-        torque: Factor on the drives' torque, no unit; the feedforward is not scaled.
-        micro_step: Longest Runge-Kutta step in s.
-
-    Returns:
-        The states one planner period later, same shape.
-
-    Raises:
-        ValueError: The states have a wrong number of rows, or the periods do not fit.
+    `coupling` and `torque` are factors on the coupling torques and on the drives' torque; the
+    feedforward is not scaled. `micro_step` is the longest Runge-Kutta step, s.
     """
-    if states.shape[0] != state_size(loop):
-        raise ValueError(f"states need {state_size(loop)} rows, not {states.shape[0]}")
     n_commands, n_writes = _under_way(loop)
     n_open = int(np.count_nonzero(loop.S))
     plant = _Plant(loop)
@@ -373,30 +323,6 @@ def advance(
     return np.vstack(parts)
 
 
-def monodromy(
-    loop: Loop, coupling: float = 1.0, torque: float = 1.0, micro_step: float = 25e-6
-) -> Array:
-    """The matrix that takes the discrete state over one planner period.
-
-    Args:
-        loop: The constants of the loop.
-        coupling: Factor on the coupling torques c, no unit.
-        torque: Factor on the drives' torque, no unit; the feedforward is not scaled.
-        micro_step: Longest Runge-Kutta step in s.
-
-    Returns:
-        A square matrix of state_size(loop) rows; rows as in the module's text, SI units.
-    """
-    return advance(loop, np.eye(state_size(loop)), coupling, torque, micro_step)
-
-
-def growth(
-    loop: Loop, coupling: float = 1.0, torque: float = 1.0, micro_step: float = 25e-6
-) -> float:
-    """The growth rate of the slowest motion of the loop in 1/s; below 0 the loop is stable.
-
-    It is the logarithm of the largest eigenvalue modulus of `monodromy` over the planner period.
-    The arguments are those of `monodromy`.
-    """
-    eigenvalues = np.linalg.eigvals(monodromy(loop, coupling, torque, micro_step))
-    return float(np.log(np.max(np.abs(eigenvalues))) / loop.planner_period)
+def monodromy(loop: Loop, coupling: float = 1.0, torque: float = 1.0) -> Array:
+    """The matrix that takes the discrete state over one planner period; rows as in `advance`."""
+    return advance(loop, np.eye(state_size(loop)), coupling, torque)

@@ -63,7 +63,7 @@ def torques_at_rest(robot: RobotConfig, posed: Posed, force: Array) -> Array:
     world.stand_at(posed.q)
     world.start()
     to_motor = np.linalg.inv(2.0 * np.pi * body.motor_from_joint.T)
-    q_index, v_index = world._q_index, world._v_index
+    q_index, v_index = world.joints.q_index, world.joints.v_index
     begin_q = world.data.qpos[q_index].copy()
     tau = posed.tau
     for _ in range(round(SETTLE_S / world.timestep)):

@@ -19,6 +19,7 @@ from tests.lockstep.runs import still
 from tests.tools.lab.design import loop_oracle
 from tools.lab.design.dynamic_certificate import (
     Condition,
+    Design,
     DynamicCertificate,
     StiffnessNode,
     nodes_of,
@@ -35,7 +36,6 @@ from tools.lab.design.sampled_loop import (
     whole,
 )
 from tools.lab.design.split_program import design_of
-from tools.lab.design.stability_margins import stability_margins_of
 from tools.sim.lockstep import Lockstep
 
 
@@ -52,35 +52,39 @@ def certificate(robot: RobotConfig, nodes: list[StiffnessNode]) -> DynamicCertif
     return DynamicCertificate(robot, nodes)
 
 
-def oracle_of(
-    stand: Stand,
-    feedback: Feedback,
-    drivetrain: DrivetrainModel,
-    timing: LoopTiming,
-    hand: HandModel,
-) -> loop_oracle.Loop:
-    return loop_oracle.Loop(
-        M=stand.M, K_geo=stand.K_geo, T=stand.T, J=stand.J, J_harness=stand.J_harness,
-        H=stand.H, S=stand.S, D=feedback.D, D_B=feedback.D_B,
-        C_q=feedback.C_q, C_v=feedback.C_v, bandwidth_hz=feedback.bandwidth_hz,
-        lead_easing=feedback.lead_easing, easing_bandwidth_hz=feedback.easing_bandwidth_hz,
-        k=drivetrain.stiffness, b=drivetrain.damping, I=drivetrain.rotor_inertia,
-        d_motor=drivetrain.motor_damping, d_joint=drivetrain.joint_damping,
-        lag_s=drivetrain.lag_s, encoder_bandwidth=drivetrain.encoder_bandwidth,
-        hand=tuple(hand), joint_period=timing.joint_period,
-        planner_period=timing.planner_period, delay=timing.delay,
-        drive_step=timing.drive_step, write_delay=timing.write_delay,
+@pytest.fixture(scope="module")
+def design(robot: RobotConfig) -> Design:
+    assert robot.gain_schedule is not None
+    return design_of(robot.gain_schedule)
+
+
+def led(node: StiffnessNode, half: int, stiffness: float, delay_s: float) -> Condition:
+    """Return a condition in TRACK without a hand, nominal."""
+    return Condition("TRACK", node, half, stiffness, delay_s, NO_HAND, Gains())
+
+
+def whole_loop(
+    certificate: DynamicCertificate, condition: Condition, design: Design
+) -> tuple[SampledLoop, loop_oracle.Loop]:
+    """Return both halves as one loop, and the same for the oracle."""
+    stand, hand = condition.node.stand, condition.hand
+    feedback = certificate.feedback(condition.node, design)
+    drive = certificate.drivetrain(condition.stiffness)
+    timing = certificate.timing(condition.delay_s)
+    oracle = loop_oracle.Loop(
+        **stand._asdict(), **feedback._asdict(), **timing._asdict(), hand=tuple(hand),
+        k=drive.stiffness, b=drive.damping, I=drive.rotor_inertia, d_motor=drive.motor_damping,
+        d_joint=drive.joint_damping, lag_s=drive.lag_s, encoder_bandwidth=drive.encoder_bandwidth,
     )  # fmt: skip
+    return SampledLoop(stand, whole(), feedback, drive, timing, hand), oracle
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_its_eigenvalues_are_those_of_an_independent_implementation(
-    robot: RobotConfig, nodes: list[StiffnessNode], certificate: DynamicCertificate, seed: int
+    nodes: list[StiffnessNode], certificate: DynamicCertificate, design: Design, seed: int
 ) -> None:
     """Another formulation (all joints, queues, events) and another integrator (RK4), to 1 %."""
     dice = np.random.default_rng(seed)
-    assert robot.gain_schedule is not None
-    design = design_of(robot.gain_schedule)
     design = design._replace(
         D_B=tuple(dice.uniform(3.0, 60.0, 6)),
         coupling=design.coupling._replace(bandwidth_hz=float(dice.uniform(2.0, 8.0))),
@@ -88,19 +92,11 @@ def test_its_eigenvalues_are_those_of_an_independent_implementation(
     node = nodes[int(dice.integers(len(nodes)))]
     hand = HandModel(1500.0, 150.0, 200.0, 20.0) if seed % 2 else NO_HAND
     delay = float(dice.choice([0.002, 0.01, 0.016]))
-    stiffness = float(dice.choice([2000.0, 5000.0, 15000.0]))
-    condition = Condition("TRACK", node, 0, stiffness, delay, hand, Gains())
-    feedback = certificate.feedback(node, design)
-    drivetrain = certificate._drivetrain(condition.stiffness)
-    timing = certificate._timing(delay)
+    condition = led(node, 0, float(dice.choice([2000.0, 5000.0, 15000.0])), delay)
+    own, oracle = whole_loop(certificate, condition._replace(hand=hand), design)
     gains = Gains(coupling=float(dice.uniform(0.5, 2.0)), torque=float(dice.uniform(0.7, 1.5)))
-    own = SampledLoop(node.stand, whole(), feedback, drivetrain, timing, hand)
-    mine = np.linalg.eigvals(own.period_map(gains)[0])
-    theirs = np.linalg.eigvals(
-        loop_oracle.monodromy(
-            oracle_of(node.stand, feedback, drivetrain, timing, hand), gains.coupling, gains.torque
-        )
-    )
+    mine = own.eigenvalues(gains)
+    theirs = np.linalg.eigvals(loop_oracle.monodromy(oracle, gains.coupling, gains.torque))
     mine, theirs = (sorted(values, key=abs, reverse=True)[:24] for values in (mine, theirs))
     np.testing.assert_allclose(np.abs(mine), np.abs(theirs), rtol=1e-3)
     for value in mine:
@@ -108,21 +104,11 @@ def test_its_eigenvalues_are_those_of_an_independent_implementation(
 
 
 def test_the_two_halves_together_are_the_whole(
-    robot: RobotConfig, nodes: list[StiffnessNode], certificate: DynamicCertificate
+    nodes: list[StiffnessNode], certificate: DynamicCertificate, design: Design
 ) -> None:
-    assert robot.gain_schedule is not None
-    design = design_of(robot.gain_schedule)
-    node = nodes[0]
-    halves = [
-        certificate.loop(
-            Condition("TRACK", node, half, 5000.0, 0.01, NO_HAND, Gains()), design
-        ).eigenvalues()
-        for half in (0, 1)
-    ]
-    feedback = certificate.feedback(node, design)
-    loop = SampledLoop(
-        node.stand, whole(), feedback, certificate._drivetrain(5000.0), certificate._timing(0.01)
-    )
+    cases = [led(nodes[0], half, 5000.0, 0.01) for half in (0, 1)]
+    halves = [certificate.loop(case, design).eigenvalues() for case in cases]
+    loop, _ = whole_loop(certificate, cases[0], design)
     together = np.sort(np.abs(np.concatenate(halves)))[::-1][:30]
     np.testing.assert_allclose(together, np.sort(np.abs(loop.eigenvalues()))[::-1][:30], rtol=1e-6)
 
@@ -143,7 +129,7 @@ def test_the_plant_has_the_simulated_world_s_modes(robot: RobotConfig) -> None:
         fleet.advance()
     world = fleet.world
     simulated = modes(simulated_transition(world, fleet._torque.copy()), world.model.opt.timestep)
-    stand = stand_at(robot, world._actuation.flexible.theta)
+    stand = stand_at(robot, world.actuation.flexible.theta)
     nothing = np.zeros((12, 12))
     drivetrain = DrivetrainModel(5000.0, 10.0, 0.15)
     loop = SampledLoop(
@@ -178,10 +164,10 @@ def stand_at(robot: RobotConfig, q: np.ndarray) -> Stand:
 
 def simulated_transition(world: World, torque: np.ndarray) -> np.ndarray:
     """Return d state+ / d state (60, 60) of one step: body and rotors, torque held."""
-    model, data, rotors = world.model, world.data, world._actuation.flexible
+    model, data, rotors = world.model, world.data, world.actuation.flexible
     assert rotors is not None
     world._steps = 1
-    tau, warm = world._actuation._tau.copy(), data.qacc_warmstart.copy()
+    tau, warm = world.actuation._tau.copy(), data.qacc_warmstart.copy()
     qpos, theta = data.qpos.copy(), rotors.theta.copy()
 
     def step(dx: np.ndarray) -> np.ndarray:
@@ -190,7 +176,7 @@ def simulated_transition(world: World, torque: np.ndarray) -> np.ndarray:
         data.qpos[:], data.qvel[:] = moved, dx[18:36]
         rotors.theta[:], rotors.rate[:] = theta + dx[36:48], dx[48:]
         data.qacc_warmstart[:] = warm
-        world._actuation._tau[:] = tau
+        world.actuation._tau[:] = tau
         world.step(torque)
         dq = np.zeros(18)
         mujoco.mj_differentiatePos(model, dq, 1.0, qpos, data.qpos)
@@ -215,69 +201,59 @@ def modes_of(values: np.ndarray) -> np.ndarray:
 def test_inertia_along_p_is_that_of_the_simulated_body(robot: RobotConfig) -> None:
     """Kinetic energy of a motion with both feet still, by MuJoCo's own mass matrix."""
     world = World(body_of(robot, changed(IDEAL, {"drivetrain.rotor_inertia": 0.01})), still(1.0))
-    q = world.data.qpos[world._q_index].copy()
+    q = world.data.qpos[world.joints.q_index].copy()
     stand = stand_at(robot, q)
     M = np.zeros((18, 18))
     mujoco.mj_fullM(world.model, world.data, M)
-    M[world._v_index, world._v_index] -= 0.01  # the rotors
+    M[world.joints.v_index, world.joints.v_index] -= 0.01  # the rotors
     rates = np.zeros((18, 6))
-    rates[world._v_index] = stand.T
+    rates[world.joints.v_index] = stand.T
     foot = np.zeros((6, 18))
-    mujoco.mj_jacBody(world.model, world.data, foot[:3], foot[3:], world._placement.feet[0])
+    mujoco.mj_jacBody(world.model, world.data, foot[:3], foot[3:], world.placement.feet[0])
     rates[:6] = -np.linalg.solve(foot[:, :6], foot[:, 6:] @ rates[6:])
     np.testing.assert_allclose(rates.T @ M @ rates, stand.M, rtol=2e-3, atol=2e-2)
 
 
 def test_a_hand_that_moves_it_feels_little_more_than_its_mass(
-    robot: RobotConfig, nodes: list[StiffnessNode], certificate: DynamicCertificate
+    nodes: list[StiffnessNode], certificate: DynamicCertificate, design: Design
 ) -> None:
-    assert robot.gain_schedule is not None
-    design = design_of(robot.gain_schedule)
     node = next(node for node in nodes if node.pitch == 0.0 and node.z > 0.75)
-    loop = certificate.loop(Condition("TRACK", node, 0, 20000.0, 2e-3, NO_HAND, Gains()), design)
+    loop = certificate.loop(led(node, 0, 20000.0, 2e-3), design)
     w = 2.0 * math.pi * 1.0
-    led = np.ix_([2, 4], [2, 4])  # height and pitch give way, the rest hardly does
-    mass = (node.stand.M + 0.15 * node.stand.T.T @ node.stand.T)[led]
+    given = np.ix_([2, 4], [2, 4])  # height and pitch give way, the rest hardly does
+    mass = (node.stand.M + 0.15 * node.stand.T.T @ node.stand.T)[given]
     up = (node.stand.J_harness[2] @ node.stand.T)[[2, 4]]
     felt = 1.0 / (up @ np.linalg.solve(mass, up))
     assert abs(loop.impedance_z(w)) == pytest.approx(felt * w, rel=0.4)
 
 
 def test_the_shipped_design_is_stable_at_its_poses(
-    robot: RobotConfig, nodes: list[StiffnessNode], certificate: DynamicCertificate
+    certificate: DynamicCertificate, design: Design
 ) -> None:
-    assert robot.gain_schedule is not None
-    verdict = certificate.worst(design_of(robot.gain_schedule), margins=False)
+    verdict = certificate.worst(design, margins=False)
     assert verdict.stable, verdict.words()
 
 
+@pytest.mark.parametrize("stiffness", [2000.0, 8000.0, 20000.0])
 def test_yesterday_s_coupling_is_called_unstable(
-    robot: RobotConfig, nodes: list[StiffnessNode], certificate: DynamicCertificate
+    nodes: list[StiffnessNode], certificate: DynamicCertificate, design: Design, stiffness: float
 ) -> None:
     """Hardly filtered, with little damping at the joints: it fell below 20 000 N m/rad."""
-    assert robot.gain_schedule is not None
-    design = design_of(robot.gain_schedule)
     soft = design._replace(
         D_B=(3.4, 21.0, 0.6, 2.5, 1.4, 0.7),
         coupling=design.coupling._replace(bandwidth_hz=100.0, damping=1.0),
     )
-    node = nodes[0]
-    for stiffness in (2000.0, 8000.0, 20000.0):
-        growth = certificate.loop(
-            Condition("TRACK", node, 1, stiffness, 2e-3, NO_HAND, Gains()), soft
-        ).growth()
-        assert growth.rate > 10.0
-        assert growth.frequency_hz > 5.0
+    growth = certificate.loop(led(nodes[0], 1, stiffness, 2e-3), soft).growth()
+    assert growth.rate > 10.0
+    assert growth.frequency_hz > 5.0
 
 
 def test_a_motion_that_hardly_grows_is_a_drift_only_where_the_person_leads(
-    robot: RobotConfig, nodes: list[StiffnessNode], certificate: DynamicCertificate
+    robot: RobotConfig, nodes: list[StiffnessNode], certificate: DynamicCertificate, design: Design
 ) -> None:
-    assert robot.gain_schedule is not None
-    design = design_of(robot.gain_schedule)
     robust = msgspec.structs.replace(robot.robustness, drift_max=0.0)
     strict = DynamicCertificate(msgspec.structs.replace(robot, robustness=robust), nodes)
-    condition = Condition("TRACK", nodes[0], 0, 2000.0, 2e-3, NO_HAND, Gains())
+    condition = led(nodes[0], 0, 2000.0, 2e-3)
     drifting = strict.judge(condition, design)
     assert drifting.growth.rate > 0.0
     assert not drifting.stable
@@ -285,13 +261,12 @@ def test_a_motion_that_hardly_grows_is_a_drift_only_where_the_person_leads(
 
 
 def test_what_is_in_hand_is_at_least_what_was_asked_for(
-    robot: RobotConfig, nodes: list[StiffnessNode]
+    robot: RobotConfig, nodes: list[StiffnessNode], design: Design
 ) -> None:
-    assert robot.gain_schedule is not None
     wanted = robot.robustness
     softest = msgspec.structs.replace(wanted, stiffness=wanted.stiffness[:1])
     certificate = DynamicCertificate(msgspec.structs.replace(robot, robustness=softest), nodes[:2])
-    (room,) = stability_margins_of(certificate, design_of(robot.gain_schedule))
+    (room,) = certificate.margins(design)
     assert room.torque >= wanted.gain_margin
     assert room.coupling >= wanted.gain_margin
     assert room.delay_s >= wanted.delay_margin * wanted.delay_ms / 1e3

@@ -17,7 +17,7 @@ from tests.planner.conftest import at_pose, com_height
 from tests.planner.oracle import Array
 from tests.planner.stands import Stand
 from tools.lab.design import design_program, split_program
-from tools.lab.design.dynamic_certificate import DynamicCertificate
+from tools.lab.design.dynamic_certificate import TRACK, DynamicCertificate
 
 SOLVED = 1e-3
 """The solver's tolerance, in margins and in shares of the cost."""
@@ -195,5 +195,5 @@ def test_the_search_starts_from_what_is_stable_and_ends_cheaper(
     nodes = split_program.dynamic_nodes(robot, robot.gain_schedule)
     few = DynamicCertificate(easier, nodes[4:5])
     found = design_program._descend(few, design_program.START, lambda _text: None)
-    assert few.worst_in_track(found).stable
+    assert few.worst(found, TRACK).stable
     assert design_program._cost(few, found) < design_program._cost(few, design_program.START)

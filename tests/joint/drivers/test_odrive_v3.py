@@ -52,39 +52,43 @@ def changed(**fields: tuple[float, float]) -> MotorTarget:
     return MotorTarget(*(fields.get(name, getattr(TARGET, name)) for name in names))
 
 
+WHOLE = {0: 1.0, 1: 0.5, 2: 2.0, 3: -0.5, 4: 20.0, 5: 0.25, 6: 20.0, 7: 0.25}
+
+
 def test_the_first_target_is_written_whole_inputs_before_gains(
     wire: Wire, writer: TargetWriter
 ) -> None:
     asyncio.run(writer.write(TARGET))
-    assert wire.last == list(range(8))
-    assert list(wire.values.values()) == [1.0, 0.5, 2.0, -0.5, 20.0, 0.25, 20.0, 0.25]
+    assert wire.last == list(WHOLE)
+    assert wire.values == WHOLE
 
 
-def test_then_only_what_is_new_is_written(wire: Wire, writer: TargetWriter) -> None:
-    asyncio.run(writer.write(TARGET))
-    asyncio.run(writer.write(changed(torque=(0.5, -0.25))))
-    assert wire.last == [3]
-    assert wire.values[3] == -0.25
-
-
-def test_gains_are_written_when_they_change_by_however_little(
-    wire: Wire, writer: TargetWriter
+@pytest.mark.parametrize(
+    ("fields", "written", "value"),
+    [({"torque": (0.5, -0.25)}, 3, -0.25), ({"pos_gain": (20.002, 20.0)}, 4, 20.002)],
+    ids=["an input", "a gain, by however little: the law has its own threshold"],
+)
+def test_then_only_what_is_new_is_written(
+    wire: Wire,
+    writer: TargetWriter,
+    fields: dict[str, tuple[float, float]],
+    written: int,
+    value: float,
 ) -> None:
-    """The law has its own threshold, and works its torques out for the gains it asked for."""
     asyncio.run(writer.write(TARGET))
-    asyncio.run(writer.write(changed(pos_gain=(20.0 * 1.0001, 20.0))))
-    assert wire.last == [4]
-    assert wire.values[4] == pytest.approx(20.0 * 1.0001, rel=1e-7)
+    asyncio.run(writer.write(changed(**fields)))
+    assert wire.last == [written]
+    assert wire.values[written] == pytest.approx(value, rel=1e-7)
 
 
-def test_after_a_failure_everything_is_written_anew(wire: Wire, writer: TargetWriter) -> None:
+def test_after_a_failure_everything_is_written_again(wire: Wire, writer: TargetWriter) -> None:
     asyncio.run(writer.write(TARGET))
     wire.fails = True
     with pytest.raises(TimeoutError):
         asyncio.run(writer.write(changed(pos_turns=(1.5, 2.0))))
     wire.fails = False
     asyncio.run(writer.write(changed(pos_turns=(1.5, 2.0))))
-    assert wire.last == list(range(8))
+    assert wire.last == list(WHOLE)
 
 
 @given(

@@ -7,22 +7,19 @@ import math
 import struct
 from typing import Any
 
-import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from services.simulator.drives.axis_bank import AxisBank
 from services.simulator.drives.axis_settings import NAMES
-from services.simulator.fronts.fibre_endpoints import CODECS, EmulatedBoard
-from services.simulator.fronts.fibre_front import FibreFront, crc16
+from services.simulator.fronts.fibre_front import CODECS, EmulatedBoard, FibreFront, crc16
 from shared.can.cansimple import AxisError, AxisState
-from shared.config.robot_config import RobotConfig
+from tests.simulator.banks import DRIVE, ZERO, idle_bank
 
 MODULE = 1
 SERIAL = 0x365A335A3438
 ANSWER = 0x8000
-TIMEOUT_S = 0.1
 
 
 class Client:
@@ -52,7 +49,7 @@ class Client:
     def exchange(self, name: str, *value: float) -> Any:
         """Read an endpoint, with a value: write it too; return what it held."""
         row = self.endpoints[name]
-        codec = struct.Struct("<" + CODECS[row["type"]])
+        codec = CODECS[row["type"]]
         payload = codec.pack(*value) if value else b""
         return codec.unpack(self.operate(row["id"], codec.size, payload))[0]
 
@@ -76,11 +73,8 @@ def flat(prefix: str, members: list[dict[str, Any]]) -> list[tuple[str, dict[str
 
 
 @pytest.fixture
-def bank(robot: RobotConfig) -> AxisBank:
-    drive = msgspec.structs.replace(robot.drive, watchdog_timeout=TIMEOUT_S, zero_mark_turns=0.0)
-    bank = AxisBank(drive, encoder_counts_per_turn=8192)
-    step(bank, 0.0)
-    return bank
+def bank() -> AxisBank:
+    return idle_bank()
 
 
 @pytest.fixture
@@ -91,11 +85,6 @@ def front(bank: AxisBank) -> FibreFront:
 @pytest.fixture
 def client(front: FibreFront) -> Client:
     return Client(front)
-
-
-def step(bank: AxisBank, now_s: float) -> None:
-    still = bank.pos_estimate * 0.0
-    bank.step(now_s, still, still)
 
 
 @pytest.mark.parametrize(
@@ -143,39 +132,35 @@ def test_an_exchange_returns_what_was_there_before(client: Client, bank: AxisBan
     assert bank.input_torque[2 * MODULE : 2 * MODULE + 2].tolist() == [0.0, 0.5]
 
 
-def test_the_answer_is_no_longer_than_asked_for(client: Client) -> None:
+def test_the_answer_is_no_longer_than_asked_for_and_than_a_packet_holds(client: Client) -> None:
     number = client.endpoints["vbus_voltage"]["id"]
     assert [len(client.operate(number, size)) for size in (0, 2, 4, 8)] == [0, 2, 4, 4]
-
-
-def test_the_answer_is_no_longer_than_a_packet_holds(client: Client) -> None:
     assert client.operate(0, 512, struct.pack("<I", 3)) == client.front.descriptor[3:65]
 
 
 def test_an_endpoint_that_does_not_exist_has_an_empty_answer(client: Client) -> None:
-    assert client.operate(1 + max(row["id"] for row in client.endpoints.values()), 4) == b""
-    assert client.operate(0x7FFF, 4) == b""
+    for number in (1 + max(row["id"] for row in client.endpoints.values()), 0x7FFF):
+        assert client.operate(number, 4) == b""
 
 
-def test_a_request_that_wants_no_answer_is_carried_out(client: Client, bank: AxisBank) -> None:
+@pytest.mark.parametrize(
+    ("flags", "wrong", "written"),
+    [(0, 0, 1.5), (ANSWER, 1, 0.0)],
+    ids=["wants no answer: carried out", "of another descriptor: ignored"],
+)
+def test_a_request_without_an_answer(
+    client: Client, bank: AxisBank, flags: int, wrong: int, written: float
+) -> None:
     number = client.endpoints["axis0.controller.input_vel"]["id"]
-    packet = struct.pack("<HHHfH", 0x81, number, 0, 1.5, client.trailer)
+    packet = struct.pack("<HHHfH", 0x81, number | flags, 0, 1.5, client.trailer ^ wrong)
     assert client.front.answer(packet) is None
-    assert bank.input_vel[2 * MODULE] == 1.5
-
-
-def test_a_request_made_for_another_descriptor_is_ignored(client: Client, bank: AxisBank) -> None:
-    number = client.endpoints["axis0.controller.input_vel"]["id"]
-    packet = struct.pack("<HHHfH", 0x81, number | ANSWER, 0, 1.5, client.trailer ^ 1)
-    assert client.front.answer(packet) is None
-    assert client.front.ignored == 1
-    assert bank.input_vel[2 * MODULE] == 0.0
+    assert client.front.ignored == wrong
+    assert bank.input_vel[2 * MODULE] == written
 
 
 @given(packet=st.binary(max_size=80))
-def test_no_packet_makes_the_front_fail(robot: RobotConfig, packet: bytes) -> None:
-    bank = AxisBank(robot.drive, encoder_counts_per_turn=8192)
-    front = FibreFront(EmulatedBoard(bank, MODULE, SERIAL))
+def test_no_packet_makes_the_front_fail(packet: bytes) -> None:
+    front = FibreFront(EmulatedBoard(idle_bank(), MODULE, SERIAL))
     front.answer(packet)
     (trailer,) = struct.unpack("<H", struct.pack("<H", crc16(1, front.descriptor)))
     front.answer(packet + struct.pack("<H", trailer))
@@ -185,17 +170,17 @@ def test_native_writes_feed_no_watchdog_but_its_function_does(
     client: Client, bank: AxisBank
 ) -> None:
     axis = 2 * MODULE
-    step(bank, 0.9 * TIMEOUT_S)
+    bank.step(0.9 * DRIVE.watchdog_timeout, ZERO, ZERO)
     client.call("axis0.watchdog_feed")
     client.exchange("axis1.controller.input_torque", 0.0)
-    step(bank, 1.1 * TIMEOUT_S)
+    bank.step(1.1 * DRIVE.watchdog_timeout, ZERO, ZERO)
     assert bank.faults[axis].axis == 0
     assert bank.faults[axis + 1].axis == AxisError.WATCHDOG_TIMER_EXPIRED
 
 
 def test_the_watchdog_is_a_setting_of_each_axis(client: Client, bank: AxisBank) -> None:
     client.exchange("axis0.config.enable_watchdog", False)
-    step(bank, 1e3)
+    bank.step(1e3, ZERO, ZERO)
     assert client.exchange("axis0.error") == 0
     assert client.exchange("axis1.error") == AxisError.WATCHDOG_TIMER_EXPIRED
 
@@ -207,22 +192,19 @@ def test_a_state_is_asked_for_and_reported(client: Client, bank: AxisBank) -> No
     assert client.exchange("axis1.motor.is_armed") is True
 
 
-def test_a_mode_that_is_not_there_is_an_error(client: Client, bank: AxisBank) -> None:
-    client.exchange("axis0.controller.config.control_mode", 1)
-    assert client.exchange("axis0.controller.config.control_mode") == 1
-    client.exchange("axis0.controller.config.input_mode", 5)
-    assert client.exchange("axis0.controller.error") == 2
-    assert client.exchange("axis0.controller.config.input_mode") == 1
-
-
-def test_position_mode_written_makes_where_the_motor_is_its_target(
+def test_a_mode_goes_to_the_controller_and_one_that_is_not_there_is_an_error(
     client: Client, bank: AxisBank
 ) -> None:
     bank.input_pos[:] = 3.0
     client.exchange("axis0.controller.config.input_mode", 1)
     assert client.exchange("axis0.controller.input_pos") == 3.0
     client.exchange("axis0.controller.config.control_mode", 3)
-    assert client.exchange("axis0.controller.input_pos") == 0.0
+    assert client.exchange("axis0.controller.input_pos") == 0.0, "the motor's place is its target"
+    client.exchange("axis0.controller.config.control_mode", 1)
+    assert client.exchange("axis0.controller.config.control_mode") == 1
+    client.exchange("axis0.controller.config.input_mode", 5)
+    assert client.exchange("axis0.controller.error") == 2
+    assert client.exchange("axis0.controller.config.input_mode") == 1
 
 
 def test_a_setting_that_is_no_number_is_not_taken(client: Client, bank: AxisBank) -> None:
@@ -243,7 +225,7 @@ def test_a_function_is_called_with_the_argument_written_before(
 
 
 def test_clearing_errors_clears_both_axes(client: Client, bank: AxisBank) -> None:
-    step(bank, 1e3)
+    bank.step(1e3, ZERO, ZERO)
     assert client.exchange("axis0.error") != 0
     client.call("clear_errors")
     assert [client.exchange(f"axis{i}.error") for i in (0, 1)] == [0, 0]

@@ -11,19 +11,18 @@ from pathlib import Path
 import pytest
 
 from services.simulator.drives.axis_bank import AxisBank
-from services.simulator.fronts.fibre_endpoints import EmulatedBoard
-from services.simulator.fronts.fibre_front import FibreFront
-from services.simulator.fronts.fibre_port import LOOK_EVERY, FibreHub, FibrePort
-from shared.config.robot_config import RobotConfig
+from services.simulator.fronts.fibre_front import EmulatedBoard, FibreFront
+from services.simulator.fronts.fibre_port import CHECK_EVERY, FibreHub, FibrePort
 from shared.exceptions import FleetError
+from tests.simulator.banks import idle_bank
 
 VERSION = struct.pack("<HHHIH", 0x81, 0x8000, 4, 0xFFFF_FFFF, 1)
 """Asks for the id of the descriptor."""
 
 
 @pytest.fixture
-def bank(robot: RobotConfig) -> AxisBank:
-    return AxisBank(robot.drive, encoder_counts_per_turn=8192)
+def bank() -> AxisBank:
+    return idle_bank()
 
 
 @pytest.fixture
@@ -43,7 +42,7 @@ def client() -> Iterator[socket.socket]:
 
 
 def look(hub: FibreHub) -> None:
-    for _ in range(LOOK_EVERY):
+    for _ in range(CHECK_EVERY):
         hub.poll()
 
 
@@ -117,7 +116,7 @@ def test_a_dead_simulators_plug_is_taken_over_and_a_live_ones_is_not(
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as dead:
         dead.bind(str(path))
     port = FibrePort(front, path)
-    with pytest.raises(FleetError, match="no other simulator may hold it"):
+    with pytest.raises(FleetError, match="stop the simulator that holds it"):
         FibrePort(front, path)
     port.unplug()
     assert not path.exists()

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from services.simulator.physics.actuation import FlexibleDrivetrain
 from services.simulator.physics.body import body_of
-from services.simulator.physics.drivetrain import FlexibleDrivetrain
 from services.simulator.physics.plant import IDEAL, Drivetrain, PlantConfig, changed
 from services.simulator.physics.world import World
 from shared.config.robot_config import RobotConfig

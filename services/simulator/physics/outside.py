@@ -1,0 +1,165 @@
+"""What acts on the simulated torso from outside: the hand, what rests on it, pushes, the hoist."""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from services.simulator.physics.body import Body
+from services.simulator.physics.led_hand import LedHand
+from services.simulator.physics.operator import HandForce, Operator, Wearer
+from shared.bus.messages import Vector3, Vector4
+from shared.config.scenarios import Lead, Scenario, lead, push_at
+
+Array = NDArray[np.float64]
+
+HOIST_STIFFNESS: Final = (2e4, 2e3)
+"""N/m and N m/rad of the hoist while it holds the torso."""
+HOIST_DAMPING: Final = (2e3, 2e2)
+"""N s/m and N m s/rad."""
+HOIST_WEIGHT_SHARE: Final = 0.75
+"""Part of the weight the hoist takes: the soles stay on the floor."""
+
+
+class Torso(NamedTuple):
+    """The torso in MuJoCo's memory: views, because asking it for an array costs a microsecond."""
+
+    position: Array
+    """(3,) m, world."""
+    rotation: Array
+    """(9,), row by row: turns torso axes into the world's."""
+    rates: Array
+    """(6,) velocity in world axes and angular velocity in torso axes."""
+    wrench: Array
+    """(6,) N and N m, world, at the centre of mass: written by `OutsideForces`."""
+    com: list[float]
+    """Centre of mass (3,), m, torso axes; a plant may move it."""
+
+
+class Hoist(msgspec.Struct):
+    """A spring-damper on the torso that also carries weight, by a share that is let down."""
+
+    weight: float
+    """The robot's, N."""
+    release_s: float
+    """Time in which it lets go, s."""
+    position: Array
+    """Where it holds the torso, (3,) m, world."""
+    share: float = 1.0
+    """Fraction of its support: 1 hanging, 0 free."""
+    releasing: bool = False
+
+    def advance(self, torso: Torso, dt: float) -> Array:
+        """Let down further; return force and moment on the torso (6,), N and N m, world."""
+        if self.releasing:
+            self.share = max(0.0, self.share - dt / self.release_s)
+        k_lin, k_ang = HOIST_STIFFNESS
+        b_lin, b_ang = HOIST_DAMPING
+        rotation = torso.rotation.reshape(3, 3)
+        turn = 0.5 * np.array(
+            [
+                rotation[2, 1] - rotation[1, 2],
+                rotation[0, 2] - rotation[2, 0],
+                rotation[1, 0] - rotation[0, 1],
+            ]
+        )
+        wrench = np.concatenate(
+            (
+                k_lin * (self.position - torso.position) - b_lin * torso.rates[:3],
+                -k_ang * turn - b_ang * (rotation @ torso.rates[3:]),
+            )
+        )
+        wrench[2] += HOIST_WEIGHT_SHARE * self.weight
+        wrench = np.asarray(self.share * wrench, float)
+        wrench[3:] -= np.cross(rotation @ torso.com, wrench[:3])
+        return wrench
+
+
+class OutsideForces:
+    """The operator, pushes and the hoist.
+
+    Attributes:
+        operator: the hand's spring-damper; another one may take its place.
+        asked: assist, N, and shift that somebody asks for in place of the scenario.
+        led_hand: the hand that somebody leads in place of the scenario.
+        holds: the operator's hand is on the harness.
+        hand: the hand's force now.
+        push: the push now, N, world.
+        harness_force: the operator's force on the torso at the harness point, N, torso axes.
+        harness_moment: N m, torso axes.
+    """
+
+    def __init__(self, body: Body, scenario: Scenario, torso: Torso) -> None:
+        """Hold the torso by the hoist where it is."""
+        self.scenario = scenario
+        self._torso = torso
+        self._harness_point = body.harness_point
+        self.operator = Operator(body.hand, body.harness_point)
+        self.wearer = Wearer(body.plant.person)
+        self.hoist = Hoist(body.weight, body.hoist_s, torso.position.copy())
+        self.asked: tuple[float, Vector4] | None = None
+        self.led_hand: LedHand | None = None
+        self.holds = scenario.hand
+        self.hand = HandForce(0.0, 0.0)
+        self.push: Vector3 = (0.0, 0.0, 0.0)
+        self.harness_force: Vector3 = (0.0, 0.0, 0.0)
+        self.harness_moment: Vector3 = (0.0, 0.0, 0.0)
+
+    def lead(self, scenario_s: float) -> Lead:
+        """Return the operator's present request."""
+        wanted = lead(self.scenario, scenario_s)
+        if self.led_hand is not None:
+            wanted = self.led_hand.over(wanted)
+        return wanted if self.asked is None else Lead(*wanted[:4], *self.asked)
+
+    def apply(self, scenario_s: float, dt: float) -> None:
+        """Advance by dt, s, and set the wrench on the torso.
+
+        In plain numbers: this runs at every step, and numpy's calls on three numbers
+        would cost more than the physics.
+        """
+        torso, led_hand = self._torso, self.led_hand
+        if led_hand is not None:
+            led_hand.advance(dt)
+        wanted = self.lead(scenario_s)
+        r = torso.rotation.tolist()  # row by row
+        x, y, z = self._harness_point
+        arm_x = r[0] * x + r[1] * y + r[2] * z
+        arm_y = r[3] * x + r[4] * y + r[5] * z
+        # MuJoCo applies outside forces at the body's centre of mass, which a plant may move
+        com_x, com_y, com_z = torso.com
+        off_x = r[0] * com_x + r[1] * com_y + r[2] * com_z
+        off_y = r[3] * com_x + r[4] * com_y + r[5] * com_z
+        self.hand = HandForce(0.0, 0.0)
+        if self.holds and self.hoist.share == 0.0:
+            height = float(torso.position[2]) + r[6] * x + r[7] * y + r[8] * z
+            _, _, v_z, w_x, w_y, w_z = torso.rates.tolist()  # omega in torso axes
+            omega_x = r[0] * w_x + r[1] * w_y + r[2] * w_z
+            omega_y = r[3] * w_x + r[4] * w_y + r[5] * w_z
+            rate = v_z + omega_x * arm_y - omega_y * arm_x
+            self.wearer.grip(height - wanted.height - z)
+            above, rising = self.wearer.motion()
+            height, rate = height - above, rate - rising
+            self.hand = self.operator.force(wanted, height, rate, math.atan2(-r[6], r[8]), w_y)
+        self.wearer.step(dt, self.hand.force_z, wanted.assist)
+        self.push = push_at(self.scenario, scenario_s) if scenario_s >= 0.0 else (0.0, 0.0, 0.0)
+        if led_hand is not None:
+            self.push = led_hand.push or self.push
+        f, m = self.hand.force_z - self.wearer.load_n, self.hand.moment_pitch
+        # in torso axes, as the harness sensor feels it: f along world z, m about torso y
+        self.harness_force = (r[6] * f, r[7] * f, r[8] * f)
+        self.harness_moment = (0.0, m, 0.0)
+        torso.wrench[:] = (
+            self.push[0],
+            self.push[1],
+            self.push[2] + f,
+            r[1] * m + (arm_y - off_y) * f,
+            r[4] * m - (arm_x - off_x) * f,
+            r[7] * m,
+        )
+        if self.hoist.share > 0.0:
+            torso.wrench[:] += self.hoist.advance(torso, dt)
