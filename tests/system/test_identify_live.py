@@ -13,10 +13,10 @@ from shared.clock import keep_pace
 from shared.config import files as config_file
 from shared.config.scenarios import Keyframe, Scenario
 from shared.places import DEFAULT_CONFIG
-from tools.identify.motion import Motion
-from tools.identify.quasi_static import moments_of
-from tools.tune.excitation import Excitation, SinePart
-from tools.tune.pose_probe import LiveProbe
+from tools.bringup.identify.motion import Motion
+from tools.bringup.identify.quasi_static import moments_of
+from tools.bringup.tune.excitation import Excitation, SinePart
+from tools.bringup.tune.pose_probe import LiveProbe
 
 pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(240)]
 

@@ -26,14 +26,14 @@ from shared.exceptions import DECLINED_EXIT_CODE, RunError
 from shared.extras import require
 from shared.joints import AXES, MODULES
 from tools.bringup.bench import confirm
+from tools.bringup.identify import joint_bench, report
+from tools.bringup.identify.body_fit import Record, fit
+from tools.bringup.identify.estimates import of_body, zero_corrections
+from tools.bringup.identify.motion import Motion
+from tools.bringup.identify.picture import draw_body
+from tools.bringup.identify.quasi_static import Moments, TimedRows, moments_of
 from tools.bringup.jog_drive import Interrupts
 from tools.fleet.supervise import SupervisedFleet
-from tools.identify import joint_bench, report
-from tools.identify.body_fit import Record, fit
-from tools.identify.estimates import of_body, zero_corrections
-from tools.identify.motion import Motion
-from tools.identify.picture import draw_body
-from tools.identify.quasi_static import Moments, TimedRows, moments_of
 from tools.live import experiment
 from tools.logs.recorded_robot import robot_of
 from tools.logs.run_log import RunLog, read_run

@@ -21,17 +21,23 @@ from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, RunError
 from shared.extras import require
 from shared.joints import AXES, MODULES
 from tools.bringup import bench, jog_drive
+from tools.bringup.identify import joint_bench, joint_drive
+from tools.bringup.tune import module_probe
+from tools.bringup.tune.excitation import Excitation, excitation
+from tools.bringup.tune.pose_probe import (
+    DIRECTIONS,
+    LiveProbe,
+    ProbeCourse,
+    in_lockstep,
+    inertia_along,
+)
+from tools.bringup.tune.report import answer_table, draw
+from tools.bringup.tune.response import ResponseFit, answer_of, propose
 from tools.fleet.supervise import SupervisedFleet
-from tools.identify import joint_bench, joint_drive
 from tools.live import experiment
 from tools.number_arguments import finite
 from tools.output import make_folder, progress_along
 from tools.terminal import Console, marked
-from tools.tune import module_probe
-from tools.tune.excitation import Excitation, excitation
-from tools.tune.pose_probe import DIRECTIONS, LiveProbe, ProbeCourse, in_lockstep, inertia_along
-from tools.tune.report import answer_table, draw
-from tools.tune.response import ResponseFit, answer_of, propose
 from tools.verb_table import FLEET, Subparsers, add_config, add_run_dir, add_verb
 
 SIZE_SHARE: Final = 0.8

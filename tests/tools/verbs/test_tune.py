@@ -15,9 +15,9 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from tests.conftest import ROBOT_FILE
 from tests.tools.exit_codes import exit_code
-from tools.tune import excitation
-from tools.tune.excitation import Excitation
-from tools.tune.pose_probe import ProbeCourse
+from tools.bringup.tune import excitation
+from tools.bringup.tune.excitation import Excitation
+from tools.bringup.tune.pose_probe import ProbeCourse
 from tools.verbs import tune
 
 

@@ -10,12 +10,12 @@ import numpy as np
 from shared.bus.messages import Pair
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import StandGains
+from tools.bringup.identify.joint_drive import Hanging, bias_of
+from tools.bringup.identify.sines import BIAS_TORQUE, HEAVY, led_there_and_back, rest_s
 from tools.bringup.jogging import Sample
-from tools.identify.joint_drive import Hanging, bias_of
-from tools.identify.sines import BIAS_TORQUE, HEAVY, led_there_and_back, rest_s
-from tools.tune.excitation import BODY_RATE, Excitation, excitation
-from tools.tune.pose_probe import ProbeCourse
-from tools.tune.response import SecondOrder
+from tools.bringup.tune.excitation import BODY_RATE, Excitation, excitation
+from tools.bringup.tune.pose_probe import ProbeCourse
+from tools.bringup.tune.response import SecondOrder
 
 LIGHT_TORQUE: Final = 15.0
 HEAVY_TORQUE: Final = 60.0

@@ -14,9 +14,7 @@ from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.places import refuse_shipped
-from tools.fleet import procfs
-from tools.fleet.run_dir import RunDir
-from tools.identify.estimates import (
+from tools.bringup.identify.estimates import (
     ParameterEstimate,
     Value,
     Verdict,
@@ -24,7 +22,9 @@ from tools.identify.estimates import (
     measured,
     remarks,
 )
-from tools.identify.robot_file_edit import apply
+from tools.bringup.identify.robot_file_edit import apply
+from tools.fleet import procfs
+from tools.fleet.run_dir import RunDir
 from tools.terminal import Console
 
 _STYLES = {

@@ -13,7 +13,7 @@ from shared.exceptions import RunError
 from shared.joints import JOINTS
 from shared.robot.robot_model import stand_pose
 from tests.planner.oracle import Array
-from tools.identify.body_fit import (
+from tools.bringup.identify.body_fit import (
     COM,
     HARNESS,
     MASS,
@@ -24,7 +24,7 @@ from tools.identify.body_fit import (
     Record,
     fit,
 )
-from tools.identify.estimates import (
+from tools.bringup.identify.estimates import (
     Verdict,
     changes,
     measured,
@@ -32,7 +32,7 @@ from tools.identify.estimates import (
     remarks,
     zero_corrections,
 )
-from tools.identify.quasi_static import Moments
+from tools.bringup.identify.quasi_static import Moments
 
 FRICTION = 0.3
 SCALE_TRUE, PAYLOAD_TRUE = 0.94, 17.0

@@ -9,7 +9,7 @@ from services.planner.law.kinematics import Kinematics
 from shared.config.robot_config import GRAVITY, RobotConfig
 from tests.planner.conftest import Closed, closed, ik, limits  # noqa: F401 - fixtures
 from tests.planner.oracle import Array
-from tools.identify.body_statics import Balance, BodyStatics, rotation_vector
+from tools.bringup.identify.body_statics import Balance, BodyStatics, rotation_vector
 
 UP = np.array([0.0, 0.0, 1.0])
 POSES = (

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from tools.tune.excitation import HOLD_S, REST_S, Excitation
+from tools.bringup.tune.excitation import HOLD_S, REST_S, Excitation
 
 Array = NDArray[np.float64]
 

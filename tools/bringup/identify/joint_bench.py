@@ -21,12 +21,12 @@ from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, DriveError
 from shared.extras import require
 from shared.joints import AXES, MODULES
 from tools.bringup import bench, jog_drive, limits
+from tools.bringup.identify import joint_drive, report
+from tools.bringup.identify.estimates import JointResult, of_joints
+from tools.bringup.identify.picture import draw_joints
+from tools.bringup.identify.sines import SinePlan, fit_sines
 from tools.bringup.jogging import MotionPlan, Sample, outside
 from tools.bringup.stops import within_stops
-from tools.identify import joint_drive, report
-from tools.identify.estimates import JointResult, of_joints
-from tools.identify.picture import draw_joints
-from tools.identify.sines import SinePlan, fit_sines
 from tools.output import make_folder
 from tools.terminal import Console, marked
 

@@ -13,7 +13,7 @@ from shared.atomic_file import atomic_file, replace_file
 from shared.config import files as config_file
 from shared.exceptions import RunError
 from shared.text_file import read_text
-from tools.identify.estimates import Value
+from tools.bringup.identify.estimates import Value
 
 
 def edited(text: str, file: str, values: Mapping[str, Value], measured: Collection[str]) -> str:

@@ -9,8 +9,8 @@ from typing import Final, NamedTuple
 
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
-from tools.identify.body_fit import COM, COMPLIANCE, HARNESS, MASS, SCALE, ZEROS, BodyFit
-from tools.identify.sines import MASS_SD, YIELDS, JointFit
+from tools.bringup.identify.body_fit import COM, COMPLIANCE, HARNESS, MASS, SCALE, ZEROS, BodyFit
+from tools.bringup.identify.sines import MASS_SD, YIELDS, JointFit
 
 HALF_WIDTH: Final = 1.96
 """Standard deviations on either side: 95 %."""

@@ -12,14 +12,14 @@ from shared.can.cansimple import AxisState
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
 from shared.joints import MODULE_INDEX
-from tests.tools.identify.hung_robot import HungRobot
+from tests.tools.bringup.identify.hung_robot import HungRobot
 from tests.tools.verbs.bench_drive import START, BenchDrive
 from tools.bringup import jog_drive
+from tools.bringup.identify import joint_drive
+from tools.bringup.identify.estimates import JointResult, Verdict, changes, measured, of_joints
+from tools.bringup.identify.sines import SinePlan, fit_sines, plan_for
 from tools.bringup.jogging import Sample, gentle
 from tools.bringup.stops import within_stops
-from tools.identify import joint_drive
-from tools.identify.estimates import JointResult, Verdict, changes, measured, of_joints
-from tools.identify.sines import SinePlan, fit_sines, plan_for
 
 MODULE = "ankle_left"
 

@@ -19,9 +19,9 @@ from shared.exceptions import DriveError
 from shared.joints import MODULE_INDEX, MODULES, N_JOINTS
 from tools.bringup import jog_drive
 from tools.bringup.held_module import HeldModule
+from tools.bringup.identify.sines import SinePlan, plan_for
 from tools.bringup.jogging import MotionPlan, Sample, gentle
 from tools.bringup.stops import within_stops
-from tools.identify.sines import SinePlan, plan_for
 
 STILL: Final = 0.004
 """rad that a leg which hangs still moves in `STILL_FOR_S`; an idle drive may report no rate."""

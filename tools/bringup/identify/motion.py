@@ -18,8 +18,8 @@ from shared.clock import NS_PER_S, now_ns
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Lead, Scenario, lead
 from shared.joints import MODULES
+from tools.bringup.identify.quasi_static import TimedRows
 from tools.fleet.led_planner import LedPlanner
-from tools.identify.quasi_static import TimedRows
 
 ASK_S: Final = 0.02
 """Between two requests: an intent fades out once nobody repeats it."""

@@ -17,8 +17,8 @@ from shared.config import scenarios
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
 from tests.conftest import ROBOT_FILE
-from tools.identify.body_fit import COM, HARNESS, MASS, SCALE, ZEROS, Record, fit
-from tools.identify.quasi_static import Moments, TimedRows, moments_of
+from tools.bringup.identify.body_fit import COM, HARNESS, MASS, SCALE, ZEROS, Record, fit
+from tools.bringup.identify.quasi_static import Moments, TimedRows, moments_of
 from tools.lab.studies.sweeps import plants
 from tools.sim.lockstep import Lockstep
 

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from tools.identify.body_fit import BodyFit
-from tools.identify.estimates import JointResult, ParameterEstimate, Verdict
-from tools.identify.quasi_static import SLOT_S
+from tools.bringup.identify.body_fit import BodyFit
+from tools.bringup.identify.estimates import JointResult, ParameterEstimate, Verdict
+from tools.bringup.identify.quasi_static import SLOT_S
 from tools.output import new_figure, save_figure
 
 FARTHEST = 6.0

@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.joints import AXES, JOINTS, N_JOINTS, SIDES
-from tools.identify.body_statics import BodyStatics
-from tools.identify.quasi_static import SLOT_S, Moments
+from tools.bringup.identify.body_statics import BodyStatics
+from tools.bringup.identify.quasi_static import SLOT_S, Moments
 
 Array = NDArray[np.float64]
 

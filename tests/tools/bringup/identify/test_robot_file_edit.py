@@ -9,8 +9,8 @@ import pytest
 from shared.config import files as config_file
 from shared.exceptions import ConfigError, RunError
 from tests.conftest import ROBOT_FILE
-from tools.identify.estimates import Value
-from tools.identify.robot_file_edit import apply, edited
+from tools.bringup.identify.estimates import Value
+from tools.bringup.identify.robot_file_edit import apply, edited
 
 VALUES: dict[str, Value] = {
     "mass.payload": 18.4,

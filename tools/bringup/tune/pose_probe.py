@@ -23,10 +23,10 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Scenario
 from shared.exceptions import RunError
 from shared.robot.robot_model import stand_pose
+from tools.bringup.tune.excitation import Excitation
 from tools.fleet.led_planner import LedPlanner
 from tools.sim.lockstep import Lockstep
 from tools.sim.standing_start import begin_standing
-from tools.tune.excitation import Excitation
 
 Array = NDArray[np.float64]
 

@@ -10,10 +10,10 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
+from tools.bringup.tune.excitation import HOLD_S, REST_S
+from tools.bringup.tune.pose_probe import ProbeCourse
+from tools.bringup.tune.response import ResponseFit
 from tools.output import new_figure, save_figure
-from tools.tune.excitation import HOLD_S, REST_S
-from tools.tune.pose_probe import ProbeCourse
-from tools.tune.response import ResponseFit
 
 _COLOURS: Final = {"measured": "#1f5fa8", "predicted": "#9aa0a6", "proposed": "#2c7a4b"}
 

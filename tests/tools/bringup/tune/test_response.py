@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tools.tune.excitation import FREQUENCIES_HZ, Excitation, excitation
-from tools.tune.response import ResponseFit, SecondOrder, answer_of, propose
+from tools.bringup.tune.excitation import FREQUENCIES_HZ, Excitation, excitation
+from tools.bringup.tune.response import ResponseFit, SecondOrder, answer_of, propose
 
 Array = NDArray[np.float64]
 DT = 0.004
