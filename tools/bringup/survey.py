@@ -21,7 +21,7 @@ from tools.bringup import (
 )
 from tools.bringup.boards import STATUS, Board, FoundBoards, Value, is_known, number
 from tools.bringup.can_monitor import BusTraffic, listen, long_enough
-from tools.bringup.reach import boards_on_usb, drives_within_reach, is_up
+from tools.bringup.drive_access import boards_on_usb, drives_within_reach, is_up
 from tools.bringup.rows import Finding, FindingKind, judged, ok
 from tools.fleet.process_table import is_simulated
 

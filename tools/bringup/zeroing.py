@@ -18,11 +18,10 @@ from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_S, now_ns
 from shared.config.robot_config import RobotConfig
 from shared.joints import kind_of
+from tools.bringup.motion_runner import NO_ANSWER, await_reading
 
 LOOK_S: Final = 0.3
 """A joint is watched for so long before it is taken to be still."""
-ANSWER_S: Final = 3.0
-"""Longest wait for a drive's first words: its link, and a heartbeat of both axes."""
 STILL: Final = 0.05
 """rad/s; an encoder count in a millisecond is 0.02 rad/s at the joint."""
 MOVED_MAX: Final = 0.005
@@ -64,6 +63,11 @@ class DriveLook(NamedTuple):
     """`AxisError` bits of both axes."""
 
 
+SILENT: Final = DriveLook(
+    DriveStatus.LOST, zeroed=False, q=(0.0, 0.0), speed=0.0, moved=0.0, error=0
+)
+
+
 def look(drive: Drive, mark_turns: float, gear_ratio: float) -> DriveLook:
     """Observe a drive for `LOOK_S`, once it answers.
 
@@ -72,14 +76,9 @@ def look(drive: Drive, mark_turns: float, gear_ratio: float) -> DriveLook:
         mark_turns: a motor's reading at q = 0.
         gear_ratio: N of the differential.
     """
-    answer_by = time.monotonic() + ANSWER_S
-    reading = drive.read(_READ_S)
-    while reading is None or reading.status is DriveStatus.LOST:
-        if time.monotonic() > answer_by:
-            return DriveLook(
-                DriveStatus.LOST, zeroed=False, q=(0.0, 0.0), speed=0.0, moved=0.0, error=0
-            )
-        reading = drive.read(_READ_S)
+    reading = await_reading(drive)
+    if reading is None:
+        return SILENT
     first = newest = reading
     speed = moved = 0.0
     errors = reading.error
@@ -107,7 +106,7 @@ def look(drive: Drive, mark_turns: float, gear_ratio: float) -> DriveLook:
 def refusal(seen: DriveLook) -> str:
     """Return why a drive cannot be zeroed now; "" if it can."""
     if seen.status is DriveStatus.LOST:
-        return "its drive does not answer; look at its power and its bus (`xrl doctor`)"
+        return NO_ANSWER
     if seen.status is DriveStatus.ARMED:
         return "its drive is armed (closed loop); make it idle first"
     if seen.error & AxisError.ENCODER_FAILED:
@@ -120,7 +119,7 @@ def refusal(seen: DriveLook) -> str:
     return ""
 
 
-def outside(robot: RobotConfig, module: str, q: Pair) -> str:
+def why_outside(robot: RobotConfig, module: str, q: Pair) -> str:
     """Return which angle of (phi, theta), rad, is outside of a module's limits; "" if none."""
     limit = getattr(robot.limits, kind_of(module))
     for axis, angle, (low, high) in zip(("phi", "theta"), q, (limit.phi, limit.theta), strict=True):
@@ -130,12 +129,7 @@ def outside(robot: RobotConfig, module: str, q: Pair) -> str:
 
 
 def zero(drive: Drive, q: Pair, robot: RobotConfig) -> Back | None:
-    """Write both motors' positions; return the drive's reading.
-
-    Args:
-        drive: idle, in its own count.
-        q: joint angles (phi, theta), rad.
-        robot: its mark and gear ratio.
+    """Write both motors' positions for joint angles q, rad, to an idle drive in its own count.
 
     Returns:
         The position read back, right or not (`is_right`); None if none came.

@@ -30,7 +30,7 @@ from tools.bringup.can_monitor import (
 )
 from tools.bringup.check_can import bus_nodes
 from tools.bringup.check_socketcan import setup_commands
-from tools.bringup.reach import drives_within_reach
+from tools.bringup.drive_access import drives_within_reach
 from tools.number_arguments import count, finite
 from tools.terminal import Console, marked
 from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb

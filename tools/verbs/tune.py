@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from services.simulator.physics.plant import IDEAL, PlantConfig, plant_from
 from shared import places
+from shared.bus.messages import Pair
 from shared.bus.operator_key import require_operator
 from shared.bus.session import open_session
 from shared.config import files as config_file
@@ -20,8 +21,9 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, RunError
 from shared.extras import require
 from shared.joints import AXES, MODULES
-from tools.bringup import bench, jog_drive
-from tools.bringup.identify import joint_bench, joint_drive
+from tools.bringup import drive_access, module_motion
+from tools.bringup.hanging_leg import hanging_joint
+from tools.bringup.motion_runner import Interrupts
 from tools.bringup.tune import module_probe
 from tools.bringup.tune.excitation import Excitation, excitation
 from tools.bringup.tune.pose_probe import (
@@ -210,16 +212,16 @@ def _live(
     console.print("leave the robot alone but for the hand that holds its height")
     question = "Does it stand, with room around it, and the stop at hand?"
     simulated = "simulator" in fleet.manifest.services
-    if not simulated and not bench.confirm(question, yes=args.yes):
+    if not simulated and not drive_access.confirm(question, yes=args.yes):
         return None
-    interrupts = jog_drive.Interrupts()
+    interrupts = Interrupts()
     with open_session(robot, "tune", fleet.run.path) as session:
         probe = LiveProbe(session)
         with interrupts.kept(), progress_along("probing", plan.duration_s) as progress:
             course = probe.go(row, plan, progress, lambda: bool(interrupts.number))
     if interrupts.number:
         console.print("stopped: the probe ends by itself")
-        sys.exit(128 + interrupts.number)
+    module_motion.exit_if_interrupted(interrupts)
     return course
 
 
@@ -305,36 +307,37 @@ def with_local_gains_kept(robot: RobotConfig) -> RobotConfig:
 
 
 def _tune_module(args: argparse.Namespace, console: Console) -> int:
-    module, axis = args.what, AXES.index(args.axis or "theta")
-    path = bench.robot_file(args)
+    module, axis = joint = args.what, AXES.index(args.axis or "theta")
+    path = drive_access.robot_file(args)
     robot = config_file.load_without_schedule(path)
-    joint_bench.refuse_services(robot, [module], args.run_dir)
-    interrupts = jog_drive.Interrupts()
+    module_motion.refuse_services(robot, [module], args.run_dir)
+    interrupts = Interrupts()
+    k_p, k_d = module_probe.axis_gains(robot, module, axis)
 
-    def plan_of(where: joint_drive.Hanging) -> module_probe.ModulePlan:
-        plan = module_probe.module_plan(robot, module, axis, args.torque, where)
+    def plan_of(q: Mapping[str, Pair]) -> module_probe.ProbePlan:
+        hung = hanging_joint(robot, q, module, axis)
+        plan = module_probe.probe_plan(robot, module, axis, args.torque, hung)
         console.print(
-            f"{module} {AXES[axis]}: a step of {1e3 * plan.excitation.size:.1f} mrad there and "
+            f"{module} {AXES[axis]}: a step of {1e3 * plan.course.size:.1f} mrad there and "
             f"back, then sines of it, {plan.duration_s:.0f} s, at most {plan.torque_limit:.0f} N "
-            f"m, on the stand gains ({plan.k_p:g} N m/rad, {plan.k_d:g} N m s/rad)"
+            f"m, on the stand gains ({k_p:g} N m/rad, {k_d:g} N m s/rad)"
         )
         return plan
 
-    with bench.drives_to_ourselves(
-        robot, path, args.run_dir, console.print, lifted=joint_bench.LIFTED
+    with drive_access.drives_to_ourselves(
+        robot, path, args.run_dir, console.print, lifted=module_motion.LIFTED
     ):
-        moved = joint_bench.move_joint(args, robot, (module, axis), plan_of, interrupts, console)
+        moved = module_motion.look_ask_and_move(args, robot, joint, plan_of, interrupts, console)
     if moved is None:
         return 0
-    if isinstance(moved, joint_bench.Stopped):
-        code = joint_bench.tell_stopped(moved, console)
-        if interrupts.number:
-            sys.exit(128 + interrupts.number)
+    if isinstance(moved, module_motion.Stopped):
+        code = module_motion.tell_stopped(moved, console)
+        module_motion.exit_if_interrupted(interrupts)
         return code
-    plan = moved.plan
+    plan, hung = moved.plan, hanging_joint(robot, moved.q, module, axis)
     course = module_probe.course_of_samples(moved.samples, plan)
-    answer = _answer(course, plan.excitation)
-    model = module_probe.predicted(robot, plan.k_p, plan.k_d, moved.where)
+    answer = _answer(course, plan.course)
+    model = module_probe.predicted(robot, module, axis, hung)
     _tell(args, {"measured": course}, {"measured": answer}, console, closed=False)
     console.print(
         f"predicted, rotor and leg rigid: natural frequency {model.natural_frequency:.1f} rad/s, "
@@ -347,8 +350,8 @@ def _tune_module(args: argparse.Namespace, console: Console) -> int:
         )
     elif args.bandwidth is not None:
         # k_p below 0: gravity alone is stiffer than what is wanted
-        inertia = plan.k_p / answer.model.b_0
-        k_p = inertia * args.bandwidth**2 - moved.where.gravity
+        inertia = k_p / answer.model.b_0
+        k_p = inertia * args.bandwidth**2 - hung.gravity
         k_d = 2.0 * args.damping * args.bandwidth * inertia
         console.print(
             f"for {args.bandwidth:g} rad/s and a damping ratio of {args.damping:g}: k_p = "

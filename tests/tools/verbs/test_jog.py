@@ -19,24 +19,17 @@ from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
 from tests.tools.verbs.bench_drive import START, BenchDrive
-from tools.bringup import jog_drive
-from tools.bringup.jogging import (
-    APART_MAX,
-    JogPlan,
-    Sample,
-    gentle,
-    judge,
-    outside,
-    what_to_see,
-)
+from tools.bringup.jog import JogPlan, ThereAndBack, judge, what_to_see
+from tools.bringup.motion import APART_MAX, Sample, limit_drives, why_out_of_reach
+from tools.bringup.motion_runner import Interrupts, MotionResult, run_motion
 
 MODULE = "knee_left"
-PLAN = JogPlan(axis=1, by=0.05, period_s=2.0, cycles=2, torque_limit=10.0)
+PLAN = JogPlan(axis=1, course=ThereAndBack(0.05, 2.0, 2), torque_limit=10.0)
 
 
 @pytest.fixture
 def limited(robot: RobotConfig) -> RobotConfig:
-    return gentle(robot, PLAN)
+    return limit_drives(robot, PLAN)
 
 
 @pytest.fixture
@@ -50,26 +43,24 @@ def jog(
     plan: JogPlan = PLAN,
     *,
     q_seen: Pair = START,
-    interrupts: jog_drive.Interrupts | None = None,
+    interrupts: Interrupts | None = None,
     published: list[Sample] | None = None,
-) -> jog_drive.JogResult:
+) -> MotionResult:
     def progress(sample: Sample) -> None:
         if published is not None:
             published.append(sample)
 
-    return jog_drive.jog_drive(
-        drive,
-        robot,
-        MODULE,
-        plan,
-        q_seen=q_seen,
-        interrupts=interrupts or jog_drive.Interrupts(),
-        progress=progress,
-        clock=drive.clock,
-    )
+    return run_motion(
+        {MODULE: drive}, robot, MODULE, plan, q_seen=q_seen,
+        interrupts=interrupts or Interrupts(), progress=progress, clock=drive.clock,
+    )  # fmt: skip
 
 
-@pytest.mark.parametrize("plan", [PLAN, PLAN._replace(axis=0, by=-0.08, cycles=1)])
+def by(rad: float) -> JogPlan:
+    return PLAN._replace(course=PLAN.course._replace(by=rad))
+
+
+@pytest.mark.parametrize("plan", [PLAN, JogPlan(0, ThereAndBack(-0.08, 2.0, 1), 10.0)])
 def test_a_free_joint_follows_and_comes_back_and_is_idle(
     drive: BenchDrive, limited: RobotConfig, plan: JogPlan
 ) -> None:
@@ -78,7 +69,7 @@ def test_a_free_joint_follows_and_comes_back_and_is_idle(
     assert outcome.trouble == ""
     assert all(row.good for row in judge(outcome.samples, plan))
     assert drive.q == pytest.approx(START, abs=0.01)
-    assert outcome.is_idle
+    assert outcome.not_idle == ()
     assert drive.status is DriveStatus.IDLE
     assert drive.largest <= PLAN.torque_limit + 1e-9
     assert len(published) > 8
@@ -98,19 +89,17 @@ def test_a_jammed_joint_is_given_up_at_the_torque_limit(
     drive: BenchDrive, limited: RobotConfig
 ) -> None:
     drive.jammed = True
-    outcome = jog(drive, limited, PLAN._replace(by=0.12))
+    outcome = jog(drive, limited, by(0.12))
     assert "torque limit of 10 N m" in outcome.trouble
     assert drive.largest == pytest.approx(PLAN.torque_limit, abs=0.01)
-    assert outcome.is_idle
+    assert outcome.not_idle == ()
 
 
 def test_a_joint_that_moves_too_little_did_not_follow(
     drive: BenchDrive, limited: RobotConfig
 ) -> None:
     drive.friction = 9.5  # below the limit, so nothing stops it, but hardly anything moves
-    rows = {
-        row.what: row for row in judge(jog(drive, limited, PLAN._replace(by=0.01)).samples, PLAN)
-    }
+    rows = {row.what: row for row in judge(jog(drive, limited, by(0.01)).samples, PLAN)}
     assert not rows["theta went"].good
 
 
@@ -155,18 +144,18 @@ def test_a_drive_that_fails_stops_it(
     outcome = jog(drive, limited)
     assert words in outcome.trouble
     assert drive.idles >= 3
-    assert outcome.is_idle == ("silent_at_s" not in fault), "a silent drive proves nothing"
+    assert bool(outcome.not_idle) == ("silent_at_s" in fault), "a silent drive proves nothing"
 
 
 def test_a_drive_that_stays_armed_is_not_reported_idle(
     drive: BenchDrive, limited: RobotConfig
 ) -> None:
     drive.deaf = True
-    assert not jog(drive, limited).is_idle
+    assert jog(drive, limited).not_idle == (MODULE,)
 
 
 def test_an_interrupt_idles_the_drive_first(drive: BenchDrive, limited: RobotConfig) -> None:
-    interrupts = jog_drive.Interrupts()
+    interrupts = Interrupts()
     with interrupts.kept():
         drive_read = drive.read
 
@@ -178,7 +167,7 @@ def test_an_interrupt_idles_the_drive_first(drive: BenchDrive, limited: RobotCon
         drive.read = read  # type: ignore[method-assign]
         outcome = jog(drive, limited, interrupts=interrupts)
     assert outcome.trouble == "stopped by SIGTERM"
-    assert outcome.is_idle
+    assert outcome.not_idle == ()
     assert interrupts.number == signal.SIGTERM
 
 
@@ -187,9 +176,9 @@ def test_an_error_of_our_own_idles_the_drive_too(drive: BenchDrive, limited: Rob
         raise BrokenPipeError
 
     with pytest.raises(BrokenPipeError):
-        jog_drive.jog_drive(
-            drive, limited, MODULE, PLAN, q_seen=START,
-            interrupts=jog_drive.Interrupts(), progress=broken, clock=drive.clock,
+        run_motion(
+            {MODULE: drive}, limited, MODULE, PLAN, q_seen=START,
+            interrupts=Interrupts(), progress=broken, clock=drive.clock,
         )  # fmt: skip
     assert drive.status is DriveStatus.IDLE
 
@@ -204,21 +193,21 @@ def test_a_joint_that_was_moved_after_the_question_is_not_jogged(
 
 
 def test_the_drive_itself_is_limited_to_the_torque_asked_for(robot: RobotConfig) -> None:
-    limited = gentle(robot, PLAN)
+    limited = limit_drives(robot, PLAN)
     motor = limited.drive.current_lim * limited.drive.torque_constant
     phi, theta = joint_torque((motor, motor), robot.joint.gear_ratio)
     assert abs(phi) + abs(theta) == pytest.approx(PLAN.torque_limit)
     assert limited.drive.vel_limit <= robot.drive.vel_limit
     for wrong in (0.5, robot.joint.tau_module_max + 1.0, math.nan):
         with pytest.raises(DriveError, match="--torque-limit"):
-            gentle(robot, PLAN._replace(torque_limit=wrong))
+            limit_drives(robot, PLAN._replace(torque_limit=wrong))
 
 
 def test_the_reference_is_smooth_and_ends_where_it_began() -> None:
     times = np.linspace(0.0, PLAN.duration_s, 4000)
     q, v = np.array([[row[1] for row in PLAN.offset(float(t))] for t in times]).T
     assert (q[0], q[-1]) == (0.0, 0.0)
-    assert q.max() == pytest.approx(PLAN.by, abs=1e-6)
+    assert q.max() == pytest.approx(PLAN.course.by, abs=1e-6)
     np.testing.assert_allclose(np.gradient(q, times), v, atol=2e-3)
 
 
@@ -234,8 +223,8 @@ def test_the_reference_is_smooth_and_ends_where_it_began() -> None:
 def test_a_joint_that_would_leave_its_limits_is_refused(
     robot: RobotConfig, q: Pair, plan: JogPlan, words: str
 ) -> None:
-    assert re.search(words, outside(robot, MODULE, plan, q))
-    assert outside(robot, MODULE, PLAN, START) == ""
+    assert re.search(words, why_out_of_reach(robot, MODULE, plan, q))
+    assert why_out_of_reach(robot, MODULE, PLAN, START) == ""
 
 
 def turned(axis: int, angle: float) -> np.ndarray:

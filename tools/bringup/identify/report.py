@@ -1,20 +1,22 @@
-"""Tells what was identified: a table, the robot file's new lines, what to do about zeros."""
+"""Tells what was identified: a table, pictures, the robot file's new lines, what has to follow."""
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any, Final
 
+import numpy as np
 from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import RunError
-from shared.places import refuse_shipped
+from tools.bringup.identify.body_fit import BodyFit
 from tools.bringup.identify.estimates import (
+    JointResult,
     ParameterEstimate,
     Value,
     Verdict,
@@ -22,15 +24,20 @@ from tools.bringup.identify.estimates import (
     measured,
     remarks,
 )
-from tools.bringup.identify.robot_file_edit import apply
-from tools.fleet import procfs
-from tools.fleet.run_dir import RunDir
+from tools.bringup.identify.quasi_static import SLOT_S
+from tools.bringup.identify.robot_file_edit import apply, refuse_other_robot
+from tools.output import new_figure, save_figure
 from tools.terminal import Console
 
-_STYLES = {
-    Verdict.CHANGE: "bold yellow", Verdict.AGREES: "green", Verdict.MEASURED: "",
-    Verdict.UNKNOWN: "dim",
+FARTHEST: Final = 6.0
+"""Half widths; an interval farther away is an arrow."""
+SCHEDULED: Final = ("joint.armature", "mass.", "geometry.")
+"""Beginnings of keys that the gain schedule depends on."""
+_STYLES: Final = {
+    Verdict.CHANGE: ("bold yellow", "#c0392b"), Verdict.AGREES: ("green", "#2c7a4b"),
+    Verdict.MEASURED: ("", "#1f5fa8"), Verdict.UNKNOWN: ("dim", "#9aa0a6"),
 }  # fmt: skip
+"""On a terminal, and in a picture."""
 
 
 def estimates_table(estimates: Sequence[ParameterEstimate]) -> Table:
@@ -42,12 +49,11 @@ def estimates_table(estimates: Sequence[ParameterEstimate]) -> Table:
     table.add_column("unit", no_wrap=True)
     table.add_column("", no_wrap=True)
     for row in estimates:
-        digits = row.digits
+        digits, (style, _) = row.digits, _STYLES[row.verdict]
         table.add_row(
             row.what, "" if row.file is None else f"{row.file:.{digits}f}",
-            f"{row.value:.{digits}f}",
-            f"± {row.half_width:.{digits}f}", row.unit,
-            Text(row.verdict.value, _STYLES[row.verdict]),
+            f"{row.value:.{digits}f}", f"± {row.half_width:.{digits}f}", row.unit,
+            Text(row.verdict.value, style),
         )  # fmt: skip
     return table
 
@@ -68,13 +74,7 @@ def lines_of(values: Mapping[str, Value]) -> str:
 def tell(
     estimates: list[ParameterEstimate], robot: RobotConfig, path: Path | None, console: Console
 ) -> None:
-    """Print the estimates, what to write and what to know; write it if there is a path.
-
-    Args:
-        estimates: of one measurement.
-        robot: that they were measured against.
-        path: of the robot file to write; None: none.
-        console: to speak on.
+    """Print the estimates, what to write and what to know; write it into the robot file `path`.
 
     Raises:
         RunError: the file is another robot's, or cannot be read or written.
@@ -91,69 +91,75 @@ def tell(
         console.print(f"measured now, no longer assumed: {', '.join(sorted(known))}", style="dim")
     for remark in remarks(estimates, robot):
         console.print(remark, style="yellow")
-    if path is not None:
-        refuse_other_robot(path, robot, values)
-        write(path, values, known, console)
-
-
-def refuse_running(path: Path) -> None:
-    """Refuse to write the robot file of a fleet that is up: a service that restarts would read it.
-
-    Raises:
-        RunError: naming the fleet, and what to do; or it is the shipped one of an installed wheel.
-    """
-    refuse_shipped(path)
-    for place in sorted(procfs.fleets()):
-        manifest = RunDir(Path(place)).read_manifest()
-        if manifest is not None and Path(manifest.config).resolve() == path.resolve():
-            raise RunError(
-                f"{path}: the fleet in {place} runs with it; measure without --apply, `xrl down "
-                f"--run-dir {place}`, then --apply (`xrl identify body RECORD --apply`)"
-            )
-
-
-def refuse_other_robot(path: Path, robot: RobotConfig, values: Mapping[str, Value]) -> None:
-    """Refuse to write what was measured against another file than the one to be written.
-
-    Args:
-        path: of the robot file.
-        robot: that the record was made with.
-        values: new ones by dotted key.
-
-    Raises:
-        RunError: the file has another value where a new one would go, or another robot's name.
-        ConfigError: the file cannot be read.
-    """
-    file = config_file.load_without_schedule(path)
-    if file.name != robot.name:
-        raise RunError(f"{path}: the robot {file.name}; the record is of {robot.name}")
-    for key in values:
-        section, name = key.split(".")
-        here, there = (getattr(getattr(one, section), name) for one in (file, robot))
-        if here != there:
-            raise RunError(
-                f"{path}: {key} is {here}, and was {there} when the record was made; give that "
-                "robot's file as --config, or record again"
-            )
-
-
-def write(
-    path: Path, values: Mapping[str, Value], known: Collection[str], console: Console
-) -> None:
-    """Write the new values, and say what has to follow.
-
-    Raises:
-        RunError: a file cannot be read or written.
-        ConfigError: the new values make no robot file that can be used.
-    """
+    if path is None:
+        return
+    refuse_other_robot(path, robot, values)
     if not values and not known:
         console.print(f"{path}: nothing to write")
         return
     backup = apply(path, values, known, time.strftime("%Y%m%d-%H%M%S"))
     console.print(f"{path}: written; as it was: {backup}")
-    if any(key in SCHEDULED or key.startswith(("mass.", "geometry.")) for key in values):
+    if any(key.startswith(SCHEDULED) for key in values):
         console.print(f"now `xrl gains --config {path}`: its schedule is another robot's")
 
 
-SCHEDULED = ("joint.armature",)
-"""Keys beside masses and lengths that the gain schedule depends on."""
+def draw_body(estimates: Sequence[ParameterEstimate], fit: BodyFit, path: Path) -> None:
+    """Draw intervals, and both sets of equations before and after, into a PNG file."""
+    figure = new_figure(13, 8)
+    right = _draw_intervals(figure, estimates, width=1.1)
+    axes = right.subplots(3, 1, sharex=True)
+    t = SLOT_S * np.arange(len(fit.residuals))
+    rows = (
+        ("force left over, N", fit.residuals_before[:, 2], fit.residuals[:, 2], "up"),
+        ("moment left over, N m", fit.residuals_before[:, 4], fit.residuals[:, 4], "about pitch"),
+        ("feet apart, mm", 1e3 * fit.feet_before[:, 3], 1e3 * fit.feet[:, 3], "along x"),
+    )
+    for axis, (label, before, after, what) in zip(axes, rows, strict=True):
+        axis.plot(t, before, ".", ms=3, color="#9aa0a6", label=f"{what}, by the robot file")
+        axis.plot(t, after, ".", ms=3, color="#1f5fa8", label=f"{what}, as identified")
+        axis.axhline(0.0, lw=0.8, color="black")
+        axis.set_ylabel(label)
+        axis.legend(loc="upper right", fontsize=8)
+    axes[-1].set_xlabel("quasi-static time, s")
+    save_figure(figure, path)
+
+
+def draw_joints(
+    estimates: Sequence[ParameterEstimate], results: Sequence[JointResult], path: Path
+) -> None:
+    """Draw intervals, and each joint's torque over its angle beside the fit, into a PNG file."""
+    figure = new_figure(13, 2.0 + 2.4 * len(results))
+    right = _draw_intervals(figure, estimates, width=1.0)
+    axes = right.subplots(len(results), 1, squeeze=False)[:, 0]
+    for axis, (joint, fit, _) in zip(axes, results, strict=True):
+        axis.plot(1e3 * fit.q, fit.tau, ".", ms=1.5, color="#9aa0a6", label="measured")
+        axis.plot(1e3 * fit.q, fit.fitted, ".", ms=1.5, color="#1f5fa8", label="fitted")
+        axis.set_ylabel(f"{joint}\ntorque, N m")
+        axis.legend(loc="upper right", fontsize=8, markerscale=4)
+    axes[-1].set_xlabel("angle from its mean, mrad")
+    save_figure(figure, path)
+
+
+def _draw_intervals(figure: Any, estimates: Sequence[ParameterEstimate], *, width: float) -> Any:
+    """Draw each interval, in its own half widths, about the file's value; return the right half."""
+    left, right = figure.subfigures(1, 2, width_ratios=(width, 1.0))
+    axis = left.subplots(1, 1)
+    for place, row in enumerate(reversed(estimates)):
+        file = row.value if row.file is None else row.file
+        by = (row.value - file) / row.half_width if row.half_width else 0.0
+        _, colour = _STYLES[row.verdict]
+        if abs(by) > FARTHEST:
+            axis.plot(math.copysign(FARTHEST, by), place, ">" if by > 0.0 else "<", color=colour)
+            continue
+        axis.errorbar(by, place, xerr=1.0, fmt="o", ms=5, color=colour, capsize=3)
+    labels = [
+        f"{row.what}: {row.value:.4g} ± {row.half_width:.2g} {row.unit}"
+        + ("" if row.file is None else f" (file {row.file:.4g})")
+        for row in reversed(estimates)
+    ]
+    axis.set_yticks(range(len(estimates)), labels, fontsize=8)
+    axis.axvline(0.0, lw=0.8, color="black")
+    axis.set_xlabel("away from the robot file, in half widths of the 95 % interval")
+    axis.set_title("red: change   green: agrees   grey: not shown by this record", fontsize=9)
+    axis.set_xlim(-FARTHEST - 0.5, FARTHEST + 0.5)
+    return right

@@ -11,9 +11,13 @@ from tomlkit.exceptions import TOMLKitError
 
 from shared.atomic_file import atomic_file, replace_file
 from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
+from shared.places import refuse_shipped
 from shared.text_file import read_text
 from tools.bringup.identify.estimates import Value
+from tools.fleet import procfs
+from tools.fleet.run_dir import RunDir
 
 
 def edited(text: str, file: str, values: Mapping[str, Value], measured: Collection[str]) -> str:
@@ -46,13 +50,7 @@ def edited(text: str, file: str, values: Mapping[str, Value], measured: Collecti
 
 
 def apply(path: Path, values: Mapping[str, Value], measured: Collection[str], stamp: str) -> Path:
-    """Write new values into a robot file; return its backup.
-
-    Args:
-        path: of the robot file.
-        values: new ones by dotted key.
-        measured: keys that come off the list of what is assumed.
-        stamp: of the time, in the backup's name.
+    """Write new values into a robot file; return its backup, named by a stamp of the time.
 
     Raises:
         RunError: a file cannot be read or written, or there is such a backup already; the robot
@@ -69,3 +67,39 @@ def apply(path: Path, values: Mapping[str, Value], measured: Collection[str], st
     except (OSError, UnicodeError) as error:
         raise RunError(f"{path}: not changed: {error}") from None
     return backup
+
+
+def refuse_running(path: Path) -> None:
+    """Refuse to write the robot file of a fleet that is up: a service that restarts would read it.
+
+    Raises:
+        RunError: naming the fleet, and what to do; or it is the shipped one of an installed wheel.
+    """
+    refuse_shipped(path)
+    for place in sorted(procfs.fleets()):
+        manifest = RunDir(Path(place)).read_manifest()
+        if manifest is not None and Path(manifest.config).resolve() == path.resolve():
+            raise RunError(
+                f"{path}: the fleet in {place} runs with it; measure without --apply, `xrl down "
+                f"--run-dir {place}`, then --apply (`xrl identify body RECORD --apply`)"
+            )
+
+
+def refuse_other_robot(path: Path, robot: RobotConfig, values: Mapping[str, Value]) -> None:
+    """Refuse to write what was measured against another file than the one to be written.
+
+    Raises:
+        RunError: the file has another value where a new one would go, or another robot's name.
+        ConfigError: the file cannot be read.
+    """
+    file = config_file.load_without_schedule(path)
+    if file.name != robot.name:
+        raise RunError(f"{path}: the robot {file.name}; the record is of {robot.name}")
+    for key in values:
+        section, name = key.split(".")
+        here, there = (getattr(getattr(one, section), name) for one in (file, robot))
+        if here != there:
+            raise RunError(
+                f"{path}: {key} is {here}, and was {there} when the record was made; give that "
+                "robot's file as --config, or record again"
+            )

@@ -25,15 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.bus.messages import Pair
-from shared.config.sections import StandGains
-from tools.bringup.jogging import SETTLE_S, Sample
+from tools.bringup.hanging_leg import HEAVY, HangingJoint
+from tools.bringup.motion import MotionPlan, Sample
 
 Array = NDArray[np.float64]
 
 TONES: Final = ((0.4, 5), (1.0, 8), (2.0, 12))
 """Hz and cycles of each tone; the first cycle and the last swell and fade, and are not used."""
-HEAVY: Final = 1.0
-"""kg m^2; with more on it a joint that is shaken quickly shakes the hoist."""
 HEAVY_TONES: Final = ((0.2, 5), (0.5, 8))
 AMPLITUDE_MAX: Final = 0.06
 """rad; the lowest tone, where nothing else limits it."""
@@ -50,8 +48,6 @@ AFTER: Final = 0.25
 """Share of the new target's torque: as if it came 0.5 ms after the sample."""
 TIME_SD: Final = 5e-4
 """s; how well that is known."""
-BIAS_TORQUE: Final = 1.3
-"""Times what gravity takes at the bias, by the robot file."""
 YIELDS: Final = 0.05
 """Share of an inertia that is uncertain: leg and hoist, on the joint's other side, give way."""
 DRY_SD: Final = 0.04
@@ -61,8 +57,6 @@ MASS_SD: Final = 0.03
 HARMONICS: Final = 9
 MOVING: Final = 0.3
 """Of a tone's fastest rate: slower samples, about the turns, are not used. There a joint sticks."""
-BIAS_S: Final = 2.0
-"""Time in which a module is led to its place, s."""
 
 
 class Tone(NamedTuple):
@@ -94,94 +88,44 @@ class Tone(NamedTuple):
         )
 
 
-class SinePlan(NamedTuple):
-    """Tones one after the other, about a place that the module is led to and back from.
+class Tones(NamedTuple):
+    """Tones one after the other (`tools.bringup.motion.AxisCourse`)."""
 
-    A `tools.bringup.jogging.MotionPlan`.
-    """
-
-    axis: int
     tones: tuple[Tone, ...]
-    torque_limit: float
-    soft: Pair
-    """k_p, N m/rad, and k_d, N m s/rad, of both axes."""
-    bias: Pair = (0.0, 0.0)
-    """From where the module hangs, rad: a knee hangs straight, on its stop."""
 
     @property
     def duration_s(self) -> float:
-        """How long the whole takes, s."""
-        return 2.0 * self._rest_s + sum(tone.duration_s for tone in self.tones)
+        """Of all tones, s."""
+        return sum(tone.duration_s for tone in self.tones)
 
     @property
-    def reach(self) -> tuple[Pair, Pair]:
-        """Lowest and highest offset that phi, and that theta, is led to, rad."""
+    def span(self) -> Pair:
+        """Lowest and highest offset, rad."""
         most = max(tone.amplitude for tone in self.tones)
-        around = [most if axis == self.axis else 0.0 for axis in (0, 1)]
-        phi, theta = ((b - a, b + a) for b, a in zip(self.bias, around, strict=True))
-        return phi, theta
-
-    @property
-    def _rest_s(self) -> float:
-        """Time before the first tone and after the last, s."""
-        return rest_s(self.bias)
+        return -most, most
 
     @property
     def rate_max(self) -> float:
         """Fastest rate that it asks for, rad/s."""
         return max(2.0 * math.pi * tone.frequency_hz * tone.amplitude for tone in self.tones)
 
-    def gains(self, stand: StandGains) -> tuple[Pair, Pair]:  # noqa: ARG002 - soft, whatever it is
-        """Return soft gains, alike for both axes: both motors' own loops then do all of it."""
-        k_p, k_d = self.soft
-        return (k_p, k_p), (k_d, k_d)
-
-    def offset(self, t_s: float) -> tuple[Pair, Pair]:
-        """Return the offsets of (phi, theta), rad, and their rates, rad/s, at a time, s."""
-        moved, rate = 0.0, 0.0
+    def at(self, t_s: float) -> Pair:
+        """Return offset, rad, and rate, rad/s."""
         for begin_s, tone in self.begins():
             if begin_s <= t_s < begin_s + tone.duration_s:
-                moved, rate = tone.offset(t_s - begin_s)
-        return led_there_and_back(self.bias, t_s, self.duration_s, self.axis, moved, rate)
+                return tone.offset(t_s - begin_s)
+        return 0.0, 0.0
 
     def begins(self) -> list[tuple[float, Tone]]:
-        """Return when each tone begins, s since the drive armed."""
-        found, at = [], self._rest_s
+        """Return when each tone begins, s."""
+        found, at = [], 0.0
         for tone in self.tones:
             found.append((at, tone))
             at += tone.duration_s
         return found
 
 
-def rest_s(bias: Pair) -> float:
-    """Return the time before the first motion and after the last, s, with the way to a bias."""
-    return SETTLE_S + (BIAS_S + SETTLE_S if any(bias) else 0.0)
-
-
-def led_there_and_back(
-    bias: Pair, t_s: float, duration_s: float, axis: int, moved: float, rate: float
-) -> tuple[Pair, Pair]:
-    """Return offsets of (phi, theta), rad, and their rates: of a motion about a bias.
-
-    There after the first rest, back before the last.
-
-    Args:
-        bias: (phi, theta), rad.
-        t_s: time since the drive was armed, s.
-        duration_s: of the whole.
-        axis: that is moved; 0: phi.
-        moved: its offset from the bias, rad.
-        rate: rad/s.
-    """
-    side = 1.0 if t_s < 0.5 * duration_s else -1.0
-    phase = min(1.0, max(0.0, (min(t_s, duration_s - t_s) - SETTLE_S) / BIAS_S))
-    way = 0.5 - 0.5 * math.cos(math.pi * phase)
-    slope = side * 0.5 * math.pi / BIAS_S * math.sin(math.pi * phase)
-    (phi, theta), own = bias, (1.0 - axis, float(axis))
-    return (
-        (way * phi + own[0] * moved, way * theta + own[1] * moved),
-        (slope * phi + own[0] * rate, slope * theta + own[1] * rate),
-    )
+SinePlan = MotionPlan[Tones]
 
 
 class JointFit(NamedTuple):
@@ -203,40 +147,29 @@ class JointFit(NamedTuple):
     """Torque of the fit (n,), N m."""
 
 
-def plan_for(
-    axis: int, torque: float, inertia: float, gravity: float, bias: Pair = (0.0, 0.0)
-) -> SinePlan:
-    """Return sines that need a part of a torque.
+def plan_for(axis: int, torque: float, armature: float, joint: HangingJoint) -> SinePlan:
+    """Return sines that need a part of a torque, N m, of a joint led inside its limits first.
 
-    Args:
-        axis: 0: phi, 1: theta.
-        torque: N m; what holds the leg at its bias comes on top.
-        inertia: of rotor and leg by the robot file, kg m^2.
-        gravity: stiffness of the hanging leg, N m/rad.
-        bias: from where the module hangs, (phi, theta), rad.
+    What holds the leg at its bias comes on top.
     """
+    inertia, gravity = joint.inertia + armature, joint.gravity
     tones = []
     for hertz, cycles in HEAVY_TONES if inertia > HEAVY else TONES:
         needed = abs(inertia * (2.0 * math.pi * hertz) ** 2 - gravity)
         most = TORQUE_SHARE * torque / max(needed, gravity, 1e-9)
         tones.append(Tone(hertz, float(min(AMPLITUDE_MAX, most)), cycles))
-    held = BIAS_TORQUE * gravity * sum(map(abs, bias))
-    soft = (
-        min(max(PER_INERTIA[0] * inertia, K_P[0]), K_P[1]),
-        min(max(PER_INERTIA[1] * inertia, K_D[0]), K_D[1]),
-    )
-    return SinePlan(axis, tuple(tones), torque + held, soft, bias)
+    k_p = min(max(PER_INERTIA[0] * inertia, K_P[0]), K_P[1])
+    k_d = min(max(PER_INERTIA[1] * inertia, K_D[0]), K_D[1])
+    # alike for both axes: both motors' own loops then do all of it
+    soft = ((k_p, k_p), (k_d, k_d))
+    return SinePlan(axis, Tones(tuple(tones)), torque + joint.held_torque, joint.bias, soft)
 
 
 def fit_sines(samples: Sequence[Sample], plan: SinePlan) -> JointFit | None:
-    """Return what steady samples show; None if there are too few.
-
-    Args:
-        samples: of the whole motion.
-        plan: that was followed.
-    """
+    """Return what steady samples of a whole motion show; None if there are too few."""
     parts = []
-    for begin_s, tone in plan.begins():
+    for along_s, tone in plan.course.begins():
+        begin_s = plan.rest_s + along_s
         period = 1.0 / tone.frequency_hz
         first, last = begin_s + period, begin_s + tone.duration_s - period
         rows = [s for s in samples if first <= s.t_s < last]
@@ -251,7 +184,8 @@ def fit_sines(samples: Sequence[Sample], plan: SinePlan) -> JointFit | None:
     scores = np.array([weighted[cycle == k].T @ left[cycle == k] for k in np.unique(cycle)])
     covariance = H @ scores.T @ scores @ H
     inertia_sd, viscous_sd, dry_sd, stiffness_sd = np.sqrt(np.diag(covariance)[:4]).tolist()
-    k_p, k_d = plan.soft
+    assert plan.own_gains is not None  # noqa: S101 - `plan_for` gives them
+    (k_p, _), (k_d, _) = plan.own_gains
     inertia, viscous, dry, stiffness = x[:4].tolist()
     inertia_sd = math.hypot(inertia_sd, k_d * TIME_SD, YIELDS * inertia)
     viscous_sd = math.hypot(viscous_sd, k_p * TIME_SD)

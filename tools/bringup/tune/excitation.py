@@ -30,7 +30,7 @@ class SinePart(NamedTuple):
 
 
 class Excitation(NamedTuple):
-    """Step and sines of one size."""
+    """Step and sines of one size; of a module, a `tools.bringup.motion.AxisCourse`."""
 
     size: float
     """m or rad"""
@@ -41,7 +41,21 @@ class Excitation(NamedTuple):
         """How long the whole takes, s."""
         return self.sines[-1].end_s + REST_S
 
-    def at(self, t_s: float) -> float:
+    @property
+    def span(self) -> tuple[float, float]:
+        """Lowest and highest offset, m or rad."""
+        return -self.size, self.size
+
+    @property
+    def rate_max(self) -> float:
+        """Fastest rate of the sines, m/s or rad/s."""
+        return 2.0 * math.pi * max(sine.frequency_hz for sine in self.sines) * self.size
+
+    def at(self, t_s: float) -> tuple[float, float]:
+        """Return the offset at a time, m or rad, and no rate."""
+        return self.offset(t_s), 0.0
+
+    def offset(self, t_s: float) -> float:
         """Return the offset at a time, m or rad."""
         if t_s < REST_S + HOLD_S:
             return self.size if t_s >= REST_S else 0.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import ClassVar, Final, NamedTuple
 
@@ -18,11 +17,12 @@ from shared.bus import topics
 from shared.bus.messages import Message, PlannerMode, PlannerStatus
 from shared.bus.session import Session
 from shared.bus.topics import Topic
-from shared.clock import NS_PER_S, now_ns
+from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Scenario
 from shared.exceptions import RunError
 from shared.robot.robot_model import stand_pose
+from tools.bringup.led_run import run_led
 from tools.bringup.tune.excitation import Excitation
 from tools.fleet.led_planner import LedPlanner
 from tools.sim.lockstep import Lockstep
@@ -33,7 +33,6 @@ Array = NDArray[np.float64]
 DIRECTIONS: Final = ("x", "y", "z", "roll", "pitch", "yaw")
 """Rows of p."""
 ASK_S: Final = 0.01
-LISTEN_S: Final = 0.001
 
 
 class ProbeCourse(NamedTuple):
@@ -71,7 +70,7 @@ class ProbedLockstep(Lockstep):
         wanted, t_s = super()._request(), self.world.scenario_s
         if self.excitation is None or t_s < 0.0:
             return wanted
-        return wanted._replace(probe_row=self.row, probe=self.excitation.at(t_s))
+        return wanted._replace(probe_row=self.row, probe=self.excitation.offset(t_s))
 
 
 def in_lockstep(
@@ -136,25 +135,18 @@ class LiveProbe:
         progress: Callable[[float], None],
         stopped: Callable[[], bool],
     ) -> ProbeCourse:
-        """Probe a row; whatever ends it, nothing is asked for any more and the probe ends.
-
-        Args:
-            row: of p.
-            excitation: of its reference.
-            progress: is given the time, s.
-            stopped: True to end it.
-        """
+        """Probe a row of p; whatever ends it, the probe ends."""
         statuses: list[PlannerStatus] = []
-        begin, ask_s, ended = now_ns(), 0.0, ""
-        while not ended and (t_s := (now_ns() - begin) / NS_PER_S) < excitation.duration_s:
-            if t_s >= ask_s:
-                self._planner.ask(probe_row=row, probe=excitation.at(t_s))
-                progress(t_s)
-                ask_s = t_s + ASK_S
+
+        def ask(t_s: float) -> None:
+            self._planner.ask(probe_row=row, probe=excitation.offset(t_s))
+            progress(t_s)
+
+        def listen() -> None:
             if self._planner.look() and self._planner.status.probe_row == row:
                 statuses.append(self._planner.status)
-            ended = "stopped" if stopped() else self._planner.trouble()
-            time.sleep(LISTEN_S)
+
+        ended = run_led(self._planner, excitation.duration_s, ask, listen, stopped, every_s=ASK_S)
         self._planner.ask()
         return course_of(statuses, row, ended)
 

@@ -14,33 +14,41 @@ from shared.exceptions import DriveError
 from shared.joints import MODULE_INDEX
 from tests.tools.bringup.identify.hung_robot import HungRobot
 from tests.tools.verbs.bench_drive import START, BenchDrive
-from tools.bringup import jog_drive
-from tools.bringup.identify import joint_drive
+from tools.bringup import motion_runner
+from tools.bringup.hanging_leg import HangingJoint, hanging_joint, leg_of
 from tools.bringup.identify.estimates import JointResult, Verdict, changes, measured, of_joints
 from tools.bringup.identify.sines import SinePlan, fit_sines, plan_for
-from tools.bringup.jogging import Sample, gentle
-from tools.bringup.stops import within_stops
+from tools.bringup.motion import AnyPlan, Sample, limit_drives, within_stops
+from tools.bringup.motion_runner import Interrupts, MotionResult, look_at, run_motion
 
 MODULE = "ankle_left"
 
 
+def sines(axis: int, inertia: float, gravity: float = 0.0, torque: float = 15.0) -> SinePlan:
+    return plan_for(axis, torque, 0.0, HangingJoint(inertia, gravity, (0.0, 0.0)))
+
+
+def limited(robot: RobotConfig, plan: AnyPlan) -> RobotConfig:
+    return limit_drives(within_stops(robot), plan)
+
+
 def test_the_plan_is_smooth_stays_in_its_reach_and_ends_where_it_began() -> None:
-    plan = plan_for(1, 15.0, 9.4, 88.0, bias=(0.0, -0.3))
+    plan = plan_for(1, 15.0, 0.0, HangingJoint(9.4, 88.0, (0.0, -0.3)))
     t = np.linspace(0.0, plan.duration_s, 60001)
     q, v = np.array([[pair[1] for pair in plan.offset(float(one))] for one in t]).T
     assert (q[0], q[-1]) == pytest.approx((0.0, 0.0), abs=1e-12)
     low, high = plan.reach[1]
     assert low - 1e-9 <= q.min()
     assert max(q.max(), 0.0) <= max(high, 0.0) + 1e-9
-    assert np.abs(v).max() <= 1.2 * plan.rate_max + 0.3
+    assert np.abs(v).max() <= 1.2 * plan.course.rate_max + 0.3
     np.testing.assert_allclose(np.gradient(q, t), v, atol=2e-3)
 
 
 def test_heavy_joints_are_moved_slowly_and_within_the_torque() -> None:
-    light, heavy = plan_for(0, 15.0, 0.17, 0.0), plan_for(0, 15.0, 15.0, 134.0)
-    assert max(tone.frequency_hz for tone in heavy.tones) < 1.0
-    assert light.tones[0].amplitude > heavy.tones[0].amplitude
-    for tone in heavy.tones:
+    light, heavy = sines(0, 0.17), sines(0, 15.0, 134.0)
+    assert max(tone.frequency_hz for tone in heavy.course.tones) < 1.0
+    assert light.course.tones[0].amplitude > heavy.course.tones[0].amplitude
+    for tone in heavy.course.tones:
         assert 134.0 * tone.amplitude < 15.0
 
 
@@ -48,15 +56,15 @@ def test_heavy_joints_are_moved_slowly_and_within_the_torque() -> None:
 def test_a_bench_joint_has_the_inertia_and_friction_that_it_has(
     robot: RobotConfig, friction: float, axis: int
 ) -> None:
-    plan = plan_for(axis, 15.0, 0.5, 0.0)
-    limited = gentle(robot, plan)
+    plan = sines(axis, 0.5)
+    limited = limit_drives(robot, plan)
     drive = BenchDrive(limited)
     drive.friction = friction
-    result = jog_drive.jog_drive(
-        drive, limited, "knee_left", plan, q_seen=START, interrupts=jog_drive.Interrupts(),
+    result = run_motion(
+        {"knee_left": drive}, limited, "knee_left", plan, q_seen=START, interrupts=Interrupts(),
         progress=lambda _: None, clock=drive.clock,
     )  # fmt: skip
-    assert (result.trouble, result.is_idle) == ("", True)
+    assert (result.trouble, result.not_idle) == ("", ())
     fit = fit_sines(result.samples, plan)
     assert fit is not None
     for truth, (value, sd) in ((0.5, fit.inertia), (0.5, fit.viscous), (friction, fit.dry)):
@@ -67,20 +75,20 @@ def test_a_bench_joint_has_the_inertia_and_friction_that_it_has(
 def moved(
     hung: HungRobot, robot: RobotConfig, module: str, axis: int
 ) -> tuple[JointResult, SinePlan]:
-    leg = {name: hung.drives[name] for name in joint_drive.leg_of(module)}
-    interrupts = jog_drive.Interrupts()
-    q = joint_drive.wait_until_still(leg, robot, interrupts, hung.clock)
+    leg = {name: hung.drives[name] for name in leg_of(module)}
+    interrupts = Interrupts()
+    q = look_at(leg, robot, interrupts, hung.clock)
     assert q is not None
-    where = joint_drive.hanging(robot, q, module, axis)
-    plan = joint_drive.plan_at(robot, module, axis, 15.0, where)
-    result = joint_drive.move(
-        leg, joint_drive.limited(robot, plan), module, plan, q_seen=q, interrupts=interrupts,
+    joint = hanging_joint(robot, q, module, axis)
+    plan = plan_for(axis, 15.0, robot.joint.armature, joint)
+    result = run_motion(
+        leg, limited(robot, plan), module, plan, q_seen=q[module], interrupts=interrupts,
         progress=lambda _: None, clock=hung.clock,
     )  # fmt: skip
     assert (result.trouble, result.not_idle) == ("", ())
     fit = fit_sines(result.samples, plan)
     assert fit is not None
-    return JointResult(f"{module}_{'phi' if axis == 0 else 'theta'}", fit, where.inertia), plan
+    return JointResult(f"{module}_{'phi' if axis == 0 else 'theta'}", fit, joint.inertia), plan
 
 
 def test_an_ankles_rotor_and_friction_are_found_within_their_intervals(robot: RobotConfig) -> None:
@@ -121,31 +129,29 @@ def test_a_leg_that_swings_is_waited_for_but_not_for_ever(
 ) -> None:
     hung = HungRobot(robot, PlantConfig())
     hung.world.data.qvel[6:] = 0.5
-    leg = {name: hung.drives[name] for name in joint_drive.leg_of(MODULE)}
-    interrupts = jog_drive.Interrupts()
-    monkeypatch.setattr(joint_drive, "STILL_WAIT_S", 1.0)
+    leg = {name: hung.drives[name] for name in leg_of(MODULE)}
+    interrupts = Interrupts()
+    monkeypatch.setattr(motion_runner, "STILL_WAIT_S", 1.0)
     with pytest.raises(DriveError, match="swings"):
-        joint_drive.wait_until_still(leg, robot, interrupts, hung.clock)
+        look_at(leg, robot, interrupts, hung.clock)
     interrupts.number = 2
-    assert joint_drive.wait_until_still(leg, robot, interrupts, hung.clock) is None
+    assert look_at(leg, robot, interrupts, hung.clock) is None
 
 
-def started(hung: HungRobot, robot: RobotConfig, **change: object) -> joint_drive.LegResult:
+def started(hung: HungRobot, robot: RobotConfig, **change: object) -> MotionResult:
     """Return how a motion of the left ankle ended, with the leg's other modules held."""
-    leg = {name: hung.drives[name] for name in joint_drive.leg_of(MODULE)}
-    interrupts = jog_drive.Interrupts()
-    q = joint_drive.wait_until_still(leg, robot, interrupts, hung.clock)
+    leg = {name: hung.drives[name] for name in leg_of(MODULE)}
+    interrupts = Interrupts()
+    q = look_at(leg, robot, interrupts, hung.clock)
     assert q is not None
-    where = joint_drive.hanging(robot, q, MODULE, 0)
-    plan = joint_drive.plan_at(robot, MODULE, 0, 15.0, where)
-    words = {
-        "q_seen": q, "interrupts": interrupts, "progress": lambda _: None, "clock": hung.clock,
-    } | change  # fmt: skip
-    return joint_drive.move(leg, joint_drive.limited(robot, plan), MODULE, plan, **words)  # type: ignore[arg-type]
+    plan = plan_for(0, 15.0, robot.joint.armature, hanging_joint(robot, q, MODULE, 0))
+    words = {"q_seen": q[MODULE], "interrupts": interrupts, "clock": hung.clock}
+    words |= {"progress": lambda _: None} | change
+    return run_motion(leg, limited(robot, plan), MODULE, plan, **words)  # type: ignore[arg-type]
 
 
 def all_idle(hung: HungRobot) -> bool:
-    readings = [hung.drives[name].read(0.02) for name in joint_drive.leg_of(MODULE)]
+    readings = [hung.drives[name].read(0.02) for name in leg_of(MODULE)]
     return all(one is not None and one.status is not DriveStatus.ARMED for one in readings)
 
 
@@ -211,9 +217,9 @@ def test_drives_that_do_not_say_that_they_are_idle_are_named(robot: RobotConfig)
 
 
 def test_a_torque_beyond_the_robots_is_refused(robot: RobotConfig) -> None:
-    plan = plan_for(0, 500.0, 0.17, 0.0)
+    plan = sines(0, 0.17, torque=500.0)
     with pytest.raises(DriveError, match="torque"):
-        joint_drive.limited(robot, plan)
+        limited(robot, plan)
 
 
 def test_limits_at_the_stops_are_wider_than_the_soft_ones(robot: RobotConfig) -> None:

@@ -21,7 +21,7 @@ def answered(
     """Return what is told of a system that is simulated in fine steps."""
     steps, fine = round(plan.duration_s / DT), 8
     t = DT * np.arange(steps)
-    r = np.array([plan.at(float(one)) for one in t])
+    r = np.array([plan.offset(float(one)) for one in t])
     y, v, found = 0.0, 0.0, np.zeros(steps)
     for k in range(steps):
         late = r[max(0, k - round(delay_s / DT))]
@@ -88,7 +88,7 @@ def test_no_answer_is_said_to_be_none() -> None:
 def test_what_is_no_second_order_system_is_said_to_be_none() -> None:
     plan = excitation(0.01)
     t = DT * np.arange(round(plan.duration_s / DT))
-    r = np.array([plan.at(float(one)) for one in t])
+    r = np.array([plan.offset(float(one)) for one in t])
     y = 0.8 * r  # a motor that moves within its play
     y += 0.5 * 0.01 * np.sign(np.sin(37.0 * t))
     answer = answer_of(t, r, np.roll(y, 60), plan)
@@ -110,7 +110,7 @@ def test_proposed_gains_make_the_wanted_answer() -> None:
 def test_the_excitation_is_as_large_as_asked_and_returns() -> None:
     plan = excitation(0.01, scale=2.0)
     t = np.linspace(0.0, plan.duration_s, 20_001)
-    values = np.array([plan.at(float(one)) for one in t])
+    values = np.array([plan.offset(float(one)) for one in t])
     assert np.abs(values).max() == pytest.approx(0.01, rel=1e-3)
     assert (values[0], values[-1]) == (0.0, 0.0)
     assert [sine.frequency_hz for sine in plan.sines] == [2.0 * hz for hz in FREQUENCIES_HZ]

@@ -2,33 +2,31 @@
 
 The robot's own limits stay in force: shifts and assist are asked for as any operator asks, and the
 planner limits them. Height and pitch are led by a hand: the simulated one, or a person who is told
-where to lead. Whatever ends it, nothing is asked for any more, and the requests fade out.
+where to lead.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from shared.bus import topics
 from shared.bus.messages import HandLead, JointState, PlannerStatus, Wrench
 from shared.bus.session import Session
-from shared.clock import NS_PER_S, now_ns
+from shared.clock import now_ns
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Lead, Scenario, lead
 from shared.joints import MODULES
 from tools.bringup.identify.quasi_static import TimedRows
+from tools.bringup.led_run import run_led
 from tools.fleet.led_planner import LedPlanner
 
 ASK_S: Final = 0.02
-"""Between two requests: an intent fades out once nobody repeats it."""
-LISTEN_S: Final = 0.002
 
 Progress = Callable[[float, Lead, PlannerStatus], None]
 
 
-class MotionRecord(NamedTuple):
+class LeadRecord(NamedTuple):
     """What was heard meanwhile, by arrival."""
 
     states: tuple[TimedRows[JointState], ...]
@@ -38,16 +36,11 @@ class MotionRecord(NamedTuple):
     """Why it ended before its time; "" if it did not."""
 
 
-class Motion:
+class BodyLead:
     """A robot that is led."""
 
     def __init__(self, robot: RobotConfig, session: Session, *, simulated: bool) -> None:
-        """Meet the robot.
-
-        Args:
-            robot: its file; limits what is asked for.
-            session: of an operator.
-            simulated: a simulated hand leads height and pitch.
+        """Meet the robot; a simulated hand leads height and pitch.
 
         Raises:
             FleetError: the robot is silent, does not lead, or somebody else asks it for something.
@@ -59,26 +52,17 @@ class Motion:
         self._planner = LedPlanner(session, "identify")
         self._sent = 0
 
-    def go(
-        self, scenario: Scenario, progress: Progress, stopped: Callable[[], bool]
-    ) -> MotionRecord:
-        """Lead through a scenario's keyframes; return all that was heard.
-
-        Args:
-            scenario: its hand's path; nothing else of it is used.
-            progress: receives time, request and the planner's status now and then.
-            stopped: True to end it.
-        """
+    def go(self, scenario: Scenario, progress: Progress, stopped: Callable[[], bool]) -> LeadRecord:
+        """Lead through a scenario's keyframes; return all that was heard."""
         states: list[tuple[list[int], list[JointState]]] = [([], []) for _ in MODULES]
         wrenches: tuple[list[int], list[Wrench]] = ([], [])
-        begin = now_ns()
-        ask_s, ended = 0.0, ""
-        while not ended and (t_s := (now_ns() - begin) / NS_PER_S) < scenario.duration:
-            if t_s >= ask_s:
-                wanted = self._limited(lead(scenario, t_s))
-                self._ask(wanted)
-                progress(t_s, wanted, self._planner.status)
-                ask_s = t_s + ASK_S
+
+        def ask(t_s: float) -> None:
+            wanted = self._limited(lead(scenario, t_s))
+            self._ask(wanted)
+            progress(t_s, wanted, self._planner.status)
+
+        def listen() -> None:
             for (t_ns, rows), source in zip(states, self._states, strict=True):
                 if (state := source.take()) is not None:
                     t_ns.append(now_ns())
@@ -87,9 +71,9 @@ class Motion:
                 wrenches[0].append(now_ns())
                 wrenches[1].append(wrench)
             self._planner.look()
-            ended = "stopped" if stopped() else self._planner.trouble()
-            time.sleep(LISTEN_S)
-        return MotionRecord(tuple(TimedRows(*one) for one in states), TimedRows(*wrenches), ended)
+
+        ended = run_led(self._planner, scenario.duration, ask, listen, stopped, every_s=ASK_S)
+        return LeadRecord(tuple(TimedRows(*one) for one in states), TimedRows(*wrenches), ended)
 
     def _limited(self, wanted: Lead) -> Lead:
         x, y, roll, yaw = (

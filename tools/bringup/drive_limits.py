@@ -1,6 +1,6 @@
-"""Restores a drive's own limits after a jog to those of the robot file.
+"""Restores a drive's own limits after a motion to those of the robot file.
 
-A drive keeps the small limits of a jog until a service arms it or it restarts. `xrl doctor` would
+A drive keeps a motion's small limits until a service arms it or it restarts. `xrl doctor` would
 find them wrong, and `xrl configure --apply` would restart the board for them, which loses its zero.
 """
 
@@ -18,7 +18,7 @@ from shared.config.robot_config import RobotConfig, expand
 from shared.config.sections import CanConfig
 from shared.exceptions import DriveError, XrlError
 from tools.bringup.boards import Value, equal
-from tools.bringup.reach import boards_on_usb
+from tools.bringup.drive_access import boards_on_usb
 
 TIMES: Final = 3
 """CAN of firmware 0.5 does not tell its limits, and a frame may be lost."""
@@ -29,8 +29,7 @@ def give_back(robot: RobotConfig, module: str, run_dir: Path) -> None:
     """Set the limits of a module's drive, which must be idle and nobody's, to the robot file's.
 
     Raises:
-        DriveError: the drive cannot be reached, or does not keep them.
-        FleetError: the stand-in for libusb cannot be built.
+        XrlError: the drive cannot be reached, or does not keep them.
     """
     if robot.joint_service.driver == "odrive_usb":
         _over_usb(robot, module, run_dir)
@@ -53,10 +52,7 @@ def not_given_back(robot: RobotConfig, module: str, run_dir: Path) -> str:
 def _over_can(robot: RobotConfig, module: str, run_dir: Path) -> None:
     wiring, drive = robot.module_named(module), robot.drive
     bus = robot.can[wiring.bus]
-    limits = (
-        Command.SET_LIMITS,
-        cansimple.pack_two_floats(drive.vel_limit, drive.current_lim),
-    )
+    limits = (Command.SET_LIMITS, cansimple.pack_two_floats(drive.vel_limit, drive.current_lim))
     channel = expand(bus.channel, run_dir)
     link = CanLink(CanConfig(interface=bus.interface, channel=channel), wiring.node_ids)
     try:

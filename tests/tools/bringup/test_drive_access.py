@@ -10,7 +10,7 @@ import pytest
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import CanConfig
 from shared.exceptions import FleetError
-from tools.bringup import reach
+from tools.bringup import drive_access
 
 
 def on_socketcan(robot: RobotConfig, *buses: str) -> RobotConfig:
@@ -26,12 +26,12 @@ def test_a_robot_file_with_one_bus_forgotten_never_finds_emulated_drives_right(
 ) -> None:
     """Its USB would be the emulated one, and every setting there is as wanted."""
     half = on_socketcan(robot, *(name for name in robot.can if name != "harness"))
-    drives = reach.drives_within_reach(half, tmp_path / "robot.toml", tmp_path / "r")
+    drives = drive_access.drives_within_reach(half, tmp_path / "robot.toml", tmp_path / "r")
     with pytest.raises(FleetError, match=r"\[can\.harness\] is emulated"), drives:
         pass
     assert not (tmp_path / "r").exists()
 
 
 def test_a_robot_file_that_is_all_real_or_all_emulated_is_clear(robot: RobotConfig) -> None:
-    reach.refuse_half_emulated(robot)
-    reach.refuse_half_emulated(on_socketcan(robot, *robot.can))
+    drive_access.refuse_half_emulated(robot)
+    drive_access.refuse_half_emulated(on_socketcan(robot, *robot.can))

@@ -1,14 +1,14 @@
-"""Moving one axis of one module a little and back, by the drive's own loop: law and judgement.
+"""Moving one axis of one module a little and back, by the drive's own loop: plan, limits, guards.
 
 Law, torque limiter and drive targets are the joint service's, so a sign that is right here is right
 there. Only the force differs: the drive's own current limit keeps every motor below the requested
-torque, whatever happens to this process. Pure; `jog_drive` has the clock and the drive.
+torque, whatever happens to this process. Pure; `motion_runner` has the clock and the drives.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple, Protocol
+from typing import Any, Final, Generic, NamedTuple, Protocol, TypeVar
 
 import msgspec
 
@@ -22,10 +22,13 @@ from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import StandGains
 from shared.exceptions import DriveError
-from shared.joints import AXES, kind_of
+from shared.joints import AXES, KINDS
+from shared.robot.robot_model import HARD_STOP_MARGIN
 
 SETTLE_S: Final = 0.7
 """Held where it is before it moves, and again afterwards."""
+BIAS_S: Final = 2.0
+"""Time in which a module is led to the place that it moves about, s."""
 VEL_LIMIT: Final = 3.0
 """turn/s at the motor, at least; a drive that is faster disarms by itself (OVERSPEED)."""
 VEL_FACTOR: Final = 5.0
@@ -39,92 +42,102 @@ SILENT_S: Final = 0.2
 """Without a sample for so long, nobody knows where the joint is."""
 STRAYED_MAX: Final = 0.05
 """rad that a limp joint may have moved between the look and the arming."""
-TRAVEL_SHARE: Final = 0.25
-"""Fraction of the requested travel by which the travel may differ."""
-LAG_MAX: Final = 0.02
-"""rad between reference and joint, beyond the deflection by its load at rest."""
-SIBLING_MAX: Final = 0.02
-"""rad that the other axis may move."""
+STOP_ROOM: Final = 0.02
+"""rad beyond a stop: zero errors of the encoders, and a stop that gives way."""
 
 
-class MotionPlan(Protocol):
-    """A motion of one axis about where the joint is found."""
-
-    @property
-    def axis(self) -> int:
-        """0: phi, 1: theta."""
-
-    @property
-    def torque_limit(self) -> float:
-        """N m at the joint: |tau_phi| + |tau_theta|."""
+class AxisCourse(Protocol):
+    """A motion of one axis about a place, from which it starts and where it ends."""
 
     @property
     def duration_s(self) -> float:
-        """How long the whole takes."""
+        """How long it takes."""
 
     @property
-    def reach(self) -> tuple[Pair, Pair]:
-        """Lowest and highest offset that phi, and that theta, is led to, rad."""
+    def span(self) -> Pair:
+        """Lowest and highest offset, rad."""
 
     @property
     def rate_max(self) -> float:
         """Fastest rate that it asks for, rad/s."""
 
-    def gains(self, stand: StandGains) -> tuple[Pair, Pair]:
-        """Return k_p, N m/rad, and k_d, N m s/rad, of (phi, theta).
-
-        Args:
-            stand: of the module.
-        """
-
-    def offset(self, t_s: float) -> tuple[Pair, Pair]:
-        """Return the offsets of (phi, theta), rad, and their rates, rad/s.
-
-        Args:
-            t_s: since the drive was armed, s.
-        """
+    def at(self, t_s: float) -> Pair:
+        """Return offset, rad, and rate, rad/s, at a time within its duration."""
 
 
-class JogPlan(NamedTuple):
-    """There and back: by/2 (1 - cos) along the axis, between two rests."""
+class Stay:
+    """No motion, for as long as it takes: of a module that is held."""
+
+    duration_s: float = math.inf
+    span: Pair = pd_law.ZERO
+    rate_max: float = 0.0
+
+    def at(self, t_s: float) -> Pair:  # noqa: ARG002 - at every time
+        """Return no offset and no rate."""
+        return pd_law.ZERO
+
+
+C = TypeVar("C", bound=AxisCourse)
+
+
+class MotionPlan(NamedTuple, Generic[C]):
+    """A course of one axis about where the joint is found, or about a bias from there."""
 
     axis: int
-    by: float
-    """rad, there and back."""
-    period_s: float
-    """Period of one motion there and back, s."""
-    cycles: int
+    """0: phi, 1: theta."""
+    course: C
     torque_limit: float
+    """N m at the joint: |tau_phi| + |tau_theta|."""
+    bias: Pair = pd_law.ZERO
+    """Where the module is led first, and back from, rad: a knee hangs straight, on its stop."""
+    own_gains: tuple[Pair, Pair] | None = None
+    """k_p, N m/rad, and k_d, N m s/rad, of (phi, theta); None: the module's stand gains."""
+
+    @property
+    def rest_s(self) -> float:
+        """Time before the course and after it, s, with the way to the bias."""
+        return SETTLE_S + (BIAS_S + SETTLE_S if any(self.bias) else 0.0)
 
     @property
     def duration_s(self) -> float:
         """How long the whole takes."""
-        return SETTLE_S + self.cycles * self.period_s + SETTLE_S
+        return 2.0 * self.rest_s + self.course.duration_s
 
     @property
     def reach(self) -> tuple[Pair, Pair]:
         """Lowest and highest offset that phi, and that theta, is led to, rad."""
-        moved = (min(0.0, self.by), max(0.0, self.by))
-        return (moved, pd_law.ZERO) if self.axis == 0 else (pd_law.ZERO, moved)
-
-    @property
-    def rate_max(self) -> float:
-        """Fastest rate that it asks for, rad/s."""
-        return math.pi * abs(self.by) / self.period_s
+        phi, theta = (
+            (self.bias[axis] + low, self.bias[axis] + high)
+            for axis in (0, 1)
+            for low, high in [self.course.span if axis == self.axis else pd_law.ZERO]
+        )
+        return phi, theta
 
     def gains(self, stand: StandGains) -> tuple[Pair, Pair]:
-        """Return the stand gains."""
-        return stand.k_p, stand.k_d
+        """Return k_p and k_d of a module with these stand gains."""
+        return self.own_gains or (stand.k_p, stand.k_d)
 
     def offset(self, t_s: float) -> tuple[Pair, Pair]:
-        """Return the offsets of (phi, theta), rad, and their rates, rad/s, at a time, s."""
-        moving_s = t_s - SETTLE_S
-        if not 0.0 <= moving_s <= self.cycles * self.period_s:
-            return pd_law.ZERO, pd_law.ZERO
-        omega = 2.0 * math.pi / self.period_s
-        way = 0.5 * self.by * (1.0 - math.cos(omega * moving_s))
-        rate = 0.5 * self.by * omega * math.sin(omega * moving_s)
-        return ((way, 0.0), (rate, 0.0)) if self.axis == 0 else ((0.0, way), (0.0, rate))
+        """Return the offsets of (phi, theta), rad, and their rates, rad/s, at a time.
+
+        Args:
+            t_s: since the drive was armed.
+        """
+        left_s, along_s = self.duration_s - t_s, t_s - self.rest_s
+        inside = 0.0 <= along_s <= self.course.duration_s
+        moved, rate = self.course.at(along_s) if inside else pd_law.ZERO
+        phase = min(1.0, max(0.0, (min(t_s, left_s) - SETTLE_S) / BIAS_S))
+        way = 0.5 - 0.5 * math.cos(math.pi * phase)
+        side = 1.0 if t_s < left_s else -1.0
+        slope = side * 0.5 * math.pi / BIAS_S * math.sin(math.pi * phase)
+        (phi, theta), own = self.bias, (1.0 - self.axis, float(self.axis))
+        return (
+            (way * phi + own[0] * moved, way * theta + own[1] * moved),
+            (slope * phi + own[0] * rate, slope * theta + own[1] * rate),
+        )
+
+
+AnyPlan = MotionPlan[Any]
 
 
 class Sample(NamedTuple):
@@ -140,17 +153,7 @@ class Sample(NamedTuple):
     """Torque at this sample by the target before it, which the drive had up to now."""
 
 
-class JogCheck(NamedTuple):
-    """One line of the verdict."""
-
-    what: str
-    value: str
-    wanted: str
-    """Remedy; "" if there is none."""
-    good: bool
-
-
-def gentle(robot: RobotConfig, plan: MotionPlan) -> RobotConfig:
+def limit_drives(robot: RobotConfig, plan: AnyPlan) -> RobotConfig:
     """Return the robot with its drives limited to the plan's torque and speed.
 
     A motor's torque is at most T / 2N, so that |tau_phi| + |tau_theta| <= T in the drive.
@@ -166,7 +169,7 @@ def gentle(robot: RobotConfig, plan: MotionPlan) -> RobotConfig:
             f"--torque-limit {plan.torque_limit:g}: {per_ampere:.1f} .. {most:.1f} N m are right "
             "(one ampere, and what the robot file allows)"
         )
-    asked = plan.rate_max * joint.gear_ratio / (2.0 * math.pi)
+    asked = plan.course.rate_max * joint.gear_ratio / (2.0 * math.pi)
     speed = min(drive.vel_limit, max(VEL_LIMIT, VEL_FACTOR * asked))
     limited = msgspec.structs.replace(
         drive, current_lim=plan.torque_limit / per_ampere, vel_limit=speed
@@ -174,17 +177,27 @@ def gentle(robot: RobotConfig, plan: MotionPlan) -> RobotConfig:
     return msgspec.structs.replace(robot, drive=limited)
 
 
-def outside(robot: RobotConfig, module: str, plan: MotionPlan, q: Pair) -> str:
+def within_stops(robot: RobotConfig) -> RobotConfig:
+    """Return the robot with its limits at the mechanism's stops: a hanging leg may rest on one."""
+    limits, m = {}, HARD_STOP_MARGIN + STOP_ROOM
+    for kind in KINDS:
+        limit = getattr(robot.limits, kind)
+        (a, b), (c, d) = limit.phi, limit.theta
+        limits[kind] = msgspec.structs.replace(limit, phi=(a - m, b + m), theta=(c - m, d + m))
+    return msgspec.structs.replace(robot, limits=msgspec.structs.replace(robot.limits, **limits))
+
+
+def why_out_of_reach(robot: RobotConfig, module: str, plan: AnyPlan, q: Pair) -> str:
     """Return why the joint may not go where the plan leads it from q, rad; "" if it may."""
     limits = limits_of(robot, module)
     for axis, (low, high) in enumerate((limits.phi, limits.theta)):
-        reach = [q[axis] + offset for offset in plan.reach[axis]]
-        if not low <= q[axis] <= high:
+        if not low <= q[axis] <= high:  # so that a NaN is outside
             return (
                 f"{AXES[axis]} is at {q[axis]:.3f} rad, outside of {low:g} .. {high:g} rad; bring "
                 "it inside by hand, or correct its zero (`xrl zero`)"
             )
-        beyond = [to for to in reach if not low <= to <= high]
+        ends = [q[axis] + offset for offset in plan.reach[axis]]
+        beyond = [end for end in ends if not low <= end <= high]
         if beyond:
             return (
                 f"{AXES[axis]} is at {q[axis]:.3f} rad and would go to {beyond[0]:.3f}, outside of "
@@ -194,26 +207,16 @@ def outside(robot: RobotConfig, module: str, plan: MotionPlan, q: Pair) -> str:
     return ""
 
 
-def what_to_see(module: str, axis: int, by: float) -> str:
-    """Return a description of the right motion, for a person who watches.
-
-    A positive angle leans the part above the joint forward (theta) or to the right (phi)
-    against the part below; below a hanging torso, the lower part swings the same way.
-    """
-    kind, positive = kind_of(module), by > 0.0
-    upper = {"ankle": "shin", "knee": "thigh", "hip": "torso"}[kind]
-    if axis == 1:
-        way = "forward" if positive else "back"
-        foot = "the toes point up" if positive else "the toes point down"
-    else:
-        way = "to its right" if positive else "to its left"
-        foot = f"the sole turns its {'right' if positive else 'left'} edge up"
-    lower = {"ankle": foot, "knee": f"the shin swings {way}", "hip": f"the thigh swings {way}"}
-    return f"the {upper} leans {way}; where the torso hangs, {lower[kind]}"
+def why_strayed(q: Pair, q_seen: Pair) -> str:
+    """Return what to say of a joint that is elsewhere than it was seen; "" if it is not."""
+    strayed = max(abs(q[0] - q_seen[0]), abs(q[1] - q_seen[1]))
+    if strayed <= STRAYED_MAX:
+        return ""
+    return f"the joint has moved by {strayed:.3f} rad before it was armed"
 
 
-class Jog:
-    """The law of one jog and its state, cycle by cycle.
+class GuardedMotion:
+    """The law of one motion and its state, cycle by cycle.
 
     Attributes:
         trouble: why it was stopped; "" if it was not.
@@ -222,17 +225,9 @@ class Jog:
     """
 
     def __init__(
-        self, robot: RobotConfig, module: str, plan: MotionPlan, q: Pair, now_ns: int
+        self, robot: RobotConfig, module: str, plan: AnyPlan, q: Pair, now_ns: int
     ) -> None:
-        """Begin at q, rad, with a drive that has just been armed.
-
-        Args:
-            robot: as `gentle` made it.
-            module: which.
-            plan: what to do.
-            q: where the joint was found.
-            now_ns: monotonic time.
-        """
+        """Begin at q, rad, with a drive that has just been armed; robot: as of `limit_drives`."""
         self._k_p, self._k_d = plan.gains(robot.stand_gains(module))
         limits = limits_of(robot, module)
         self._limits: TorqueLimits = msgspec.structs.replace(
@@ -267,7 +262,8 @@ class Jog:
             return None
         q = joint_from_motor(reading.pos_turns, self._gear_ratio)
         v = joint_from_motor(reading.vel_turns, self._gear_ratio)
-        q_ref, v_ref = self._reference(t_s)
+        (by_phi, by_theta), v_ref = self._plan.offset(t_s)
+        q_ref = (self._q_start[0] + by_phi, self._q_start[1] + by_theta)
         before = self._setpoint or pd_law.Setpoint(
             q, pd_law.ZERO, pd_law.ZERO, pd_law.ZERO, self._k_p, self._k_d
         )
@@ -276,20 +272,14 @@ class Jog:
         self._tau = limit_torque(pd_law.torque(setpoint, q, v), q, self._tau, self._limits)
         self._setpoint = setpoint
         self.samples.append(Sample(t_s, q_ref, q, self._tau, tau_before))
-        self.trouble = self._watch(t_s, q_ref, q)
+        self.trouble = self._why_stop(t_s, q_ref, q)
         self.done = t_s > self._plan.duration_s
         if self.trouble:
             return None
         pos, vel = reading.pos_turns, reading.vel_turns
         return self._onboard.target(now_ns, setpoint, self._tau, pos, vel)
 
-    def _reference(self, t_s: float) -> tuple[Pair, Pair]:
-        """Return q_ref, rad, and v_ref, rad/s."""
-        (by_phi, by_theta), v_ref = self._plan.offset(t_s)
-        phi, theta = self._q_start
-        return (phi + by_phi, theta + by_theta), v_ref
-
-    def _watch(self, t_s: float, q_ref: Pair, q: Pair) -> str:
+    def _why_stop(self, t_s: float, q_ref: Pair, q: Pair) -> str:
         """Return what speaks against going on; "" if nothing does."""
         for axis in (0, 1):
             if not abs(q[axis] - q_ref[axis]) <= APART_MAX:
@@ -308,60 +298,3 @@ class Jog:
                 "the way, or the load needs more (--torque-limit)"
             )
         return ""
-
-
-def judge(samples: list[Sample], plan: JogPlan) -> list[JogCheck]:
-    """Return the verdict on a jog that came to its end."""
-    axis, other = plan.axis, 1 - plan.axis
-    rest = [s for s in samples if s.t_s < SETTLE_S][-20:]
-    moving = [s for s in samples if SETTLE_S <= s.t_s <= plan.duration_s - SETTLE_S]
-    if not rest or not moving:
-        return [
-            JogCheck("samples", f"{len(rest)} at rest, {len(moving)} moving", "some of both", False)
-        ]
-    q_rest = _mean([s.q[axis] for s in rest])
-    sag = q_rest - rest[-1].q_ref[axis]
-    sign = math.copysign(1.0, plan.by)
-    travel = sign * max(sign * (s.q[axis] - q_rest) for s in moving)
-    lag = max(abs(s.q[axis] - s.q_ref[axis] - sag) for s in moving)
-    still = _mean([s.q[other] for s in rest])
-    strayed = max(abs(s.q[other] - still) for s in moving)
-    peak = max(abs(s.tau[0]) + abs(s.tau[1]) for s in samples)
-    return [
-        JogCheck(
-            f"{AXES[axis]} went",
-            f"{travel:+.4f} rad",
-            f"{plan.by:+.4f} within {TRAVEL_SHARE:.0%}",
-            abs(travel - plan.by) <= TRAVEL_SHARE * abs(plan.by),
-        ),
-        JogCheck("largest lag", f"{lag:.4f} rad", f"<= {LAG_MAX:g}", lag <= LAG_MAX),
-        JogCheck(
-            f"{AXES[other]} strayed",
-            f"{strayed:.4f} rad",
-            f"<= {SIBLING_MAX:g}",
-            strayed <= SIBLING_MAX,
-        ),
-        JogCheck("torque at rest", f"{_mean([s.tau[axis] for s in rest]):+.2f} N m", "", True),
-        JogCheck("largest torque, both axes", f"{peak:.2f} N m", f"< {plan.torque_limit:g}", True),
-        JogCheck("friction, dry and viscous", f"{friction(moving, plan):.2f} N m", "", True),
-    ]
-
-
-def friction(moving: list[Sample], plan: JogPlan) -> float:
-    """Return half the difference of torque between the way there and the way back, N m.
-
-    Only where the motion is fast; gravity and springs are the same on both ways and cancel.
-    """
-    omega = 2.0 * math.pi / plan.period_s
-    sign = math.copysign(1.0, plan.by)
-    there: list[float] = []
-    back: list[float] = []
-    for s in moving:
-        sine = math.sin(omega * (s.t_s - SETTLE_S))
-        if abs(sine) > 0.5:
-            (there if sine > 0.0 else back).append(sign * s.tau[plan.axis])
-    return 0.5 * (_mean(there) - _mean(back)) if there and back else math.nan
-
-
-def _mean(values: list[float]) -> float:
-    return math.fsum(values) / len(values)

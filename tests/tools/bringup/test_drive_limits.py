@@ -15,7 +15,7 @@ from shared.can.cansimple import Command
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
 from tests.tools.bringup.board_in_memory import BoardInMemory, as_wanted
-from tools.bringup import limits
+from tools.bringup import drive_limits
 from tools.bringup.boards import FoundBoards
 
 MODULE = "knee_left"
@@ -47,14 +47,14 @@ class Link:
 @pytest.fixture
 def link(monkeypatch: pytest.MonkeyPatch) -> Link:
     link = Link()
-    monkeypatch.setattr(limits, "CanLink", lambda *_: link)
+    monkeypatch.setattr(drive_limits, "CanLink", lambda *_: link)
     return link
 
 
 def test_over_can_both_axes_get_the_robot_files_limits_more_than_once(
     robot: RobotConfig, link: Link
 ) -> None:
-    limits.give_back(robot, MODULE, Path("/nowhere"))
+    drive_limits.give_back(robot, MODULE, Path("/nowhere"))
     wanted = (robot.drive.vel_limit, robot.drive.current_lim)
     for node in robot.module_named(MODULE).node_ids:
         found = [
@@ -62,15 +62,15 @@ def test_over_can_both_axes_get_the_robot_files_limits_more_than_once(
             for message in link.sent
             if message.arbitration_id == cansimple.arbitration_id(node, Command.SET_LIMITS)
         ]
-        assert found == [pytest.approx(wanted)] * limits.TIMES
-    assert len(link.sent) == 2 * limits.TIMES, "and nothing else"
+        assert found == [pytest.approx(wanted)] * drive_limits.TIMES
+    assert len(link.sent) == 2 * drive_limits.TIMES, "and nothing else"
     assert not link.open
 
 
 def test_a_bus_that_is_gone_is_reported(robot: RobotConfig, link: Link) -> None:
     link.open = False
     with pytest.raises(DriveError, match="takes no frames"):
-        limits.give_back(robot, MODULE, Path("/nowhere"))
+        drive_limits.give_back(robot, MODULE, Path("/nowhere"))
 
 
 @pytest.fixture
@@ -81,7 +81,7 @@ def on_usb(robot: RobotConfig, monkeypatch: pytest.MonkeyPatch) -> tuple[RobotCo
     def boards(*_: object):  # type: ignore[no-untyped-def]
         yield found
 
-    monkeypatch.setattr(limits, "boards_on_usb", boards)
+    monkeypatch.setattr(drive_limits, "boards_on_usb", boards)
     service = msgspec.structs.replace(robot.joint_service, driver="odrive_usb")
     return msgspec.structs.replace(robot, joint_service=service), found
 
@@ -90,17 +90,17 @@ def test_over_usb_they_are_written_and_read_back(on_usb: tuple[RobotConfig, Foun
     robot, found = on_usb
     board = found.boards[SERIAL]
     assert isinstance(board, BoardInMemory)
-    limits.give_back(robot, MODULE, Path("/nowhere"))
+    drive_limits.give_back(robot, MODULE, Path("/nowhere"))
     assert board.now == as_wanted()
     assert board.saves == 0, "a board that saves restarts, and has lost its zero"
     board.now |= SMALL
     board.deaf.add("axis0.controller.config.vel_limit")
     with pytest.raises(DriveError, match="did not keep"):
-        limits.give_back(robot, MODULE, Path("/nowhere"))
+        drive_limits.give_back(robot, MODULE, Path("/nowhere"))
 
 
 def test_a_board_that_has_gone_is_reported(on_usb: tuple[RobotConfig, FoundBoards]) -> None:
     robot, found = on_usb
     found.boards.clear()
     with pytest.raises(DriveError, match=f"{SERIAL}: not there"):
-        limits.give_back(robot, MODULE, Path("/nowhere"))
+        drive_limits.give_back(robot, MODULE, Path("/nowhere"))

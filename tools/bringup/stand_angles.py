@@ -20,7 +20,7 @@ ROUNDS: Final = 20
 """Most rounds of the search for the COM height of a torso height; three are usual."""
 
 
-class Standing(NamedTuple):
+class StandAngles(NamedTuple):
     """An upright stand, soles flat, COM over the ankles."""
 
     q: dict[str, Pair]
@@ -29,12 +29,8 @@ class Standing(NamedTuple):
     """Position of the hips ahead of the ankles with the COM over the ankles, m."""
 
 
-def standing(robot: RobotConfig, height: float) -> Standing:
-    """Return the stand with the torso level at a height.
-
-    Args:
-        robot: the robot.
-        height: of the torso's origin (midway between the hips) above the ankles, m.
+def stand_angles(robot: RobotConfig, height: float) -> StandAngles:
+    """Return the stand with the torso level and its origin (between the hips) at a height, m.
 
     Raises:
         RunError: the legs do not reach there within their limits.
@@ -59,7 +55,7 @@ def standing(robot: RobotConfig, height: float) -> Standing:
         if abs(height - z) <= HEIGHT_TOLERANCE:
             angles = ik.q.reshape(len(MODULES), 2).tolist()
             q = {module: (angles[i][0], angles[i][1]) for module, i in MODULE_INDEX.items()}
-            return Standing(q, float(kinematics.r_torso[0]))
+            return StandAngles(q, float(kinematics.r_torso[0]))
         if before is not None and z != before[0]:
             slope = (z_com - before[1]) / (z - before[0])
         before = (z, z_com)

@@ -1,8 +1,11 @@
-"""The drives within reach of bring-up: real ones as they are, emulated ones by the same code.
+"""Who holds the drives now, and how a verb of bring-up gets at them.
 
-Where the drives are emulated, `xrl doctor` and `xrl configure` look at them by the same code as
-at real ones: over the emulated CAN buses, and with the genuine `odrive` package over the stand-in
-of libusb. A fleet that is up is looked at as it is; else the simulator runs alone for the while.
+A drive has one master. Before a verb writes to one it asks whether a joint service has it; while
+it works, no fleet can be started in the same run directory.
+
+Emulated drives are looked at by the same code as real ones: over the emulated CAN buses, and with
+the genuine `odrive` package over the stand-in of libusb. A fleet that is up is looked at as it is;
+else the simulator runs alone for the while.
 """
 
 from __future__ import annotations
@@ -10,18 +13,22 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
 from services.simulator.drives.axis_settings import Settings, plant
 from services.simulator.fronts import usb_standin
+from shared import places
+from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig, expand
 from shared.config.sections import CanConfig
-from shared.exceptions import FleetError
+from shared.exceptions import FleetError, XrlError
 from shared.extras import require
+from shared.joints import MODULES
 from tools.bringup.boards import FoundBoards
 from tools.bringup.can_monitor import listen
 from tools.fleet import procfs
@@ -33,19 +40,104 @@ STARTED_S: Final = 15.0
 """Longest wait for the first frames of a simulator that was started."""
 UP_S: Final = 3.0
 """The same where a fleet is up: its simulator may be dead, or another verb's that is starting."""
+SETTLE_S: Final = 1.5
+"""Until an emulated robot hangs still in its hoist."""
+GONE: Final = (
+    "the drives were emulated for this command only, and the written values are gone; "
+    "`xrl up --only simulator` keeps them"
+)
 _POLL_S = 0.05
+
+
+def robot_file(args: argparse.Namespace) -> Path:
+    """Return the robot file: of the fleet that is up in `--run-dir`, else as `places.robot_file`.
+
+    Raises:
+        ConfigError: there is no fleet, and the file found may not be taken.
+        FleetError: `--config` is not the fleet's.
+    """
+    run = RunDir(args.run_dir)
+    manifest = run.read_manifest()
+    if manifest is None or not is_up(run.path):
+        return Path(os.path.abspath(places.robot_file(args.config)))  # noqa: PTH100 - links stay
+    if args.config is None:
+        return Path(manifest.config)
+    given = Path(os.path.abspath(args.config))  # noqa: PTH100 - as the manifest has it
+    if given != Path(manifest.config):
+        raise FleetError(
+            f"the fleet in {run.path} runs with {manifest.config}, not with {given}; "
+            "leave --config out, or name another fleet with --run-dir"
+        )
+    return Path(manifest.config)
+
+
+def is_up(run_dir: Path) -> bool:
+    """Return True if a fleet has a process in this run directory."""
+    return bool(procfs.fleet_pids(RunDir(run_dir).path))
+
+
+def service_on(robot: RobotConfig, module: str, run_dir: Path) -> SupervisedFleet | None:
+    """Return the fleet of this user's that has a joint service on a module's drive, or None.
+
+    In whatever run directory: two fleets may mean the same drive.
+    """
+    drive = _drive_of(robot, module, RunDir(run_dir).path)
+    for path in sorted(map(Path, procfs.fleets())):
+        manifest = RunDir(path).read_manifest()
+        if manifest is None:
+            continue
+        with contextlib.suppress(XrlError):  # a file that has become unreadable since is ignored
+            other = config_file.load_without_schedule(Path(manifest.config))
+            services = [name for name in manifest.services if name in MODULES]
+            if any(_drive_of(other, name, path) == drive for name in services):
+                return SupervisedFleet(path)
+    return None
+
+
+def _drive_of(robot: RobotConfig, module: str, run_dir: Path) -> tuple[str, ...]:
+    """Return a unique id of a drive; of an emulated one with its run directory."""
+    wiring = robot.module_named(module)
+    place = str(run_dir) if is_simulated(robot) else ""
+    if robot.joint_service.driver == "odrive_usb":
+        return (place, wiring.serial_number.upper())
+    bus = robot.can[wiring.bus]
+    return (place, bus.interface, expand(bus.channel, run_dir), *map(str, wiring.node_ids))
+
+
+def refuse_service(robot: RobotConfig, module: str, run_dir: Path) -> None:
+    """Refuse a module whose joint service is up: a drive has one master.
+
+    Raises:
+        FleetError: it is.
+    """
+    fleet = service_on(robot, module, run_dir)
+    if fleet is not None:
+        raise FleetError(
+            f"{module}: its joint service in {fleet.run.path} has the drive; hang the robot and "
+            f"`xrl down --run-dir {fleet.run.path}` first"
+        )
+
+
+def confirm(question: str, *, yes: bool) -> bool:
+    """Ask on the terminal; True at once if it was answered by `--yes`.
+
+    Raises:
+        FleetError: there is no terminal to ask on.
+    """
+    if yes:
+        return True
+    if not sys.stdin.isatty():
+        raise FleetError("no terminal to ask on; give --yes if the robot may be touched unasked")
+    return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
 
 
 def add_plant(parser: argparse.ArgumentParser) -> None:
     """Add `--plant`: settings that the emulated drives have kept."""
     parser.add_argument(
-        "--plant",
-        action="append",
-        default=[],
-        metavar="MODULE.NAME=VALUE",
+        "--plant", action="append", default=[], metavar="MODULE.NAME=VALUE",
         help="emulated robot only: a setting that a drive has kept, as "
         "knee_left.axis0.controller.config.vel_limit=2; may be given several times",
-    )
+    )  # fmt: skip
 
 
 def check_plants(robot: RobotConfig, run_dir: Path, plants: Sequence[str]) -> None:
@@ -73,28 +165,18 @@ def refuse_half_emulated(robot: RobotConfig) -> None:
     """Refuse a robot file some of whose buses are emulated and others real.
 
     One bus that was forgotten would make its USB the emulated one: emulated drives are as wanted.
-
-    Raises:
-        FleetError: naming the buses.
     """
-    used = sorted(robot.buses)
-    emulated = [name for name in used if robot.can[name].interface == SIMULATED_CAN]
-    if emulated and len(emulated) < len(used):
-        real = [name for name in used if name not in emulated]
+    emulated = {name: robot.can[name].interface == SIMULATED_CAN for name in sorted(robot.buses)}
+    if len(set(emulated.values())) > 1:
+        some, real = (
+            ", ".join(f"[can.{name}]" for name, is_so in emulated.items() if is_so == wanted)
+            for wanted in (True, False)
+        )
         raise FleetError(
-            f"robot file: {_tables(emulated)} {'is' if len(emulated) == 1 else 'are'} emulated "
-            f'(interface = "{SIMULATED_CAN}"), {_tables(real)} not: which drives are meant? Make '
+            f"robot file: {some} {'are' if ',' in some else 'is'} emulated "
+            f'(interface = "{SIMULATED_CAN}"), {real} not: which drives are meant? Make '
             "all of them real ones, or all emulated"
         )
-
-
-def _tables(buses: Sequence[str]) -> str:
-    return ", ".join(f"[can.{name}]" for name in buses)
-
-
-def is_up(run_dir: Path) -> bool:
-    """Return True if a fleet has a process in this run directory."""
-    return bool(procfs.fleet_pids(RunDir(run_dir).path))
 
 
 @contextlib.contextmanager
@@ -131,15 +213,11 @@ def drives_within_reach(
         # a light foot in the air on a damped drivetrain wants a finer step than a standing robot
         words += ["--lifted", f"{lifted:g}", "--plant", "steps=4"] if lifted else []
         simulator = SupervisedFleet.start(
-            config_path,
-            run_dir,
-            overrides={"simulator": words},
-            no_restart=frozenset({"simulator"}),
-            services=["simulator"],
-            leashed=True,
-        )
+            config_path, run_dir, overrides={"simulator": words},
+            no_restart=frozenset({"simulator"}), services=["simulator"], leashed=True,
+        )  # fmt: skip
     try:
-        wait_for_simulator(robot, run_dir, UP_S if simulator is None else STARTED_S)
+        _await_simulator(robot, run_dir, UP_S if simulator is None else STARTED_S)
         yield simulator is not None
         if simulator is not None and not simulator.pids():
             log = simulator.run.log_of("simulator")
@@ -150,7 +228,7 @@ def drives_within_reach(
             simulator.stop()
 
 
-def wait_for_simulator(robot: RobotConfig, run_dir: Path, seconds: float) -> None:
+def _await_simulator(robot: RobotConfig, run_dir: Path, seconds: float) -> None:
     """Wait until an emulated robot's load cells speak: its buses are there, and its loop runs.
 
     Not for ever: its simulator may be dead.
@@ -158,10 +236,9 @@ def wait_for_simulator(robot: RobotConfig, run_dir: Path, seconds: float) -> Non
     bus = robot.can[robot.harness.bus]
     config = CanConfig(interface=bus.interface, channel=expand(bus.channel, RunDir(run_dir).path))
     until = time.monotonic() + seconds
-    while (
-        time.monotonic() < until
-        and not listen(config, (), poll_nodes=False, seconds=_POLL_S).frames
-    ):
+    while time.monotonic() < until:
+        if listen(config, (), poll_nodes=False, seconds=_POLL_S).frames:
+            return
         time.sleep(_POLL_S)
 
 
@@ -184,6 +261,35 @@ def no_fleet_meanwhile(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
     finally:
         run.clear(keep_logs=True)
         os.close(lock)
+
+
+@contextlib.contextmanager
+def drives_to_ourselves(
+    robot: RobotConfig,
+    config_path: Path,
+    run_dir: Path,
+    progress: Callable[[str], None],
+    *,
+    lifted: float = 0.0,
+) -> Iterator[bool]:
+    """Have the drives within reach, and no new fleet on them; yields True as the function above.
+
+    Raises:
+        FleetError: the simulator cannot be started, or a fleet is being started.
+    """
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(no_fleet_meanwhile(robot, run_dir))
+        started = stack.enter_context(
+            drives_within_reach(robot, config_path, run_dir, lifted=lifted)
+        )
+        if started:
+            progress(
+                "no fleet is up and the drives are emulated: their simulator runs for the while"
+            )
+            time.sleep(SETTLE_S)
+        if is_simulated(robot) and robot.joint_service.driver == "odrive_usb":
+            stack.enter_context(emulated_usb(run_dir))
+        yield started
 
 
 @contextlib.contextmanager
