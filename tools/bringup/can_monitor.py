@@ -7,11 +7,12 @@ encoder's count, which only 0.5 does, and its supply's voltage.
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from statistics import fmean, median
-from typing import Final, NamedTuple
+from typing import Final, Generic, NamedTuple, TypeVar
 
 import can
 import msgspec
@@ -34,6 +35,7 @@ ANSWER_S: Final = 0.1
 HEARTBEATS: Final = 3.0
 """Periods of the heartbeat that are listened for, at least."""
 
+QUESTIONS: Final = (Command06.GET_VERSION, Command.GET_ENCODER_COUNT, Command.GET_VBUS)
 _WAIT_S = 0.05
 _FRAME_BYTES = 8
 _GAPS_MIN = 3
@@ -58,6 +60,16 @@ class NodeTraffic(msgspec.Struct):
     vbus_voltage: float | None = None
 
 
+S = TypeVar("S")
+
+
+class SensorTraffic(msgspec.Struct, Generic[S]):
+    """Samples of a sensor, and when they came."""
+
+    samples: list[S] = []
+    times_s: list[float] = []
+
+
 class BusTraffic(msgspec.Struct):
     """Traffic of one bus."""
 
@@ -68,16 +80,10 @@ class BusTraffic(msgspec.Struct):
     error_frames: int = 0
     nodes: dict[int, NodeTraffic] = {}
     """By node id: those that should be there, and whoever else sends heartbeats."""
-    samples: list[Vector6] = []
-    """Samples of the load cells."""
-    samples_s: list[float] = []
-    """When they came."""
+    cells: SensorTraffic[Vector6] = msgspec.field(default_factory=SensorTraffic)
+    imu: SensorTraffic[ImuSample] = msgspec.field(default_factory=SensorTraffic)
     malformed: int = 0
     """Frames of a sensor that were out of order or too short."""
-    attitudes: list[ImuSample] = []
-    """Samples of the IMU."""
-    attitudes_s: list[float] = []
-    """When they came."""
 
 
 def listen(
@@ -101,14 +107,31 @@ def listen(
     """
     traffic = BusTraffic(nodes={node: NodeTraffic() for node in nodes})
     try:
-        with can.Bus(interface=config.interface, channel=config.channel, ignore_config=True) as bus:
-            if poll_nodes:
-                for message in _questions(nodes):
-                    bus.send(message, timeout=_WAIT_S)
-            _take_in(bus, traffic, seconds, cells=cells, imu=imu)
-    except (can.CanError, OSError, ValueError, NotImplementedError) as error:
-        traffic.trouble = str(error) or type(error).__name__
+        with _bus(config) as bus:
+            for node in nodes if poll_nodes else ():
+                for command in QUESTIONS:
+                    bus.send(_question(node, command), timeout=_WAIT_S)
+            _receive(bus, traffic, seconds, cells=cells, imu=imu)
+    except DriveError as error:
+        traffic.trouble = str(error)
     return traffic
+
+
+@contextlib.contextmanager
+def _bus(config: CanConfig) -> Iterator[can.BusABC]:
+    """Open a bus; all that goes wrong with it is a DriveError."""
+    try:
+        with can.Bus(interface=config.interface, channel=config.channel, ignore_config=True) as bus:
+            yield bus
+    except (can.CanError, OSError, ValueError, NotImplementedError) as error:
+        raise DriveError(str(error) or type(error).__name__) from None
+
+
+def _question(node: int, command: Command | Command06) -> can.Message:
+    return can.Message(
+        arbitration_id=cansimple.arbitration_id(node, command),
+        is_remote_frame=True, dlc=_FRAME_BYTES, is_extended_id=False,
+    )  # fmt: skip
 
 
 class RoundTrips(NamedTuple):
@@ -121,37 +144,29 @@ class RoundTrips(NamedTuple):
 
 
 def round_trips(config: CanConfig, nodes: Sequence[int], count: int) -> dict[int, RoundTrips]:
-    """Ask axes for their supply's voltage, one after the other; return how long each takes.
+    """Ask axes for their supply's voltage `count` times; return how long each takes.
 
     Not where services are up: any frame feeds a drive's watchdog.
-
-    Args:
-        config: of the bus, `{run}` in its channel expanded.
-        nodes: of the axes.
-        count: requests to each.
 
     Raises:
         DriveError: the bus cannot be used.
     """
     times: dict[int, list[float]] = {node: [] for node in nodes}
     try:
-        with can.Bus(interface=config.interface, channel=config.channel, ignore_config=True) as bus:
+        with _bus(config) as bus:
             for _ in range(count):
                 for node in nodes:
                     took_s = _asked(bus, node)
                     if took_s is not None:
                         times[node].append(1e3 * took_s)
-    except (can.CanError, OSError, ValueError, NotImplementedError) as error:
-        raise DriveError(f"{config.channel}: {error or type(error).__name__}") from None
+    except DriveError as error:
+        raise DriveError(f"{config.channel}: {error}") from None
     return {node: RoundTrips(tuple(found), count - len(found)) for node, found in times.items()}
 
 
 def _asked(bus: can.BusABC, node: int) -> float | None:
     """Ask an axis once; return the time until its answer, s, or None."""
-    wanted = cansimple.arbitration_id(node, Command.GET_VBUS)
-    question = can.Message(
-        arbitration_id=wanted, is_remote_frame=True, dlc=_FRAME_BYTES, is_extended_id=False
-    )
+    question = _question(node, Command.GET_VBUS)
     _forget_waiting(bus)
     began = time.monotonic()
     bus.send(question, timeout=_WAIT_S)
@@ -161,7 +176,7 @@ def _asked(bus: can.BusABC, node: int) -> float | None:
             return None
         # Whoever answers is the axis that was asked: by its id, and with a whole answer.
         answers = is_data_frame(message) and len(message.data) == _FRAME_BYTES
-        if answers and message.arbitration_id == wanted:
+        if answers and message.arbitration_id == question.arbitration_id:
             return time.monotonic() - began
     return None
 
@@ -195,20 +210,7 @@ def mean_ms(times_s: Sequence[float]) -> float:
     return 1e3 * (times_s[-1] - times_s[0]) / (len(times_s) - 1)
 
 
-def _questions(nodes: Iterable[int]) -> list[can.Message]:
-    return [
-        can.Message(
-            arbitration_id=cansimple.arbitration_id(node, command),
-            is_remote_frame=True,
-            dlc=_FRAME_BYTES,
-            is_extended_id=False,
-        )
-        for node in nodes
-        for command in (Command06.GET_VERSION, Command.GET_ENCODER_COUNT, Command.GET_VBUS)
-    ]
-
-
-def _take_in(
+def _receive(
     bus: can.BusABC, traffic: BusTraffic, seconds: float, *, cells: bool, imu: bool
 ) -> None:
     assembler, orientation = SampleAssembler(), ImuAssembler()
@@ -222,19 +224,19 @@ def _take_in(
         elif is_data_frame(message):
             traffic.frames += 1
             if cells and message.arbitration_id in FRAME_IDS:
-                sample = assembler.add(message.arbitration_id, message.data)
-                if sample is not None:
-                    traffic.samples.append(sample)
-                    traffic.samples_s.append(message.timestamp)
+                _add(traffic.cells, assembler.add(message.arbitration_id, message.data), message)
             elif imu and message.arbitration_id in IMU_IDS:
-                attitude = orientation.add(message.arbitration_id, message.data)
-                if attitude is not None:
-                    traffic.attitudes.append(attitude)
-                    traffic.attitudes_s.append(message.timestamp)
+                _add(traffic.imu, orientation.add(message.arbitration_id, message.data), message)
             elif len(message.data) == _FRAME_BYTES:
                 _of_node(message, traffic.nodes)
     traffic.seconds = time.monotonic() - begun
     traffic.malformed = assembler.malformed + orientation.malformed
+
+
+def _add(sensor: SensorTraffic[S], sample: S | None, message: can.Message) -> None:
+    if sample is not None:
+        sensor.samples.append(sample)
+        sensor.times_s.append(message.timestamp)
 
 
 def _of_node(message: can.Message, nodes: dict[int, NodeTraffic]) -> None:

@@ -11,22 +11,13 @@ from shared.config.robot_config import RobotConfig, expand
 from shared.config.sections import CanConfig
 from shared.exceptions import DriveError, FleetError, MissingPackageError
 from shared.joints import MODULES
-from tools.bringup import (
-    check_alike,
-    check_board,
-    check_can,
-    check_keys,
-    check_machine,
-    check_robot,
-)
+from tools.bringup import check_alike, check_board, check_can, check_machine, check_robot
 from tools.bringup.boards import STATUS, Board, FoundBoards, Value, is_known, number
 from tools.bringup.can_monitor import BusTraffic, listen, long_enough
 from tools.bringup.drive_access import boards_on_usb, drives_within_reach, is_up
-from tools.bringup.rows import Finding, FindingKind, judged, ok
+from tools.bringup.findings import Finding, Groups, ok, warning, wrong
 from tools.fleet.process_table import is_simulated
 
-Groups = dict[str, list[Finding]]
-"""Rows by the heading that they stand under."""
 Progress = Callable[[str], None]
 
 COMPUTER: Final = "this computer"
@@ -41,17 +32,14 @@ GROUPS: Final = (COMPUTER, ROBOT, CAN, DRIVES, HARNESS, IMU)
 def survey(
     robot: RobotConfig, config_path: Path, run_dir: Path, plants: Sequence[str], progress: Progress
 ) -> Groups:
-    """Check everything and return the rows.
+    """Check everything; if no fleet is up, an emulated robot's simulator runs meanwhile.
 
     Args:
         robot: from the robot file.
         config_path: the robot file.
-        run_dir: of the fleet; if none is up, an emulated robot's simulator runs there meanwhile.
+        run_dir: of the fleet.
         plants: settings that the emulated drives have kept.
         progress: receives the subject of each check.
-
-    Raises:
-        FleetError: the simulator cannot be started.
     """
     fleet_is_up = is_up(run_dir)
     progress("this computer, the robot file, the bus")
@@ -60,7 +48,7 @@ def survey(
         ROBOT: [
             *check_robot.robot_rows(robot, config_path),
             *check_robot.endpoint_rows(robot, run_dir, fleet_is_up=fleet_is_up),
-            *check_keys.security_rows(robot),
+            *check_robot.security_rows(robot),
         ],
     }
     services_up = bool(check_robot.joint_services(check_robot.services_up(robot, run_dir)))
@@ -71,16 +59,10 @@ def survey(
         progress("the drives over USB")
         groups[DRIVES] = _usb(robot, run_dir, traffic, services_up=services_up)
     if robot.joint_service.driver == "odrive_can":
-        groups[CAN] = [
-            row
-            for module in MODULES
-            for row in check_can.drive_rows(
-                robot,
-                module,
-                traffic[robot.module_named(module).bus],
-                services_up=services_up,
-            )
-        ]
+        groups[CAN] = []
+        for module in MODULES:
+            heard = traffic[robot.module_named(module).bus]
+            groups[CAN] += check_can.drive_rows(robot, module, heard, services_up=services_up)
     groups[HARNESS] = check_can.harness_rows(robot, traffic[robot.harness.bus])
     if robot.imu.fitted:
         groups[IMU] = check_can.imu_rows(robot, traffic[robot.imu.bus])
@@ -118,32 +100,18 @@ def _usb(
     try:
         with boards_on_usb(robot, run_dir, MODULES) as found:
             for module in MODULES:
-                rows += _module(robot, module, found, read, services_up=services_up)
-                rows += _position(robot, module, found, traffic)
+                board = found.boards.get(robot.module_named(module).serial_number.upper())
+                if board is None:
+                    why = _why_not(robot, module, found, services_up=services_up)
+                    rows.append(_unreached(robot, module, *why))
+                else:
+                    rows += _board(robot, module, board, read, services_up=services_up)
+                rows += _position(robot, module, board, traffic)
             rows += check_alike.alike_rows(read)
     except (DriveError, FleetError, MissingPackageError) as error:
         found_out, _, fix = str(error).removeprefix("USB: ").partition("; ")
         rows.append(_unreached(robot, "all drives", found_out, fix or "see there"))
     return rows
-
-
-def _module(
-    robot: RobotConfig,
-    module: str,
-    found: FoundBoards,
-    read: dict[str, Mapping[str, Value]],
-    *,
-    services_up: bool,
-) -> list[Finding]:
-    """Check a module's board, and add its settings to `read`."""
-    serial = robot.module_named(module).serial_number.upper()
-    board = found.boards.get(serial)
-    if board is None:
-        return [_unreached(robot, module, *_why_not(robot, serial, found, services_up=services_up))]
-    try:
-        return _board(robot, module, board, read, services_up=services_up)
-    except DriveError as error:
-        return [_unreached(robot, module, str(error), "plug it in again; look at its cable")]
 
 
 def _board(
@@ -154,34 +122,35 @@ def _board(
     *,
     services_up: bool,
 ) -> list[Finding]:
-    """Check a board that is connected."""
+    """Check a board that is connected, and add its settings to `read`."""
     rows = [
         ok(module, "USB", board.serial_number, "there"),
         check_board.firmware_row(module, board.firmware),
     ]
     if not is_known(board.firmware):
         return rows
-    settings = board.read(board.settings)
-    status = board.read(STATUS)
-    read[module] = {**settings, **status}
-    wanted = drive_settings.of_module(robot, module)
-    levels = check_board.trip_levels_of(settings)
-    return [
-        *rows,
-        *check_board.settings_rows(module, wanted, settings),
-        *check_board.direction_rows(module, read[module], robot),
-        *check_board.error_rows(module, status),
-        *check_board.condition_rows(module, read[module], levels, services_up=services_up),
-    ]
+    try:
+        settings, status = board.read(board.settings), board.read(STATUS)
+        read[module] = {**settings, **status}
+        wanted = drive_settings.of_module(robot, module)
+        levels = check_board.trip_levels_of(settings)
+        return [
+            *rows,
+            *check_board.settings_rows(module, wanted, settings),
+            *check_board.direction_rows(module, read[module], robot),
+            *check_board.error_rows(module, status),
+            *check_board.condition_rows(module, read[module], levels, services_up=services_up),
+        ]
+    except DriveError as error:
+        return [_unreached(robot, module, str(error), "plug it in again; look at its cable")]
 
 
 def _position(
-    robot: RobotConfig, module: str, found: FoundBoards, traffic: dict[str, BusTraffic]
+    robot: RobotConfig, module: str, board: Board | None, traffic: dict[str, BusTraffic]
 ) -> list[Finding]:
     """Judge where a module is, by its bus if it is on one, else by its board."""
     bus = traffic.get(robot.module_named(module).bus)
     turns = check_can.positions(robot, module, bus) if bus else None
-    board = found.boards.get(robot.module_named(module).serial_number.upper())
     if turns is None and board is not None:
         try:
             names = [f"{axis}.encoder.pos_estimate" for axis in drive_settings.AXES]
@@ -193,10 +162,10 @@ def _position(
 
 
 def _why_not(
-    robot: RobotConfig, serial: str, found: FoundBoards, *, services_up: bool
+    robot: RobotConfig, module: str, found: FoundBoards, *, services_up: bool
 ) -> tuple[str, str]:
     """Return why a module's board was not reached, and what to do."""
-    strangers = ", ".join(found.strangers)
+    serial, strangers = robot.module_named(module).serial_number.upper(), ", ".join(found.strangers)
     there = f"; plugged in and in no [[module]]: {strangers}" if strangers else ""
     if not serial:
         return f"no serial_number{there}", "`serial_number` in its [[module]], by `odrivetool`"
@@ -208,7 +177,7 @@ def _why_not(
 
 def _unreached(robot: RobotConfig, subject: str, found: str, fix: str) -> Finding:
     """Return the row of a board that USB does not reach: its settings stay unknown."""
-    on_usb = robot.joint_service.driver == "odrive_usb"
-    verdict = FindingKind.WRONG if on_usb else FindingKind.WARNING
-    why = "its settings are not read back" + ("" if on_usb else ": CAN of firmware 0.5 cannot")
-    return judged(False, subject, "USB", found, "there", fix, why, otherwise=verdict)
+    why = "its settings are not read back"
+    if robot.joint_service.driver == "odrive_usb":
+        return wrong(subject, "USB", found, "there", fix, why)
+    return warning(subject, "USB", found, "there", fix, f"{why}: CAN of firmware 0.5 cannot")

@@ -151,11 +151,11 @@ def _listen(
             console.print(_node_table(robot, traffic))
         complete &= all(traffic.nodes[node].heartbeats_s for node in nodes)
         if name == robot.harness.bus:
-            console.print("  load cells:", _rate(traffic.samples_s, traffic.seconds))
-            complete &= bool(traffic.samples_s)
+            console.print("  load cells:", _rate(traffic.cells.times_s, traffic.seconds))
+            complete &= bool(traffic.cells.times_s)
         if robot.imu.fitted and name == robot.imu.bus:
-            console.print("  IMU:", _rate(traffic.attitudes_s, traffic.seconds))
-            complete &= bool(traffic.attitudes_s)
+            console.print("  IMU:", _rate(traffic.imu.times_s, traffic.seconds))
+            complete &= bool(traffic.imu.times_s)
     return 0 if complete else FAULT_EXIT_CODE
 
 

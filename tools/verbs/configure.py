@@ -19,7 +19,6 @@ from tools.bringup import backup, changes, drive_access
 from tools.bringup.boards import FIRMWARE, Board, FoundBoards, describe_firmware, is_known
 from tools.bringup.changes import ChangeResult, SettingChange
 from tools.bringup.check_robot import joint_services, services_up
-from tools.bringup.difference import shown
 from tools.bringup.drive_access import (
     add_plant,
     boards_on_usb,
@@ -104,7 +103,7 @@ def look_and_write(
     ):
         boards = boards_of(robot, modules, found)
         difference = differences(robot, boards, saved)
-        console.print(shown(difference) if difference else "nothing to change")
+        console.print(changes.difference_table(difference) if difference else "nothing to change")
         if not args.apply or not difference:
             if difference:
                 console.print("\nnothing was written; `--apply` writes it")

@@ -10,7 +10,7 @@ from rich.text import Text
 from shared.config import files as config_file
 from shared.exceptions import FAULT_EXIT_CODE
 from tools.bringup.drive_access import add_plant, check_plants, robot_file
-from tools.bringup.report import report_of, show
+from tools.bringup.findings import report_of, show
 from tools.bringup.survey import survey
 from tools.terminal import Console
 from tools.verb_table import FLEET, Subparsers, add_config, add_run_dir, add_verb

@@ -82,7 +82,7 @@ def test_heartbeats_estimates_and_load_cells_are_taken_in(bus: Bus) -> None:
     assert axis.heartbeat == IDLE
     assert axis.pos_turns == 64.5
     assert len(axis.heartbeats_s) > 3
-    assert traffic.samples[0] == (1.0, 2.0, 3.0, 4.0, 5.0, -6.0)
+    assert traffic.cells.samples[0] == (1.0, 2.0, 3.0, 4.0, 5.0, -6.0)
     assert traffic.malformed == 0
     assert sorted(traffic.nodes) == [NODE, STRANGER], "load cells are no nodes"
 
@@ -104,9 +104,9 @@ def test_an_imu_is_received_where_there_is_one(tmp_path: Path) -> None:
         traffic = listen(config, (), poll_nodes=False, imu=True)
         done.set()
         speaker.join()
-    assert traffic.attitudes[0].rate == (0.0, 0.5, 0.0)
-    assert traffic.attitudes[0].valid
-    assert len(traffic.attitudes) == len(traffic.attitudes_s) > 3
+    assert traffic.imu.samples[0].rate == (0.0, 0.5, 0.0)
+    assert traffic.imu.samples[0].valid
+    assert len(traffic.imu.samples) == len(traffic.imu.times_s) > 3
     assert traffic.nodes == {}, "its frames are no nodes"
 
 

@@ -8,7 +8,7 @@ from shared.joints import MODULES
 from tests.tools.bringup.board_in_memory import as_wanted, healthy
 from tools.bringup.boards import Value
 from tools.bringup.check_alike import alike_rows
-from tools.bringup.rows import Finding, FindingKind
+from tools.bringup.findings import Finding, FindingKind
 
 POLES = "axis0.motor.config.pole_pairs"
 RESISTANCE = "axis1.motor.config.phase_resistance"

@@ -11,7 +11,7 @@ from shared.config.robot_config import RobotConfig
 from tests.tools.bringup.board_in_memory import as_wanted, healthy
 from tools.bringup import check_board
 from tools.bringup.boards import Value
-from tools.bringup.rows import Finding, FindingKind
+from tools.bringup.findings import Finding, FindingKind
 
 MODULE = "knee_left"
 

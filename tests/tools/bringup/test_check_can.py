@@ -15,8 +15,14 @@ from shared.config.robot_config import RobotConfig
 from shared.config.sections import CanConfig
 from tests.imu.robots import with_imu
 from tools.bringup import check_can
-from tools.bringup.can_monitor import BusTraffic, NodeTraffic, long_enough, period_ms
-from tools.bringup.rows import Finding, FindingKind
+from tools.bringup.can_monitor import (
+    BusTraffic,
+    NodeTraffic,
+    SensorTraffic,
+    long_enough,
+    period_ms,
+)
+from tools.bringup.findings import Finding, FindingKind
 
 MODULE = "knee_left"
 NODES = (8, 9)
@@ -137,7 +143,8 @@ def test_two_axes_under_one_node_id_show_however_their_heartbeats_fall(
 def cells(rate_hz: float = 250.0, force: float = 20.0) -> BusTraffic:
     n = 50
     sample = (force, 0.0, 0.0, 0.0, 0.0, -force)
-    return BusTraffic(seconds=n / rate_hz, samples=[sample] * n, samples_s=times(1.0 / rate_hz, n))
+    heard = SensorTraffic([sample] * n, times(1.0 / rate_hz, n))
+    return BusTraffic(seconds=n / rate_hz, cells=heard)
 
 
 @pytest.mark.parametrize(
@@ -190,7 +197,7 @@ def test_every_bus_of_the_robot_is_listened_to(robot: RobotConfig) -> None:
 
 def imu_heard(*, valid: bool = True, period_s: float = 0.01) -> BusTraffic:
     sample = ImuSample((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), valid)
-    return BusTraffic(frames=150, attitudes=[sample] * 50, attitudes_s=times(period_s, 50))
+    return BusTraffic(frames=150, imu=SensorTraffic([sample] * 50, times(period_s, 50)))
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from shared import scheduling
 from shared.config.robot_config import RobotConfig
 from shared.places import DEFAULT_CONFIG
 from tools.bringup import check_machine
-from tools.bringup.rows import Finding, FindingKind
+from tools.bringup.findings import Finding, FindingKind
 
 ROOT = DEFAULT_CONFIG.parents[1]
 

@@ -11,7 +11,7 @@ import pytest
 from shared.config.robot_config import RobotConfig
 from tools.bringup import check_socketcan
 from tools.bringup.check_socketcan import socketcan_rows
-from tools.bringup.rows import Finding, FindingKind
+from tools.bringup.findings import Finding, FindingKind
 
 UP, DOWN = "0x40081", "0x40080"
 

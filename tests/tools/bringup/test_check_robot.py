@@ -11,8 +11,8 @@ import pytest
 
 from shared.config.robot_config import RobotConfig
 from tests.certified import certified, opened
-from tools.bringup.check_keys import security_rows
-from tools.bringup.rows import FindingKind
+from tools.bringup.check_robot import security_rows
+from tools.bringup.findings import FindingKind
 from tools.keys import authority as authority_module
 
 

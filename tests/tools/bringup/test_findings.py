@@ -9,8 +9,18 @@ import pytest
 
 from shared.can.drive_settings import AXES
 from shared.joints import MODULES
-from tools.bringup.report import Report, report_of, show, verdict_line
-from tools.bringup.rows import Finding, FindingKind, merged, ok, warning, wrong
+from tools.bringup.findings import (
+    Finding,
+    FindingKind,
+    Report,
+    merged,
+    ok,
+    report_of,
+    show,
+    verdict_line,
+    warning,
+    wrong,
+)
 from tools.terminal import Console
 
 FINE = [ok(f"m{i}", "supply", f"{volts:.1f} V", "8 to 60 V") for i, volts in enumerate((9.5, 48.0))]
