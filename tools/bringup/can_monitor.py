@@ -147,9 +147,6 @@ def round_trips(config: CanConfig, nodes: Sequence[int], count: int) -> dict[int
     """Ask axes for their supply's voltage `count` times; return how long each takes.
 
     Not where services are up: any frame feeds a drive's watchdog.
-
-    Raises:
-        DriveError: the bus cannot be used.
     """
     times: dict[int, list[float]] = {node: [] for node in nodes}
     try:

@@ -96,11 +96,7 @@ def against_backup(module: str, saved: Mapping[str, Value], board: Board) -> lis
 
 
 def refuse_armed(module: str, board: Board) -> None:
-    """Refuse a board one of whose axes is not idle: saving restarts it, and it lets go.
-
-    Raises:
-        DriveError: naming the axis.
-    """
+    """Refuse a board one of whose axes is not idle: saving restarts it, and it lets go."""
     for axis, state in zip(AXES, board.states(), strict=True):
         if state != AxisState.IDLE:
             known = state in AxisState.__members__.values()

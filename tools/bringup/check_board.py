@@ -215,11 +215,7 @@ def _voltage(module: str, volts: float, trip_levels: tuple[float, float]) -> Fin
 
 
 def trip_levels_of(values: Values) -> tuple[float, float]:
-    """Return a board's own under- and over-voltage levels, V.
-
-    Raises:
-        DriveError: it does not have them.
-    """
+    """Return a board's own under- and over-voltage levels, V."""
     low, high = (
         number(values, f"config.dc_bus_{name}voltage_trip_level") for name in ("under", "over")
     )

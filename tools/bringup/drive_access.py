@@ -105,11 +105,7 @@ def _drive_of(robot: RobotConfig, module: str, run_dir: Path) -> tuple[str, ...]
 
 
 def refuse_service(robot: RobotConfig, module: str, run_dir: Path) -> None:
-    """Refuse a module whose joint service is up: a drive has one master.
-
-    Raises:
-        FleetError: it is.
-    """
+    """Refuse a module whose joint service is up: a drive has one master."""
     fleet = service_on(robot, module, run_dir)
     if fleet is not None:
         raise FleetError(
@@ -119,11 +115,7 @@ def refuse_service(robot: RobotConfig, module: str, run_dir: Path) -> None:
 
 
 def confirm(question: str, *, yes: bool) -> bool:
-    """Ask on the terminal; True at once if it was answered by `--yes`.
-
-    Raises:
-        FleetError: there is no terminal to ask on.
-    """
+    """Ask on the terminal; True at once if it was answered by `--yes`."""
     if yes:
         return True
     if not sys.stdin.isatty():
@@ -141,12 +133,7 @@ def add_plant(parser: argparse.ArgumentParser) -> None:
 
 
 def check_plants(robot: RobotConfig, run_dir: Path, plants: Sequence[str]) -> None:
-    """Refuse planted settings with which no emulated drive can start.
-
-    Raises:
-        FleetError: the robot is a real one, or its fleet is up already.
-        DriveError: there is no such module or setting, or it cannot have that value.
-    """
+    """Refuse planted settings with which no emulated drive can start."""
     if not plants:
         return
     if not is_simulated(robot):
@@ -247,9 +234,6 @@ def no_fleet_meanwhile(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
     """Keep a fleet from being started on real drives for a while, in this run directory.
 
     A fleet that is up stays; an emulated robot's simulator holds the directory itself.
-
-    Raises:
-        FleetError: one is being started now, or the directory cannot be used.
     """
     if is_simulated(robot) or is_up(run_dir):
         yield
@@ -272,11 +256,7 @@ def drives_to_ourselves(
     *,
     lifted: float = 0.0,
 ) -> Iterator[bool]:
-    """Have the drives within reach, and no new fleet on them; yields True as the function above.
-
-    Raises:
-        FleetError: the simulator cannot be started, or a fleet is being started.
-    """
+    """Have the drives within reach, and no new fleet on them; yields True as the function above."""
     with contextlib.ExitStack() as stack:
         stack.enter_context(no_fleet_meanwhile(robot, run_dir))
         started = stack.enter_context(
@@ -297,9 +277,6 @@ def emulated_usb(run_dir: Path) -> Iterator[None]:
     """Put the emulated drives on this process's USB, before anything imports `odrive`.
 
     The environment is as it was afterwards; the stand-in stays loaded.
-
-    Raises:
-        FleetError: the stand-in cannot be built: there is no C compiler.
     """
     with tempfile.TemporaryDirectory(prefix="xrl-usb-") as folder:
         usb_standin.load(usb_standin.build(Path(folder)))
@@ -327,10 +304,6 @@ def boards_on_usb(
     """Connect to the boards of these modules over USB, or to the emulated ones.
 
     Modules without a serial number have none.
-
-    Raises:
-        DriveError: there is no libusb-1.0.
-        FleetError: the stand-in for it cannot be built.
     """
     serials = [robot.module_named(module).serial_number for module in modules]
     with contextlib.ExitStack() as stack:

@@ -26,11 +26,7 @@ _APART_S: Final = 0.02
 
 
 def give_back(robot: RobotConfig, module: str, run_dir: Path) -> None:
-    """Set the limits of a module's drive, which must be idle and nobody's, to the robot file's.
-
-    Raises:
-        XrlError: the drive cannot be reached, or does not keep them.
-    """
+    """Set the limits of a module's drive, which must be idle and nobody's, to the robot file's."""
     if robot.joint_service.driver == "odrive_usb":
         _over_usb(robot, module, run_dir)
     else:

@@ -124,13 +124,13 @@ def merged(rows: Iterable[Finding]) -> list[Finding]:
 
 def _of_all_or_both_axes(group: list[Finding]) -> list[Finding]:
     """Return as few rows as can stand for rows of one matter, none of which is ok."""
-    subjects = {row.subject for row in group}
-    if len(subjects) == len(group) and subjects in (_MODULES, _AXES):
+    by_subject = {row.subject: row for row in group}
+    if len(by_subject) == len(group) and set(by_subject) in (_MODULES, _AXES):
         return [msgspec.structs.replace(_one(group), fix=_anywhere(group[0]))]
     together = []
     for row in group:
         module, _, axis = row.subject.partition(".")
-        both = [other for other in group if other.subject in {f"{module}.{a}" for a in AXES}]
+        both = [by_subject[name] for a in AXES if (name := f"{module}.{a}") in by_subject]
         if axis not in AXES or len(both) != len(AXES):
             together.append(row)
         elif row is both[0]:
@@ -145,23 +145,15 @@ def _anywhere(row: Finding) -> str:
 
 
 def _one(group: list[Finding]) -> Finding:
-    """Return the row that stands for rows of one matter."""
+    """Return the row that stands for rows of one matter: its values from least to largest."""
     first = group[0]
     if len(group) == 1:
         return first
+    values = sorted({row.found for row in group}, key=_by_number)
+    found = values[0] if len(values) == 1 else f"{values[0]} .. {values[-1]}"
     wanted = first.wanted if len({row.wanted for row in group}) == 1 else ""
-    return msgspec.structs.replace(
-        first,
-        subject=f"{ALL} {len(group)}",
-        found=_together([row.found for row in group]),
-        wanted=wanted,
-    )
-
-
-def _together(values: list[str]) -> str:
-    """Return one text for several: itself if they agree, else the smallest and the largest."""
-    distinct = sorted(set(values), key=_by_number)
-    return distinct[0] if len(distinct) == 1 else f"{distinct[0]} .. {distinct[-1]}"
+    subject = f"{ALL} {len(group)}"
+    return msgspec.structs.replace(first, subject=subject, found=found, wanted=wanted)
 
 
 def _by_number(text: str) -> tuple[float, str]:
@@ -199,75 +191,53 @@ def show(console: Console, groups: Groups, *, verbose: bool) -> None:
 def verdict_line(groups: Groups) -> str:
     """Return "all ok", or how much is wrong and what: the command's answer in a line."""
     rows = list(chain(*groups.values()))
-    put_together = [row for group in groups.values() for row in merged(group)]
     wrong, warnings = count(rows, FindingKind.WRONG), count(rows, FindingKind.WARNING)
-    named = _names(row for row in put_together if row.verdict is FindingKind.WARNING)
-    noted = f"{warnings} warning{'s' * (warnings != 1)}: {named}"
+    noted = f"{warnings} warning{'s' * (warnings != 1)}: {_names(groups, FindingKind.WARNING)}"
     if wrong:
-        named = _names(row for row in put_together if row.verdict is FindingKind.WRONG)
-        text = f"{wrong} wrong: {named}"
+        text = f"{wrong} wrong: {_names(groups, FindingKind.WRONG)}"
         return f"{text}; {noted}" if warnings else text
     return f"nothing wrong; {noted}" if warnings else "all ok"
 
 
 def _group(title: str, rows: list[Finding], width: int) -> RenderableType:
-    wide = width >= WIDE
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
-    names = {row.what: _broken(row.what) for row in rows}
     table.add_column("part", no_wrap=True, min_width=12)
     table.add_column("what", no_wrap=True, min_width=16)
     table.add_column("found", overflow="fold")
     table.add_column("wanted", overflow="fold")
     table.add_column("", no_wrap=True, min_width=max(len(row.verdict) for row in rows))
-    wide = wide and any(row.fix for row in rows)
+    wide = width >= WIDE and any(row.fix for row in rows)
     if wide:
         table.add_column("what to do", overflow="fold")
+    subjects: dict[tuple[str, str], list[str]] = {}
     for row in rows:
-        cells = (row.subject, names[row.what], row.found, row.wanted)
+        head, _, tail = row.what.rpartition(".")
+        is_long = len(row.what) > NAME_MAX and head
+        cells = (row.subject, f"{head}.\n{tail}" if is_long else row.what, row.found, row.wanted)
         verdict = Text(row.verdict, COLOURS[row.verdict])
         table.add_row(*cells, verdict, *([row.fix] if wide else []))
-    below = [Padding(Text(note), (0, 1, 0, 2)) for note in _notes(rows, wide=wide)]
+        fix = "" if wide else row.fix
+        if note := f"{fix} ({row.why})" if fix and row.why else fix or row.why:
+            subjects.setdefault((row.what, note), []).append(row.subject)
+    # below the table, a text that several rows share appears once
+    notes = [f"{', '.join(who)} {what}: {note}" for (what, note), who in subjects.items()]
+    below = [Padding(Text(note), (0, 1, 0, 2)) for note in notes]
     return Group(table, *below, *([Text("")] if below else []))
 
 
-def _notes(rows: list[Finding], *, wide: bool) -> list[str]:
-    """Return the lines below the table; a text that several rows share appears once."""
-    subjects: dict[tuple[str, str], list[str]] = {}
-    for row in rows:
-        if note := _note(row, wide=wide):
-            subjects.setdefault((row.what, note), []).append(row.subject)
-    return [f"{', '.join(who)} {what}: {note}" for (what, note), who in subjects.items()]
-
-
-def _broken(name: str) -> str:
-    """Return a setting's name on two lines: it is too long for a column."""
-    if len(name) <= NAME_MAX or "." not in name:
-        return name
-    head, _, tail = name.rpartition(".")
-    return f"{head}.\n{tail}"
-
-
-def _note(row: Finding, *, wide: bool) -> str:
-    """Return the text on a row below the table: why, and the remedy if it has no column."""
-    fix = "" if wide else row.fix
-    return f"{fix} ({row.why})" if fix and row.why else fix or row.why
-
-
-def _names(rows: Iterable[Finding]) -> str:
-    """Return the first of the rows, and how many more lines there are."""
-    names = [f"{row.subject} {_short(row.what)}" for row in rows]
-    more = len(names) - NAMED_MAX
-    return ", ".join(names[:NAMED_MAX]) + (f" and {more} more" if more > 0 else "")
-
-
-def _short(name: str) -> str:
-    """Return the last part of a setting's name; any other name unchanged."""
-    return name.rpartition(".")[2] if "config." in name else name
+def _names(groups: Groups, verdict: FindingKind) -> str:
+    """Return the first of the rows with a verdict, and how many more lines there are."""
+    rows = [row for group in groups.values() for row in merged(group) if row.verdict is verdict]
+    names = [
+        # the last part of a setting's name
+        f"{row.subject} {row.what.rpartition('.')[2] if 'config.' in row.what else row.what}"
+        for row in rows[:NAMED_MAX]
+    ]
+    more = len(rows) - NAMED_MAX
+    return ", ".join(names) + (f" and {more} more" if more > 0 else "")
 
 
 def _worst(rows: Iterable[Finding]) -> FindingKind:
     verdicts = {row.verdict for row in rows}
-    for verdict in (FindingKind.WRONG, FindingKind.WARNING):
-        if verdict in verdicts:
-            return verdict
-    return FindingKind.OK
+    order = (FindingKind.WRONG, FindingKind.WARNING)
+    return next((verdict for verdict in order if verdict in verdicts), FindingKind.OK)

@@ -74,11 +74,7 @@ def exit_if_interrupted(interrupts: Interrupts) -> None:
 
 
 def refuse_services(robot: RobotConfig, modules: Sequence[str], run_dir: Path) -> None:
-    """Refuse if the leg of one of these modules has a joint service up.
-
-    Raises:
-        FleetError: naming the first.
-    """
+    """Refuse if the leg of one of these modules has a joint service up."""
     for name in dict.fromkeys(name for one in modules for name in leg_of(one)):
         refuse_service(robot, name, run_dir)
 

@@ -106,11 +106,7 @@ def await_reading(drive: Drive, clock: Clock = now_ns) -> DriveReading | None:
 
 
 def idle_reading(drive: Drive, clock: Clock = now_ns) -> DriveReading:
-    """Return the first reading of a drive that is nobody's and has its zero.
-
-    Raises:
-        DriveError: none comes, it has no zero, or somebody has armed it.
-    """
+    """Return the first reading of a drive that is nobody's and has its zero."""
     reading = await_reading(drive, clock)
     if reading is None:
         raise DriveError(NO_ANSWER)
@@ -129,11 +125,7 @@ def look_at(
     *,
     until_still: bool = True,
 ) -> dict[str, Pair] | None:
-    """Return where modules are, (phi, theta), rad, once they hang still; None if interrupted.
-
-    Raises:
-        DriveError: they do not in a minute, or a drive is not as `idle_reading` wants it.
-    """
+    """Return where modules are, (phi, theta), rad, once they hang still; None if interrupted."""
     begin = still_since = clock()
     rest: dict[str, Pair] = {}
     while True:

@@ -30,11 +30,7 @@ class StandAngles(NamedTuple):
 
 
 def stand_angles(robot: RobotConfig, height: float) -> StandAngles:
-    """Return the stand with the torso level and its origin (between the hips) at a height, m.
-
-    Raises:
-        RunError: the legs do not reach there within their limits.
-    """
+    """Return the stand with the torso level and its origin (between the hips) at a height, m."""
     longest = robot.geometry.l1 + robot.geometry.l2
     if not 0.0 < height < longest:
         text = f"--standing {height:g}: the hips are between 0 and {longest:g} m above the ankles"

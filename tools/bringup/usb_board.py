@@ -44,11 +44,7 @@ T = TypeVar("T")
 
 
 class UsbBus:
-    """The ODrives on this machine's USB.
-
-    Raises:
-        DriveError: there is no libusb-1.0.
-    """
+    """The ODrives on this machine's USB."""
 
     def __init__(self) -> None:
         self._manager = device_manager()
@@ -83,11 +79,7 @@ class UsbBus:
             self.run(self._leave(), TRANSFER_S)
 
     def run(self, coroutine: Coroutine[Any, Any, T], timeout_s: float) -> T:
-        """Run a coroutine on the package's loop and return its result.
-
-        Raises:
-            DriveError: it fails, or times out.
-        """
+        """Run a coroutine on the package's loop and return its result."""
         task = asyncio.run_coroutine_threadsafe(coroutine, self._manager.loop)
         try:
             return task.result(timeout_s)

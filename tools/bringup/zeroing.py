@@ -133,9 +133,6 @@ def zero(drive: Drive, q: Pair, robot: RobotConfig) -> Back | None:
 
     Returns:
         The position read back, right or not (`is_right`); None if none came.
-
-    Raises:
-        DriveError: the drive cannot be written.
     """
     mark, gear_ratio = robot.drive.zero_mark_turns, robot.joint.gear_ratio
     m1, m2 = motor_from_joint(q, gear_ratio)

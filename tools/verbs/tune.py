@@ -268,22 +268,22 @@ def _proposed(
         console.print("no second-order answer was measured: no gains follow from it")
         return None
     law = robot.law
-    new = propose(
-        answer.model, K_p=law.K_p[row], B_p=law.B_p[row], inertia=inertia_along(robot, row),
+    k, b = propose(
+        answer.model, (law.K_p[row], law.B_p[row]), inertia_along(robot, row),
         bandwidth=args.bandwidth, damping_ratio=args.damping,
     )  # fmt: skip
-    if new.K_p <= 0.0 or new.B_p <= 0.0:
+    if k <= 0.0 or b <= 0.0:
         console.print(
             marked(
                 "[yellow]no gains: with K_p = {:.3g} and B_p = {:.3g} it would be so; "
                 "local gains and joints give more stiffness or damping than was wanted[/]",
-                new.K_p,
-                new.B_p,
+                k,
+                b,
             )
         )
         return None
     K_p, B_p = list(law.K_p), list(law.B_p)
-    K_p[row], B_p[row] = float(f"{new.K_p:.3g}"), float(f"{new.B_p:.3g}")
+    K_p[row], B_p[row] = float(f"{k:.3g}"), float(f"{b:.3g}")
     console.print(
         f"for {args.bandwidth:g} rad/s and a damping ratio of {args.damping:g}, in {UNITS[row]}:"
     )

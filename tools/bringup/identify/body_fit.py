@@ -17,7 +17,7 @@ a parameter that the record does not show keeps its prior's width, and is said t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -151,16 +151,13 @@ def fit(
     level_sd: float,
     payload_sd: float | None = None,
 ) -> BodyFit:
-    """Fit the parameters.
+    """Fit the errors of a robot file to at least one record.
 
     Args:
         robot: the robot file.
-        records: at least one.
+        records: of one robot.
         level_sd: standard deviation of the floor's slope about level, rad.
         payload_sd: kg by which the file's payload may be wrong, where it was weighed.
-
-    Raises:
-        RunError: there are too few quasi-static moments.
     """
     count = sum(len(record.moments.t_s) for record in records)
     if count < MOMENTS_MIN:
@@ -169,9 +166,7 @@ def fit(
             "all six modules in TRACK and the harness valid; lead the robot slowly "
             "(`xrl sim --scenario identify` shows how)"
         )
-    priors = _priors(records, level_sd, payload_sd)
-    problem = _Problem(robot, records, priors)
-    return problem.solve()
+    return _Problem(robot, records, _priors(records, level_sd, payload_sd)).solve()
 
 
 def _priors(
@@ -215,7 +210,8 @@ class _Problem:
         rows, A = self._linear(z, noise)
         weight = self._weights(rows)
         H = np.asarray(np.linalg.inv(A.T @ (weight[:, None] * A) + np.eye(len(z))), float)
-        scores = self._blocks(A * (weight * rows)[:, None])
+        starts = np.arange(0, len(rows), 12 * BLOCK)
+        scores = np.asarray(np.add.reduceat(A * (weight * rows)[:, None], starts, axis=0))
         sandwich = H @ (scores.T @ scores + np.eye(len(z))) @ H
         wider = MODEL_ERROR * np.sqrt(np.maximum(1.0, np.diag(sandwich) / np.diag(H)))
         covariance = H * np.outer(wider, wider)
@@ -226,17 +222,12 @@ class _Problem:
         wrench, feet, _ = self._residuals(x)
         wrench_before, feet_before, _ = self._residuals(before)
         return BodyFit(
-            tuple(row.name for row in self._priors),
-            self._priors,
-            x,
-            covariance * np.outer(self._sd, self._sd),
-            wrench,
-            wrench_before,
-            feet,
-            feet_before,
-        )
+            names=tuple(self._index), priors=self._priors, x=x,
+            covariance=covariance * np.outer(self._sd, self._sd),
+            residuals=wrench, residuals_before=wrench_before, feet=feet, feet_before=feet_before,
+        )  # fmt: skip
 
-    def _of(self, x: Array, names: Sequence[str]) -> Array:
+    def _of(self, x: Array, names: Iterable[str]) -> Array:
         return x[[self._index[name] for name in names]]
 
     def _residuals(self, x: Array) -> tuple[Array, Array, list[Array]]:
@@ -257,14 +248,9 @@ class _Problem:
             slope = self._of(x, [f"slope {number} {axis}" for axis in "xy"])
             up = np.array([slope[0], slope[1], 1.0])
             found = self._body.balance(
-                q,
-                tau,
-                up / np.linalg.norm(up),
-                mass=self._body.torso_mass + mass + added_kg,
-                moment=moment,
-                force=m.force,
-                force_moment=m.moment + np.cross(arm, m.force),
-            )
+                q, tau, up / np.linalg.norm(up), mass=self._body.torso_mass + mass + added_kg,
+                moment=moment, force=m.force, force_moment=m.moment + np.cross(arm, m.force),
+            )  # fmt: skip
             place = self._of(x, [f"feet {number} {k}" for k in range(6)])
             wrenches.append(found.wrench)
             feet.append(found.feet - self._apart - place)
@@ -307,9 +293,3 @@ class _Problem:
         _, feet, _ = self._residuals(x)
         spread = np.sqrt(np.mean(feet**2, axis=0))
         return np.array([max(torque, 0.02), *np.maximum(spread, 1e-5)])
-
-    @staticmethod
-    def _blocks(scores: Array) -> Array:
-        """Return the sums of scores (12 n, m) over blocks of moments."""
-        starts = np.arange(0, len(scores), 12 * BLOCK)
-        return np.asarray(np.add.reduceat(scores, starts, axis=0))

@@ -40,11 +40,7 @@ class BodyLead:
     """A robot that is led."""
 
     def __init__(self, robot: RobotConfig, session: Session, *, simulated: bool) -> None:
-        """Meet the robot; a simulated hand leads height and pitch.
-
-        Raises:
-            FleetError: the robot is silent, does not lead, or somebody else asks it for something.
-        """
+        """Meet the robot; a simulated hand leads height and pitch."""
         self._robot = robot
         self._hand = session.publisher(topics.OPERATOR_HAND, HandLead) if simulated else None
         self._states = [session.latest(topics.JOINT_STATE, JointState, name) for name in MODULES]

@@ -58,7 +58,6 @@ class BodyStatics:
     """The robot of a file, with loads that a caller adds."""
 
     def __init__(self, robot: RobotConfig) -> None:
-        """Read lengths and masses."""
         self._legs = leg_geometry(robot)
         self.torso_mass = robot.torso_mass
         """kg"""
@@ -107,12 +106,7 @@ class BodyStatics:
 
 
 def leg_pose(geometry: LegGeometry, q: Array) -> LegPose:
-    """Return a leg by the product of exponentials, from the foot up.
-
-    Args:
-        geometry: at q = 0; the foot's place in it is taken off.
-        q: its joints (n, 6), rad, from the ankle up.
-    """
+    """Return a leg at q (n, 6), rad, by the product of exponentials, from the foot up."""
     n = len(q)
     rotation = np.broadcast_to(np.eye(3), (n, 3, 3))
     shift = np.zeros((n, 3))

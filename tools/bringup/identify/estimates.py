@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from enum import Enum
 from typing import Final, NamedTuple
 
@@ -65,23 +65,79 @@ def estimate(
 ) -> ParameterEstimate:
     """Return an estimate with its verdict; `sd` is the value's standard deviation."""
     half_width = HALF_WIDTH * sd
-    if file is None:
+    verdict = Verdict.UNKNOWN
+    if known and file is None:
         verdict = Verdict.MEASURED
-    else:
+    elif known and file is not None:
         verdict = Verdict.AGREES if abs(value - file) <= half_width else Verdict.CHANGE
     return ParameterEstimate(
-        key, what, unit, file, value, half_width, verdict if known else Verdict.UNKNOWN
-    )
+        key=key, what=what, unit=unit, file=file, value=value, half_width=half_width,
+        verdict=verdict,
+    )  # fmt: skip
 
 
 def of_body(fit: BodyFit, robot: RobotConfig) -> list[ParameterEstimate]:
-    """Return what a standing record says of the body.
+    """Return what a standing record says of the body, by a fit against the robot file."""
 
-    Args:
-        fit: of the record.
-        robot: that the fit was made against.
+    def row(
+        key: str, what: str, unit: str, name: str, file: float, by: float = 1.0
+    ) -> ParameterEstimate:
+        error, sd = fit.of(name)
+        known = fit.known(name) >= KNOWN_MIN
+        return estimate(
+            key, what, unit, file=file, value=file + by * error, sd=by * sd, known=known
+        )
+
+    mass = row("mass.payload", "payload", "kg", MASS, robot.mass.payload)
+    constant = robot.drive.torque_constant
+    points = zip(HARNESS, robot.geometry.harness_point, strict=True)
+    return [
+        mass,
+        *_centre(fit, robot, mass),
+        *(row("geometry.harness_point", name, "m", name, at) for name, at in points),
+        row("drive.torque_constant", "torque constant", "N m/A", SCALE, constant, constant),
+        *_stiffness(fit),
+        *(row("", name, "rad", name, 0.0) for name in ZEROS),
+    ]
+
+
+def _centre(fit: BodyFit, robot: RobotConfig, mass: ParameterEstimate) -> list[ParameterEstimate]:
+    """Return the payload's centre: a moment is what is measured.
+
+    Its place goes with the payload that the file will have.
     """
-    return [*_masses(fit, robot), *_harness(fit, robot), *_drive(fit, robot), *_zeros(fit)]
+    is_new = _is_written(mass, robot)
+    payload = max(mass.value if is_new else robot.mass.payload, LIGHT)
+    _, mass_sd = fit.of(MASS)
+    rows = []
+    for name, at_file in zip(COM, robot.mass.payload_com, strict=True):
+        moment, moment_sd = fit.of(name)
+        place = (robot.mass.payload * at_file + moment) / payload
+        variance = moment_sd**2
+        if is_new:
+            variance += place * (place * mass_sd**2 - 2.0 * fit.covariance_of(name, MASS))
+        rows.append(estimate(
+            "mass.payload_com", f"payload's centre {name[-1]}", "m",
+            file=at_file, value=place, sd=math.sqrt(max(0.0, variance)) / payload,
+            known=fit.known(name) >= KNOWN_MIN and payload > LIGHT,
+        ))  # fmt: skip
+    return rows
+
+
+def _is_written(mass: ParameterEstimate, robot: RobotConfig) -> bool:
+    return mass.verdict is Verdict.CHANGE and 0.0 <= mass.value <= robot.mass.payload_max
+
+
+def _stiffness(fit: BodyFit) -> list[ParameterEstimate]:
+    compliance, sd = fit.of(COMPLIANCE)
+    if compliance <= 2.0 * HALF_WIDTH * sd:
+        return []
+    k = 1.0 / compliance
+    return [
+        estimate(
+            "", "drivetrain's stiffness", "N m/rad", file=None, value=k, sd=sd * k * k, known=True
+        )
+    ]
 
 
 class JointResult(NamedTuple):
@@ -101,30 +157,27 @@ class JointResult(NamedTuple):
 
 def of_joints(results: Sequence[JointResult], robot: RobotConfig) -> list[ParameterEstimate]:
     """Return what small sines say of joints; the rotors' inertia is one for all of them."""
-    rows = []
+
+    def row(
+        what: str, unit: str, of: tuple[float, float], file: float | None = None
+    ) -> ParameterEstimate:
+        return estimate("", what, unit, file=file, value=of[0], sd=of[1], known=True)
+
+    armature, rows = robot.joint.armature, []
     for joint, fit, leg_inertia in results:
-        for what, unit, (value, sd) in (
-            ("dry friction", "N m", fit.dry),
-            ("viscous friction", "N m s/rad", fit.viscous),
-        ):
-            rows.append(estimate(
-                "", f"{what} {joint}", unit, file=None, value=value, sd=sd, known=True
-            ))  # fmt: skip
-        file = leg_inertia + robot.joint.armature
-        value, sd = fit.inertia
-        sd = math.hypot(sd, MASS_SD * leg_inertia)
-        rows.append(estimate(
-            "", f"inertia {joint}", "kg m^2", file=file, value=value, sd=sd, known=True
-        ))  # fmt: skip
+        inertia = fit.inertia[0], math.hypot(fit.inertia[1], MASS_SD * leg_inertia)
+        rows += [
+            row(f"dry friction {joint}", "N m", fit.dry),
+            row(f"viscous friction {joint}", "N m s/rad", fit.viscous),
+            row(f"inertia {joint}", "kg m^2", inertia, leg_inertia + armature),
+        ]
     rotors = [result.rotor for result in results]
     weight = sum(1.0 / sd**2 for _, sd in rotors)
-    mean, sd = (
-        sum(value / sd**2 for value, sd in rotors) / weight,
-        max(weight**-0.5, YIELDS * robot.joint.armature),
-    )
+    mean = sum(value / sd**2 for value, sd in rotors) / weight
+    sd = max(weight**-0.5, YIELDS * armature)
     rows.append(estimate(
-        "joint.armature", "reflected inertia", "kg m^2", file=robot.joint.armature, value=mean,
-        sd=sd, known=HALF_WIDTH * sd < 0.5 * robot.joint.armature,
+        "joint.armature", "reflected inertia", "kg m^2", file=armature, value=mean, sd=sd,
+        known=HALF_WIDTH * sd < 0.5 * armature,
     ))  # fmt: skip
     return rows
 
@@ -198,67 +251,3 @@ def zero_corrections(estimates: list[ParameterEstimate]) -> dict[str, tuple[floa
         for module in MODULES
         if f"{module}_phi" in by_joint or f"{module}_theta" in by_joint
     }
-
-
-def _masses(fit: BodyFit, robot: RobotConfig) -> Iterator[ParameterEstimate]:
-    more, sd = fit.of(MASS)
-    mass = estimate(
-        "mass.payload", "payload", "kg",
-        file=robot.mass.payload, value=robot.mass.payload + more, sd=sd,
-        known=fit.known(MASS) >= KNOWN_MIN,
-    )  # fmt: skip
-    yield mass
-    # a moment is what is measured; its place goes with the payload that the file will have
-    is_new = _is_written(mass, robot)
-    payload = max(mass.value if is_new else robot.mass.payload, LIGHT)
-    for axis, name in enumerate(COM):
-        at_file = robot.mass.payload_com[axis]
-        moment, moment_sd = fit.of(name)
-        place = (robot.mass.payload * at_file + moment) / payload
-        variance = moment_sd**2
-        if is_new:
-            variance += place * (place * sd**2 - 2.0 * fit.covariance_of(name, MASS))
-        yield estimate(
-            "mass.payload_com", f"payload's centre {'xyz'[axis]}", "m",
-            file=at_file, value=place, sd=math.sqrt(max(0.0, variance)) / payload,
-            known=fit.known(name) >= KNOWN_MIN and payload > LIGHT,
-        )  # fmt: skip
-
-
-def _is_written(mass: ParameterEstimate, robot: RobotConfig) -> bool:
-    return mass.verdict is Verdict.CHANGE and 0.0 <= mass.value <= robot.mass.payload_max
-
-
-def _harness(fit: BodyFit, robot: RobotConfig) -> Iterator[ParameterEstimate]:
-    for axis, name in enumerate(HARNESS):
-        at_file = robot.geometry.harness_point[axis]
-        by, sd = fit.of(name)
-        yield estimate(
-            "geometry.harness_point", f"harness point {'xyz'[axis]}", "m",
-            file=at_file, value=at_file + by, sd=sd, known=fit.known(name) >= KNOWN_MIN,
-        )  # fmt: skip
-
-
-def _drive(fit: BodyFit, robot: RobotConfig) -> Iterator[ParameterEstimate]:
-    scale, sd = fit.of(SCALE)
-    constant = robot.drive.torque_constant
-    yield estimate(
-        "drive.torque_constant", "torque constant", "N m/A",
-        file=constant, value=constant * (1.0 + scale), sd=constant * sd,
-        known=fit.known(SCALE) >= KNOWN_MIN,
-    )  # fmt: skip
-    compliance, sd = fit.of(COMPLIANCE)
-    if compliance > 2.0 * HALF_WIDTH * sd:
-        stiffness = 1.0 / compliance
-        yield estimate(
-            "", "drivetrain's stiffness", "N m/rad",
-            file=None, value=stiffness, sd=sd * stiffness * stiffness, known=True,
-        )  # fmt: skip
-
-
-def _zeros(fit: BodyFit) -> Iterator[ParameterEstimate]:
-    for name in ZEROS:
-        value, sd = fit.of(name)
-        yield estimate(
-            "", name, "rad", file=0.0, value=value, sd=sd, known=fit.known(name) >= KNOWN_MIN
-        )

@@ -62,11 +62,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 
 def _asked(args: argparse.Namespace) -> tuple[Sequence[str], Sequence[int]]:
-    """Return modules and axes.
-
-    Raises:
-        DriveError: they name none, or no such module; or the torque is none.
-    """
+    """Return modules and axes."""
     unknown = [name for name in args.module if name not in MODULES]
     if unknown:
         raise DriveError(f"{unknown[0][:40]}: one of {', '.join(MODULES)} is right")

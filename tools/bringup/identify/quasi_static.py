@@ -52,12 +52,7 @@ class TimedRows(NamedTuple, Generic[M]):
 
 
 def moments_of(states: Sequence[TimedRows[JointState]], wrenches: TimedRows[Wrench]) -> Moments:
-    """Return the quasi-static moments of a record; none if a stream is empty.
-
-    Args:
-        states: one stream for each of the six modules.
-        wrenches: of the harness.
-    """
+    """Return the quasi-static moments of a record; none if a stream is empty."""
     streams: tuple[TimedRows[Any], ...] = (*states, wrenches)
     if not all(len(stream.rows) for stream in streams):
         return _moments(*(np.zeros((0, k)) for k in (1, 12, 12, 12, 6)))

@@ -74,12 +74,7 @@ def lines_of(values: Mapping[str, Value]) -> str:
 def tell(
     estimates: list[ParameterEstimate], robot: RobotConfig, path: Path | None, console: Console
 ) -> None:
-    """Print the estimates, what to write and what to know; write it into the robot file `path`.
-
-    Raises:
-        RunError: the file is another robot's, or cannot be read or written.
-        ConfigError: the new values make no robot file that can be used.
-    """
+    """Print the estimates, what to write and what to know; write it into the robot file `path`."""
     values, known = changes(estimates, robot), measured(estimates)
     console.print(estimates_table(estimates))
     if values:

@@ -21,17 +21,9 @@ from tools.fleet.run_dir import RunDir
 
 
 def edited(text: str, file: str, values: Mapping[str, Value], measured: Collection[str]) -> str:
-    """Return a robot file's text with new values, checked as a robot.
+    """Return a robot file's text with new values by dotted key, checked as a robot.
 
-    Args:
-        text: of the file.
-        file: its name, for errors.
-        values: new ones by dotted key.
-        measured: keys that come off the list of what is assumed.
-
-    Raises:
-        RunError: it is no TOML.
-        ConfigError: it would be no robot file that can be used.
+    The measured keys come off the list of what is assumed.
     """
     try:
         document = tomlkit.parse(text)
@@ -70,11 +62,7 @@ def apply(path: Path, values: Mapping[str, Value], measured: Collection[str], st
 
 
 def refuse_running(path: Path) -> None:
-    """Refuse to write the robot file of a fleet that is up: a service that restarts would read it.
-
-    Raises:
-        RunError: naming the fleet, and what to do; or it is the shipped one of an installed wheel.
-    """
+    """Refuse to write the robot file of a fleet that is up: a restarted service would read it."""
     refuse_shipped(path)
     for place in sorted(procfs.fleets()):
         manifest = RunDir(Path(place)).read_manifest()
@@ -86,12 +74,7 @@ def refuse_running(path: Path) -> None:
 
 
 def refuse_other_robot(path: Path, robot: RobotConfig, values: Mapping[str, Value]) -> None:
-    """Refuse to write what was measured against another file than the one to be written.
-
-    Raises:
-        RunError: the file has another value where a new one would go, or another robot's name.
-        ConfigError: the file cannot be read.
-    """
+    """Refuse to write what was measured against another file than the one to be written."""
     file = config_file.load_without_schedule(path)
     if file.name != robot.name:
         raise RunError(f"{path}: the robot {file.name}; the record is of {robot.name}")

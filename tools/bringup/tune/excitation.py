@@ -67,12 +67,7 @@ class Excitation(NamedTuple):
 
 
 def excitation(size: float, scale: float = 1.0) -> Excitation:
-    """Return step and sines of a size, m or rad.
-
-    Args:
-        size: of both.
-        scale: factor on the frequencies, which are those of a standing body.
-    """
+    """Return step and sines of a size, m or rad, at a standing body's frequencies times `scale`."""
     begin_s, sines = REST_S + 2.0 * HOLD_S, []
     for hertz in (scale * one for one in FREQUENCIES_HZ):
         sine = SinePart(begin_s, hertz, max(CYCLES, math.ceil(SHORTEST_S * hertz) + 1))

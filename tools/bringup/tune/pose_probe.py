@@ -80,18 +80,7 @@ def in_lockstep(
     plant: PlantConfig,
     progress: Callable[[float], None],
 ) -> ProbeCourse:
-    """Return what a robot in virtual time does.
-
-    Args:
-        robot: ready to run.
-        row: of p.
-        excitation: of its reference.
-        plant: the true robot.
-        progress: is given the time, s.
-
-    Raises:
-        RunError: it fell, or is not led on this plant.
-    """
+    """Return what a robot on a plant does in virtual time with a row of its reference offset."""
     scenario = Scenario(
         name="tune", about="one reference is offset", duration=excitation.duration_s,
         keyframe=(Keyframe(at=0.0, height=robot.simulation.stand_height),),
@@ -121,11 +110,7 @@ class LiveProbe:
     """A robot that is up."""
 
     def __init__(self, session: Session) -> None:
-        """Meet the robot.
-
-        Raises:
-            FleetError: it is silent, does not lead, or somebody else asks it for something.
-        """
+        """Meet the robot."""
         self._planner = LedPlanner(session, "tune")
 
     def go(

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from tools.bringup.tune.excitation import HOLD_S, REST_S, Excitation
+from tools.bringup.tune.excitation import HOLD_S, REST_S, Excitation, SinePart
 
 Array = NDArray[np.float64]
 
@@ -104,19 +104,14 @@ class ResponseFit(NamedTuple):
 
 
 def answer_of(t_s: Array, r: Array, y: Array, excitation: Excitation) -> ResponseFit | None:
-    """Return how a reference was answered; None if it was hardly answered at all.
+    """Return how a reference's offsets r (n,) were answered by y (n,), both m or rad.
 
-    Args:
-        t_s: times since the excitation began (n,), s.
-        r: offset of the reference (n,), m or rad.
-        y: of the robot (n,), m or rad.
-        excitation: that was asked for.
+    None: it was hardly answered at all. Times are since the excitation began.
     """
     rest = t_s < REST_S
     y = y - np.mean(y[rest])
     step = _step(t_s, y, excitation.size)
-    points = tuple(_point(t_s, r, y, sine.begin_s, sine.frequency_hz, sine.end_s)
-                   for sine in excitation.sines)  # fmt: skip
+    points = tuple(_point(t_s, r, y, sine) for sine in excitation.sines)
     if max(abs(point.H) for point in points) < MOVED_MIN:
         return None
     band = in_band(points)
@@ -151,11 +146,10 @@ def _first(t: Array, reached: NDArray[np.bool_]) -> float:
     return float(t[np.argmax(reached)]) if reached.any() else math.nan
 
 
-def _point(
-    t_s: Array, r: Array, y: Array, begin_s: float, hertz: float, end_s: float
-) -> FrequencyPoint:
+def _point(t_s: Array, r: Array, y: Array, sine: SinePart) -> FrequencyPoint:
     """Return y / r at a sine, by least squares over whole cycles without the first."""
-    chosen = (t_s >= begin_s + 1.0 / hertz) & (t_s < end_s)
+    hertz = sine.frequency_hz
+    chosen = (t_s >= sine.begin_s + 1.0 / hertz) & (t_s < sine.end_s)
     t = t_s[chosen]
     omega = 2.0 * math.pi * hertz
     basis = np.stack([np.cos(omega * t), np.sin(omega * t), np.ones(len(t)), t], axis=1)
@@ -209,22 +203,14 @@ def _phase_margin(points: tuple[FrequencyPoint, ...], model: SecondOrder) -> flo
     return min(margins, key=abs) if margins else math.nan
 
 
-class Proposal(NamedTuple):
-    """Body gains for a wanted answer."""
-
-    K_p: float
-    B_p: float
-
-
 def propose(
     model: SecondOrder,
-    *,
-    K_p: float,
-    B_p: float,
+    gains: tuple[float, float],
     inertia: float,
+    *,
     bandwidth: float,
     damping_ratio: float,
-) -> Proposal:
+) -> tuple[float, float]:
     """Return K_p and B_p that make the measured answer the wanted one; below 0 there are none.
 
     The model's a_0 and a_1 are all stiffness and damping over inertia, whoever gives them; what is
@@ -232,13 +218,13 @@ def propose(
 
     Args:
         model: measured.
-        K_p: of the robot file, N/m or N m/rad.
-        B_p: of the robot file, N s/m or N m s/rad.
+        gains: K_p and B_p of the robot file, N/m and N s/m, or N m/rad and N m s/rad.
         inertia: along the direction, kg or kg m^2.
         bandwidth: wanted natural frequency, rad/s.
         damping_ratio: wanted.
     """
-    return Proposal(
+    K_p, B_p = gains
+    return (
         K_p + inertia * (bandwidth**2 - model.a_0),
         B_p + inertia * (2.0 * damping_ratio * bandwidth - model.a_1),
     )
