@@ -6,93 +6,76 @@ import pytest
 
 from shared.joints import MODULES
 from tests.tools.bringup.board_in_memory import as_wanted, healthy
+from tests.tools.bringup.verdicts import OK, WARNING, WRONG, bad
 from tools.bringup.boards import Value
 from tools.bringup.check_alike import alike_rows
-from tools.bringup.findings import Finding, FindingKind
+from tools.bringup.findings import FindingKind
 
-POLES = "axis0.motor.config.pole_pairs"
-RESISTANCE = "axis1.motor.config.phase_resistance"
+POLES, NAME = "axis0.motor.config.pole_pairs", "motor.config.pole_pairs"
+OHM, PHASE = "axis1.motor.config.phase_resistance", "motor.config.phase_resistance"
+Changes = dict[str, dict[str, Value]]
 
 
-def boards() -> dict[str, dict[str, Value]]:
+def boards(changes: Changes) -> Changes:
     return {
-        module: as_wanted() | healthy() | {POLES: 7, RESISTANCE: 0.1 + 0.001 * i}
+        module: as_wanted()
+        | healthy()
+        | {POLES: 7, OHM: 0.1 + 0.001 * i, "vbus_voltage": 48.0}
+        | changes.get(module, {})
         for i, module in enumerate(MODULES)
     }
 
 
-def bad(rows: list[Finding]) -> list[tuple[str, str, FindingKind]]:
-    return [(row.subject, row.what, row.verdict) for row in rows if row.verdict != FindingKind.OK]
-
-
-def test_boards_that_are_alike_are_one_row() -> None:
-    (row,) = alike_rows(boards())
-    assert (row.verdict, row.subject) == (FindingKind.OK, "all 6")
-
-
-def test_the_one_that_differs_is_named_with_what_the_others_have() -> None:
-    six = boards()
-    six["knee_left"][POLES] = 20
-    (row,) = alike_rows(six)
-    assert (row.subject, row.what) == ("knee_left.axis0", "motor.config.pole_pairs")
-    assert (row.verdict, row.found, row.wanted) == (FindingKind.WARNING, "20", "7, as 5 others")
-
-
-def test_a_setting_that_one_board_lacks_shows() -> None:
-    six = boards()
-    del six["hip_right"][POLES]
-    assert bad(alike_rows(six)) == [
-        ("hip_right.axis0", "motor.config.pole_pairs", FindingKind.WARNING)
-    ]
-
-
-def test_half_against_half_accuses_no_module() -> None:
-    six = boards()
-    for module in MODULES[:3]:
-        six[module][POLES] = 20
-    assert bad(alike_rows(six)) == []
-
-
-def test_two_boards_prove_nothing() -> None:
-    assert alike_rows(dict(list(boards().items())[:2])) == []
-
-
-def test_what_belongs_to_one_board_may_differ() -> None:
-    six = boards()
-    for i, values in enumerate(six.values()):
-        values |= {
-            "axis0.config.can.node_id": 2 * i,
-            "axis0.encoder.config.phase_offset": 1000 * i,
-            "axis0.controller.config.vel_gain": 0.1 * i,
-            "axis0.encoder.pos_estimate": 64.0 + i,
-        }
-    assert bad(alike_rows(six)) == []
+OWN: Changes = {
+    module: {
+        "axis0.config.can.node_id": 2 * i,
+        "axis0.encoder.config.phase_offset": 1000 * i,
+        "axis0.controller.config.vel_gain": 0.1 * i,
+        "axis0.encoder.pos_estimate": 64.0 + i,
+    }
+    for i, module in enumerate(MODULES)
+}
 
 
 @pytest.mark.parametrize(
-    ("ohm", "expected"),
+    ("changes", "expected"),
     [
-        (0.125, []),
-        (0.2, [FindingKind.WARNING]),
-        (0.05, [FindingKind.WARNING]),
-        (0.0, [FindingKind.WRONG]),
+        pytest.param({"knee_left": {POLES: 20}}, [("knee_left.axis0", NAME, WARNING)],
+                     id="the one that differs is named"),
+        pytest.param({module: {POLES: 20} for module in MODULES[:3]}, [],
+                     id="half against half accuses no module"),
+        pytest.param(OWN, [], id="what belongs to one board may differ"),
+        pytest.param({"ankle_left": {OHM: 0.125}}, [], id="a phase within its tolerance"),
+        pytest.param({"ankle_left": {OHM: 0.2}}, [("ankle_left.axis1", PHASE, WARNING)],
+                     id="a loose phase"),
+        pytest.param({"ankle_left": {OHM: 0.05}}, [("ankle_left.axis1", PHASE, WARNING)],
+                     id="another motor"),
+        pytest.param({"ankle_left": {OHM: 0.0}}, [("ankle_left.axis1", PHASE, WRONG)],
+                     id="no motor has no resistance"),
+        pytest.param({"ankle_left": {OHM: 0.0, "axis1.motor.is_calibrated": False}}, [],
+                     id="a motor that is not calibrated has no resistance yet"),
+        pytest.param({"hip_left": {"vbus_voltage": 46.5}}, [("hip_left", "supply", WARNING)],
+                     id="a supply lower than the others is a bad plug"),
     ],
-)
-def test_a_phase_resistance_unlike_the_others_is_a_loose_phase_or_another_motor(
-    ohm: float, expected: list[FindingKind]
+)  # fmt: skip
+def test_the_board_that_is_unlike_the_others_is_named(
+    changes: Changes, expected: list[tuple[str, str, FindingKind]]
 ) -> None:
-    six = boards()
-    six["ankle_left"][RESISTANCE] = ohm
-    assert [row.verdict for row in alike_rows(six) if row.verdict != FindingKind.OK] == expected
+    assert bad(alike_rows(boards(changes))) == expected
 
 
-def test_a_motor_that_is_not_calibrated_has_no_resistance_yet() -> None:
-    six = boards()
-    six["ankle_left"] |= {RESISTANCE: 0.0, "axis1.motor.is_calibrated": False}
-    assert bad(alike_rows(six)) == []
+def test_boards_that_are_alike_are_one_row_and_two_boards_prove_nothing() -> None:
+    (row,) = alike_rows(boards({}))
+    assert (row.verdict, row.subject) == (OK, "all 6")
+    assert alike_rows(dict(list(boards({}).items())[:2])) == []
 
 
-def test_a_supply_lower_than_the_others_is_a_bad_plug() -> None:
-    six = boards()
-    six["hip_left"]["vbus_voltage"] = 46.5
-    assert bad(alike_rows(six)) == [("hip_left", "supply", FindingKind.WARNING)]
+def test_the_row_has_what_the_others_have() -> None:
+    (row,) = alike_rows(boards({"knee_left": {POLES: 20}}))
+    assert (row.found, row.wanted) == ("20", "7, as 5 others")
+
+
+def test_a_setting_that_one_board_lacks_shows() -> None:
+    six = boards({})
+    del six["hip_right"][POLES]
+    assert bad(alike_rows(six)) == [("hip_right.axis0", NAME, WARNING)]
