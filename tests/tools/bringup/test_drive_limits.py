@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import contextmanager
+from contextlib import nullcontext
 from pathlib import Path
 
 import can
@@ -20,13 +20,14 @@ from tools.bringup.boards import FoundBoards
 
 MODULE = "knee_left"
 SERIAL = "3A0000000005"
+NOWHERE = Path("/nowhere")
 SMALL = {"axis0.controller.config.vel_limit": 3.0, "axis1.motor.config.current_lim": 3.5}
 
 
 class Link:
     """A CAN link that keeps what it is given."""
 
-    def __init__(self, *_: object) -> None:
+    def __init__(self) -> None:
         self.open = True
         self.sent: list[can.Message] = []
 
@@ -54,53 +55,50 @@ def link(monkeypatch: pytest.MonkeyPatch) -> Link:
 def test_over_can_both_axes_get_the_robot_files_limits_more_than_once(
     robot: RobotConfig, link: Link
 ) -> None:
-    drive_limits.give_back(robot, MODULE, Path("/nowhere"))
+    drive_limits.give_back(robot, MODULE, NOWHERE)
     wanted = (robot.drive.vel_limit, robot.drive.current_lim)
-    for node in robot.module_named(MODULE).node_ids:
-        found = [
-            cansimple.unpack_two_floats(bytes(message.data))
-            for message in link.sent
-            if message.arbitration_id == cansimple.arbitration_id(node, Command.SET_LIMITS)
-        ]
-        assert found == [pytest.approx(wanted)] * drive_limits.TIMES
-    assert len(link.sent) == 2 * drive_limits.TIMES, "and nothing else"
+    sent = [(m.arbitration_id, cansimple.unpack_two_floats(bytes(m.data))) for m in link.sent]
+    ids = [
+        cansimple.arbitration_id(node, Command.SET_LIMITS)
+        for node in robot.module_named(MODULE).node_ids
+    ]
+    assert sorted(can_id for can_id, _ in sent) == sorted(ids * drive_limits.TIMES), "nothing else"
+    assert all(limits == pytest.approx(wanted) for _, limits in sent)
     assert not link.open
 
 
 def test_a_bus_that_is_gone_is_reported(robot: RobotConfig, link: Link) -> None:
     link.open = False
     with pytest.raises(DriveError, match="takes no frames"):
-        drive_limits.give_back(robot, MODULE, Path("/nowhere"))
+        drive_limits.give_back(robot, MODULE, NOWHERE)
 
 
 @pytest.fixture
-def on_usb(robot: RobotConfig, monkeypatch: pytest.MonkeyPatch) -> tuple[RobotConfig, FoundBoards]:
+def found(monkeypatch: pytest.MonkeyPatch) -> FoundBoards:
     found = FoundBoards({SERIAL: BoardInMemory(as_wanted() | SMALL)}, {}, ())
+    monkeypatch.setattr(drive_limits, "boards_on_usb", lambda *_: nullcontext(found))
+    return found
 
-    @contextmanager
-    def boards(*_: object):  # type: ignore[no-untyped-def]
-        yield found
 
-    monkeypatch.setattr(drive_limits, "boards_on_usb", boards)
+@pytest.fixture
+def on_usb(robot: RobotConfig) -> RobotConfig:
     service = msgspec.structs.replace(robot.joint_service, driver="odrive_usb")
-    return msgspec.structs.replace(robot, joint_service=service), found
+    return msgspec.structs.replace(robot, joint_service=service)
 
 
-def test_over_usb_they_are_written_and_read_back(on_usb: tuple[RobotConfig, FoundBoards]) -> None:
-    robot, found = on_usb
+def test_over_usb_they_are_written_and_read_back(on_usb: RobotConfig, found: FoundBoards) -> None:
     board = found.boards[SERIAL]
     assert isinstance(board, BoardInMemory)
-    drive_limits.give_back(robot, MODULE, Path("/nowhere"))
+    drive_limits.give_back(on_usb, MODULE, NOWHERE)
     assert board.now == as_wanted()
     assert board.saves == 0, "a board that saves restarts, and has lost its zero"
     board.now |= SMALL
     board.deaf.add("axis0.controller.config.vel_limit")
     with pytest.raises(DriveError, match="did not keep"):
-        drive_limits.give_back(robot, MODULE, Path("/nowhere"))
+        drive_limits.give_back(on_usb, MODULE, NOWHERE)
 
 
-def test_a_board_that_has_gone_is_reported(on_usb: tuple[RobotConfig, FoundBoards]) -> None:
-    robot, found = on_usb
+def test_a_board_that_has_gone_is_reported(on_usb: RobotConfig, found: FoundBoards) -> None:
     found.boards.clear()
     with pytest.raises(DriveError, match=f"{SERIAL}: not there"):
-        drive_limits.give_back(robot, MODULE, Path("/nowhere"))
+        drive_limits.give_back(on_usb, MODULE, NOWHERE)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import msgspec
 import numpy as np
 import pytest
@@ -12,11 +14,18 @@ from shared.can.cansimple import AxisState
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
 from shared.joints import MODULE_INDEX
-from tests.tools.bringup.identify.hung_robot import HungRobot
+from tests.tools.bringup.identify.hung_robot import HungDrive, HungRobot
 from tests.tools.verbs.bench_drive import START, BenchDrive
 from tools.bringup import motion_runner
 from tools.bringup.hanging_leg import HangingJoint, hanging_joint, leg_of
-from tools.bringup.identify.estimates import JointResult, Verdict, changes, measured, of_joints
+from tools.bringup.identify.estimates import (
+    JointResult,
+    ParameterEstimate,
+    Verdict,
+    changes,
+    measured,
+    of_joints,
+)
 from tools.bringup.identify.sines import SinePlan, fit_sines, plan_for
 from tools.bringup.motion import AnyPlan, Sample, limit_drives, within_stops
 from tools.bringup.motion_runner import Interrupts, MotionResult, look_at, run_motion
@@ -72,52 +81,60 @@ def test_a_bench_joint_has_the_inertia_and_friction_that_it_has(
     assert fit_sines(result.samples[:3000], plan) is None
 
 
-def moved(
-    hung: HungRobot, robot: RobotConfig, module: str, axis: int
-) -> tuple[JointResult, SinePlan]:
-    leg = {name: hung.drives[name] for name in leg_of(module)}
-    interrupts = Interrupts()
+def hung_leg(hung: HungRobot, module: str = MODULE) -> dict[str, HungDrive]:
+    return {name: hung.drives[name] for name in leg_of(module)}
+
+
+def run(
+    hung: HungRobot,
+    robot: RobotConfig,
+    module: str = MODULE,
+    axis: int = 0,
+    progress: Callable[[Sample], None] = lambda _: None,
+) -> tuple[MotionResult, SinePlan, HangingJoint]:
+    """Move a joint by sines, its leg's other modules held."""
+    leg, interrupts = hung_leg(hung, module), Interrupts()
     q = look_at(leg, robot, interrupts, hung.clock)
     assert q is not None
     joint = hanging_joint(robot, q, module, axis)
     plan = plan_for(axis, 15.0, robot.joint.armature, joint)
     result = run_motion(
         leg, limited(robot, plan), module, plan, q_seen=q[module], interrupts=interrupts,
-        progress=lambda _: None, clock=hung.clock,
+        progress=progress, clock=hung.clock,
     )  # fmt: skip
+    return result, plan, joint
+
+
+def identified(
+    hung: HungRobot, robot: RobotConfig, module: str
+) -> tuple[dict[str, ParameterEstimate], SinePlan]:
+    """Return what theta's sines show, by its name without the joint's."""
+    result, plan, joint = run(hung, robot, module, 1)
     assert (result.trouble, result.not_idle) == ("", ())
     fit = fit_sines(result.samples, plan)
     assert fit is not None
-    return JointResult(f"{module}_{'phi' if axis == 0 else 'theta'}", fit, joint.inertia), plan
+    rows = of_joints([JointResult(f"{module}_theta", fit, joint.inertia)], robot)
+    return {row.what.removesuffix(f" {module}_theta"): row for row in rows}, plan
 
 
 def test_an_ankles_rotor_and_friction_are_found_within_their_intervals(robot: RobotConfig) -> None:
-    plant = changed(
-        PlantConfig(),
-        {
-            "steps": 4,
-            "drivetrain.rotor_inertia": 0.11,
-            "drivetrain.motor_friction": 0.5,
-            "drivetrain.motor_damping": 1.0,
-        },
-    )
-    result, _ = moved(HungRobot(robot, plant), robot, MODULE, 1)
-    rows = {row.what.split(" ankle")[0]: row for row in of_joints([result], robot)}
+    rotor = {"rotor_inertia": 0.11, "motor_friction": 0.5, "motor_damping": 1.0}
+    planted = {f"drivetrain.{name}": value for name, value in rotor.items()}
+    plant = changed(PlantConfig(), {"steps": 4} | planted)
+    rows, _ = identified(HungRobot(robot, plant), robot, MODULE)
     assert rows["dry friction"].describes(0.6)
     assert rows["viscous friction"].describes(1.2)
     assert rows["reflected inertia"].describes(0.11)
     assert rows["reflected inertia"].verdict is Verdict.CHANGE
-    values = changes(list(rows.values()), robot)
-    assert values.keys() == {"joint.armature"}
-    assert measured(list(rows.values())) == {"joint.armature"}
+    values = list(rows.values())
+    assert changes(values, robot).keys() == measured(values) == {"joint.armature"}
 
 
 def test_a_knee_that_hangs_on_its_stop_is_led_off_it_and_its_friction_found(
     robot: RobotConfig,
 ) -> None:
-    result, plan = moved(HungRobot(robot, PlantConfig(steps=2)), robot, "knee_left", 1)
+    rows, plan = identified(HungRobot(robot, PlantConfig(steps=2)), robot, "knee_left")
     assert plan.bias[1] < -0.2
-    rows = {row.what.split(" knee")[0]: row for row in of_joints([result], robot)}
     assert rows["dry friction"].describes(0.3)
     assert rows["inertia"].verdict is Verdict.AGREES
     # two percent of a leg are more than the rotor
@@ -127,56 +144,51 @@ def test_a_knee_that_hangs_on_its_stop_is_led_off_it_and_its_friction_found(
 def test_a_leg_that_swings_is_waited_for_but_not_for_ever(
     robot: RobotConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    hung = HungRobot(robot, PlantConfig())
+    hung, interrupts = HungRobot(robot, PlantConfig()), Interrupts()
     hung.world.data.qvel[6:] = 0.5
-    leg = {name: hung.drives[name] for name in leg_of(MODULE)}
-    interrupts = Interrupts()
     monkeypatch.setattr(motion_runner, "STILL_WAIT_S", 1.0)
     with pytest.raises(DriveError, match="swings"):
-        look_at(leg, robot, interrupts, hung.clock)
+        look_at(hung_leg(hung), robot, interrupts, hung.clock)
     interrupts.number = 2
-    assert look_at(leg, robot, interrupts, hung.clock) is None
-
-
-def started(hung: HungRobot, robot: RobotConfig, **change: object) -> MotionResult:
-    """Return how a motion of the left ankle ended, with the leg's other modules held."""
-    leg = {name: hung.drives[name] for name in leg_of(MODULE)}
-    interrupts = Interrupts()
-    q = look_at(leg, robot, interrupts, hung.clock)
-    assert q is not None
-    plan = plan_for(0, 15.0, robot.joint.armature, hanging_joint(robot, q, MODULE, 0))
-    words = {"q_seen": q[MODULE], "interrupts": interrupts, "clock": hung.clock}
-    words |= {"progress": lambda _: None} | change
-    return run_motion(leg, limited(robot, plan), MODULE, plan, **words)  # type: ignore[arg-type]
+    assert look_at(hung_leg(hung), robot, interrupts, hung.clock) is None
 
 
 def all_idle(hung: HungRobot) -> bool:
-    readings = [hung.drives[name].read(0.02) for name in leg_of(MODULE)]
+    readings = [drive.read(0.02) for drive in hung_leg(hung).values()]
     return all(one is not None and one.status is not DriveStatus.ARMED for one in readings)
+
+
+def at_third(then: Callable[[], None]) -> tuple[list[Sample], Callable[[Sample], None]]:
+    """Return what is seen of a motion, and who does something at the third look."""
+    seen: list[Sample] = []
+
+    def progress(sample: Sample) -> None:
+        seen.append(sample)
+        if len(seen) == 3:
+            then()
+
+    return seen, progress
 
 
 def test_all_are_idle_again_when_a_held_module_does_not_arm(robot: RobotConfig) -> None:
     hung = HungRobot(robot, PlantConfig())
     hung.drives["hip_left"].never_arms = True
-    result = started(hung, robot)
+    result, *_ = run(hung, robot)
     assert "hip_left: it does not arm" in result.trouble
     assert result.not_idle == ()
     assert all_idle(hung)
 
 
 @pytest.mark.parametrize("name", ["knee_left", "hip_left"])
-def test_a_held_module_that_disarms_or_moves_stops_the_motion(
-    robot: RobotConfig, name: str
-) -> None:
-    hung, seen = HungRobot(robot, PlantConfig()), []
+def test_a_held_module_that_disarms_stops_the_motion(robot: RobotConfig, name: str) -> None:
+    hung = HungRobot(robot, PlantConfig())
 
-    def progress(sample: Sample) -> None:
-        seen.append(sample)
-        if len(seen) == 3:
-            for axis in (0, 1):
-                hung.bank.request_state(2 * MODULE_INDEX[name] + axis, AxisState.IDLE)
+    def disarm() -> None:
+        for axis in (0, 1):
+            hung.bank.request_state(2 * MODULE_INDEX[name] + axis, AxisState.IDLE)
 
-    result = started(hung, robot, progress=progress)
+    seen, progress = at_third(disarm)
+    result, *_ = run(hung, robot, progress=progress)
     assert result.trouble.startswith(f"{name}: the drive is IDLE")
     assert len(seen) < 8
     assert all_idle(hung)
@@ -184,28 +196,39 @@ def test_a_held_module_that_disarms_or_moves_stops_the_motion(
 
 def test_a_held_modules_target_goes_out_in_every_cycle(robot: RobotConfig) -> None:
     """A frame may be lost: the drive would be armed and hold nothing."""
-    hung, seen = HungRobot(robot, PlantConfig()), []
+    hung = HungRobot(robot, PlantConfig())
 
-    def progress(sample: Sample) -> None:
-        seen.append(sample)
-        if len(seen) == 3:  # as if its gains had not arrived
-            hung.bank.pos_gain[:] = 0.0
-            hung.bank.vel_gain[:] = 0.0
+    def lose_gains() -> None:
+        hung.bank.pos_gain[:] = 0.0
+        hung.bank.vel_gain[:] = 0.0
 
-    result = started(hung, robot, progress=progress)
+    _, progress = at_third(lose_gains)
+    result, *_ = run(hung, robot, progress=progress)
     assert result.trouble == ""
-    knee = 2 * MODULE_INDEX["knee_left"]
-    assert hung.bank.pos_gain[knee] > 0.0
+    assert hung.bank.pos_gain[2 * MODULE_INDEX["knee_left"]] > 0.0
 
 
 def test_an_exception_idles_the_whole_leg(robot: RobotConfig) -> None:
     hung = HungRobot(robot, PlantConfig())
 
-    def progress(_: Sample) -> None:
+    def fail(_: Sample) -> None:
         raise RuntimeError("a test")
 
     with pytest.raises(RuntimeError):
-        started(hung, robot, progress=progress)
+        run(hung, robot, progress=fail)
+    assert all_idle(hung)
+
+
+def test_a_drive_that_raises_while_it_is_idled_leaves_no_other_armed(robot: RobotConfig) -> None:
+    hung = HungRobot(robot, PlantConfig())
+    hung.drives["hip_left"].never_arms = True
+
+    def broken() -> None:
+        raise OSError("a test")
+
+    hung.drives[MODULE].idle = broken  # type: ignore[method-assign]
+    with pytest.raises(OSError, match="a test"):
+        run(hung, robot)
     assert all_idle(hung)
 
 
@@ -213,7 +236,8 @@ def test_drives_that_do_not_say_that_they_are_idle_are_named(robot: RobotConfig)
     hung = HungRobot(robot, PlantConfig())
     hung.drives["knee_left"].deaf = True
     hung.drives["hip_left"].never_arms = True
-    assert started(hung, robot).not_idle == ("knee_left",)
+    result, *_ = run(hung, robot)
+    assert result.not_idle == ("knee_left",)
 
 
 def test_a_torque_beyond_the_robots_is_refused(robot: RobotConfig) -> None:
