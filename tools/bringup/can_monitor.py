@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
+from pathlib import Path
 from statistics import fmean, median
 from typing import Final, Generic, NamedTuple, TypeVar
 
@@ -25,6 +26,7 @@ from shared.can.cansimple_06 import Command06, Version, unpack_version
 from shared.can.imu_can import IDS as IMU_IDS
 from shared.can.imu_can import ImuAssembler, ImuSample
 from shared.can.loadcell_can import FRAME_IDS, SampleAssembler
+from shared.config.robot_config import RobotConfig, expand
 from shared.config.sections import CanConfig
 from shared.exceptions import DriveError
 
@@ -95,10 +97,10 @@ def listen(
     imu: bool = False,
     seconds: float = LISTEN_S,
 ) -> BusTraffic:
-    """Listen to a bus for a while.
+    """Listen to a bus for some seconds.
 
     Args:
-        config: of the bus, `{run}` in its channel expanded.
+        config: of the bus.
         nodes: of the axes that should be on it.
         poll_nodes: whether to ask them; not where services are up.
         cells: whether the load cells are on it.
@@ -115,6 +117,32 @@ def listen(
     except DriveError as error:
         traffic.trouble = str(error)
     return traffic
+
+
+def listen_to(
+    robot: RobotConfig, name: str, run_dir: Path, *, poll_nodes: bool, seconds: float | None = None
+) -> BusTraffic:
+    """Listen to a bus of a robot for all that should be on it; without a time, long enough."""
+    nodes = bus_nodes(robot)[name]
+    return listen(
+        bus_config(robot, name, run_dir), nodes, poll_nodes=poll_nodes,
+        cells=name == robot.harness.bus, imu=robot.imu.fitted and name == robot.imu.bus,
+        seconds=seconds or long_enough(robot.drive.heartbeat_period_ms if nodes else 0),
+    )  # fmt: skip
+
+
+def bus_config(robot: RobotConfig, name: str, run_dir: Path) -> CanConfig:
+    """Return a bus of a robot, `{run}` in its channel expanded."""
+    bus = robot.can[name]
+    return CanConfig(interface=bus.interface, channel=expand(bus.channel, run_dir))
+
+
+def bus_nodes(robot: RobotConfig) -> Mapping[str, tuple[int, ...]]:
+    """Return the nodes that should be on each bus, also where there are none."""
+    nodes: dict[str, tuple[int, ...]] = dict.fromkeys(robot.buses, ())
+    for module in robot.module:
+        nodes[module.bus] = (*nodes[module.bus], *module.node_ids)
+    return nodes
 
 
 @contextlib.contextmanager

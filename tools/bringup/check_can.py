@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Mapping
 from typing import Any, Final
 
 from shared.can.cansimple import AxisError
@@ -141,14 +140,6 @@ def _turns(traffic: NodeTraffic, counts_per_turn: int) -> float | None:
     if traffic.pos_turns == 0.0 and traffic.shadow_count is not None:
         return traffic.shadow_count / counts_per_turn
     return traffic.pos_turns
-
-
-def bus_nodes(robot: RobotConfig) -> Mapping[str, tuple[int, ...]]:
-    """Return the nodes that should be on each bus, also where there are none."""
-    nodes: dict[str, tuple[int, ...]] = dict.fromkeys(robot.buses, ())
-    for module in robot.module:
-        nodes[module.bus] = (*nodes[module.bus], *module.node_ids)
-    return nodes
 
 
 def _axis_rows(

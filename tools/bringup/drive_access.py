@@ -24,13 +24,12 @@ from services.simulator.drives.axis_settings import Settings, plant
 from services.simulator.fronts import usb_standin
 from shared import places
 from shared.config import files as config_file
-from shared.config.robot_config import RobotConfig, expand
-from shared.config.sections import CanConfig
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError, XrlError
 from shared.extras import require
 from shared.joints import MODULES
 from tools.bringup.boards import FoundBoards
-from tools.bringup.can_monitor import listen
+from tools.bringup.can_monitor import bus_config, listen
 from tools.fleet import procfs
 from tools.fleet.process_table import SIMULATED_CAN, is_simulated
 from tools.fleet.run_dir import RunDir
@@ -100,8 +99,8 @@ def _drive_of(robot: RobotConfig, module: str, run_dir: Path) -> tuple[str, ...]
     place = str(run_dir) if is_simulated(robot) else ""
     if robot.joint_service.driver == "odrive_usb":
         return (place, wiring.serial_number.upper())
-    bus = robot.can[wiring.bus]
-    return (place, bus.interface, expand(bus.channel, run_dir), *map(str, wiring.node_ids))
+    bus = bus_config(robot, wiring.bus, run_dir)
+    return (place, bus.interface, bus.channel, *map(str, wiring.node_ids))
 
 
 def refuse_service(robot: RobotConfig, module: str, run_dir: Path) -> None:
@@ -220,8 +219,7 @@ def _await_simulator(robot: RobotConfig, run_dir: Path, seconds: float) -> None:
 
     Not for ever: its simulator may be dead.
     """
-    bus = robot.can[robot.harness.bus]
-    config = CanConfig(interface=bus.interface, channel=expand(bus.channel, RunDir(run_dir).path))
+    config = bus_config(robot, robot.harness.bus, RunDir(run_dir).path)
     until = time.monotonic() + seconds
     while time.monotonic() < until:
         if listen(config, (), poll_nodes=False, seconds=_POLL_S).frames:

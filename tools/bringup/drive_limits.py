@@ -14,10 +14,10 @@ from services.joint.drivers.odrive_frames import messages_of
 from shared.can import cansimple
 from shared.can.cansimple import Command
 from shared.can.drive_settings import AXES
-from shared.config.robot_config import RobotConfig, expand
-from shared.config.sections import CanConfig
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError, XrlError
 from tools.bringup.boards import Value, equal
+from tools.bringup.can_monitor import bus_config
 from tools.bringup.drive_access import boards_on_usb
 
 TIMES: Final = 3
@@ -47,10 +47,8 @@ def not_given_back(robot: RobotConfig, module: str, run_dir: Path) -> str:
 
 def _over_can(robot: RobotConfig, module: str, run_dir: Path) -> None:
     wiring, drive = robot.module_named(module), robot.drive
-    bus = robot.can[wiring.bus]
     limits = (Command.SET_LIMITS, cansimple.pack_two_floats(drive.vel_limit, drive.current_lim))
-    channel = expand(bus.channel, run_dir)
-    link = CanLink(CanConfig(interface=bus.interface, channel=channel), wiring.node_ids)
+    link = CanLink(bus_config(robot, wiring.bus, run_dir), wiring.node_ids)
     try:
         taken = link.connect()
         for _ in range(TIMES):

@@ -140,10 +140,10 @@ def look_at(
             if max(abs(phi - at[0]), abs(theta - at[1])) > STILL:
                 rest, still_since = {}, clock()
         rest = rest or q
-        if not until_still or clock() - still_since > _ns(STILL_FOR_S):
-            return q
         if interrupts.number:
             return None
+        if not until_still or clock() - still_since > _ns(STILL_FOR_S):
+            return q
         if clock() - begin > _ns(STILL_WAIT_S):
             raise DriveError("the leg swings: hold it still, and again")
 
@@ -268,6 +268,8 @@ def arm(drive: Drive, interrupts: Interrupts, clock: Clock) -> DriveReading | st
     """Arm a drive; return its first armed reading, or why there is none."""
     reading: DriveReading | None = None
     for _ in range(ARM_TRIES):
+        if interrupts.number:
+            return interrupts.words
         drive.arm(onboard=True)
         until = clock() + _ns(ARM_S)
         while clock() < until:

@@ -11,7 +11,7 @@ import time
 from typing import Final, NamedTuple
 
 from services.joint.differential import joint_from_motor, motor_from_joint
-from services.joint.drivers.base import Drive, DriveReading, DriveStatus
+from services.joint.drivers.base import Drive, DriveStatus
 from services.joint.drivers.wired_drive import MotorFrame
 from shared.bus.messages import Pair
 from shared.can.cansimple import AxisError
@@ -80,8 +80,7 @@ def look(drive: Drive, mark_turns: float, gear_ratio: float) -> DriveLook:
     if reading is None:
         return SILENT
     first = newest = reading
-    speed = moved = 0.0
-    errors = reading.error
+    speed, moved, errors = 0.0, 0.0, reading.error
     until = time.monotonic() + LOOK_S
     while time.monotonic() < until:
         reading = drive.read(_READ_S)
@@ -89,18 +88,13 @@ def look(drive: Drive, mark_turns: float, gear_ratio: float) -> DriveLook:
             continue
         newest = reading
         errors |= reading.error
-        rates = joint_from_motor(reading.vel_turns, gear_ratio)
-        speed = max(speed, *map(abs, rates))
-        moved = max(moved, _apart(reading, first, gear_ratio))
+        speed = max(speed, *map(abs, joint_from_motor(reading.vel_turns, gear_ratio)))
+        (a1, a2), (b1, b2) = reading.pos_turns, first.pos_turns
+        moved = max(moved, *map(abs, joint_from_motor((a1 - b1, a2 - b2), gear_ratio)))
     counted = MotorFrame(mark_turns).from_drive(newest)
-    return DriveLook(
-        newest.status,
-        counted.status is not DriveStatus.UNZEROED,
-        joint_from_motor(counted.pos_turns, gear_ratio),
-        speed,
-        moved,
-        errors,
-    )
+    q = joint_from_motor(counted.pos_turns, gear_ratio)
+    zeroed = counted.status is not DriveStatus.UNZEROED
+    return DriveLook(newest.status, zeroed=zeroed, q=q, speed=speed, moved=moved, error=errors)
 
 
 def refusal(seen: DriveLook) -> str:
@@ -159,9 +153,3 @@ def is_right(back: Back | None, q: Pair) -> bool:
         return False
     within = HELD_WITHIN if back.armed else WITHIN
     return all(abs(a - b) <= within for a, b in zip(back.q, q, strict=True))
-
-
-def _apart(a: DriveReading, b: DriveReading, gear_ratio: float) -> float:
-    """Return the larger angle between two samples, rad."""
-    (a1, a2), (b1, b2) = a.pos_turns, b.pos_turns
-    return max(map(abs, joint_from_motor((a1 - b1, a2 - b2), gear_ratio)))

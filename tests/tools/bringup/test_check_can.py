@@ -22,6 +22,7 @@ from tools.bringup.can_monitor import (
     BusTraffic,
     NodeTraffic,
     SensorTraffic,
+    bus_nodes,
     long_enough,
     period_ms,
 )
@@ -179,9 +180,9 @@ def test_it_listens_for_some_heartbeats_but_not_for_ever(period: int, seconds: f
 def test_every_bus_of_the_robot_is_listened_to_an_imus_where_one_is_fitted(
     robot: RobotConfig,
 ) -> None:
-    nodes = check_can.bus_nodes(robot)
+    nodes = bus_nodes(robot)
     assert sorted(nodes) == sorted(robot.buses)
     assert nodes[MODULE] == NODES
     assert nodes[robot.harness.bus] == ()
     assert "imu" not in nodes
-    assert check_can.bus_nodes(with_imu(robot))["imu"] == ()
+    assert bus_nodes(with_imu(robot))["imu"] == ()

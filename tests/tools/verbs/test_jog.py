@@ -171,6 +171,14 @@ def test_an_interrupt_idles_the_drive_first(drive: BenchDrive, limited: RobotCon
     assert interrupts.number == signal.SIGTERM
 
 
+def test_a_drive_is_not_armed_after_an_interrupt(drive: BenchDrive, limited: RobotConfig) -> None:
+    interrupts, armed = Interrupts(), []
+    interrupts.number = signal.SIGINT
+    drive.arm = lambda *, onboard: armed.append(onboard)  # type: ignore[method-assign]
+    assert jog(drive, limited, interrupts=interrupts).trouble == "stopped by SIGINT"
+    assert armed == []
+
+
 def test_an_error_of_our_own_idles_the_drive_too(drive: BenchDrive, limited: RobotConfig) -> None:
     def broken(_sample: Sample) -> None:
         raise BrokenPipeError

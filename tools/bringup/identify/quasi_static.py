@@ -54,62 +54,53 @@ class TimedRows(NamedTuple, Generic[M]):
 def moments_of(states: Sequence[TimedRows[JointState]], wrenches: TimedRows[Wrench]) -> Moments:
     """Return the quasi-static moments of a record; none if a stream is empty."""
     streams: tuple[TimedRows[Any], ...] = (*states, wrenches)
-    if not all(len(stream.rows) for stream in streams):
-        return _moments(*(np.zeros((0, k)) for k in (1, 12, 12, 12, 6)))
-    begin = max(stream.t_ns[0] for stream in streams)
-    end = min(stream.t_ns[-1] for stream in streams)
+    begin = end = 0
+    if all(len(stream.rows) for stream in streams):
+        begin = max(stream.t_ns[0] for stream in streams)
+        end = min(stream.t_ns[-1] for stream in streams)
     count = max(0, int((end - begin) / (SLOT_S * NS_PER_S)))
     good = np.ones(count, bool)
     q, v, tau = (np.zeros((count, 12)) for _ in range(3))
-    for module, (t_ns, rows) in enumerate(states):
-        slot = _slot_of(np.array(t_ns), begin)
-        stands = np.array([row.mode == Mode.TRACK for row in rows])
-        good &= _filled(slot, count) & ~_any(~stands, slot, count)
+    felt = np.zeros((count, 6))
+    for module, (t_ns, rows) in enumerate(states if count else ()):
+        slots = _Slots(t_ns, begin, count)
+        modes = np.array([row.mode for row in rows])
+        changed = np.diff(modes, prepend=modes[:1]) != 0
+        good &= slots.filled() & ~slots.any((modes != Mode.TRACK) | changed)
         columns = slice(2 * module, 2 * module + 2)
         for out, name in ((q, "q"), (v, "v"), (tau, "tau")):
-            out[:, columns] = _means(np.array([getattr(row, name) for row in rows]), slot, count)
-        modes = np.array([row.mode for row in rows])
-        good &= ~_any(np.diff(modes, prepend=modes[:1]) != 0, slot, count)
-    slot = _slot_of(np.array(wrenches.t_ns), begin)
-    valid = np.array([row.valid and not row.saturated for row in wrenches.rows])
-    good &= _filled(slot, count) & ~_any(~valid, slot, count)
-    felt = np.array([(*row.force, *row.moment) for row in wrenches.rows])
-    wrench = _means(felt, slot, count)
+            out[:, columns] = slots.means([getattr(row, name) for row in rows])
     if count:
+        slots = _Slots(wrenches.t_ns, begin, count)
+        invalid = np.array([not row.valid or row.saturated for row in wrenches.rows])
+        good &= slots.filled() & ~slots.any(invalid)
+        felt = slots.means([(*row.force, *row.moment) for row in wrenches.rows])
         change = np.abs(np.gradient(v, SLOT_S, axis=0)) if count > 1 else np.zeros_like(v)
         good &= (np.abs(v) < RATE_MAX).all(axis=1) & (change < ACCELERATION_MAX).all(axis=1)
-    t_s = begin / NS_PER_S + SLOT_S * (0.5 + np.flatnonzero(good))
-    return _moments(np.asarray(t_s, float)[:, None], q[good], v[good], tau[good], wrench[good])
+    t_s = np.asarray(begin / NS_PER_S + SLOT_S * (0.5 + np.flatnonzero(good)), float)
+    return Moments(t_s, q[good], v[good], tau[good], felt[good, :3], felt[good, 3:])
 
 
-def _moments(t_s: Array, q: Array, v: Array, tau: Array, wrench: Array) -> Moments:
-    return Moments(t_s[:, 0], q, v, tau, wrench[:, :3], wrench[:, 3:])
+class _Slots:
+    """In which of `count` slots from `begin` on each message of a stream lies."""
 
+    def __init__(self, t_ns: Sequence[int], begin: int, count: int) -> None:
+        slot = np.floor_divide(np.array(t_ns) - begin, round(SLOT_S * NS_PER_S))
+        self._inside = (slot >= 0) & (slot < count)
+        self._slot, self._count = slot[self._inside], count
 
-def _slot_of(t_ns: NDArray[np.int64], begin: int) -> NDArray[np.int64]:
-    return np.floor_divide(t_ns - begin, round(SLOT_S * NS_PER_S))
+    def _sums(self, weights: Array) -> Array:
+        sums = np.bincount(self._slot, weights=weights[self._inside], minlength=self._count)
+        return np.asarray(sums, float)
 
+    def filled(self) -> NDArray[np.bool_]:
+        return np.asarray(np.bincount(self._slot, minlength=self._count) >= STATES_MIN)
 
-def _inside(slot: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
-    return (slot >= 0) & (slot < count)
+    def any(self, flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        return np.asarray(self._sums(flags.astype(float)) > 0.0)
 
-
-def _filled(slot: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
-    inside = slot[_inside(slot, count)]
-    return np.asarray(np.bincount(inside, minlength=count) >= STATES_MIN)
-
-
-def _any(flags: NDArray[np.bool_], slot: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
-    chosen = _inside(slot, count) & flags
-    return np.asarray(np.bincount(slot[chosen], minlength=count) > 0)
-
-
-def _means(values: Array, slot: NDArray[np.int64], count: int) -> Array:
-    """Return the means (count, k) of values (m, k) by slot."""
-    chosen = _inside(slot, count)
-    number = np.maximum(np.bincount(slot[chosen], minlength=count), 1)
-    columns = [
-        np.bincount(slot[chosen], weights=values[chosen, k], minlength=count) / number
-        for k in range(values.shape[1])
-    ]
-    return np.stack(columns, axis=1)
+    def means(self, rows: Sequence[Sequence[float]]) -> Array:
+        """Return the means (count, k) of rows (m, k) by slot."""
+        values = np.array(rows)
+        number = np.maximum(np.bincount(self._slot, minlength=self._count), 1)
+        return np.stack([self._sums(column) / number for column in values.T], axis=1)
