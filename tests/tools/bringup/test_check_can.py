@@ -16,7 +16,7 @@ from shared.can.imu_can import ImuSample
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import CanConfig
 from tests.imu.robots import with_imu
-from tests.tools.bringup.verdicts import OK, WARNING, WRONG, bad
+from tests.tools.bringup.verdicts import OK, WRONG, bad
 from tools.bringup import check_can
 from tools.bringup.can_monitor import (
     BusTraffic,
@@ -26,14 +26,13 @@ from tools.bringup.can_monitor import (
     long_enough,
     period_ms,
 )
-from tools.bringup.findings import Finding, FindingKind
+from tools.bringup.findings import Finding
 
 MODULE = "knee_left"
 NODES = (8, 9)
 AXIS0, AXIS1 = f"{MODULE}.axis0", f"{MODULE}.axis1"
 IDLE = Heartbeat(0, AxisState.IDLE, False, False, False, True)
 FAILED = IDLE._replace(motor_failed=True)
-Expected = list[tuple[str, str, FindingKind]]
 
 
 def times(period_s: float, n: int = 40) -> list[float]:
@@ -65,34 +64,36 @@ MUTE = axis()
 MUTE.estimates_s = []
 
 
-@pytest.mark.parametrize(
-    ("traffic", "expected", "words"),
-    [
-        pytest.param(healthy(), [], (), id="both axes at their periods"),
-        pytest.param(healthy(node8=axis(encoder_s=0.01)), [(AXIS0, "encoder frames", WARNING)],
-                     ("10.0 ms", "2 ms", "encoder_rate_ms"), id="an encoder at its factory period"),
-        pytest.param(healthy(node9=MUTE), [(AXIS1, "encoder frames", WRONG)], (),
-                     id="no encoder frames"),
-        pytest.param(healthy(node9=NodeTraffic()), [(AXIS1, "heartbeat", WRONG)], (),
-                     id="no heartbeat"),
-        pytest.param(
-            BusTraffic(nodes={8: NodeTraffic(), 9: NodeTraffic(), 0: axis(), 1: axis()}),
-            [(MODULE, "heartbeats", WRONG)], ("nodes 0, 1 are heard",),
-            id="other nodes on a silent bus",
-        ),
-        pytest.param(healthy(node8=axis(FAILED)), [(AXIS0, "errors", WRONG)], ("MOTOR_FAILED",),
-                     id="a failed motor though the axis error is 0"),
-        pytest.param(healthy(node8=NEW), [(AXIS0, "firmware", WARNING)], (),
-                     id="firmware 0.6, whose heartbeats are not taken for errors"),
-        *(
-            pytest.param(healthy(node8=twice(apart_s)), [(AXIS0, "heartbeat", WARNING)],
-                         ("the same node id",), id=f"two axes under one node id, {apart_s} s apart")
-            for apart_s in (0.001, 0.005, 0.010)
-        ),
-    ],
-)  # fmt: skip
+STRANGERS = BusTraffic(nodes={8: NodeTraffic(), 9: NodeTraffic(), 0: axis(), 1: axis()})
+CASES: dict[str, tuple[BusTraffic, list[str], tuple[str, ...]]] = {
+    "both axes at their periods": (healthy(), [], ()),
+    "an encoder at its factory period": (
+        healthy(node8=axis(encoder_s=0.01)), [f"{AXIS0}: encoder frames: warning"],
+        ("10.0 ms", "2 ms", "encoder_rate_ms"),
+    ),
+    "no encoder frames": (healthy(node9=MUTE), [f"{AXIS1}: encoder frames: wrong"], ()),
+    "no heartbeat": (healthy(node9=NodeTraffic()), [f"{AXIS1}: heartbeat: wrong"], ()),
+    "others on a silent bus": (
+        STRANGERS, [f"{MODULE}: heartbeats: wrong"], ("nodes 0, 1 are heard",)
+    ),
+    "a failed motor though the axis error is 0": (
+        healthy(node8=axis(FAILED)), [f"{AXIS0}: errors: wrong"], ("MOTOR_FAILED",)
+    ),
+    "firmware 0.6, whose heartbeats are not taken for errors": (
+        healthy(node8=NEW), [f"{AXIS0}: firmware: warning"], ()
+    ),
+    **{
+        f"two axes under one node id, {apart_s} s apart": (
+            healthy(node8=twice(apart_s)), [f"{AXIS0}: heartbeat: warning"], ("the same node id",)
+        )
+        for apart_s in (0.001, 0.005, 0.010)
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("traffic", "expected", "words"), CASES.values(), ids=CASES.keys())
 def test_what_is_not_right_with_a_modules_axes_is_named(
-    robot: RobotConfig, traffic: BusTraffic, expected: Expected, words: tuple[str, ...]
+    robot: RobotConfig, traffic: BusTraffic, expected: list[str], words: tuple[str, ...]
 ) -> None:
     rows = rows_of(robot, traffic)
     assert bad(rows) == expected
@@ -139,24 +140,24 @@ HARNESS, IMU = check_can.harness_rows, check_can.imu_rows
     ("judge", "traffic", "expected"),
     [
         (HARNESS, cells(), []),
-        (HARNESS, cells(rate_hz=100.0), [("harness", "load cells", WARNING)]),
-        (HARNESS, cells(force=1500.0), [("harness", "largest force", WRONG)]),
-        (HARNESS, cells(force=math.nan), [("harness", "largest force", WRONG)]),
-        (HARNESS, cells(malformed=3), [("harness", "frames out of order", WARNING)]),
-        (HARNESS, BusTraffic(seconds=0.5, frames=3), [("harness", "load cells", WRONG)]),
-        (HARNESS, BusTraffic(trouble="gone"), [("harness", "CAN bus", WRONG)]),
+        (HARNESS, cells(rate_hz=100.0), ["harness: load cells: warning"]),
+        (HARNESS, cells(force=1500.0), ["harness: largest force: wrong"]),
+        (HARNESS, cells(force=math.nan), ["harness: largest force: wrong"]),
+        (HARNESS, cells(malformed=3), ["harness: frames out of order: warning"]),
+        (HARNESS, BusTraffic(seconds=0.5, frames=3), ["harness: load cells: wrong"]),
+        (HARNESS, BusTraffic(trouble="gone"), ["harness: CAN bus: wrong"]),
         (IMU, imu(), []),
-        (IMU, imu(period_s=0.02), [("IMU", "samples", WARNING)]),
-        (IMU, imu(valid=False), [("IMU", "orientation valid", WRONG)]),
-        (IMU, BusTraffic(frames=7), [("IMU", "samples", WRONG)]),
-        (IMU, BusTraffic(trouble="no such device"), [("IMU", "CAN bus", WRONG)]),
+        (IMU, imu(period_s=0.02), ["IMU: samples: warning"]),
+        (IMU, imu(valid=False), ["IMU: orientation valid: wrong"]),
+        (IMU, BusTraffic(frames=7), ["IMU: samples: wrong"]),
+        (IMU, BusTraffic(trouble="no such device"), ["IMU: CAN bus: wrong"]),
     ],
 )
 def test_a_sensor_is_judged_by_its_rate_its_range_and_its_own_flags(
     robot: RobotConfig,
     judge: Callable[[RobotConfig, BusTraffic], list[Finding]],
     traffic: BusTraffic,
-    expected: Expected,
+    expected: list[str],
 ) -> None:
     rows = judge(robot, traffic)
     assert bad(rows) == expected

@@ -72,7 +72,7 @@ def test_what_stops_or_delays_frames_is_named(
     real: RobotConfig, tmp_path: Path, said: dict[str, Any], what: str, verdict: FindingKind
 ) -> None:
     rows = rows_of(real, tmp_path, said)
-    assert bad(rows) == [("can0", what, verdict)]
+    assert bad(rows) == [f"can0: {what}: {verdict}"]
     assert all(row.fix for row in rows if row.verdict != OK)
 
 

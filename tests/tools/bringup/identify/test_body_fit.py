@@ -41,11 +41,15 @@ ARM_TRUE = (0.1, 0.02, 0.03)
 ZERO = {"knee_right_theta": -0.01, "hip_left_theta": 0.012}
 
 
+def with_mass(robot: RobotConfig, **masses: object) -> RobotConfig:
+    return msgspec.structs.replace(robot, mass=msgspec.structs.replace(robot.mass, **masses))
+
+
 @pytest.fixture(scope="module")
 def true_robot(robot: RobotConfig) -> RobotConfig:
-    mass = msgspec.structs.replace(robot.mass, payload=PAYLOAD_TRUE, payload_com=COM_TRUE)
     geometry = msgspec.structs.replace(robot.geometry, harness_point=ARM_TRUE)
-    return msgspec.structs.replace(robot, mass=mass, geometry=geometry)
+    heavy = with_mass(robot, payload=PAYLOAD_TRUE, payload_com=COM_TRUE)
+    return msgspec.structs.replace(heavy, geometry=geometry)
 
 
 def poses(robot: RobotConfig, count: int, *, rich: bool) -> list[Array]:
@@ -79,10 +83,7 @@ def moments(
     if added_kg:
         payload = true_robot.mass.payload + added_kg
         place = tuple(true_robot.mass.payload / payload * c for c in COM_TRUE)
-        mass = msgspec.structs.replace(
-            true_robot.mass, payload=payload, payload_max=100.0, payload_com=place
-        )
-        laden = msgspec.structs.replace(true_robot, mass=mass)
+        laden = with_mass(true_robot, payload=payload, payload_max=100.0, payload_com=place)
     kinematics = Kinematics(laden)
     stands = poses(laden, count, rich=rich)
     v = np.gradient(np.array(stands), 0.5, axis=0)
@@ -100,12 +101,6 @@ def moments(
     return Moments(t, np.array(stands) + errors, v, tau / SCALE_TRUE, force, np.zeros((count, 3)))
 
 
-TRUTH = {
-    SCALE: SCALE_TRUE - 1.0,
-    **{f"zero {joint}": value for joint, value in ZERO.items()},
-}
-
-
 @pytest.fixture(scope="module")
 def fitted(robot: RobotConfig, true_robot: RobotConfig) -> BodyFit:
     return fit(robot, [Record(moments(true_robot))], level_sd=0.003)
@@ -114,15 +109,11 @@ def fitted(robot: RobotConfig, true_robot: RobotConfig) -> BodyFit:
 def test_each_planted_error_is_found_within_its_interval(
     robot: RobotConfig, true_robot: RobotConfig, fitted: BodyFit
 ) -> None:
-    more = PAYLOAD_TRUE - robot.mass.payload
-    truth = TRUTH | {MASS: more}
+    arm = np.array(ARM_TRUE) - robot.geometry.harness_point
+    truth = {SCALE: SCALE_TRUE - 1.0, MASS: PAYLOAD_TRUE - robot.mass.payload}
     truth |= dict(zip(COM, true_robot.torso_mass * np.array(true_robot.torso_com), strict=True))
-    truth |= {
-        name: a - b
-        for name, a, b in zip(HARNESS, ARM_TRUE, robot.geometry.harness_point, strict=True)
-    }
-    for name in ZEROS:
-        truth.setdefault(name, 0.0)
+    truth |= dict(zip(HARNESS, arm, strict=True)) | dict.fromkeys(ZEROS, 0.0)
+    truth |= {f"zero {joint}": value for joint, value in ZERO.items()}
     for name, value in truth.items():
         found, sd = fitted.of(name)
         assert abs(found - value) < 1.96 * sd, (name, found, value, sd)
@@ -155,6 +146,7 @@ def test_the_findings_name_the_lines_to_write_and_the_zeros_to_correct(
     assert isinstance(constant, float)
     assert values["joint.tau_module_max"] == pytest.approx(most * constant, abs=0.1)
     assert "drive.torque_constant" in measured(estimates)
+    assert any("xrl configure" in remark for remark in remarks(estimates, robot)), "drives copy it"
     corrections = zero_corrections(estimates)
     assert corrections["knee_right"][1] == pytest.approx(0.01, abs=5e-3)
     assert corrections["hip_left"][1] == pytest.approx(-0.012, abs=6e-3)
@@ -178,15 +170,18 @@ def test_a_known_weight_and_a_weighed_payload_sharpen_the_torques_scale(
     plain = Record(moments(true_robot, 120, rich=False))
     heavier = Record(moments(true_robot, 120, rich=False, added_kg=10.0), added_kg=10.0)
     alone = fit(robot, [plain], level_sd=0.003).of(SCALE)[1]
-    value, sd = fit(robot, [plain, heavier], level_sd=0.003).of(SCALE)
-    assert sd < 0.5 * alone
-    assert abs(value - (SCALE_TRUE - 1.0)) < 1.96 * sd
-    weighed = msgspec.structs.replace(
-        robot, mass=msgspec.structs.replace(robot.mass, payload=PAYLOAD_TRUE)
-    )
-    value, sd = fit(weighed, [plain], level_sd=0.003, payload_sd=0.1).of(SCALE)
-    assert sd < 0.5 * alone
-    assert abs(value - (SCALE_TRUE - 1.0)) < 1.96 * sd
+    added = fit(robot, [plain, heavier], level_sd=0.003)
+    weighed = with_mass(robot, payload=PAYLOAD_TRUE)
+    known = fit(weighed, [plain], level_sd=0.003, payload_sd=0.1)
+    for value, sd in (added.of(SCALE), known.of(SCALE)):
+        assert sd < 0.5 * alone
+        assert abs(value - (SCALE_TRUE - 1.0)) < 1.96 * sd
+
+
+def test_a_weighed_payload_is_known(robot: RobotConfig, true_robot: RobotConfig) -> None:
+    weighed = with_mass(robot, payload=PAYLOAD_TRUE)
+    found = fit(weighed, [Record(moments(true_robot, 120))], level_sd=0.003, payload_sd=0.1)
+    assert of_body(found, weighed)[0].verdict is Verdict.AGREES
 
 
 def test_too_few_moments_are_refused_in_words(robot: RobotConfig, true_robot: RobotConfig) -> None:
@@ -221,17 +216,3 @@ def test_a_payload_beyond_the_largest_is_not_written_but_the_rest_is(robot: Robo
     assert robot.mass.payload + 3.0 > robot.mass.payload_max
     assert changes(rows, robot).keys() == {"mass.payload_com"}
     assert any("mass.payload_max" in remark for remark in remarks(rows, robot))
-
-
-def test_a_new_torque_constant_comes_with_what_the_drives_need(
-    robot: RobotConfig, fitted: BodyFit
-) -> None:
-    assert any("xrl configure" in remark for remark in remarks(of_body(fitted, robot), robot))
-
-
-def test_a_weighed_payload_is_known(robot: RobotConfig, true_robot: RobotConfig) -> None:
-    weighed = msgspec.structs.replace(
-        robot, mass=msgspec.structs.replace(robot.mass, payload=PAYLOAD_TRUE)
-    )
-    found = fit(weighed, [Record(moments(true_robot, 120))], level_sd=0.003, payload_sd=0.1)
-    assert of_body(found, weighed)[0].verdict is Verdict.AGREES
