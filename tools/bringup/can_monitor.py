@@ -97,16 +97,7 @@ def listen(
     imu: bool = False,
     seconds: float = LISTEN_S,
 ) -> BusTraffic:
-    """Listen to a bus for some seconds.
-
-    Args:
-        config: of the bus.
-        nodes: of the axes that should be on it.
-        poll_nodes: whether to ask them; not where services are up.
-        cells: whether the load cells are on it.
-        imu: whether the IMU is on it.
-        seconds: how long.
-    """
+    """Listen to a bus for axes, load cells and an IMU; ask axes only where no services are up."""
     traffic = BusTraffic(nodes={node: NodeTraffic() for node in nodes})
     try:
         with _bus(config) as bus:
@@ -192,7 +183,9 @@ def round_trips(config: CanConfig, nodes: Sequence[int], count: int) -> dict[int
 def _asked(bus: can.BusABC, node: int) -> float | None:
     """Ask an axis once; return the time until its answer, s, or None."""
     question = _question(node, Command.GET_VBUS)
-    _forget_waiting(bus)
+    for _ in range(_WAITING_MAX):  # an answer that comes too late is none to the next request
+        if bus.recv(0.0) is None:
+            break
     began = time.monotonic()
     bus.send(question, timeout=_WAIT_S)
     while (left := began + ANSWER_S - time.monotonic()) > 0.0:
@@ -204,13 +197,6 @@ def _asked(bus: can.BusABC, node: int) -> float | None:
         if answers and message.arbitration_id == question.arbitration_id:
             return time.monotonic() - began
     return None
-
-
-def _forget_waiting(bus: can.BusABC) -> None:
-    """Drop what waits: an answer that comes too late is none to the next request."""
-    for _ in range(_WAITING_MAX):
-        if bus.recv(0.0) is None:
-            return
 
 
 def long_enough(heartbeat_period_ms: int) -> float:

@@ -176,18 +176,8 @@ def drives_within_reach(
 ) -> Iterator[bool]:
     """Have the drives there for a while; yields True if the simulator was started for it.
 
-    Real drives are there or not; nothing is started for them.
-
-    Args:
-        robot: what stands in the robot file.
-        config_path: the robot file.
-        run_dir: of the fleet.
-        plants: settings that the emulated drives have kept, as `--drive-setting` takes them.
-        lifted: a simulator that is started hangs the robot this much higher, m.
-
-    Raises:
-        FleetError: the simulator cannot be started, or it ended meanwhile, or the robot file has
-            emulated buses and real ones.
+    Real drives are there or not; nothing is started for them. A simulator that is started plants
+    settings that its drives have kept, and hangs the robot higher by `lifted`, m.
     """
     refuse_half_emulated(robot)
     if not is_simulated(robot):

@@ -18,17 +18,12 @@ def run_led(
     *,
     every_s: float,
 ) -> str:
-    """Ask again and again, and listen; return why it ended before its time, "" if it did not.
+    """Ask for what is wanted at a time, s, again and again, and listen ten times as often.
 
     Whatever ends it, nothing is asked for any more, and what was asked for fades out.
 
-    Args:
-        planner: that leads.
-        duration_s: of the whole.
-        ask: asks for what is wanted at a time, s.
-        listen: called ten times as often.
-        stopped: True to end it.
-        every_s: between two requests: an intent fades out once nobody repeats it.
+    Returns:
+        Why it ended before its time; "" if it did not.
     """
     begin, ask_s, ended = now_ns(), 0.0, ""
     while not ended and (t_s := (now_ns() - begin) / NS_PER_S) < duration_s:

@@ -100,10 +100,6 @@ def look_ask_and_move(
         console: to speak on.
         alone: the module alone, within its soft limits. Else its leg hangs still first, on the
             mechanism's stops perhaps, and the leg's other modules are held.
-
-    Raises:
-        DriveError: a drive does not answer, or the joint may not go there.
-        FleetError: nobody is there to ask, or a service has a drive.
     """
     module, axis = joint
     modules = (module,) if alone else leg_of(module)

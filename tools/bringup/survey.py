@@ -31,15 +31,7 @@ GROUPS: Final = (COMPUTER, ROBOT, CAN, DRIVES, HARNESS, IMU)
 def survey(
     robot: RobotConfig, config_path: Path, run_dir: Path, plants: Sequence[str], progress: Progress
 ) -> Groups:
-    """Check everything; if no fleet is up, an emulated robot's simulator runs meanwhile.
-
-    Args:
-        robot: from the robot file.
-        config_path: the robot file.
-        run_dir: of the fleet.
-        plants: settings that the emulated drives have kept.
-        progress: receives the subject of each check.
-    """
+    """Check everything; if no fleet is up, an emulated robot's simulator runs meanwhile."""
     fleet_is_up = is_up(run_dir)
     progress("this computer, the robot file, the bus")
     groups: Groups = {

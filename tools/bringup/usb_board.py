@@ -54,12 +54,7 @@ class UsbBus:
         self._subscription: Subscription = self.run(self._watch(), TRANSFER_S)
 
     def open(self, serial_numbers: Iterable[str], timeout_s: float = FIND_S) -> FoundBoards:
-        """Connect to boards by their serial numbers, to all at once.
-
-        Args:
-            serial_numbers: 12 hexadecimal digits each.
-            timeout_s: longest wait until all are plugged in.
-        """
+        """Connect to boards by their serial numbers, once all are plugged in or it is too long."""
         wanted = [serial.upper() for serial in serial_numbers]
         results = self.run(self._connect_all(wanted, timeout_s), timeout_s + CONNECT_S + TRANSFER_S)
         boards: dict[str, Board] = {}

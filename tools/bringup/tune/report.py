@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -19,32 +20,24 @@ _COLOURS: Final = {"measured": "#1f5fa8", "predicted": "#9aa0a6", "proposed": "#
 
 
 def answer_table(answers: dict[str, ResponseFit], *, closed: bool) -> Table:
-    """Return answers beside each other.
-
-    Args:
-        answers: by what they are of.
-        closed: the planner closes this direction, so that it has a phase margin.
-    """
+    """Return answers beside each other; a direction that the planner closes has a phase margin."""
     table = Table(box=box.SIMPLE_HEAD)
     table.add_column("")
     for name in answers:
         table.add_column(name, justify="right")
     table.add_column("unit")
-    step = {name: one.step for name, one in answers.items()}
-    rows = (
-        ("rise, 10 to 90 %", [s.rise_s for s in step.values()], "s", 2),
-        ("overshoot", [100.0 * s.overshoot for s in step.values()], "%", 0),
-        ("settled within 5 %", [s.settling_s for s in step.values()], "s", 2),
-        ("final value", [100.0 * s.final for s in step.values()], "% of the step", 0),
-        ("natural frequency", [_fitted(a, a.model.natural_frequency) for a in answers.values()],
-         "rad/s", 1),
-        ("damping ratio", [_fitted(a, a.model.damping_ratio) for a in answers.values()], "", 2),
-    )  # fmt: skip
-    for what, values, unit, digits in rows:
-        table.add_row(what, *(_number(value, digits) for value in values), unit)
+    rows: list[tuple[str, Callable[[ResponseFit], float], str, int]] = [
+        ("rise, 10 to 90 %", lambda a: a.step.rise_s, "s", 2),
+        ("overshoot", lambda a: 100.0 * a.step.overshoot, "%", 0),
+        ("settled within 5 %", lambda a: a.step.settling_s, "s", 2),
+        ("final value", lambda a: 100.0 * a.step.final, "% of the step", 0),
+        ("natural frequency", lambda a: _fitted(a, a.model.natural_frequency), "rad/s", 1),
+        ("damping ratio", lambda a: _fitted(a, a.model.damping_ratio), "", 2),
+    ]
     if closed:
-        margins = [_fitted(a, a.phase_margin_deg) for a in answers.values()]
-        table.add_row("phase margin", *(_number(value, 0) for value in margins), "degrees")
+        rows.append(("phase margin", lambda a: _fitted(a, a.phase_margin_deg), "degrees", 0))
+    for what, value_of, unit, digits in rows:
+        table.add_row(what, *(_number(value_of(a), digits) for a in answers.values()), unit)
     return table
 
 
