@@ -134,19 +134,21 @@ TOOL_LAWS = [
     "shared/can/cansimple*.py",
     "shared/mcap_log/records.py",
     "shared/mcap_log/sequence_stats.py",
-    "tools/bringup/jogging.py",
-    "tools/identify/body_fit.py",
-    "tools/identify/body_statics.py",
-    "tools/identify/estimates.py",
-    "tools/identify/quasi_static.py",
-    "tools/identify/sines.py",
+    "tools/bringup/hanging_leg.py",
+    "tools/bringup/identify/body_fit.py",
+    "tools/bringup/identify/body_statics.py",
+    "tools/bringup/identify/estimates.py",
+    "tools/bringup/identify/quasi_static.py",
+    "tools/bringup/identify/sines.py",
+    "tools/bringup/jog.py",
+    "tools/bringup/motion.py",
+    "tools/bringup/tune/excitation.py",
+    "tools/bringup/tune/response.py",
     "tools/lab/design/*.py",
     "tools/lab/learning/policy.py",
     "tools/logs/reexecution/compare.py",
     "tools/logs/reexecution/found.py",
     "tools/logs/reexecution/params.py",
-    "tools/tune/excitation.py",
-    "tools/tune/response.py",
 ]
 
 
@@ -257,8 +259,8 @@ ORDER = {
     "services/planner": ("law", "watch"),
     "services/simulator": ("drives", "physics", "fronts"),
     "tools": (
-        "fleet", "keys", "pads", "logs", "judge", "export", "live", "sim", "bringup", "identify",
-        "tune", "hosts", "view", "lab", "verbs", "dev",
+        "fleet", "keys", "pads", "logs", "judge", "export", "live", "sim", "bringup", "hosts",
+        "view", "lab", "verbs", "dev",
     ),
 }  # fmt: skip
 """Rooms of each storey, the lowest first: a room knows those before it. What lies beside rooms of

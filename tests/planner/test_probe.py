@@ -19,9 +19,9 @@ from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Scenario
 from shared.state import copied
+from tools.bringup.tune.excitation import Excitation, SinePart
+from tools.bringup.tune.pose_probe import DIRECTIONS, ProbedLockstep, course_of
 from tools.sim.standing_start import begin_standing
-from tools.tune.excitation import Excitation, SinePart
-from tools.tune.pose_probe import DIRECTIONS, ProbedLockstep, course_of
 
 Array = NDArray[np.float64]
 MOST = (0.01, 0.01, 0.01, 0.02, 0.05, 0.0)

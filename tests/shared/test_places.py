@@ -13,7 +13,7 @@ from shared.places import DEFAULT_CONFIG
 from shared.process import service_parser
 from tests.tools.exit_codes import exit_code
 from tools import cli
-from tools.bringup import bench, reach
+from tools.bringup import drive_access
 from tools.fleet.run_dir import RunDir
 from tools.verbs import estop
 
@@ -117,9 +117,9 @@ def test_a_fleet_that_is_up_keeps_its_robot_file(
     fleets = here.with_name("fleet.toml")
     manifest = argparse.Namespace(config=str(fleets))
     monkeypatch.setattr(RunDir, "read_manifest", lambda _: manifest)
-    monkeypatch.setattr(reach, "is_up", lambda _: True)
+    monkeypatch.setattr(drive_access, "is_up", lambda _: True)
     args = argparse.Namespace(run_dir=here.parent, config=Path(given) if given else None)
-    assert bench.robot_file(args) == fleets
+    assert drive_access.robot_file(args) == fleets
     assert capsys.readouterr().err == ""
 
 

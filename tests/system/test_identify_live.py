@@ -13,10 +13,10 @@ from shared.clock import keep_pace
 from shared.config import files as config_file
 from shared.config.scenarios import Keyframe, Scenario
 from shared.places import DEFAULT_CONFIG
-from tools.identify.motion import Motion
-from tools.identify.quasi_static import moments_of
-from tools.tune.excitation import Excitation, SinePart
-from tools.tune.pose_probe import LiveProbe
+from tools.bringup.identify.body_lead import BodyLead
+from tools.bringup.identify.quasi_static import moments_of
+from tools.bringup.tune.excitation import Excitation, SinePart
+from tools.bringup.tune.pose_probe import LiveProbe
 
 pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(240)]
 
@@ -45,13 +45,13 @@ def test_a_live_robot_is_led_for_a_fit_and_probed_and_leads_on(
         keep_pace(run_dir)
         robot = config_file.load(DEFAULT_CONFIG)
         with open_session(robot, "identify", run_dir) as session:
-            motion = Motion(robot, session, simulated=True)
-            heard = motion.go(SHORT, lambda *_: None, lambda: False)
+            body = BodyLead(robot, session, simulated=True)
+            heard = body.go(SHORT, lambda *_: None, lambda: False)
             assert heard.ended == ""
             moments = moments_of(heard.states, heard.wrenches)
             assert len(moments.t_s) > 20
             assert moments.q[:, 5].max() - moments.q[:, 5].min() > 0.05, "the hips went down"
-            stopped = motion.go(SHORT, lambda *_: None, lambda: True)
+            stopped = body.go(SHORT, lambda *_: None, lambda: True)
             assert stopped.ended == "stopped"
             applied = xrl("identify", "body", *place, "--apply")
             assert applied.returncode == 2

@@ -25,7 +25,7 @@ from shared.config.robot_config import RobotConfig, expand
 from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
 from tests.system.verbs import xrl
-from tools.bringup import bench, zeroing
+from tools.bringup import drive_access, zeroing
 from tools.bringup.zeroing import DriveLook, look
 from tools.fleet import procfs
 from tools.fleet.supervise import SupervisedFleet
@@ -70,7 +70,7 @@ def torso_height(robot: RobotConfig, run_dir: Path) -> float:
     """Return how high the emulated robot hangs, once it hangs still, m above the ankles."""
     with open_session(robot, "test", run_dir) as session:
         truths = session.latest(topics.SIM_TRUTH, SimTruth)
-        until = time.monotonic() + bench.SETTLE_S
+        until = time.monotonic() + drive_access.SETTLE_S
         newest: SimTruth | None = None
         while newest is None or time.monotonic() < until:
             newest = truths.take() or newest

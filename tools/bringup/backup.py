@@ -73,11 +73,7 @@ def write(path: Path, boards: Sequence[BoardBackup], *, time: str, robot_file: s
 
 
 def read(path: Path) -> Backup:
-    """Read a backup.
-
-    Raises:
-        DriveError: it cannot be read, or is none.
-    """
+    """Read a backup."""
     try:
         backup = msgspec.json.decode(read_text(path), type=Backup)
     except OSError as error:

@@ -101,11 +101,7 @@ def describe_firmware(firmware: tuple[int, int, int]) -> str:
 
 
 def number(values: Mapping[str, Value], name: str) -> float:
-    """Return a value that must be a number.
-
-    Raises:
-        DriveError: the board does not have it.
-    """
+    """Return a value that must be a number."""
     value = values.get(name)
     if not isinstance(value, int | float):
         raise DriveError(f"no number at {name}; is this an ODrive v3 with firmware 0.5.x?")

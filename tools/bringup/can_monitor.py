@@ -7,11 +7,13 @@ encoder's count, which only 0.5 does, and its supply's voltage.
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
+from pathlib import Path
 from statistics import fmean, median
-from typing import Final, NamedTuple
+from typing import Final, Generic, NamedTuple, TypeVar
 
 import can
 import msgspec
@@ -24,6 +26,7 @@ from shared.can.cansimple_06 import Command06, Version, unpack_version
 from shared.can.imu_can import IDS as IMU_IDS
 from shared.can.imu_can import ImuAssembler, ImuSample
 from shared.can.loadcell_can import FRAME_IDS, SampleAssembler
+from shared.config.robot_config import RobotConfig, expand
 from shared.config.sections import CanConfig
 from shared.exceptions import DriveError
 
@@ -34,6 +37,7 @@ ANSWER_S: Final = 0.1
 HEARTBEATS: Final = 3.0
 """Periods of the heartbeat that are listened for, at least."""
 
+QUESTIONS: Final = (Command06.GET_VERSION, Command.GET_ENCODER_COUNT, Command.GET_VBUS)
 _WAIT_S = 0.05
 _FRAME_BYTES = 8
 _GAPS_MIN = 3
@@ -58,6 +62,16 @@ class NodeTraffic(msgspec.Struct):
     vbus_voltage: float | None = None
 
 
+S = TypeVar("S")
+
+
+class SensorTraffic(msgspec.Struct, Generic[S]):
+    """Samples of a sensor, and when they came."""
+
+    samples: list[S] = []
+    times_s: list[float] = []
+
+
 class BusTraffic(msgspec.Struct):
     """Traffic of one bus."""
 
@@ -68,16 +82,10 @@ class BusTraffic(msgspec.Struct):
     error_frames: int = 0
     nodes: dict[int, NodeTraffic] = {}
     """By node id: those that should be there, and whoever else sends heartbeats."""
-    samples: list[Vector6] = []
-    """Samples of the load cells."""
-    samples_s: list[float] = []
-    """When they came."""
+    cells: SensorTraffic[Vector6] = msgspec.field(default_factory=SensorTraffic)
+    imu: SensorTraffic[ImuSample] = msgspec.field(default_factory=SensorTraffic)
     malformed: int = 0
     """Frames of a sensor that were out of order or too short."""
-    attitudes: list[ImuSample] = []
-    """Samples of the IMU."""
-    attitudes_s: list[float] = []
-    """When they came."""
 
 
 def listen(
@@ -89,26 +97,60 @@ def listen(
     imu: bool = False,
     seconds: float = LISTEN_S,
 ) -> BusTraffic:
-    """Listen to a bus for a while.
-
-    Args:
-        config: of the bus, `{run}` in its channel expanded.
-        nodes: of the axes that should be on it.
-        poll_nodes: whether to ask them; not where services are up.
-        cells: whether the load cells are on it.
-        imu: whether the IMU is on it.
-        seconds: how long.
-    """
+    """Listen to a bus for axes, load cells and an IMU; ask axes only where no services are up."""
     traffic = BusTraffic(nodes={node: NodeTraffic() for node in nodes})
     try:
-        with can.Bus(interface=config.interface, channel=config.channel, ignore_config=True) as bus:
-            if poll_nodes:
-                for message in _questions(nodes):
-                    bus.send(message, timeout=_WAIT_S)
-            _take_in(bus, traffic, seconds, cells=cells, imu=imu)
-    except (can.CanError, OSError, ValueError, NotImplementedError) as error:
-        traffic.trouble = str(error) or type(error).__name__
+        with _bus(config) as bus:
+            for node in nodes if poll_nodes else ():
+                for command in QUESTIONS:
+                    bus.send(_question(node, command), timeout=_WAIT_S)
+            _receive(bus, traffic, seconds, cells=cells, imu=imu)
+    except DriveError as error:
+        traffic.trouble = str(error)
     return traffic
+
+
+def listen_to(
+    robot: RobotConfig, name: str, run_dir: Path, *, poll_nodes: bool, seconds: float | None = None
+) -> BusTraffic:
+    """Listen to a bus of a robot for all that should be on it; without a time, long enough."""
+    nodes = bus_nodes(robot)[name]
+    return listen(
+        bus_config(robot, name, run_dir), nodes, poll_nodes=poll_nodes,
+        cells=name == robot.harness.bus, imu=robot.imu.fitted and name == robot.imu.bus,
+        seconds=seconds or long_enough(robot.drive.heartbeat_period_ms if nodes else 0),
+    )  # fmt: skip
+
+
+def bus_config(robot: RobotConfig, name: str, run_dir: Path) -> CanConfig:
+    """Return a bus of a robot, `{run}` in its channel expanded."""
+    bus = robot.can[name]
+    return CanConfig(interface=bus.interface, channel=expand(bus.channel, run_dir))
+
+
+def bus_nodes(robot: RobotConfig) -> Mapping[str, tuple[int, ...]]:
+    """Return the nodes that should be on each bus, also where there are none."""
+    nodes: dict[str, tuple[int, ...]] = dict.fromkeys(robot.buses, ())
+    for module in robot.module:
+        nodes[module.bus] = (*nodes[module.bus], *module.node_ids)
+    return nodes
+
+
+@contextlib.contextmanager
+def _bus(config: CanConfig) -> Iterator[can.BusABC]:
+    """Open a bus; all that goes wrong with it is a DriveError."""
+    try:
+        with can.Bus(interface=config.interface, channel=config.channel, ignore_config=True) as bus:
+            yield bus
+    except (can.CanError, OSError, ValueError, NotImplementedError) as error:
+        raise DriveError(str(error) or type(error).__name__) from None
+
+
+def _question(node: int, command: Command | Command06) -> can.Message:
+    return can.Message(
+        arbitration_id=cansimple.arbitration_id(node, command),
+        is_remote_frame=True, dlc=_FRAME_BYTES, is_extended_id=False,
+    )  # fmt: skip
 
 
 class RoundTrips(NamedTuple):
@@ -121,38 +163,29 @@ class RoundTrips(NamedTuple):
 
 
 def round_trips(config: CanConfig, nodes: Sequence[int], count: int) -> dict[int, RoundTrips]:
-    """Ask axes for their supply's voltage, one after the other; return how long each takes.
+    """Ask axes for their supply's voltage `count` times; return how long each takes.
 
     Not where services are up: any frame feeds a drive's watchdog.
-
-    Args:
-        config: of the bus, `{run}` in its channel expanded.
-        nodes: of the axes.
-        count: requests to each.
-
-    Raises:
-        DriveError: the bus cannot be used.
     """
     times: dict[int, list[float]] = {node: [] for node in nodes}
     try:
-        with can.Bus(interface=config.interface, channel=config.channel, ignore_config=True) as bus:
+        with _bus(config) as bus:
             for _ in range(count):
                 for node in nodes:
                     took_s = _asked(bus, node)
                     if took_s is not None:
                         times[node].append(1e3 * took_s)
-    except (can.CanError, OSError, ValueError, NotImplementedError) as error:
-        raise DriveError(f"{config.channel}: {error or type(error).__name__}") from None
+    except DriveError as error:
+        raise DriveError(f"{config.channel}: {error}") from None
     return {node: RoundTrips(tuple(found), count - len(found)) for node, found in times.items()}
 
 
 def _asked(bus: can.BusABC, node: int) -> float | None:
     """Ask an axis once; return the time until its answer, s, or None."""
-    wanted = cansimple.arbitration_id(node, Command.GET_VBUS)
-    question = can.Message(
-        arbitration_id=wanted, is_remote_frame=True, dlc=_FRAME_BYTES, is_extended_id=False
-    )
-    _forget_waiting(bus)
+    question = _question(node, Command.GET_VBUS)
+    for _ in range(_WAITING_MAX):  # an answer that comes too late is none to the next request
+        if bus.recv(0.0) is None:
+            break
     began = time.monotonic()
     bus.send(question, timeout=_WAIT_S)
     while (left := began + ANSWER_S - time.monotonic()) > 0.0:
@@ -161,16 +194,9 @@ def _asked(bus: can.BusABC, node: int) -> float | None:
             return None
         # Whoever answers is the axis that was asked: by its id, and with a whole answer.
         answers = is_data_frame(message) and len(message.data) == _FRAME_BYTES
-        if answers and message.arbitration_id == wanted:
+        if answers and message.arbitration_id == question.arbitration_id:
             return time.monotonic() - began
     return None
-
-
-def _forget_waiting(bus: can.BusABC) -> None:
-    """Drop what waits: an answer that comes too late is none to the next request."""
-    for _ in range(_WAITING_MAX):
-        if bus.recv(0.0) is None:
-            return
 
 
 def long_enough(heartbeat_period_ms: int) -> float:
@@ -195,20 +221,7 @@ def mean_ms(times_s: Sequence[float]) -> float:
     return 1e3 * (times_s[-1] - times_s[0]) / (len(times_s) - 1)
 
 
-def _questions(nodes: Iterable[int]) -> list[can.Message]:
-    return [
-        can.Message(
-            arbitration_id=cansimple.arbitration_id(node, command),
-            is_remote_frame=True,
-            dlc=_FRAME_BYTES,
-            is_extended_id=False,
-        )
-        for node in nodes
-        for command in (Command06.GET_VERSION, Command.GET_ENCODER_COUNT, Command.GET_VBUS)
-    ]
-
-
-def _take_in(
+def _receive(
     bus: can.BusABC, traffic: BusTraffic, seconds: float, *, cells: bool, imu: bool
 ) -> None:
     assembler, orientation = SampleAssembler(), ImuAssembler()
@@ -222,19 +235,19 @@ def _take_in(
         elif is_data_frame(message):
             traffic.frames += 1
             if cells and message.arbitration_id in FRAME_IDS:
-                sample = assembler.add(message.arbitration_id, message.data)
-                if sample is not None:
-                    traffic.samples.append(sample)
-                    traffic.samples_s.append(message.timestamp)
+                _add(traffic.cells, assembler.add(message.arbitration_id, message.data), message)
             elif imu and message.arbitration_id in IMU_IDS:
-                attitude = orientation.add(message.arbitration_id, message.data)
-                if attitude is not None:
-                    traffic.attitudes.append(attitude)
-                    traffic.attitudes_s.append(message.timestamp)
+                _add(traffic.imu, orientation.add(message.arbitration_id, message.data), message)
             elif len(message.data) == _FRAME_BYTES:
                 _of_node(message, traffic.nodes)
     traffic.seconds = time.monotonic() - begun
     traffic.malformed = assembler.malformed + orientation.malformed
+
+
+def _add(sensor: SensorTraffic[S], sample: S | None, message: can.Message) -> None:
+    if sample is not None:
+        sensor.samples.append(sample)
+        sensor.times_s.append(message.timestamp)
 
 
 def _of_node(message: can.Message, nodes: dict[int, NodeTraffic]) -> None:

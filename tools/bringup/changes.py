@@ -1,9 +1,16 @@
-"""Differences between a board's settings and the wanted ones, and how they are written."""
+"""Differences between a board's settings and the wanted ones: found, shown, written, read back."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
+
+from rich import box
+from rich.console import Group
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
 
 from shared.can.cansimple import AxisState
 from shared.can.drive_settings import AXES, WantedSetting, describe_value
@@ -51,11 +58,7 @@ class ChangeResult(NamedTuple):
 def changes_to_wanted(
     module: str, wanted: Iterable[WantedSetting], board: Board
 ) -> list[SettingChange]:
-    """Return what of a board is not as the robot wants it.
-
-    Raises:
-        DriveError: the board does not answer.
-    """
+    """Return what of a board is not as the robot wants it."""
     settings = board.read(board.settings)
     calibrated = board.read([f"{axis}.{name}" for axis in AXES for name in _CALIBRATED.values()])
     changes = []
@@ -67,18 +70,13 @@ def changes_to_wanted(
             continue
         else:
             inhibit = _uncalibrated(row.name, calibrated)
-        changes.append(
-            SettingChange(module, row.name, before, row.value, row.why, inhibit, _fitter(row))
-        )
+        fits = partial(_fits, row)
+        changes.append(SettingChange(module, row.name, before, row.value, row.why, inhibit, fits))
     return changes
 
 
 def against_backup(module: str, saved: Mapping[str, Value], board: Board) -> list[SettingChange]:
-    """Return what of a board is not as a backup has it.
-
-    Raises:
-        DriveError: the board does not answer.
-    """
+    """Return what of a board is not as a backup has it."""
     settings = board.read(board.settings)
     changes = []
     for name, value in saved.items():
@@ -92,19 +90,13 @@ def against_backup(module: str, saved: Mapping[str, Value], board: Board) -> lis
             )
         else:
             inhibit = ""
-        changes.append(
-            SettingChange(module, name, settings.get(name), value, "", inhibit,
-                   _equal_to(value))
-        )  # fmt: skip
+        fits, before = partial(equal, value), settings.get(name)
+        changes.append(SettingChange(module, name, before, value, "", inhibit, fits))
     return changes
 
 
 def refuse_armed(module: str, board: Board) -> None:
-    """Refuse a board one of whose axes is not idle: saving restarts it, and it lets go.
-
-    Raises:
-        DriveError: naming the axis.
-    """
+    """Refuse a board one of whose axes is not idle: saving restarts it, and it lets go."""
     for axis, state in zip(AXES, board.states(), strict=True):
         if state != AxisState.IDLE:
             known = state in AxisState.__members__.values()
@@ -116,11 +108,7 @@ def refuse_armed(module: str, board: Board) -> None:
 
 
 def apply(board: Board, changes: Sequence[SettingChange]) -> list[ChangeResult]:
-    """Write a board's changes, save them, and read them back after the restart.
-
-    Raises:
-        DriveError: the board does not answer, or does not restart.
-    """
+    """Write a board's changes, save them, and read them back after the restart."""
     to_write = [change for change in changes if not change.inhibit]
     if to_write:
         board.write({change.name: change.after for change in to_write})
@@ -139,16 +127,31 @@ def describe(value: Value) -> str:
     return "-" if value is None else describe_value(value)
 
 
+def difference_table(difference: Sequence[SettingChange]) -> Group:
+    """Return a difference for the terminal: a table, and below it why each is wanted."""
+    rows = Table(title="difference", title_justify="left", box=box.SIMPLE_HEAD)
+    for heading in ("module", "setting", "now"):
+        rows.add_column(heading, no_wrap=heading != "now")
+    rows.add_column("new")
+    reasons: dict[str, None] = {}
+    for change in difference:
+        head, _, tail = change.name.rpartition(".")
+        rows.add_row(
+            change.module,
+            f"{head}.\n{tail}" if head else tail,
+            describe(change.before),
+            describe(change.after),
+        )
+        if change.why:
+            reasons.setdefault(f"{tail}: {change.why}")
+        if change.inhibit:
+            inhibit = f"{change.module} {change.name} cannot be written: {change.inhibit}"
+            reasons.setdefault(inhibit)
+    return Group(rows, *(Padding(Text(reason), (0, 1, 0, 2)) for reason in reasons))
+
+
 def _fits(row: WantedSetting, value: Value) -> bool:
     return isinstance(value, bool | int | float) and row.fits(value)
-
-
-def _fitter(row: WantedSetting) -> Callable[[Value], bool]:
-    return lambda value: _fits(row, value)
-
-
-def _equal_to(wanted: Value) -> Callable[[Value], bool]:
-    return lambda value: equal(value, wanted)
 
 
 def _uncalibrated(name: str, calibrated: Mapping[str, Value]) -> str:

@@ -14,7 +14,8 @@ from typing import Final
 
 from shared.can.drive_settings import AXES, AXIS_TABLE, DRIVE_TABLE, describe_value
 from tools.bringup.boards import Value
-from tools.bringup.rows import Finding, ok, warning, wrong
+from tools.bringup.check_board import split_name
+from tools.bringup.findings import Finding, ok, warning, wrong
 
 Boards = Mapping[str, Mapping[str, Value]]
 """By module: a board's settings and readings."""
@@ -56,7 +57,6 @@ def alike_rows(boards: Boards) -> list[Finding]:
 
 
 def _is_shared(name: str) -> bool:
-    """Return True for a setting that the boards should share."""
     axis, _, below = name.partition(".")
     return ".config." in f".{name}" and (below if axis in AXES else name) not in _OWN
 
@@ -71,14 +71,13 @@ def _odd_ones(name: str, boards: Boards) -> list[Finding]:
     wanted = f"{usual}, as {count} others"
     why = "a board that was set up otherwise behaves otherwise"
     return [
-        warning(*_subject(module, name), found, wanted, fix, why)
+        warning(*split_name(module, name), found, wanted, fix, why)
         for module, found in words.items()
         if found != usual
     ]
 
 
 def _measured_rows(name: str, boards: Boards) -> list[Finding]:
-    """Judge what calibration has found on each axis, against the others."""
     found = {
         (module, axis): float(value)
         for module, values in boards.items()
@@ -116,8 +115,3 @@ def _supply_rows(boards: Boards) -> list[Finding]:
         for module, value in volts.items()
         if abs(value - usual) > VOLTS_APART
     ]
-
-
-def _subject(module: str, name: str) -> tuple[str, str]:
-    axis, _, below = name.partition(".")
-    return (f"{module}.{axis}", below) if axis in AXES else (module, name)

@@ -21,7 +21,7 @@ from shared.exceptions import DriveError
 from shared.joints import AXES as JOINT_AXES
 from shared.joints import MODULE_INDEX
 from tools.bringup.boards import FIRMWARE, Value, describe_firmware, is_known, number
-from tools.bringup.rows import Finding, FindingKind, judged, ok, warning, wrong
+from tools.bringup.findings import Finding, advised, judged, ok, warning, wrong
 
 Values = Mapping[str, Value]
 
@@ -39,7 +39,6 @@ OVERVOLTAGE_SHARE: Final = 0.95
 TEMPERATURES: Final = (-10.0, 70.0)
 """C; of an output stage that is idle."""
 _DIRECTION: Final = "encoder.config.direction"
-_TEMPERATURE: Final = "motor.fet_thermistor.temperature"
 
 CALIBRATE: Final = (
     "unload the joint, `odrivetool`: requested_state = AXIS_STATE_FULL_CALIBRATION_SEQUENCE, "
@@ -57,10 +56,7 @@ def firmware_row(module: str, firmware: tuple[int, int, int]) -> Finding:
     )
     if is_known(firmware):
         why = "settings may have other names or defaults"
-        good = firmware == FIRMWARE
-        return judged(
-            good, module, "firmware", found, wanted, fix, why, otherwise=FindingKind.WARNING
-        )
+        return advised(firmware == FIRMWARE, module, "firmware", found, wanted, fix, why)
     why = "other settings, other errors, other CAN frames: nothing of it can be compared"
     return wrong(module, "firmware", found, wanted, fix, why)
 
@@ -70,7 +66,7 @@ def settings_rows(module: str, wanted: tuple[WantedSetting, ...], values: Values
     rows = []
     fix = f"`xrl configure --apply --module {module}`"
     for setting in wanted:
-        subject, name = _subject(module, setting.name)
+        subject, name = split_name(module, setting.name)
         value = values.get(setting.name)
         words = setting.describe()
         if not isinstance(value, bool | int | float):
@@ -87,11 +83,7 @@ def direction_rows(module: str, values: Values, robot: RobotConfig) -> list[Find
 
     The firmware turns the torque round where it is -1, so that the motion is the same; its
     currents then have the other sign. USB reads both; CAN of firmware 0.5 the currents only.
-
-    Args:
-        module: whose board it is.
-        values: its settings, and of `boards.STATUS`; an axis that is not calibrated has none.
-        robot: which driver is to speak to it.
+    An axis that is not calibrated has none.
     """
     over_can = robot.joint_service.driver == "odrive_can"
     fix = (
@@ -135,14 +127,7 @@ def error_rows(module: str, values: Values) -> list[Finding]:
 def condition_rows(
     module: str, values: Values, trip_levels: tuple[float, float], *, services_up: bool
 ) -> list[Finding]:
-    """Judge calibration, supply and state.
-
-    Args:
-        module: whose board it is.
-        values: of `boards.STATUS`, and the board's settings.
-        trip_levels: the board's own under- and over-voltage levels, V.
-        services_up: whether a joint service has the drive.
-    """
+    """Judge calibration, supply and state, by the board's settings and `boards.STATUS`."""
     rows = [_voltage(module, number(values, "vbus_voltage"), trip_levels)]
     if values.get("config.enable_brake_resistor") and "brake_resistor_armed" in values:
         armed = bool(values["brake_resistor_armed"])
@@ -151,19 +136,19 @@ def condition_rows(
         found = "armed" if armed else "not armed"
         rows.append(judged(armed, module, "brake resistor", found, "armed", fix, why))
     for axis in AXES:
-        rows += _temperature(f"{module}.{axis}", values.get(f"{axis}.{_TEMPERATURE}"))
+        subject = f"{module}.{axis}"
+        celsius = values.get(f"{axis}.motor.fet_thermistor.temperature")
+        if isinstance(celsius, int | float):
+            rows.append(_temperature(subject, celsius))
         lacking = [
             part
             for part, name in (("motor", "motor.is_calibrated"), ("encoder", "encoder.is_ready"))
             if not values.get(f"{axis}.{name}")
         ]
-        found = f"{' and '.join(lacking)} not" if lacking else "yes"
-        subject = f"{module}.{axis}"
-        rows.append(
-            judged(not lacking, subject, "calibrated", found, "yes", CALIBRATE, "it does not arm")
-        )
+        found, why = f"{' and '.join(lacking)} not" if lacking else "yes", "it does not arm"
+        rows.append(judged(not lacking, subject, "calibrated", found, "yes", CALIBRATE, why))
         state = int(number(values, f"{axis}.current_state"))
-        rows.append(state_row(f"{module}.{axis}", state, services_up=services_up))
+        rows.append(state_row(subject, state, services_up=services_up))
     return rows
 
 
@@ -181,34 +166,22 @@ def state_row(subject: str, state: int, *, services_up: bool) -> Finding:
 
 def position_rows(module: str, turns: tuple[float, float], robot: RobotConfig) -> list[Finding]:
     """Judge where a module's joint is, by its motors' positions as the drive counts them."""
-    mark = robot.drive.zero_mark_turns
+    mark, again = robot.drive.zero_mark_turns, f"`xrl zero {module} --at PHI,THETA`"
     a, b = turns[0] - mark, turns[1] - mark
     if mark > 0.0 and max(abs(a), abs(b)) > 0.5 * mark:
-        return [
-            wrong(
-                module,
-                "zero",
-                f"motors at {turns[0]:.1f}, {turns[1]:.1f} turns",
-                f"about {mark:g}",
-                f"`xrl zero {module} --at PHI,THETA`",
-                "it lost its zero with the power, and is not armed without one",
-            )
-        ]
+        found = f"motors at {turns[0]:.1f}, {turns[1]:.1f} turns"
+        why = "it lost its zero with the power, and is not armed without one"
+        return [wrong(module, "zero", found, f"about {mark:g}", again, why)]
     q = joint_from_motor((a, b), robot.joint.gear_ratio)
     rows = [ok(module, "zero", "known", "known")]
     limits = robot.joint_limits()[2 * MODULE_INDEX[module] :][:2]
+    fix, why = (
+        f"move it there by hand; if it is there, {again}",
+        "it is not armed outside of its limits",
+    )
     for name, angle, (low, high) in zip(JOINT_AXES, q, limits, strict=True):
-        rows.append(
-            judged(
-                low <= angle <= high,
-                f"{module}.{name}",
-                "angle",
-                f"{angle:.2f} rad",
-                f"{low:g} to {high:g}",
-                f"move it there by hand; if it is there, `xrl zero {module} --at PHI,THETA`",
-                "it is not armed outside of its limits",
-            )
-        )
+        inside, found, wanted = low <= angle <= high, f"{angle:.2f} rad", f"{low:g} to {high:g}"
+        rows.append(judged(inside, f"{module}.{name}", "angle", found, wanted, fix, why))
     return rows
 
 
@@ -219,26 +192,12 @@ def describe_flags(kind: type[IntFlag], bits: int) -> str:
     return " ".join([*names, *([hex(rest)] if rest else [])])
 
 
-def _temperature(subject: str, celsius: Value) -> list[Finding]:
-    """Judge an output stage's temperature; nothing where the board does not tell it."""
-    if not isinstance(celsius, int | float):
-        return []
+def _temperature(subject: str, celsius: float) -> Finding:
     low, high = TEMPERATURES
     fix = "let it cool; a reading that stays is a broken thermistor: another board"
     why = "from 100 C on the drive cuts its current, at 120 C it disarms"
-    good = low <= celsius <= high  # NaN is not
-    return [
-        judged(
-            good,
-            subject,
-            "temperature",
-            f"{celsius:.0f} C",
-            f"{low:g} to {high:g} C",
-            fix,
-            why,
-            otherwise=FindingKind.WARNING,
-        )
-    ]
+    good, found = low <= celsius <= high, f"{celsius:.0f} C"  # NaN is not good
+    return advised(good, subject, "temperature", found, f"{low:g} to {high:g} C", fix, why)
 
 
 def _voltage(module: str, volts: float, trip_levels: tuple[float, float]) -> Finding:
@@ -256,11 +215,7 @@ def _voltage(module: str, volts: float, trip_levels: tuple[float, float]) -> Fin
 
 
 def trip_levels_of(values: Values) -> tuple[float, float]:
-    """Return a board's own under- and over-voltage levels, V.
-
-    Raises:
-        DriveError: it does not have them.
-    """
+    """Return a board's own under- and over-voltage levels, V."""
     low, high = (
         number(values, f"config.dc_bus_{name}voltage_trip_level") for name in ("under", "over")
     )
@@ -269,7 +224,7 @@ def trip_levels_of(values: Values) -> tuple[float, float]:
     return low, high
 
 
-def _subject(module: str, name: str) -> tuple[str, str]:
+def split_name(module: str, name: str) -> tuple[str, str]:
     """Return "knee_left.axis0" and the setting's name below it."""
     axis, _, rest = name.partition(".")
     return (f"{module}.{axis}", rest) if axis in AXES else (module, name)

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Mapping
-from typing import Final
+from typing import Any, Final
 
 from shared.can.cansimple import AxisError
 from shared.can.drive_settings import AXES
 from shared.config.robot_config import RobotConfig
-from shared.config.sections import CanConfig
 from tools.bringup.boards import describe_firmware
-from tools.bringup.can_monitor import BusTraffic, NodeTraffic, mean_ms, period_ms
+from tools.bringup.can_monitor import BusTraffic, NodeTraffic, SensorTraffic, mean_ms, period_ms
 from tools.bringup.check_board import describe_flags, state_row
 from tools.bringup.check_socketcan import up_command
-from tools.bringup.rows import Finding, FindingKind, judged, ok, warning, wrong
+from tools.bringup.findings import Finding, advised, judged, warning, wrong
 from tools.fleet.process_table import SIMULATED_CAN
 
 PERIOD_SHARE: Final = 0.2
@@ -29,29 +27,23 @@ def drive_rows(
     robot: RobotConfig, module: str, traffic: BusTraffic, *, services_up: bool
 ) -> list[Finding]:
     """Judge a module's two axes by what came on its bus."""
-    bus = robot.can[robot.module_named(module).bus]
+    bus, node_ids = robot.module_named(module).bus, robot.module_named(module).node_ids
     if traffic.trouble:
-        return [
-            wrong(module, "CAN bus", traffic.trouble, "open", _how_to_open(bus, traffic.trouble))
-        ]
-    node_ids = robot.module_named(module).node_ids
-    rows = []
-    for axis, node in zip(AXES, node_ids, strict=True):
-        known = traffic.nodes.get(node, NodeTraffic())
-        rows += _axis_rows(robot, f"{module}.{axis}", node, known, services_up=services_up)
+        return [_closed(robot, module, bus, traffic)]
     if not any(traffic.nodes[node].heartbeat for node in node_ids if node in traffic.nodes):
-        strangers = sorted(
-            node
-            for node, other in traffic.nodes.items()
-            if other.heartbeat and node not in node_ids
-        )
+        heard = (node for node, other in traffic.nodes.items() if other.heartbeat)
+        strangers = ", ".join(map(str, sorted(set(heard) - set(node_ids))))
         fix = (
-            f"nodes {', '.join(map(str, strangers))} are heard: set `node_ids`, or the drive's"
+            f"nodes {strangers} are heard: set `node_ids`, or the drive's"
             if strangers
             else "supply, wires, 120 ohm at both ends; the drive's baud rate must be 1000000"
         )
         found = f"{traffic.frames} frames, {traffic.error_frames} errors"
         return [wrong(module, "heartbeats", found, f"nodes {node_ids[0]}, {node_ids[1]}", fix)]
+    rows = []
+    for axis, node in zip(AXES, node_ids, strict=True):
+        known = traffic.nodes.get(node, NodeTraffic())
+        rows += _axis_rows(robot, f"{module}.{axis}", node, known, services_up=services_up)
     if traffic.error_frames:
         fix = "wires, 120 ohm at both ends, one baud rate"
         found = f"{traffic.error_frames} in {traffic.seconds:.1f} s"
@@ -61,54 +53,67 @@ def drive_rows(
 
 def harness_rows(robot: RobotConfig, traffic: BusTraffic) -> list[Finding]:
     """Judge the load cells by what came on their bus."""
-    subject, harness = "harness", robot.harness
-    wanted = f"{harness.rate_hz:g} Hz"
+    subject, what, harness, cells = "harness", "load cells", robot.harness, traffic.cells
     if traffic.trouble:
-        fix = _how_to_open(robot.can[harness.bus], traffic.trouble)
-        return [wrong(subject, "CAN bus", traffic.trouble, "open", fix)]
-    if not traffic.samples:
+        return [_closed(robot, subject, harness.bus, traffic)]
+    if not cells.samples:
         fix = "the amplifier's supply and wires; its frames are in shared/can/loadcell_can.py"
         why = "no assist force, no easing, no stop at overload"
-        return [wrong(subject, "load cells", f"{traffic.frames} other frames", wanted, fix, why)]
-    fix = "the amplifier's rate, or `harness.rate_hz`"
-    rows = [_rate_row(subject, "load cells", traffic.samples_s, harness.rate_hz, fix)]
-    largest = max(abs(force) for sample in traffic.samples for force in sample)
+        found, wanted = f"{traffic.frames} other frames", f"{harness.rate_hz:g} Hz"
+        return [wrong(subject, what, found, wanted, fix, why)]
+    largest = max(abs(force) for sample in cells.samples for force in sample)
     good = largest < harness.leg_force_max  # NaN is not
     fix = "unload the harness; a cell that stays there is broken, or its wire"
     found, limit = f"{largest:.0f} N", f"< {harness.leg_force_max:g} N"
-    rows.append(judged(good, subject, "largest force", found, limit, fix, "saturated, not valid"))
-    return rows + _lost_frames(subject, traffic)
+    rate_fix = "the amplifier's rate, or `harness.rate_hz`"
+    return [
+        _rate_row(subject, what, cells, harness.rate_hz, rate_fix),
+        judged(good, subject, "largest force", found, limit, fix, "saturated, not valid"),
+        *_lost_frames(subject, traffic),
+    ]
 
 
 def imu_rows(robot: RobotConfig, traffic: BusTraffic) -> list[Finding]:
     """Judge the IMU by what came on its bus."""
-    subject, imu = "IMU", robot.imu
-    wanted = f"{imu.rate_hz:g} Hz"
+    subject, what, imu, samples = "IMU", "samples", robot.imu, traffic.imu.samples
     if traffic.trouble:
-        fix = _how_to_open(robot.can[imu.bus], traffic.trouble)
-        return [wrong(subject, "CAN bus", traffic.trouble, "open", fix)]
+        return [_closed(robot, subject, imu.bus, traffic)]
     why = "the floor is taken as level"
-    if not traffic.attitudes:
+    if not samples:
         fix = "its supply and wires, its CAN output; its frames are in shared/can/imu_can.py"
         found = f"{traffic.frames} frames that make none"
-        return [wrong(subject, "samples", found, wanted, fix, why)]
-    fix = "its output rate, or `imu.rate_hz`"
-    rows = [_rate_row(subject, "samples", traffic.attitudes_s, imu.rate_hz, fix)]
-    known = sum(sample.valid for sample in traffic.attitudes)
-    found = f"{known} of {len(traffic.attitudes)} samples"
+        return [wrong(subject, what, found, f"{imu.rate_hz:g} Hz", fix, why)]
+    known = sum(sample.valid for sample in samples)
+    found, good = f"{known} of {len(samples)} samples", known == len(samples)
     fix = "leave it still for a minute; its status word says that its filter has not settled"
-    good = known == len(traffic.attitudes)
-    rows.append(judged(good, subject, "orientation valid", found, "all", fix, why))
-    return rows + _lost_frames(subject, traffic)
+    return [
+        _rate_row(subject, what, traffic.imu, imu.rate_hz, "its output rate, or `imu.rate_hz`"),
+        judged(good, subject, "orientation valid", found, "all", fix, why),
+        *_lost_frames(subject, traffic),
+    ]
 
 
-def _rate_row(subject: str, what: str, times_s: list[float], wanted_hz: float, fix: str) -> Finding:
-    """Judge the rate at which a sensor's samples came."""
-    period = period_ms(times_s, 1e3 / wanted_hz)
+def _closed(robot: RobotConfig, subject: str, name: str, traffic: BusTraffic) -> Finding:
+    """Return the row of a bus that cannot be listened to."""
+    bus, trouble = robot.can[name], traffic.trouble
+    if bus.interface == SIMULATED_CAN:
+        fix = "the simulator of this fleet is not there: `xrl status`, or `xrl down`, `xrl up`"
+    elif bus.interface != "socketcan":
+        fix = f"python-can's {bus.interface} on {bus.channel}: its adapter, its driver"
+    elif os.strerror(errno.EAFNOSUPPORT) in trouble:
+        fix = "`sudo modprobe can_raw`: this kernel has no CAN (a container, a small kernel)"
+    else:
+        fix = up_command(bus.channel)
+    return wrong(subject, "CAN bus", trouble, "open", fix)
+
+
+def _rate_row(
+    subject: str, what: str, sensor: SensorTraffic[Any], wanted_hz: float, fix: str
+) -> Finding:
+    period = period_ms(sensor.times_s, 1e3 / wanted_hz)
     rate_hz = 1e3 / period if period else 0.0
     near = abs(rate_hz / wanted_hz - 1.0) <= RATE_SHARE
-    found, wanted = f"{rate_hz:.0f} Hz", f"{wanted_hz:g} Hz"
-    return judged(near, subject, what, found, wanted, fix, otherwise=FindingKind.WARNING)
+    return advised(near, subject, what, f"{rate_hz:.0f} Hz", f"{wanted_hz:g} Hz", fix)
 
 
 def _lost_frames(subject: str, traffic: BusTraffic) -> list[Finding]:
@@ -137,25 +142,6 @@ def _turns(traffic: NodeTraffic, counts_per_turn: int) -> float | None:
     return traffic.pos_turns
 
 
-def bus_nodes(robot: RobotConfig) -> Mapping[str, tuple[int, ...]]:
-    """Return the nodes that should be on each bus, also where there are none."""
-    nodes: dict[str, tuple[int, ...]] = dict.fromkeys(robot.buses, ())
-    for module in robot.module:
-        nodes[module.bus] = (*nodes[module.bus], *module.node_ids)
-    return nodes
-
-
-def _how_to_open(bus: CanConfig, trouble: str) -> str:
-    """Return what to do about a bus that cannot be listened to."""
-    if bus.interface == SIMULATED_CAN:
-        return "the simulator of this fleet is not there: `xrl status`, or `xrl down`, `xrl up`"
-    if bus.interface == "socketcan" and os.strerror(errno.EAFNOSUPPORT) in trouble:
-        return "`sudo modprobe can_raw`: this kernel has no CAN (a container, a small kernel)"
-    if bus.interface == "socketcan":
-        return up_command(bus.channel)
-    return f"python-can's {bus.interface} on {bus.channel}: its adapter, its driver"
-
-
 def _axis_rows(
     robot: RobotConfig, subject: str, node: int, traffic: NodeTraffic, *, services_up: bool
 ) -> list[Finding]:
@@ -171,21 +157,10 @@ def _axis_rows(
     errors = traffic.heartbeat.errors & ~AxisError.WATCHDOG_TIMER_EXPIRED
     words = describe_flags(AxisError, errors) if errors else "none"
     fix = "find what caused it; `xrl up` clears it at arming, power off and on does too"
+    beats, estimates = traffic.heartbeats_s, traffic.estimates_s
     return [
-        _period(
-            subject,
-            "heartbeat",
-            traffic.heartbeats_s,
-            drive.heartbeat_period_ms,
-            "heartbeat_rate_ms",
-        ),
-        _period(
-            subject,
-            "encoder frames",
-            traffic.estimates_s,
-            drive.encoder_period_ms,
-            "encoder_rate_ms",
-        ),
+        _period(subject, "heartbeat", beats, drive.heartbeat_period_ms, "heartbeat_rate_ms"),
+        _period(subject, "encoder frames", estimates, drive.encoder_period_ms, "encoder_rate_ms"),
         judged(not errors, subject, "errors", words, "none", fix),
         state_row(subject, traffic.heartbeat.axis_state, services_up=services_up),
     ]
@@ -200,16 +175,12 @@ def _period(
         measured = mean_ms(times_s)  # two senders: gaps of 1 and 19 ms have a median like one's
     wanted = f"{wanted_ms:g} ms"
     fix = f"config.can.{setting}: `xrl configure --apply --module {module}`"
+    if measured is None and not times_s:
+        return wrong(subject, what, "none", wanted, fix, "they are the joint service's clock")
     if measured is None:
-        found = f"{len(times_s)} heard"
-        return (
-            warning(subject, what, found, wanted, fix)
-            if times_s
-            else wrong(subject, what, "none", wanted, fix, "they are the joint service's clock")
-        )
-    if abs(measured / wanted_ms - 1.0) <= PERIOD_SHARE:
-        return ok(subject, what, f"{measured:.1f} ms", wanted)
+        return warning(subject, what, f"{len(times_s)} heard", wanted, fix)
     why = "or this machine is too busy"
     if measured < TWICE * wanted_ms:
         why = "or a second axis on this bus has the same node id"
-    return warning(subject, what, f"{measured:.1f} ms", wanted, fix, why)
+    good = abs(measured / wanted_ms - 1.0) <= PERIOD_SHARE
+    return advised(good, subject, what, f"{measured:.1f} ms", wanted, fix, why)

@@ -1,4 +1,4 @@
-"""Checks of the computer: processors, clock, real-time permission, USB, CAN interfaces.
+"""Checks of the computer: processors, clock, real-time permission, USB.
 
 For an emulated robot, a missing capability of a sandbox or a laptop is ok if the services can do
 without it (`shared.scheduling`); the row says so.
@@ -18,7 +18,7 @@ from shared.extras import libusb_fix
 from shared.places import FILES
 from shared.robot.compiled_graph import library_of
 from tools.bringup.check_socketcan import query_ip, socketcan_rows
-from tools.bringup.rows import Finding, FindingKind, judged, ok, warning, wrong
+from tools.bringup.findings import Finding, advised, judged, ok, warning, wrong
 from tools.fleet.process_table import is_simulated
 from tools.graph_libraries import command, graphs_of
 
@@ -35,34 +35,23 @@ UDEV_FIX: Final = (
     f"`sudo cp {FILES}/udev/91-odrive.rules /etc/udev/rules.d/` and what its head says; "
     "plug in again"
 )
-RTPRIO_FIX: Final = (
-    "`YOU - rtprio 40` in /etc/security/limits.d/xrl.conf and log in again, or systemd's "
-    "LimitRTPRIO=40"
+LIMIT_FIX: Final = (
+    "`YOU - {} {}` in /etc/security/limits.d/xrl.conf and log in again, or systemd's Limit{}={}"
 )
-
-MEMLOCK_FIX: Final = (
-    "`YOU - memlock unlimited` in /etc/security/limits.d/xrl.conf and log in again, or systemd's "
-    "LimitMEMLOCK=infinity"
-)
+RTPRIO_FIX: Final = LIMIT_FIX.format("rtprio", 40, "RTPRIO", 40)
+MEMLOCK_FIX: Final = LIMIT_FIX.format("memlock", "unlimited", "MEMLOCK", "infinity")
 
 
 def machine_rows(robot: RobotConfig, root: Path = Path("/")) -> list[Finding]:
-    """Check the computer.
-
-    Args:
-        robot: says whether its drives are emulated ones, and which interfaces it needs.
-        root: of the file system; another one for tests.
-    """
+    """Check the computer; another root of the file system for tests."""
     emulated = is_simulated(robot)
-    rows = [
-        _cpus(),
-        _governor(root, emulated=emulated),
-        _clock(root, emulated=emulated),
-        _real_time(emulated=emulated),
-        _memory(emulated=emulated),
-        _swap(root, emulated=emulated),
-        _graphs(robot),
-    ]
+    rows = [_cpus(), _real_time(emulated=emulated), *_delays(root, emulated=emulated)]
+    # interpreted, the law's graphs only cost more time
+    graphs = graphs_of(robot)
+    there = sum(library_of(graph).is_file() for graph in graphs)
+    fix = f"with a C compiler `cc`: `{command()} --config FILE`"
+    found = f"{there} of {len(graphs)} in C"
+    rows.append(advised(there == len(graphs), SUBJECT, "law's graphs", found, "all in C", fix))
     if emulated:
         return rows
     if any(module.serial_number for module in robot.module):
@@ -87,56 +76,40 @@ def usb_node_rows(root: Path) -> list[Finding]:
 
 
 def _cpus() -> Finding:
-    count = len(os.sched_getaffinity(0))
-    if count < CPUS_MIN:
+    cpus = os.sched_getaffinity(0)
+    if len(cpus) < CPUS_MIN:
         fix = "another computer, or more of this one's processors (taskset, container)"
-        return warning(SUBJECT, "processors", str(count), f">= {CPUS_MIN}", fix)
+        return warning(SUBJECT, "processors", str(len(cpus)), f">= {CPUS_MIN}", fix)
     wanted = f">= {CPUS_MIN}; {CPUS_FOR_1_KHZ} for 1 kHz"
-    halves = (scheduling.half_of(os.sched_getaffinity(0), kind) for kind in ("harness", "planner"))
-    listed = " | ".join(",".join(map(str, sorted(half))) for half in halves)
-    return ok(SUBJECT, "processors", f"{count}: right leg {listed} left leg, planner", wanted)
-
-
-def _graphs(robot: RobotConfig) -> Finding:
-    """Check that the law's graphs run as C; interpreted they only cost more time."""
-    graphs = graphs_of(robot)
-    there = sum(library_of(graph).is_file() for graph in graphs)
-    found, wanted = f"{there} of {len(graphs)} in C", "all in C"
-    if there == len(graphs):
-        return ok(SUBJECT, "law's graphs", found, wanted)
-    fix = f"with a C compiler `cc`: `{command()} --config FILE`"
-    return warning(SUBJECT, "law's graphs", found, wanted, fix)
-
-
-def _governor(root: Path, *, emulated: bool) -> Finding:
-    files = (root / "sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor")
-    found = sorted({_text(file) for file in files} - {""})
-    if not found:
-        return ok(SUBJECT, "frequency governor", "unknown here", "performance")
-    return judged(
-        found == ["performance"] or emulated,
-        SUBJECT,
-        "frequency governor",
-        " and ".join(found),
-        "performance",
-        "`sudo cpupower frequency-set -g performance`",
-        "a processor that sleeps is late",
-        otherwise=FindingKind.WARNING,
+    right, left = (
+        ",".join(map(str, sorted(scheduling.half_of(cpus, kind))))
+        for kind in ("harness", "planner")
     )
+    found = f"{len(cpus)}: right leg {right} | {left} left leg, planner"
+    return ok(SUBJECT, "processors", found, wanted)
 
 
-def _clock(root: Path, *, emulated: bool) -> Finding:
-    found = _text(root / "sys/devices/system/clocksource/clocksource0/current_clocksource")
-    return judged(
-        found in CLOCKS or not found or emulated,
-        SUBJECT,
-        "clock source",
-        found or "unknown here",
-        f"{CLOCKS[0]} or alike",
-        "look in the kernel's log why it was given up",
-        "every look at the clock costs a system call",
-        otherwise=FindingKind.WARNING,
-    )
+def _delays(root: Path, *, emulated: bool) -> list[Finding]:
+    """Check what makes a loop late now and then; all of it is ok on an emulated robot."""
+    governors = (root / "sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor")
+    governor = " and ".join(sorted({_text(file) for file in governors} - {""}))
+    clock = _text(root / "sys/devices/system/clocksource/clocksource0/current_clocksource")
+    may_lock, areas = scheduling.may_lock(), len(_text(root / "proc/swaps").splitlines()) - 1
+    locked = f"refused: {resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] // 1024} KiB"
+    rows = (
+        (governor in ("", "performance"), "frequency governor", governor or "unknown here",
+         "performance", "`sudo cpupower frequency-set -g performance`",
+         "a processor that sleeps is late"),
+        (clock in ("", *CLOCKS), "clock source", clock or "unknown here", f"{CLOCKS[0]} or alike",
+         "look in the kernel's log why it was given up",
+         "every look at the clock costs a system call"),
+        (may_lock, "locked memory", "allowed" if may_lock else locked, "allowed", MEMLOCK_FIX,
+         "a page that has to be read again stops a loop"),
+        (areas <= 0, "swap", "none" if areas <= 0 else f"{areas} in use", "none",
+         "`sudo swapoff -a`",
+         "a service that may not lock its memory stops for a page that was swapped out"),
+    )  # fmt: skip
+    return [advised(good or emulated, SUBJECT, *row) for good, *row in rows]
 
 
 def _real_time(*, emulated: bool) -> Finding:
@@ -145,12 +118,11 @@ def _real_time(*, emulated: bool) -> Finding:
         return ok(SUBJECT, what, "SCHED_FIFO allowed", wanted)
     fallback = scheduling.short_slice()
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
+    why = f"the services take {fallback} instead: late when the machine is busy"
     if fallback == "normal priority":
         why = "the loops come late when the machine is busy"
-        return warning(SUBJECT, what, f"refused, RTPRIO {limit}", wanted, RTPRIO_FIX, why)
-    if emulated:
+    elif emulated:
         return ok(SUBJECT, what, f"refused; instead: {fallback}", wanted)
-    why = f"the services take {fallback} instead: late when the machine is busy"
     return warning(SUBJECT, what, f"refused, RTPRIO {limit}", wanted, RTPRIO_FIX, why)
 
 
@@ -164,43 +136,13 @@ def _may_be_fifo() -> bool:
     return True
 
 
-def _memory(*, emulated: bool) -> Finding:
-    limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
-    may = scheduling.may_lock()
-    return judged(
-        may or emulated,
-        SUBJECT,
-        "locked memory",
-        "allowed" if may else f"refused: {limit // 1024} KiB",
-        "allowed",
-        MEMLOCK_FIX,
-        "a page that has to be read again stops a loop",
-        otherwise=FindingKind.WARNING,
-    )
-
-
-def _swap(root: Path, *, emulated: bool) -> Finding:
-    areas = len(_text(root / "proc/swaps").splitlines()) - 1
-    return judged(
-        areas <= 0 or emulated,
-        SUBJECT,
-        "swap",
-        "none" if areas <= 0 else f"{areas} in use",
-        "none",
-        "`sudo swapoff -a`",
-        "a service that may not lock its memory stops for a page that was swapped out",
-        otherwise=FindingKind.WARNING,
-    )
-
-
 def _libusb() -> Finding:
+    what, wanted = "libusb-1.0", "installed"
     try:
         ctypes.CDLL("libusb-1.0.so.0")
     except OSError:
-        return wrong(
-            "USB", "libusb-1.0", "not found", "installed", libusb_fix(), "no ODrive over USB"
-        )
-    return ok("USB", "libusb-1.0", "installed", "installed")
+        return wrong("USB", what, "not found", wanted, libusb_fix(), "no ODrive over USB")
+    return ok("USB", what, wanted, wanted)
 
 
 def _text(path: Path) -> str:

@@ -1,4 +1,4 @@
-"""Checks of the robot file and of where the services will meet: schedule, endpoints."""
+"""Checks of the robot file and of the bus: schedule, endpoints, who may link, this host's keys."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ from pathlib import Path
 from typing import Final
 
 from shared.bus import security
+from shared.bus.credentials import keys_folder
 from shared.config import gain_schedule
 from shared.config.robot_config import RobotConfig, expand
-from shared.exceptions import FleetError
+from shared.exceptions import FleetError, XrlError
 from shared.joints import MODULES
-from tools.bringup.rows import Finding, judged, ok, warning, wrong
+from tools.bringup.findings import Finding, judged, ok, warning, wrong
 from tools.fleet import process_table
 from tools.fleet.process_table import ListenPoint
+from tools.keys.inspection import KeyRow, look
 
 SUBJECT: Final = "robot file"
 
@@ -53,18 +55,15 @@ def joint_services(services: tuple[str, ...]) -> tuple[str, ...]:
 
 def endpoint_rows(robot: RobotConfig, run_dir: Path, *, fleet_is_up: bool) -> list[Finding]:
     """Check that the endpoints of the bus are free, or the fleet's."""
-    up = services_up(robot, run_dir)
+    what = "endpoints"
     if fleet_is_up:
+        up = services_up(robot, run_dir)
         found = f"{len(up)} of {len(robot.services)} listen"
         if len(joint_services(up)) in (0, len(MODULES)):
-            return [ok("bus", "endpoints", found, "the fleet's")]
-        silent = [module for module in MODULES if module not in up]
-        return [
-            wrong(
-                "bus", "endpoints", found, "all six modules",
-                f"`xrl status` says why {', '.join(silent)} is not there",
-            )
-        ]  # fmt: skip
+            return [ok("bus", what, found, "the fleet's")]
+        silent = ", ".join(module for module in MODULES if module not in up)
+        fix = f"`xrl status` says why {silent} is not there"
+        return [wrong("bus", what, found, "all six modules", fix)]
     here = security.services_here(robot)
     listeners = [
         ListenPoint(service, f"bus.endpoints.{service}", expand(endpoint, run_dir))
@@ -75,6 +74,30 @@ def endpoint_rows(robot: RobotConfig, run_dir: Path, *, fleet_is_up: bool) -> li
     try:
         process_table.check_free(listeners)
     except FleetError as error:
-        fix = "`xrl down`, or another --run-dir"
-        return [wrong("bus", "endpoints", str(error), "free", fix)]
-    return [ok("bus", "endpoints", f"{len(listeners)} free", "free")]
+        return [wrong("bus", what, str(error), "free", "`xrl down`, or another --run-dir")]
+    return [ok("bus", what, f"{len(listeners)} free", "free")]
+
+
+def security_rows(robot: RobotConfig) -> list[Finding]:
+    """Check `bus.security`, and under `mtls` each certificate that this host holds."""
+    mode = robot.bus.security.mode
+    if mode == "open":
+        fix = 'mode = "mtls", or "local" for one host (docs/security.md)'
+        why = "anyone who reaches a port commands the robot"
+        return [warning("bus", "security", mode, "mtls or local", fix, why)]
+    if mode == "local":
+        return [ok("bus", "security", mode, "who may link: this user alone")]
+    try:
+        return [_key_row(row) for row in look(keys_folder(robot), robot)]
+    except XrlError as error:
+        return [wrong("bus", "keys", str(error), "this host's own", "`xrl keys pack`")]
+
+
+def _key_row(row: KeyRow) -> Finding:
+    what, wanted = f"key of {row.name}", "valid"
+    if row.wrong:
+        return wrong("bus", what, row.wrong, wanted, "`xrl keys check`", "no link")
+    if row.warning:
+        why = "then no new link: those that stand stay"
+        return warning("bus", what, row.warning, wanted, "`xrl keys renew`", why)
+    return ok("bus", what, f"from {row.begins} until {row.expires}", wanted)

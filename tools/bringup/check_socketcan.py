@@ -15,7 +15,7 @@ from typing import Any, Final
 from shared.can.drive_settings import CAN_BAUD_RATE
 from shared.config.robot_config import RobotConfig
 from shared.places import FILES
-from tools.bringup.rows import Finding, FindingKind, judged, warning, wrong
+from tools.bringup.findings import Finding, advised, judged, warning, wrong
 
 Links = Mapping[str, Mapping[str, Any]]
 """By interface: what `ip` says of it."""
@@ -39,13 +39,7 @@ def query_ip() -> Links:
 
 
 def socketcan_rows(robot: RobotConfig, root: Path, links: Links) -> list[Finding]:
-    """Check every interface that the robot uses.
-
-    Args:
-        robot: its buses.
-        root: of the file system; another one for tests.
-        links: of `query_ip`.
-    """
+    """Check every interface that the robot uses, by the file system and by `query_ip`."""
     rows = []
     used = [robot.can[name] for name in robot.buses]
     names = {bus.channel for bus in used if bus.interface == "socketcan"}
@@ -56,8 +50,7 @@ def socketcan_rows(robot: RobotConfig, root: Path, links: Links) -> list[Finding
             rows.append(wrong(name, "interface", "not there", "up", fix))
             continue
         up = bool(flags & _IFF_UP)
-        found = "up" if up else "down"
-        rows.append(judged(up, name, "interface", found, "up", up_command(name)))
+        rows.append(judged(up, name, "interface", "up" if up else "down", "up", up_command(name)))
         if up and name in links:
             rows += _details(name, links[name])
     return rows
@@ -99,19 +92,11 @@ def _details(name: str, link: Mapping[str, Any]) -> list[Finding]:
     length = link.get("txqlen")
     if length is not None:
         low, high = QUEUE
+        found, wanted = f"{length} frames", f"{low} to {high}"
+        fix = f"{FILES}/udev/92-can.rules, or `sudo ip link set {name} txqueuelen 64`"
         why = "too short for an arming; too long, old frames reach a drive that was plugged in"
-        rows.append(
-            judged(
-                low <= length <= high,
-                name,
-                "send queue",
-                f"{length} frames",
-                f"{low} to {high}",
-                f"{FILES}/udev/92-can.rules, or `sudo ip link set {name} txqueuelen 64`",
-                why,
-                otherwise=FindingKind.WARNING,
-            )
-        )
+        good = low <= length <= high
+        rows.append(advised(good, name, "send queue", found, wanted, fix, why))
     return rows
 
 
@@ -122,11 +107,7 @@ def _state(name: str, state: str, errors: Mapping[str, Any], again: str) -> Find
         return wrong(name, "controller", found, _WELL.lower(), again, "it takes no part in the bus")
     wires = "120 ohm at both ends and nowhere else, ground wired along, one bit rate, short stubs"
     why = "frames are sent again and come late, or the bus goes off"
-    good = state == _WELL
-    wanted = _WELL.lower()
-    return judged(
-        good, name, "controller", found, wanted, wires, why, otherwise=FindingKind.WARNING
-    )
+    return advised(state == _WELL, name, "controller", found, _WELL.lower(), wires, why)
 
 
 def _flags(root: Path, name: str) -> int | None:

@@ -44,11 +44,7 @@ T = TypeVar("T")
 
 
 class UsbBus:
-    """The ODrives on this machine's USB.
-
-    Raises:
-        DriveError: there is no libusb-1.0.
-    """
+    """The ODrives on this machine's USB."""
 
     def __init__(self) -> None:
         self._manager = device_manager()
@@ -58,12 +54,7 @@ class UsbBus:
         self._subscription: Subscription = self.run(self._watch(), TRANSFER_S)
 
     def open(self, serial_numbers: Iterable[str], timeout_s: float = FIND_S) -> FoundBoards:
-        """Connect to boards by their serial numbers, to all at once.
-
-        Args:
-            serial_numbers: 12 hexadecimal digits each.
-            timeout_s: longest wait until all are plugged in.
-        """
+        """Connect to boards by their serial numbers, once all are plugged in or it is too long."""
         wanted = [serial.upper() for serial in serial_numbers]
         results = self.run(self._connect_all(wanted, timeout_s), timeout_s + CONNECT_S + TRANSFER_S)
         boards: dict[str, Board] = {}
@@ -83,11 +74,7 @@ class UsbBus:
             self.run(self._leave(), TRANSFER_S)
 
     def run(self, coroutine: Coroutine[Any, Any, T], timeout_s: float) -> T:
-        """Run a coroutine on the package's loop and return its result.
-
-        Raises:
-            DriveError: it fails, or times out.
-        """
+        """Run a coroutine on the package's loop and return its result."""
         task = asyncio.run_coroutine_threadsafe(coroutine, self._manager.loop)
         try:
             return task.result(timeout_s)

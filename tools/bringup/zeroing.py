@@ -11,18 +11,17 @@ import time
 from typing import Final, NamedTuple
 
 from services.joint.differential import joint_from_motor, motor_from_joint
-from services.joint.drivers.base import Drive, DriveReading, DriveStatus
+from services.joint.drivers.base import Drive, DriveStatus
 from services.joint.drivers.wired_drive import MotorFrame
 from shared.bus.messages import Pair
 from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_S, now_ns
 from shared.config.robot_config import RobotConfig
 from shared.joints import kind_of
+from tools.bringup.motion_runner import NO_ANSWER, await_reading
 
 LOOK_S: Final = 0.3
 """A joint is watched for so long before it is taken to be still."""
-ANSWER_S: Final = 3.0
-"""Longest wait for a drive's first words: its link, and a heartbeat of both axes."""
 STILL: Final = 0.05
 """rad/s; an encoder count in a millisecond is 0.02 rad/s at the joint."""
 MOVED_MAX: Final = 0.005
@@ -64,6 +63,11 @@ class DriveLook(NamedTuple):
     """`AxisError` bits of both axes."""
 
 
+SILENT: Final = DriveLook(
+    DriveStatus.LOST, zeroed=False, q=(0.0, 0.0), speed=0.0, moved=0.0, error=0
+)
+
+
 def look(drive: Drive, mark_turns: float, gear_ratio: float) -> DriveLook:
     """Observe a drive for `LOOK_S`, once it answers.
 
@@ -72,17 +76,11 @@ def look(drive: Drive, mark_turns: float, gear_ratio: float) -> DriveLook:
         mark_turns: a motor's reading at q = 0.
         gear_ratio: N of the differential.
     """
-    answer_by = time.monotonic() + ANSWER_S
-    reading = drive.read(_READ_S)
-    while reading is None or reading.status is DriveStatus.LOST:
-        if time.monotonic() > answer_by:
-            return DriveLook(
-                DriveStatus.LOST, zeroed=False, q=(0.0, 0.0), speed=0.0, moved=0.0, error=0
-            )
-        reading = drive.read(_READ_S)
+    reading = await_reading(drive)
+    if reading is None:
+        return SILENT
     first = newest = reading
-    speed = moved = 0.0
-    errors = reading.error
+    speed, moved, errors = 0.0, 0.0, reading.error
     until = time.monotonic() + LOOK_S
     while time.monotonic() < until:
         reading = drive.read(_READ_S)
@@ -90,24 +88,19 @@ def look(drive: Drive, mark_turns: float, gear_ratio: float) -> DriveLook:
             continue
         newest = reading
         errors |= reading.error
-        rates = joint_from_motor(reading.vel_turns, gear_ratio)
-        speed = max(speed, *map(abs, rates))
-        moved = max(moved, _apart(reading, first, gear_ratio))
+        speed = max(speed, *map(abs, joint_from_motor(reading.vel_turns, gear_ratio)))
+        (a1, a2), (b1, b2) = reading.pos_turns, first.pos_turns
+        moved = max(moved, *map(abs, joint_from_motor((a1 - b1, a2 - b2), gear_ratio)))
     counted = MotorFrame(mark_turns).from_drive(newest)
-    return DriveLook(
-        newest.status,
-        counted.status is not DriveStatus.UNZEROED,
-        joint_from_motor(counted.pos_turns, gear_ratio),
-        speed,
-        moved,
-        errors,
-    )
+    q = joint_from_motor(counted.pos_turns, gear_ratio)
+    zeroed = counted.status is not DriveStatus.UNZEROED
+    return DriveLook(newest.status, zeroed=zeroed, q=q, speed=speed, moved=moved, error=errors)
 
 
 def refusal(seen: DriveLook) -> str:
     """Return why a drive cannot be zeroed now; "" if it can."""
     if seen.status is DriveStatus.LOST:
-        return "its drive does not answer; look at its power and its bus (`xrl doctor`)"
+        return NO_ANSWER
     if seen.status is DriveStatus.ARMED:
         return "its drive is armed (closed loop); make it idle first"
     if seen.error & AxisError.ENCODER_FAILED:
@@ -120,7 +113,7 @@ def refusal(seen: DriveLook) -> str:
     return ""
 
 
-def outside(robot: RobotConfig, module: str, q: Pair) -> str:
+def why_outside(robot: RobotConfig, module: str, q: Pair) -> str:
     """Return which angle of (phi, theta), rad, is outside of a module's limits; "" if none."""
     limit = getattr(robot.limits, kind_of(module))
     for axis, angle, (low, high) in zip(("phi", "theta"), q, (limit.phi, limit.theta), strict=True):
@@ -130,18 +123,10 @@ def outside(robot: RobotConfig, module: str, q: Pair) -> str:
 
 
 def zero(drive: Drive, q: Pair, robot: RobotConfig) -> Back | None:
-    """Write both motors' positions; return the drive's reading.
-
-    Args:
-        drive: idle, in its own count.
-        q: joint angles (phi, theta), rad.
-        robot: its mark and gear ratio.
+    """Write both motors' positions for joint angles q, rad, to an idle drive in its own count.
 
     Returns:
         The position read back, right or not (`is_right`); None if none came.
-
-    Raises:
-        DriveError: the drive cannot be written.
     """
     mark, gear_ratio = robot.drive.zero_mark_turns, robot.joint.gear_ratio
     m1, m2 = motor_from_joint(q, gear_ratio)
@@ -168,9 +153,3 @@ def is_right(back: Back | None, q: Pair) -> bool:
         return False
     within = HELD_WITHIN if back.armed else WITHIN
     return all(abs(a - b) <= within for a, b in zip(back.q, q, strict=True))
-
-
-def _apart(a: DriveReading, b: DriveReading, gear_ratio: float) -> float:
-    """Return the larger angle between two samples, rad."""
-    (a1, a2), (b1, b2) = a.pos_turns, b.pos_turns
-    return max(map(abs, joint_from_motor((a1 - b1, a2 - b2), gear_ratio)))

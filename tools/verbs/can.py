@@ -14,7 +14,7 @@ from rich.text import Text
 
 from shared.can.cansimple import AxisState
 from shared.config.files import load
-from shared.config.robot_config import RobotConfig, expand
+from shared.config.robot_config import RobotConfig
 from shared.config.sections import CanConfig
 from shared.exceptions import FAULT_EXIT_CODE, DriveError, FleetError
 from shared.places import FILES
@@ -23,14 +23,14 @@ from tools.bringup.can_monitor import (
     BusTraffic,
     NodeTraffic,
     RoundTrips,
-    listen,
-    long_enough,
+    bus_config,
+    bus_nodes,
+    listen_to,
     mean_ms,
     round_trips,
 )
-from tools.bringup.check_can import bus_nodes
 from tools.bringup.check_socketcan import setup_commands
-from tools.bringup.reach import drives_within_reach
+from tools.bringup.drive_access import drives_within_reach
 from tools.number_arguments import count, finite
 from tools.terminal import Console, marked
 from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
@@ -136,13 +136,8 @@ def _listen(
 ) -> int:
     console, complete = Console(), True
     for name, nodes in buses.items():
-        seconds = args.for_s or long_enough(robot.drive.heartbeat_period_ms if nodes else 0)
-        bus = _expanded(robot, name, args)
-        traffic = listen(
-            bus, nodes, poll_nodes=False,
-            cells=name == robot.harness.bus,
-            imu=robot.imu.fitted and name == robot.imu.bus, seconds=seconds,
-        )  # fmt: skip
+        bus = bus_config(robot, name, args.run_dir)
+        traffic = listen_to(robot, name, args.run_dir, poll_nodes=False, seconds=args.for_s)
         console.print(_heading(name, bus, traffic), highlight=False, soft_wrap=True)
         if traffic.trouble:
             complete = False
@@ -151,11 +146,11 @@ def _listen(
             console.print(_node_table(robot, traffic))
         complete &= all(traffic.nodes[node].heartbeats_s for node in nodes)
         if name == robot.harness.bus:
-            console.print("  load cells:", _rate(traffic.samples_s, traffic.seconds))
-            complete &= bool(traffic.samples_s)
+            console.print("  load cells:", _rate(traffic.cells.times_s, traffic.seconds))
+            complete &= bool(traffic.cells.times_s)
         if robot.imu.fitted and name == robot.imu.bus:
-            console.print("  IMU:", _rate(traffic.attitudes_s, traffic.seconds))
-            complete &= bool(traffic.attitudes_s)
+            console.print("  IMU:", _rate(traffic.imu.times_s, traffic.seconds))
+            complete &= bool(traffic.imu.times_s)
     return 0 if complete else FAULT_EXIT_CODE
 
 
@@ -219,7 +214,8 @@ def _measure(
     complete = True
     for name, nodes in buses.items():
         try:
-            found = round_trips(_expanded(robot, name, args), nodes, args.count) if nodes else {}
+            bus = bus_config(robot, name, args.run_dir)
+            found = round_trips(bus, nodes, args.count) if nodes else {}
         except DriveError as error:
             raise FleetError(f"bus {name}: {error}; `xrl can setup`, `xrl doctor`") from None
         for node, trips in found.items():
@@ -236,8 +232,3 @@ def _percentiles(trips: RoundTrips) -> tuple[str, str, str]:
     chosen = (ordered[len(ordered) // 2], ordered[(99 * len(ordered)) // 100], ordered[-1])
     middle, late, latest = (f"{value:.2f}" for value in chosen)
     return middle, late, latest
-
-
-def _expanded(robot: RobotConfig, name: str, args: argparse.Namespace) -> CanConfig:
-    bus = robot.can[name]
-    return CanConfig(interface=bus.interface, channel=expand(bus.channel, args.run_dir))

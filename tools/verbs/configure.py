@@ -15,19 +15,18 @@ from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, DriveError, FleetError
 from shared.joints import MODULES
-from tools.bringup import backup, bench, changes
+from tools.bringup import backup, changes, drive_access
 from tools.bringup.boards import FIRMWARE, Board, FoundBoards, describe_firmware, is_known
 from tools.bringup.changes import ChangeResult, SettingChange
 from tools.bringup.check_robot import joint_services, services_up
-from tools.bringup.difference import shown
-from tools.bringup.jog_drive import Interrupts
-from tools.bringup.reach import (
+from tools.bringup.drive_access import (
     add_plant,
     boards_on_usb,
     check_plants,
     drives_within_reach,
     no_fleet_meanwhile,
 )
+from tools.bringup.motion_runner import Interrupts
 from tools.fleet.process_table import is_simulated
 from tools.terminal import Console, marked
 from tools.verb_table import FLEET, Subparsers, add_config, add_run_dir, add_verb
@@ -77,7 +76,7 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Show the differences, and write them if told to; return 0 if the drives are as wanted."""
     console = Console()
-    path = bench.robot_file(args)
+    path = drive_access.robot_file(args)
     robot = config_file.load_without_schedule(path)
     saved = backup.read(args.restore) if args.restore else None
     modules = modules_of(args, robot, saved)
@@ -104,7 +103,7 @@ def look_and_write(
     ):
         boards = boards_of(robot, modules, found)
         difference = differences(robot, boards, saved)
-        console.print(shown(difference) if difference else "nothing to change")
+        console.print(changes.difference_table(difference) if difference else "nothing to change")
         if not args.apply or not difference:
             if difference:
                 console.print("\nnothing was written; `--apply` writes it")
@@ -163,7 +162,7 @@ def refuse_services(robot: RobotConfig, run_dir: Path, modules: Sequence[str]) -
                 "board under it. Hang the robot; `xrl down` first"
             )
     for module in modules:
-        other = bench.service_on(robot, module, run_dir)
+        other = drive_access.service_on(robot, module, run_dir)
         if other is not None:
             raise FleetError(
                 f"a joint service has the drive of {module}, in {other.run.path}; hang the robot; "
@@ -284,5 +283,5 @@ def conclude(
         restarted = dict.fromkeys(change.module for change in written)
         console.print(f"restarted, and so without a zero: {', '.join(restarted)}; `xrl zero`")
     if emulated and is_simulated(robot):
-        console.print(bench.GONE)
+        console.print(drive_access.GONE)
     return FAULT_EXIT_CODE if bad else 0

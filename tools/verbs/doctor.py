@@ -9,9 +9,8 @@ from rich.text import Text
 
 from shared.config import files as config_file
 from shared.exceptions import FAULT_EXIT_CODE
-from tools.bringup import bench
-from tools.bringup.reach import add_plant, check_plants
-from tools.bringup.report import report_of, show
+from tools.bringup.drive_access import add_plant, check_plants, robot_file
+from tools.bringup.findings import report_of, show
 from tools.bringup.survey import survey
 from tools.terminal import Console
 from tools.verb_table import FLEET, Subparsers, add_config, add_run_dir, add_verb
@@ -38,7 +37,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Look at everything; 0 if nothing is wrong."""
-    path = bench.robot_file(args)
+    path = robot_file(args)
     robot = config_file.load(path)
     check_plants(robot, args.run_dir, args.plant)
     with Console(stderr=True).status("looking") as status:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
@@ -25,15 +24,16 @@ from shared.config.scenarios import Lead, Scenario
 from shared.exceptions import DECLINED_EXIT_CODE, RunError
 from shared.extras import require
 from shared.joints import AXES, MODULES
-from tools.bringup.bench import confirm
-from tools.bringup.jog_drive import Interrupts
+from tools.bringup.drive_access import confirm
+from tools.bringup.identify import joints, report
+from tools.bringup.identify.body_fit import Record, fit
+from tools.bringup.identify.body_lead import BodyLead
+from tools.bringup.identify.estimates import of_body, zero_corrections
+from tools.bringup.identify.quasi_static import Moments, TimedRows, moments_of
+from tools.bringup.identify.robot_file_edit import refuse_running
+from tools.bringup.module_motion import exit_if_interrupted
+from tools.bringup.motion_runner import Interrupts
 from tools.fleet.supervise import SupervisedFleet
-from tools.identify import joint_bench, report
-from tools.identify.body_fit import Record, fit
-from tools.identify.estimates import of_body, zero_corrections
-from tools.identify.motion import Motion
-from tools.identify.picture import draw_body
-from tools.identify.quasi_static import Moments, TimedRows, moments_of
 from tools.live import experiment
 from tools.logs.recorded_robot import robot_of
 from tools.logs.run_log import RunLog, read_run
@@ -120,7 +120,7 @@ def run(args: argparse.Namespace) -> int:
     """Measure, fit, tell, and write if it is asked for."""
     console = Console()
     if args.what == "joint":
-        return joint_bench.run(args, console)
+        return joints.run(args, console)
     if not 0.0 < args.level <= LEVEL_MAX:
         raise RunError(f"--level {args.level:g}: more than 0 and at most {LEVEL_MAX:g} is right")
     scenario = scenarios.load(experiment.scenario_file(MOTIONS))
@@ -135,13 +135,13 @@ def run(args: argparse.Namespace) -> int:
         logs = [read_run(path) for path in args.record]
         robot, path = _same_robot(logs), places.robot_file(args.config)
         if args.apply:
-            report.refuse_running(path)
+            refuse_running(path)
         moments = [_moments_in(log) for log in logs]
     else:
         fleet = SupervisedFleet.attach(args.run_dir)
         path = Path(fleet.manifest.config)
         if args.apply:
-            report.refuse_running(path)
+            refuse_running(path)
         robot = config_file.load(path)
         led = _led(robot, fleet, scenario, args, console)
         if led is None:
@@ -153,7 +153,7 @@ def run(args: argparse.Namespace) -> int:
     result = fit(robot, records, level_sd=args.level, payload_sd=payload_sd)
     estimates = of_body(result, robot)
     picture = make_folder(args.out, "identify") / "identify.png"
-    draw_body(estimates, result, picture)
+    report.draw_body(estimates, result, picture)
     report.tell(estimates, robot, path if args.apply else None, console)
     corrections = zero_corrections(estimates)
     if corrections:
@@ -230,19 +230,19 @@ def _led(
             return None
     interrupts = Interrupts()
     with open_session(robot, "identify", fleet.run.path) as session:
-        motion = Motion(robot, session, simulated=simulated)
+        body = BodyLead(robot, session, simulated=simulated)
         with (
             interrupts.kept(),
             Live(console=console, refresh_per_second=4, transient=True) as shown,
         ):
-            heard = motion.go(
+            heard = body.go(
                 scenario,
                 lambda t_s, wanted, status: shown.update(_line(t_s, scenario, wanted, status)),
                 lambda: bool(interrupts.number),
             )
     if interrupts.number:
         console.print("stopped: nothing was fitted; requests fade out by themselves")
-        sys.exit(128 + interrupts.number)
+    exit_if_interrupted(interrupts)
     if heard.ended:
         raise RunError(f"{heard.ended}: nothing was fitted; requests fade out by themselves")
     return moments_of(heard.states, heard.wrenches)

@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 import argparse
-import sys
+from collections.abc import Mapping
 from typing import Final
 
 from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from services.joint.__main__ import open_drive
-from services.joint.differential import joint_from_motor
+from shared.bus.messages import Pair
 from shared.config import files as config_file
-from shared.config.robot_config import RobotConfig
-from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, DriveError
+from shared.exceptions import FAULT_EXIT_CODE, DriveError
 from shared.joints import AXES, MODULES
-from tools.bringup import bench, limits
-from tools.bringup.jog_drive import NOT_IDLE, Interrupts, JogResult, first_reading, jog_drive
-from tools.bringup.jogging import JogPlan, Sample, gentle, judge, outside, what_to_see
+from tools.bringup import drive_access
+from tools.bringup.jog import JogPlan, ThereAndBack, judge, what_to_see
+from tools.bringup.module_motion import (
+    Moved,
+    Stopped,
+    exit_if_interrupted,
+    look_ask_and_move,
+    tell_stopped,
+)
+from tools.bringup.motion import limit_drives
+from tools.bringup.motion_runner import Interrupts
 from tools.number_arguments import count, finite
 from tools.terminal import Console, marked
 from tools.verb_table import FLEET, Subparsers, add_config, add_run_dir, add_verb
@@ -81,76 +87,38 @@ def run(args: argparse.Namespace) -> int:
     """Look, ask, move, idle, judge."""
     console = Console()
     plan = plan_of(args)
-    path = bench.robot_file(args)
+    path = drive_access.robot_file(args)
     module: str = args.module
     robot = config_file.load_without_schedule(path)
-    limited = gentle(robot, plan)
-    bench.refuse_service(robot, args.module, args.run_dir)
+    limited = limit_drives(robot, plan)
+    drive_access.refuse_service(robot, module, args.run_dir)
     interrupts = Interrupts()
-    with bench.drives_to_ourselves(robot, path, args.run_dir, console.print) as started:
+
+    def introduce(_q: Mapping[str, Pair]) -> JogPlan:
+        by, period_s, cycles = plan.course
+        console.print(
+            f"{module} {args.axis}: {by:+g} rad and back, {cycles} times in {period_s:g} s each, "
+            f"with at most {plan.torque_limit:g} N m "
+            f"({limited.drive.current_lim:.1f} A a motor, {limited.drive.vel_limit:.1f} turn/s)"
+        )
+        console.print(f"to see: {what_to_see(module, plan.axis, by)}")
+        return plan
+
+    with drive_access.drives_to_ourselves(robot, path, args.run_dir, console.print) as started:
         if started:
             console.print(f"its soles rest on the floor: a leg needs --torque-limit {EMULATED:g}")
-        outcome = confirm_and_move(args, console, limited, plan, interrupts)
-        if outcome is None:
-            console.print("nothing was moved")
-            return DECLINED_EXIT_CODE
-        why = limits.not_given_back(robot, args.module, args.run_dir) if outcome.is_idle else ""
-        if why:
-            console.print(marked("[yellow]{}[/]", why))
-    code = report(outcome, module, plan, console)
-    if interrupts.number:
-        sys.exit(128 + interrupts.number)
+        moved = look_ask_and_move(
+            args, robot, (module, plan.axis), introduce, interrupts, console, alone=True
+        )
+    if isinstance(moved, Stopped):
+        code = tell_stopped(moved, console)
+    else:
+        assert moved is not None  # noqa: S101 - a jog has no dry run
+        code = report(moved, module, console)
+    if not isinstance(moved, Stopped) or not (moved.declined or moved.not_idle):
+        console.print("both axes are idle")
+    exit_if_interrupted(interrupts)
     return code
-
-
-def confirm_and_move(
-    args: argparse.Namespace,
-    console: Console,
-    robot: RobotConfig,
-    plan: JogPlan,
-    interrupts: Interrupts,
-) -> JogResult | None:
-    """Open the drive, look at the joint, ask, and move it; None if the answer was no.
-
-    Args:
-        args: of the verb.
-        console: to speak on.
-        robot: as `gentle` made it.
-        plan: what to do.
-        interrupts: kept while the drive may be armed.
-
-    Raises:
-        DriveError: the drive does not answer, or the joint may not go there.
-        FleetError: a joint service has the drive.
-    """
-    module: str = args.module
-    drive = open_drive(robot, module, args.run_dir)
-    try:
-        try:
-            reading = first_reading(drive)
-        except DriveError as error:
-            raise DriveError(f"{module}: {error}") from None
-        q = joint_from_motor(reading.pos_turns, robot.joint.gear_ratio)
-        if why := outside(robot, module, plan, q):
-            raise DriveError(f"{module}: {why}")
-        _introduce(robot, module, plan, console)
-        if not bench.confirm("Is the joint free, and the power switch at hand?", yes=args.yes):
-            return None
-        bench.refuse_service(
-            robot, args.module, args.run_dir
-        )  # a person may take minutes to answer
-        with interrupts.kept():
-            return jog_drive(
-                drive,
-                robot,
-                module,
-                plan,
-                q_seen=q,
-                interrupts=interrupts,
-                progress=lambda sample: console.print(progress(sample, plan)),
-            )
-    finally:
-        drive.close()
 
 
 def plan_of(args: argparse.Namespace) -> JogPlan:
@@ -165,51 +133,26 @@ def plan_of(args: argparse.Namespace) -> JogPlan:
         raise DriveError(f"--period {args.period:g}: {PERIOD_MIN_S:g} .. 60 s is right")
     if not 1 <= args.cycles <= CYCLES_MAX:
         raise DriveError(f"--cycles {args.cycles}: 1 .. {CYCLES_MAX} is right")
-    return JogPlan(AXES.index(args.axis), args.by, args.period, args.cycles, args.torque_limit)
+    course = ThereAndBack(args.by, args.period, args.cycles)
+    return JogPlan(AXES.index(args.axis), course, args.torque_limit)
 
 
-def progress(sample: Sample, plan: JogPlan) -> str:
-    """Return a line on a sample."""
-    axis = plan.axis
-    return (
-        f"{sample.t_s:6.2f} s  {AXES[axis]} asked {sample.q_ref[axis]:+.4f}, "
-        f"is {sample.q[axis]:+.4f} rad, torque {sample.tau[axis]:+6.2f} N m"
-    )
-
-
-def report(outcome: JogResult, module: str, plan: JogPlan, console: Console) -> int:
-    """Print how it went; return 0 if the joint followed."""
-    code = FAULT_EXIT_CODE
-    if outcome.trouble:
-        console.print(marked("[bold red]STOPPED[/]: {}", outcome.trouble))
-    else:
-        rows = judge(outcome.samples, plan)
-        table = Table(box=box.SIMPLE_HEAD)
-        for heading in ("", "measured", "wanted", ""):
-            table.add_column(heading)
-        for row in rows:
-            verdict = Text("ok") if row.good else Text("not good", "bold red")
-            table.add_row(row.what, row.value, row.wanted, verdict if row.wanted else "")
-        console.print(table)
-        code = 0 if all(row.good for row in rows) else FAULT_EXIT_CODE
-        words = "[bold red]DID NOT FOLLOW[/]" if code else "[bold green]FOLLOWED[/]"
-        console.print(marked(f"{words}: {{}} {{}}", module, AXES[plan.axis]))
-        console.print(
-            f"right only if you saw this: {what_to_see(module, plan.axis, plan.by)}; "
-            "an encoder on the motor cannot tell"
-        )
-    if outcome.is_idle:
-        console.print("both axes are idle")
-        return code
-    console.print(marked("[bold red]{}[/]", NOT_IDLE))
-    return FAULT_EXIT_CODE
-
-
-def _introduce(robot: RobotConfig, module: str, plan: JogPlan, console: Console) -> None:
-    """Print what is about to move."""
+def report(moved: Moved[ThereAndBack], module: str, console: Console) -> int:
+    """Print the verdict; return 0 if the joint followed."""
+    plan = moved.plan
+    rows = judge(moved.samples, plan)
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in ("", "measured", "wanted", ""):
+        table.add_column(heading)
+    for row in rows:
+        verdict = Text("ok") if row.good else Text("not good", "bold red")
+        table.add_row(row.what, row.value, row.wanted, verdict if row.wanted else "")
+    console.print(table)
+    code = 0 if all(row.good for row in rows) else FAULT_EXIT_CODE
+    words = "[bold red]DID NOT FOLLOW[/]" if code else "[bold green]FOLLOWED[/]"
+    console.print(marked(f"{words}: {{}} {{}}", module, AXES[plan.axis]))
     console.print(
-        f"{module} {AXES[plan.axis]}: {plan.by:+g} rad and back, {plan.cycles} times in "
-        f"{plan.period_s:g} s each, with at most {plan.torque_limit:g} N m "
-        f"({robot.drive.current_lim:.1f} A a motor, {robot.drive.vel_limit:.1f} turn/s)"
+        f"right only if you saw this: {what_to_see(module, plan.axis, plan.course.by)}; "
+        "an encoder on the motor cannot tell"
     )
-    console.print(f"to see: {what_to_see(module, plan.axis, plan.by)}")
+    return code

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from services.simulator.physics.plant import IDEAL, PlantConfig, plant_from
 from shared import places
+from shared.bus.messages import Pair
 from shared.bus.credentials import require_operator
 from shared.bus.session import open_session
 from shared.config import files as config_file
@@ -20,18 +21,25 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, RunError
 from shared.extras import require
 from shared.joints import AXES, MODULES
-from tools.bringup import bench, jog_drive
+from tools.bringup import drive_access, module_motion
+from tools.bringup.hanging_leg import hanging_joint
+from tools.bringup.motion_runner import Interrupts
+from tools.bringup.tune import module_probe
+from tools.bringup.tune.excitation import Excitation, excitation
+from tools.bringup.tune.pose_probe import (
+    DIRECTIONS,
+    LiveProbe,
+    ProbeCourse,
+    in_lockstep,
+    inertia_along,
+)
+from tools.bringup.tune.report import answer_table, draw
+from tools.bringup.tune.response import ResponseFit, answer_of, propose
 from tools.fleet.supervise import SupervisedFleet
-from tools.identify import joint_bench, joint_drive
 from tools.live import experiment
 from tools.number_arguments import finite
 from tools.output import make_folder, progress_along
 from tools.terminal import Console, marked
-from tools.tune import module_probe
-from tools.tune.excitation import Excitation, excitation
-from tools.tune.pose_probe import DIRECTIONS, LiveProbe, ProbeCourse, in_lockstep, inertia_along
-from tools.tune.report import answer_table, draw
-from tools.tune.response import ResponseFit, answer_of, propose
 from tools.verb_table import FLEET, Subparsers, add_config, add_run_dir, add_verb
 
 SIZE_SHARE: Final = 0.8
@@ -204,16 +212,16 @@ def _live(
     console.print("leave the robot alone but for the hand that holds its height")
     question = "Does it stand, with room around it, and the stop at hand?"
     simulated = "simulator" in fleet.manifest.services
-    if not simulated and not bench.confirm(question, yes=args.yes):
+    if not simulated and not drive_access.confirm(question, yes=args.yes):
         return None
-    interrupts = jog_drive.Interrupts()
+    interrupts = Interrupts()
     with open_session(robot, "tune", fleet.run.path) as session:
         probe = LiveProbe(session)
         with interrupts.kept(), progress_along("probing", plan.duration_s) as progress:
             course = probe.go(row, plan, progress, lambda: bool(interrupts.number))
     if interrupts.number:
         console.print("stopped: the probe ends by itself")
-        sys.exit(128 + interrupts.number)
+    module_motion.exit_if_interrupted(interrupts)
     return course
 
 
@@ -260,22 +268,22 @@ def _proposed(
         console.print("no second-order answer was measured: no gains follow from it")
         return None
     law = robot.law
-    new = propose(
-        answer.model, K_p=law.K_p[row], B_p=law.B_p[row], inertia=inertia_along(robot, row),
+    k, b = propose(
+        answer.model, (law.K_p[row], law.B_p[row]), inertia_along(robot, row),
         bandwidth=args.bandwidth, damping_ratio=args.damping,
     )  # fmt: skip
-    if new.K_p <= 0.0 or new.B_p <= 0.0:
+    if k <= 0.0 or b <= 0.0:
         console.print(
             marked(
                 "[yellow]no gains: with K_p = {:.3g} and B_p = {:.3g} it would be so; "
                 "local gains and joints give more stiffness or damping than was wanted[/]",
-                new.K_p,
-                new.B_p,
+                k,
+                b,
             )
         )
         return None
     K_p, B_p = list(law.K_p), list(law.B_p)
-    K_p[row], B_p[row] = float(f"{new.K_p:.3g}"), float(f"{new.B_p:.3g}")
+    K_p[row], B_p[row] = float(f"{k:.3g}"), float(f"{b:.3g}")
     console.print(
         f"for {args.bandwidth:g} rad/s and a damping ratio of {args.damping:g}, in {UNITS[row]}:"
     )
@@ -299,36 +307,37 @@ def with_local_gains_kept(robot: RobotConfig) -> RobotConfig:
 
 
 def _tune_module(args: argparse.Namespace, console: Console) -> int:
-    module, axis = args.what, AXES.index(args.axis or "theta")
-    path = bench.robot_file(args)
+    module, axis = joint = args.what, AXES.index(args.axis or "theta")
+    path = drive_access.robot_file(args)
     robot = config_file.load_without_schedule(path)
-    joint_bench.refuse_services(robot, [module], args.run_dir)
-    interrupts = jog_drive.Interrupts()
+    module_motion.refuse_services(robot, [module], args.run_dir)
+    interrupts = Interrupts()
+    k_p, k_d = module_probe.axis_gains(robot, module, axis)
 
-    def plan_of(where: joint_drive.Hanging) -> module_probe.ModulePlan:
-        plan = module_probe.module_plan(robot, module, axis, args.torque, where)
+    def plan_of(q: Mapping[str, Pair]) -> module_probe.ProbePlan:
+        hung = hanging_joint(robot, q, module, axis)
+        plan = module_probe.probe_plan(robot, module, axis, args.torque, hung)
         console.print(
-            f"{module} {AXES[axis]}: a step of {1e3 * plan.excitation.size:.1f} mrad there and "
+            f"{module} {AXES[axis]}: a step of {1e3 * plan.course.size:.1f} mrad there and "
             f"back, then sines of it, {plan.duration_s:.0f} s, at most {plan.torque_limit:.0f} N "
-            f"m, on the stand gains ({plan.k_p:g} N m/rad, {plan.k_d:g} N m s/rad)"
+            f"m, on the stand gains ({k_p:g} N m/rad, {k_d:g} N m s/rad)"
         )
         return plan
 
-    with bench.drives_to_ourselves(
-        robot, path, args.run_dir, console.print, lifted=joint_bench.LIFTED
+    with drive_access.drives_to_ourselves(
+        robot, path, args.run_dir, console.print, lifted=module_motion.LIFTED
     ):
-        moved = joint_bench.move_joint(args, robot, (module, axis), plan_of, interrupts, console)
+        moved = module_motion.look_ask_and_move(args, robot, joint, plan_of, interrupts, console)
     if moved is None:
         return 0
-    if isinstance(moved, joint_bench.Stopped):
-        code = joint_bench.tell_stopped(moved, console)
-        if interrupts.number:
-            sys.exit(128 + interrupts.number)
+    if isinstance(moved, module_motion.Stopped):
+        code = module_motion.tell_stopped(moved, console)
+        module_motion.exit_if_interrupted(interrupts)
         return code
-    plan = moved.plan
+    plan, hung = moved.plan, hanging_joint(robot, moved.q, module, axis)
     course = module_probe.course_of_samples(moved.samples, plan)
-    answer = _answer(course, plan.excitation)
-    model = module_probe.predicted(robot, plan.k_p, plan.k_d, moved.where)
+    answer = _answer(course, plan.course)
+    model = module_probe.predicted(robot, module, axis, hung)
     _tell(args, {"measured": course}, {"measured": answer}, console, closed=False)
     console.print(
         f"predicted, rotor and leg rigid: natural frequency {model.natural_frequency:.1f} rad/s, "
@@ -341,8 +350,8 @@ def _tune_module(args: argparse.Namespace, console: Console) -> int:
         )
     elif args.bandwidth is not None:
         # k_p below 0: gravity alone is stiffer than what is wanted
-        inertia = plan.k_p / answer.model.b_0
-        k_p = inertia * args.bandwidth**2 - moved.where.gravity
+        inertia = k_p / answer.model.b_0
+        k_p = inertia * args.bandwidth**2 - hung.gravity
         k_d = 2.0 * args.damping * args.bandwidth * inertia
         console.print(
             f"for {args.bandwidth:g} rad/s and a damping ratio of {args.damping:g}: k_p = "

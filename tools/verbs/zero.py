@@ -25,9 +25,9 @@ from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, DriveError, FleetError
 from shared.joints import MODULES
-from tools.bringup import bench
-from tools.bringup.stops import within_stops
-from tools.bringup.zeroing import DriveLook, is_right, look, outside, refusal, zero
+from tools.bringup import drive_access
+from tools.bringup.motion import within_stops
+from tools.bringup.zeroing import DriveLook, is_right, look, refusal, why_outside, zero
 from tools.fleet.supervise import SupervisedFleet
 from tools.number_arguments import finite, finite_numbers
 from tools.terminal import Console, marked
@@ -87,13 +87,13 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Look, ask, set, read back."""
     console = Console()
-    path = bench.robot_file(args)
+    path = drive_access.robot_file(args)
     robot = config_file.load_without_schedule(path)
     wanted = angles_of(args, robot, console)
     by = None if args.by is None else _pair("--by", args.by)
     modules = tuple(wanted) or (args.module,)
-    holders = {module: bench.service_on(robot, module, args.run_dir) for module in modules}
-    with bench.drives_to_ourselves(robot, path, args.run_dir, console.print) as started:
+    holders = {module: drive_access.service_on(robot, module, args.run_dir) for module in modules}
+    with drive_access.drives_to_ourselves(robot, path, args.run_dir, console.print) as started:
         refuse_services(robot, holders)
         with contextlib.ExitStack() as stack:
             drives = {module: _open(robot, module, args.run_dir, stack) for module in modules}
@@ -103,7 +103,7 @@ def run(args: argparse.Namespace) -> int:
             console.print(plan_table(wanted, before))
             _warn(wanted, holders, console)
             question = "Are the joints at these angles now?" if by is None else "Correct the zero?"
-            if not bench.confirm(question, yes=args.yes):
+            if not drive_access.confirm(question, yes=args.yes):
                 console.print("nothing was changed")
                 return DECLINED_EXIT_CODE
             refuse_services(robot, holders)  # a person may take minutes to answer
@@ -112,7 +112,7 @@ def run(args: argparse.Namespace) -> int:
                 wanted = corrected(now, by, robot)
             code = _set_all(robot, drives, wanted, console)
     if started:
-        console.print(bench.GONE)
+        console.print(drive_access.GONE)
     return code
 
 
@@ -131,9 +131,9 @@ def angles_of(args: argparse.Namespace, robot: RobotConfig, console: Console) ->
     if args.at is not None:
         wanted = {args.module: _pair("--at", args.at)}
     else:
-        from tools.bringup.standing import standing  # noqa: PLC0415 - takes a second
+        from tools.bringup.stand_angles import stand_angles  # noqa: PLC0415 - takes a second
 
-        stand = standing(robot, args.standing)
+        stand = stand_angles(robot, args.standing)
         console.print(
             f"a stand with the hips {args.standing:g} m above the ankles and "
             f"{abs(stand.hips_forward):.3f} m {'before' if stand.hips_forward > 0 else 'behind'} "
@@ -141,7 +141,7 @@ def angles_of(args: argparse.Namespace, robot: RobotConfig, console: Console) ->
         )
         wanted = {module: stand.q[module] for module in modules}
     for module, q in wanted.items():
-        if fault := outside(robot, module, q):
+        if fault := why_outside(robot, module, q):
             raise DriveError(f"{module}: {fault}{_if_degrees(q)}")
     return wanted
 
@@ -166,7 +166,7 @@ def corrected(before: Mapping[str, DriveLook], by: Pair, robot: RobotConfig) -> 
         if not seen.zeroed:
             raise DriveError(f"{module}: it has no zero to correct; give --at PHI,THETA")
         wanted[module] = (seen.q[0] + by[0], seen.q[1] + by[1])
-        if fault := outside(within_stops(robot), module, wanted[module]):
+        if fault := why_outside(within_stops(robot), module, wanted[module]):
             raise DriveError(f"{module}: {fault}")  # a knee may hang on its stop
     return wanted
 

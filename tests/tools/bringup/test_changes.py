@@ -8,12 +8,13 @@ from pathlib import Path
 import pytest
 
 from shared.can.cansimple import AxisState
-from shared.can.drive_settings import WantedSetting, of_module
+from shared.can.drive_settings import of_module
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
 from tests.tools.bringup.board_in_memory import BoardInMemory, as_wanted
 from tools.bringup import backup, changes
 from tools.bringup.boards import Value, equal
+from tools.bringup.changes import SettingChange
 
 MODULE = "knee_left"
 VEL_LIMIT = "axis0.controller.config.vel_limit"
@@ -21,66 +22,54 @@ PERIOD = "axis1.config.can.encoder_rate_ms"
 PRE_CALIBRATED = "axis1.encoder.config.pre_calibrated"
 
 
-@pytest.fixture
-def wanted(robot: RobotConfig) -> tuple[WantedSetting, ...]:
-    return of_module(robot, MODULE)
+def difference(robot: RobotConfig, board: BoardInMemory) -> list[SettingChange]:
+    return changes.changes_to_wanted(MODULE, of_module(robot, MODULE), board)
 
 
-def test_a_board_as_wanted_is_left_alone(wanted: tuple[WantedSetting, ...]) -> None:
-    board = BoardInMemory(as_wanted())
-    assert changes.changes_to_wanted(MODULE, wanted, board) == []
+@pytest.mark.parametrize("own", [{}, {"axis0.encoder.config.direction": -1}])
+def test_a_board_as_wanted_is_left_alone_whichever_way_its_currents_count(
+    robot: RobotConfig, own: dict[str, Value]
+) -> None:
+    board = BoardInMemory(as_wanted() | own)
+    assert difference(robot, board) == []
     assert changes.apply(board, []) == []
     assert (board.writes, board.saves) == ([], 0)
 
 
-def test_only_what_differs_is_written_saved_once_and_read_back(
-    wanted: tuple[WantedSetting, ...],
-) -> None:
+def test_only_what_differs_is_written_saved_once_and_read_back(robot: RobotConfig) -> None:
     board = BoardInMemory(as_wanted() | {VEL_LIMIT: 2.0, PERIOD: 10, "config.other": 7})
-    difference = changes.changes_to_wanted(MODULE, wanted, board)
-    assert [(c.name, c.before, c.after) for c in difference] == [
-        (VEL_LIMIT, 2.0, 60.0),
-        (PERIOD, 10, 2),
-    ]
-    outcomes = changes.apply(board, difference)
-    assert all(outcome.good for outcome in outcomes)
+    found = difference(robot, board)
+    assert [(c.name, c.before, c.after) for c in found] == [(VEL_LIMIT, 2.0, 60.0), (PERIOD, 10, 2)]
+    assert all(outcome.good for outcome in changes.apply(board, found))
     assert board.writes == [VEL_LIMIT, PERIOD]
     assert board.saves == 1
     assert board.kept == as_wanted() | {"config.other": 7}
 
 
-def test_a_value_that_the_board_does_not_take_is_not_called_good(
-    wanted: tuple[WantedSetting, ...],
-) -> None:
+def test_a_value_that_the_board_does_not_take_is_not_called_good(robot: RobotConfig) -> None:
     board = BoardInMemory(as_wanted() | {VEL_LIMIT: 2.0, PERIOD: 10})
     board.deaf = {PERIOD}
-    difference = changes.changes_to_wanted(MODULE, wanted, board)
-    outcomes = {outcome.change.name: outcome for outcome in changes.apply(board, difference)}
-    assert outcomes[VEL_LIMIT].good
-    assert not outcomes[PERIOD].good
-    assert outcomes[PERIOD].now == 10
+    outcomes = changes.apply(board, difference(robot, board))
+    assert [(o.change.name, o.good) for o in outcomes] == [(VEL_LIMIT, True), (PERIOD, False)]
+    assert outcomes[1].now == 10
 
 
 def test_pre_calibrated_is_written_to_an_axis_only_once_it_is_calibrated(
-    wanted: tuple[WantedSetting, ...],
+    robot: RobotConfig,
 ) -> None:
     raw = BoardInMemory(as_wanted() | {PRE_CALIBRATED: False}, **{"axis1.encoder.is_ready": False})
-    (change,) = changes.changes_to_wanted(MODULE, wanted, raw)
+    (change,) = difference(robot, raw)
     assert "CALIBRATION" in change.inhibit
     (outcome,) = changes.apply(raw, [change])
     assert not outcome.good
     assert (raw.writes, raw.saves) == ([], 0)
     ready = BoardInMemory(as_wanted() | {PRE_CALIBRATED: False})
-    assert changes.apply(ready, changes.changes_to_wanted(MODULE, wanted, ready))[0].good
+    assert changes.apply(ready, difference(robot, ready))[0].good
 
 
-def test_a_setting_that_is_not_in_this_firmware_is_a_row_and_no_crash(
-    wanted: tuple[WantedSetting, ...],
-) -> None:
-    settings = as_wanted()
-    del settings[PERIOD]
-    board = BoardInMemory(settings)
-    (change,) = changes.changes_to_wanted(MODULE, wanted, board)
+def test_a_setting_that_is_not_in_this_firmware_is_a_row_and_no_crash(robot: RobotConfig) -> None:
+    board = BoardInMemory({name: v for name, v in as_wanted().items() if name != PERIOD})
+    (change,) = difference(robot, board)
     assert (change.before, change.name) == (None, PERIOD)
     assert "firmware" in change.inhibit
     assert not changes.apply(board, [change])[0].good
@@ -89,32 +78,22 @@ def test_a_setting_that_is_not_in_this_firmware_is_a_row_and_no_crash(
 def test_a_backup_is_brought_back_to_the_last_setting() -> None:
     saved: dict[str, Value] = {"a.config.x": math.inf, "a.config.y": 3, "a.config.z": None}
     board = BoardInMemory({"a.config.x": 1.0, "a.config.y": 3, "a.config.z": "axis0.error"})
-    difference = changes.against_backup(MODULE, saved, board)
-    assert [change.name for change in difference] == ["a.config.x", "a.config.z"]
-    assert all(outcome.good for outcome in changes.apply(board, difference))
+    found = changes.against_backup(MODULE, saved, board)
+    assert [change.name for change in found] == ["a.config.x", "a.config.z"]
+    assert all(outcome.good for outcome in changes.apply(board, found))
     assert board.kept == saved
 
 
 def test_how_the_phases_were_wired_is_not_written_from_a_backup() -> None:
     """Wired otherwise since, and with the old offset, the motor would run away."""
-    found = {
-        f"axis1.encoder.config.{name}": value
-        for name, value in (("direction", 1), ("phase_offset", 40), ("phase_offset_float", 0.5))
-    }
+    names = ("direction", "phase_offset", "phase_offset_float")
+    found = {f"axis1.encoder.config.{name}": n + 0.5 for n, name in enumerate(names)}
     old = {name: -value for name, value in found.items()}
     board = BoardInMemory(found | {VEL_LIMIT: 2.0})
-    difference = changes.against_backup(MODULE, old | {VEL_LIMIT: 60.0}, board)
-    outcomes = changes.apply(board, difference)
+    outcomes = changes.apply(board, changes.against_backup(MODULE, old | {VEL_LIMIT: 60.0}, board))
     assert board.writes == [VEL_LIMIT]
     assert {o.change.name for o in outcomes if not o.good} == set(found), "and it is told"
     assert changes.against_backup(MODULE, found, board) == []
-
-
-def test_a_current_that_counts_the_other_way_is_nothing_to_write(
-    wanted: tuple[WantedSetting, ...],
-) -> None:
-    board = BoardInMemory(as_wanted() | {"axis0.encoder.config.direction": -1})
-    assert changes.changes_to_wanted(MODULE, wanted, board) == []
 
 
 @pytest.mark.parametrize("state", [AxisState.CLOSED_LOOP_CONTROL, AxisState.MOTOR_CALIBRATION, 99])
@@ -126,10 +105,8 @@ def test_a_board_with_an_axis_that_is_not_idle_is_refused(state: int) -> None:
 
 
 def test_a_backup_file_reads_back_as_it_was_written(tmp_path: Path) -> None:
-    settings: dict[str, Value] = {
-        "a": math.inf, "b": -math.inf, "c": math.nan, "d": True, "e": 3, "f": 0.25, "g": None,
-        "h": "axis0.error",
-    }  # fmt: skip
+    values = (math.inf, -math.inf, math.nan, True, 3, 0.25, None, "axis0.error")
+    settings: dict[str, Value] = dict(zip("abcdefgh", values, strict=True))
     path = tmp_path / "new" / "b.json"
     board = backup.of_board(MODULE, "3A0000000005", "0.5.6", settings)
     backup.write(path, [board], time="2026-03-01T10:15:00+0100", robot_file="robot.toml")

@@ -13,9 +13,10 @@ from shared import scheduling
 from shared.config.robot_config import RobotConfig
 from shared.places import DEFAULT_CONFIG
 from tools.bringup import check_machine
-from tools.bringup.rows import Finding, FindingKind
+from tools.bringup.findings import Finding, FindingKind
 
 ROOT = DEFAULT_CONFIG.parents[1]
+CPU = "sys/devices/system/cpu"
 
 
 def write(root: Path, path: str, text: str) -> None:
@@ -31,11 +32,7 @@ def row_of(rows: list[Finding], what: str) -> Finding:
 @pytest.mark.parametrize(
     ("path", "text", "what"),
     [
-        (
-            "sys/devices/system/cpu/cpu0/cpufreq/scaling_governor",
-            "powersave",
-            "frequency governor",
-        ),
+        (f"{CPU}/cpu0/cpufreq/scaling_governor", "powersave", "frequency governor"),
         ("sys/devices/system/clocksource/clocksource0/current_clocksource", "hpet", "clock source"),
         ("proc/swaps", "Filename Type\n/swapfile file", "swap"),
     ],
@@ -52,7 +49,7 @@ def test_a_slow_loop_is_a_warning_on_a_real_robot_and_a_note_on_an_emulated_one(
 
 def test_one_processor_that_sleeps_is_seen(real: RobotConfig, tmp_path: Path) -> None:
     for cpu, governor in enumerate(("performance", "powersave", "performance")):
-        write(tmp_path, f"sys/devices/system/cpu/cpu{cpu}/cpufreq/scaling_governor", governor)
+        write(tmp_path, f"{CPU}/cpu{cpu}/cpufreq/scaling_governor", governor)
     row = row_of(check_machine.machine_rows(real, tmp_path), "frequency governor")
     assert (row.verdict, row.found) == (FindingKind.WARNING, "performance and powersave")
 
@@ -72,21 +69,14 @@ def test_a_kernel_without_the_figure_is_ok(robot: RobotConfig, tmp_path: Path) -
     ],
 )
 def test_without_real_time_permission_the_services_fallback_is_named(
-    robot: RobotConfig,
-    real: RobotConfig,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    granted: str,
-    emulated: bool,
-    verdict: FindingKind,
+    monkeypatch: pytest.MonkeyPatch, granted: str, emulated: bool, verdict: FindingKind
 ) -> None:
     def refuse(*_: object) -> None:
         raise PermissionError
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
     monkeypatch.setattr(scheduling, "short_slice", lambda: granted)
-    rows = check_machine.machine_rows(robot if emulated else real, tmp_path)
-    row = row_of(rows, "real-time priority")
+    row = check_machine._real_time(emulated=emulated)
     assert row.verdict is verdict
     assert "refused" in row.found
     if verdict is FindingKind.OK:
@@ -100,12 +90,8 @@ def test_real_time_is_tried_and_not_kept(robot: RobotConfig, tmp_path: Path) -> 
 
 
 def plug_in(root: Path, product: str = "0d32") -> Path:
-    for name, text in (
-        ("idVendor", "1209"),
-        ("idProduct", product),
-        ("busnum", "1"),
-        ("devnum", "7"),
-    ):
+    device = {"idVendor": "1209", "idProduct": product, "busnum": "1", "devnum": "7"}
+    for name, text in device.items():
         write(root, f"sys/bus/usb/devices/1-2/{name}", text)
     node = root / "dev/bus/usb/001/007"
     node.parent.mkdir(parents=True)

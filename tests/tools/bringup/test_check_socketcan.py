@@ -9,9 +9,10 @@ from typing import Any
 import pytest
 
 from shared.config.robot_config import RobotConfig
+from tests.tools.bringup.verdicts import OK, WARNING, WRONG, bad
 from tools.bringup import check_socketcan
 from tools.bringup.check_socketcan import socketcan_rows
-from tools.bringup.rows import Finding, FindingKind
+from tools.bringup.findings import Finding, FindingKind
 
 UP, DOWN = "0x40081", "0x40080"
 
@@ -49,31 +50,30 @@ def test_interfaces_are_there_and_up(real: RobotConfig, tmp_path: Path) -> None:
 
 def test_an_interface_that_is_set_as_it_should_be_is_ok(real: RobotConfig, tmp_path: Path) -> None:
     rows = rows_of(real, tmp_path, link())
-    assert {row.verdict for row in rows} == {FindingKind.OK}
+    assert {row.verdict for row in rows} == {OK}
     assert {"interface", "bit rate", "controller", "send queue"} <= {row.what for row in rows}
 
 
 @pytest.mark.parametrize(
     ("said", "what", "verdict"),
     [
-        (link(bitrate=500_000), "bit rate", FindingKind.WRONG),
-        (link(state="BUS-OFF"), "controller", FindingKind.WRONG),
-        (link(state="STOPPED"), "controller", FindingKind.WRONG),
-        (link(state="ERROR-PASSIVE"), "controller", FindingKind.WARNING),
-        (link(state="ERROR-WARNING"), "controller", FindingKind.WARNING),
-        (link(ctrlmode=["LISTEN-ONLY"]), "mode", FindingKind.WRONG),
-        (link(restart_ms=0), "restart-ms", FindingKind.WARNING),
-        (link(length=10), "send queue", FindingKind.WARNING),
-        (link(length=1000), "send queue", FindingKind.WARNING),
+        (link(bitrate=500_000), "bit rate", WRONG),
+        (link(state="BUS-OFF"), "controller", WRONG),
+        (link(state="STOPPED"), "controller", WRONG),
+        (link(state="ERROR-PASSIVE"), "controller", WARNING),
+        (link(state="ERROR-WARNING"), "controller", WARNING),
+        (link(ctrlmode=["LISTEN-ONLY"]), "mode", WRONG),
+        (link(restart_ms=0), "restart-ms", WARNING),
+        (link(length=10), "send queue", WARNING),
+        (link(length=1000), "send queue", WARNING),
     ],
 )
 def test_what_stops_or_delays_frames_is_named(
     real: RobotConfig, tmp_path: Path, said: dict[str, Any], what: str, verdict: FindingKind
 ) -> None:
     rows = rows_of(real, tmp_path, said)
-    bad = [(row.what, row.verdict) for row in rows if row.verdict != FindingKind.OK]
-    assert bad == [(what, verdict)]
-    assert all(row.fix for row in rows if row.verdict != FindingKind.OK)
+    assert bad(rows) == [f"can0: {what}: {verdict}"]
+    assert all(row.fix for row in rows if row.verdict != OK)
 
 
 def test_counted_errors_are_reported(real: RobotConfig, tmp_path: Path) -> None:
@@ -83,21 +83,17 @@ def test_counted_errors_are_reported(real: RobotConfig, tmp_path: Path) -> None:
 
 def test_what_ip_does_not_report_is_not_judged(real: RobotConfig, tmp_path: Path) -> None:
     (row,) = rows_of(real, tmp_path, {"ifname": "can0", "linkinfo": {"info_kind": "vcan"}})
-    assert (row.what, row.verdict) == ("interface", FindingKind.OK)
+    assert (row.what, row.verdict) == ("interface", OK)
 
 
-@pytest.mark.parametrize("said", [b"", b"[]", b"[{}]", b"no JSON"])
-def test_unusable_output_of_ip_yields_nothing(monkeypatch: pytest.MonkeyPatch, said: bytes) -> None:
+@pytest.mark.parametrize("said", [b"", b"[]", b"[{}]", b"no JSON", None])
+def test_no_ip_command_or_its_unusable_output_yields_nothing(
+    monkeypatch: pytest.MonkeyPatch, said: bytes | None
+) -> None:
     def run(*_: object, **__: object) -> subprocess.CompletedProcess[bytes]:
+        if said is None:
+            raise FileNotFoundError
         return subprocess.CompletedProcess([], 0, stdout=said)
-
-    monkeypatch.setattr(subprocess, "run", run)
-    assert check_socketcan.query_ip() == {}
-
-
-def test_without_the_ip_command_there_is_nothing_to_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    def run(*_: object, **__: object) -> None:
-        raise FileNotFoundError
 
     monkeypatch.setattr(subprocess, "run", run)
     assert check_socketcan.query_ip() == {}

@@ -24,9 +24,9 @@ from shared.exceptions import DriveError, FleetError
 from shared.joints import MODULES
 from tests.tools.bringup.board_in_memory import BoardInMemory, as_wanted
 from tools import cli
-from tools.bringup import backup, changes, reach
+from tools.bringup import backup, changes, drive_access
 from tools.bringup.boards import FoundBoards, Value
-from tools.bringup.jog_drive import Interrupts
+from tools.bringup.motion_runner import Interrupts
 from tools.fleet import procfs
 from tools.fleet.run_dir import RunDir
 from tools.terminal import Console
@@ -201,7 +201,10 @@ def test_no_fleet_can_be_started_on_real_drives_meanwhile(
 ) -> None:
     can = {name: CanConfig(interface="socketcan", channel=name) for name in robot.can}
     real = msgspec.structs.replace(robot, can=can)
-    with reach.no_fleet_meanwhile(real, run_dir), pytest.raises(FleetError, match="a fleet is up"):
+    with (
+        drive_access.no_fleet_meanwhile(real, run_dir),
+        pytest.raises(FleetError, match="a fleet is up"),
+    ):
         RunDir(run_dir).claim()
     assert not run_dir.exists()
 

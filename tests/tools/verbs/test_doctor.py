@@ -76,7 +76,7 @@ RECORDED = """
 import contextlib, json, sys
 from shared.can import unix_can
 from tools import cli
-from tools.bringup import reach
+from tools.bringup import drive_access
 
 said = {"can": [], "usb": [], "reads": 0}
 send_many = unix_can.UnixCanBus.send_many
@@ -86,7 +86,7 @@ def record_many(bus, messages):
     send_many(bus, messages)
 
 unix_can.UnixCanBus.send_many = record_many
-emulated_usb = reach.emulated_usb
+emulated_usb = drive_access.emulated_usb
 
 @contextlib.contextmanager
 def recorded_usb(run_dir):
@@ -110,7 +110,7 @@ def recorded_usb(run_dir):
             setattr(Device, name, recorded(name))
         yield
 
-reach.emulated_usb = recorded_usb
+drive_access.emulated_usb = recorded_usb
 code = cli.main(["doctor", "--json", "--run-dir", sys.argv[1]])
 print(json.dumps(said), file=sys.stderr)
 sys.exit(code)

@@ -15,9 +15,9 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from tests.conftest import ROBOT_FILE
 from tests.tools.exit_codes import exit_code
-from tools.tune import excitation
-from tools.tune.excitation import Excitation
-from tools.tune.pose_probe import ProbeCourse
+from tools.bringup.tune import excitation
+from tools.bringup.tune.excitation import Excitation
+from tools.bringup.tune.pose_probe import ProbeCourse
 from tools.verbs import tune
 
 
@@ -92,7 +92,7 @@ def test_a_simulation_that_fails_leaves_what_was_measured(
         if plant is IDEAL:
             raise RunError("the robot fell in lockstep")
         t = np.arange(0.0, plan.duration_s, 0.004)
-        r = np.array([plan.at(one) for one in t])
+        r = np.array([plan.offset(one) for one in t])
         _, y, _ = signal.lsim(([36.0], [1.0, 6.0, 36.0]), r, t)
         return ProbeCourse(t, r, np.asarray(y), "")
 

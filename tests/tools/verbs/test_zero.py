@@ -19,9 +19,9 @@ from shared.can.cansimple import AxisError
 from shared.clock import now_ns
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError, RunError, XrlError
-from tools.bringup import bench, zeroing
-from tools.bringup.standing import standing
-from tools.bringup.zeroing import Back, DriveLook, is_right, look, outside, refusal, zero
+from tools.bringup import drive_access, motion_runner, zeroing
+from tools.bringup.stand_angles import stand_angles
+from tools.bringup.zeroing import Back, DriveLook, is_right, look, refusal, why_outside, zero
 from tools.fleet.supervise import SupervisedFleet
 from tools.terminal import Console
 from tools.verbs import zero as verb
@@ -82,7 +82,7 @@ class PlayedDrive:
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(zeroing, "LOOK_S", 0.02)
-    monkeypatch.setattr(zeroing, "ANSWER_S", 0.02)
+    monkeypatch.setattr(motion_runner, "ANSWER_S", 0.02)
     monkeypatch.setattr(zeroing, "SET_S", 0.02)
     monkeypatch.setattr(zeroing, "TAKEN_S", 0.0)
 
@@ -200,7 +200,7 @@ def test_motion_is_seen_by_the_rate_and_by_the_way() -> None:
 def test_angles_outside_of_the_limits_are_refused(
     robot: RobotConfig, q: Pair, inside: bool
 ) -> None:
-    assert (outside(robot, MODULE, q) == "") == inside
+    assert (why_outside(robot, MODULE, q) == "") == inside
 
 
 def asked(**changes: object) -> argparse.Namespace:
@@ -246,7 +246,7 @@ def test_a_stand_is_at_its_height_level_and_inside_the_limits(
     robot: RobotConfig, height: float
 ) -> None:
     """By the plain geometry of a leg in its plane, not by the planner's kinematics."""
-    stand = standing(robot, height)
+    stand = stand_angles(robot, height)
     lengths = robot.geometry
     for side in ("right", "left"):
         q = {kind: stand.q[f"{kind}_{side}"] for kind in ("ankle", "knee", "hip")}
@@ -259,12 +259,12 @@ def test_a_stand_is_at_its_height_level_and_inside_the_limits(
         forward = lengths.l2 * math.sin(shin) + lengths.l1 * math.sin(thigh)
         assert stand.hips_forward == pytest.approx(forward, abs=2e-3)
     for module, q_module in stand.q.items():
-        assert outside(robot, module, q_module) == ""
+        assert why_outside(robot, module, q_module) == ""
 
 
 def test_a_stand_that_no_leg_reaches_names_the_reason(robot: RobotConfig) -> None:
     with pytest.raises(RunError, match=r"--standing 1\.294.*at its limit"):
-        standing(robot, 1.294)
+        stand_angles(robot, 1.294)
 
 
 def test_over_usb_the_services_must_be_down(robot: RobotConfig, tmp_path: Path) -> None:
@@ -279,8 +279,8 @@ def test_over_usb_the_services_must_be_down(robot: RobotConfig, tmp_path: Path) 
 def test_without_a_terminal_yes_must_be_given(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stdin", io.StringIO("y"))
     with pytest.raises(FleetError, match="--yes"):
-        bench.confirm("sure?", yes=False)
-    assert bench.confirm("sure?", yes=True)
+        drive_access.confirm("sure?", yes=False)
+    assert drive_access.confirm("sure?", yes=True)
 
 
 def test_a_correction_goes_on_from_the_zero_that_is_there(robot: RobotConfig) -> None:

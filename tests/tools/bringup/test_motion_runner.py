@@ -1,0 +1,294 @@
+"""Every guard of the runner: on a drive on a bench, and on a leg that hangs, in virtual time."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+
+import pytest
+
+from services.joint.drivers.base import DriveReading, DriveStatus
+from services.simulator.physics.plant import PlantConfig
+from shared.can.cansimple import AxisState
+from shared.clock import NS_PER_S
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import DriveError
+from shared.joints import MODULE_INDEX
+from tests.tools.bringup.bench_drive import START, BenchDrive
+from tests.tools.bringup.hung_robot import HungRobot
+from tests.tools.bringup.moved_module import (
+    MODULE,
+    PLAN,
+    hanging,
+    jog_by,
+    leg_drives,
+    on_bench,
+)
+from tools.bringup import motion_runner
+from tools.bringup.jog import JogPlan, ThereAndBack, judge
+from tools.bringup.motion import APART_MAX, Sample, limit_drives
+from tools.bringup.motion_runner import Interrupts, MotionResult, look_at
+
+ANKLE = "ankle_left"
+
+
+@pytest.fixture
+def limited(robot: RobotConfig) -> RobotConfig:
+    return limit_drives(robot, PLAN)
+
+
+@pytest.fixture
+def drive(limited: RobotConfig) -> BenchDrive:
+    return BenchDrive(limited)
+
+
+@pytest.fixture
+def hung(robot: RobotConfig) -> HungRobot:
+    return HungRobot(robot, PlantConfig())
+
+
+@pytest.mark.parametrize("plan", [PLAN, JogPlan(0, ThereAndBack(-0.08, 2.0, 1), 10.0)])
+def test_a_free_joint_follows_and_comes_back_and_is_idle(
+    drive: BenchDrive, limited: RobotConfig, plan: JogPlan
+) -> None:
+    seen: list[Sample] = []
+    result = on_bench(drive, limited, plan, progress=seen.append)
+    assert (result.trouble, result.not_idle) == ("", ())
+    assert all(row.good for row in judge(result.samples, plan))
+    assert drive.q == pytest.approx(START, abs=0.01)
+    assert drive.status is DriveStatus.IDLE
+    assert drive.largest <= PLAN.torque_limit + 1e-9
+    assert len(seen) > 8
+
+
+def test_a_jammed_joint_is_given_up_at_the_torque_limit(
+    drive: BenchDrive, limited: RobotConfig
+) -> None:
+    drive.jammed = True
+    result = on_bench(drive, limited, jog_by(0.12))
+    assert "torque limit of 10 N m" in result.trouble
+    assert drive.largest == pytest.approx(PLAN.torque_limit, abs=0.01)
+    assert result.not_idle == ()
+
+
+def test_motors_that_push_the_wrong_way_stop_within_the_torque_limit(
+    drive: BenchDrive, limited: RobotConfig
+) -> None:
+    drive.reversed = True
+    result = on_bench(drive, limited)
+    assert "apart" in result.trouble or "torque limit" in result.trouble
+    assert drive.largest <= PLAN.torque_limit + 1e-9
+    strayed = max(abs(a - b) for a, b in zip(result.samples[-1].q, START, strict=True))
+    assert strayed < 1.5 * APART_MAX
+    assert drive.status is DriveStatus.IDLE
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ({"fails_at_s": 1.2}, "the drive is ERROR"),
+        ({"never_arms": True}, "does not arm: IDLE"),
+        ({"silent_at_s": 1.2}, "no sample of the drive"),
+    ],
+)
+def test_a_drive_that_fails_stops_it(
+    drive: BenchDrive, limited: RobotConfig, fault: dict[str, float], words: str
+) -> None:
+    for name, value in fault.items():
+        setattr(drive, name, value)
+    result = on_bench(drive, limited)
+    assert words in result.trouble
+    assert drive.idles >= 3
+    assert bool(result.not_idle) == ("silent_at_s" in fault), "a silent drive proves nothing"
+
+
+def test_samples_that_come_too_seldom_end_it(
+    drive: BenchDrive, limited: RobotConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(motion_runner, "OVERTIME_S", -4.0)
+    result = on_bench(drive, limited)
+    assert "the drive's samples come too seldom" in result.trouble
+    assert drive.status is DriveStatus.IDLE
+
+
+def test_a_drive_that_stays_armed_is_not_reported_idle(
+    drive: BenchDrive, limited: RobotConfig
+) -> None:
+    drive.deaf = True
+    assert on_bench(drive, limited).not_idle == (MODULE,)
+
+
+@pytest.mark.parametrize(
+    ("status", "words"),
+    [
+        (DriveStatus.UNZEROED, "does not know where the joint is; `xrl zero`"),
+        (DriveStatus.ARMED, "armed .closed loop. by somebody else"),
+        (DriveStatus.LOST, "does not answer"),
+    ],
+)
+def test_a_drive_that_is_somebodys_or_has_no_zero_is_not_looked_at_further(
+    drive: BenchDrive, robot: RobotConfig, status: DriveStatus, words: str
+) -> None:
+    drive.status = status
+    with pytest.raises(DriveError, match=f"{MODULE}: .*{words}"):
+        look_at({MODULE: drive}, robot, Interrupts(), drive.clock)
+    assert drive.largest == 0.0
+
+
+def test_an_interrupt_idles_the_drive_first(drive: BenchDrive, limited: RobotConfig) -> None:
+    interrupts, drive_read = Interrupts(), drive.read
+
+    def read(timeout_s: float) -> DriveReading | None:
+        if drive.now_ns > 2.5 * NS_PER_S and not interrupts.number:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return drive_read(timeout_s)
+
+    drive.read = read  # type: ignore[method-assign]
+    with interrupts.kept():
+        result = on_bench(drive, limited, interrupts=interrupts)
+    assert (result.trouble, result.not_idle) == ("stopped by SIGTERM", ())
+    assert interrupts.number == signal.SIGTERM
+
+
+def test_a_drive_is_not_armed_after_an_interrupt(drive: BenchDrive, limited: RobotConfig) -> None:
+    interrupts, armed = Interrupts(), []
+    interrupts.number = signal.SIGINT
+    drive.arm = lambda *, onboard: armed.append(onboard)  # type: ignore[method-assign]
+    assert on_bench(drive, limited, interrupts=interrupts).trouble == "stopped by SIGINT"
+    assert armed == []
+
+
+def test_an_error_of_our_own_idles_the_drive_too(drive: BenchDrive, limited: RobotConfig) -> None:
+    def broken(_sample: Sample) -> None:
+        raise BrokenPipeError
+
+    with pytest.raises(BrokenPipeError):
+        on_bench(drive, limited, progress=broken)
+    assert drive.status is DriveStatus.IDLE
+
+
+def test_a_drive_that_stays_armed_after_an_error_is_named_in_it(
+    drive: BenchDrive, limited: RobotConfig
+) -> None:
+    def broken(_sample: Sample) -> None:
+        raise BrokenPipeError
+
+    drive.deaf = True
+    with pytest.raises(BrokenPipeError) as raised:
+        on_bench(drive, limited, progress=broken)
+    assert "CUT ITS POWER" in raised.value.__notes__[0]
+
+
+@pytest.mark.parametrize(
+    ("q_seen", "plan", "words"),
+    [
+        ((START[0], START[1] + 0.06), PLAN, "has moved by 0.060 rad"),
+        (START, jog_by(2.0), "would go to 1.000"),
+    ],
+    ids=["moved after the question", "led out of its limits"],
+)
+def test_a_joint_that_may_not_move_from_where_it_is_armed_is_not_moved(
+    drive: BenchDrive, limited: RobotConfig, q_seen: tuple[float, float], plan: JogPlan, words: str
+) -> None:
+    result = on_bench(drive, limited, plan, q_seen=q_seen)
+    assert words in result.trouble
+    assert result.samples == []
+    assert drive.largest == 0.0
+
+
+def test_a_leg_that_swings_is_waited_for_but_not_for_ever(
+    hung: HungRobot, robot: RobotConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interrupts = Interrupts()
+    hung.world.data.qvel[6:] = 0.5
+    monkeypatch.setattr(motion_runner, "STILL_WAIT_S", 1.0)
+    with pytest.raises(DriveError, match="swings"):
+        look_at(leg_drives(hung, ANKLE), robot, interrupts, hung.clock)
+    interrupts.number = 2
+    assert look_at(leg_drives(hung, ANKLE), robot, interrupts, hung.clock) is None
+
+
+def run_ankle(
+    hung: HungRobot, robot: RobotConfig, at_third: Callable[[], None] = lambda: None
+) -> tuple[MotionResult, int]:
+    """Move the ankle and do something at the third look; return the end, and all looks."""
+    seen: list[Sample] = []
+
+    def progress(sample: Sample) -> None:
+        seen.append(sample)
+        if len(seen) == 3:
+            at_third()
+
+    return hanging(hung, robot, ANKLE, 0, progress)[0], len(seen)
+
+
+def all_idle(hung: HungRobot) -> bool:
+    readings = [drive.read(0.02) for drive in leg_drives(hung, ANKLE).values()]
+    return all(one is not None and one.status is not DriveStatus.ARMED for one in readings)
+
+
+def test_all_are_idle_again_when_a_held_module_does_not_arm(
+    hung: HungRobot, robot: RobotConfig
+) -> None:
+    hung.drives["hip_left"].never_arms = True
+    result, _ = run_ankle(hung, robot)
+    assert "hip_left: it does not arm" in result.trouble
+    assert result.not_idle == ()
+    assert all_idle(hung)
+
+
+@pytest.mark.parametrize("name", ["knee_left", "hip_left"])
+def test_a_held_module_that_disarms_stops_the_motion(
+    hung: HungRobot, robot: RobotConfig, name: str
+) -> None:
+    def disarm() -> None:
+        for axis in (0, 1):
+            hung.bank.request_state(2 * MODULE_INDEX[name] + axis, AxisState.IDLE)
+
+    result, looks = run_ankle(hung, robot, disarm)
+    assert result.trouble.startswith(f"{name}: the drive is IDLE")
+    assert looks < 8
+    assert all_idle(hung)
+
+
+def test_a_held_modules_target_goes_out_in_every_cycle(hung: HungRobot, robot: RobotConfig) -> None:
+    """A frame may be lost: the drive would be armed and hold nothing."""
+
+    def lose_gains() -> None:
+        hung.bank.pos_gain[:] = 0.0
+        hung.bank.vel_gain[:] = 0.0
+
+    result, _ = run_ankle(hung, robot, lose_gains)
+    assert result.trouble == ""
+    assert hung.bank.pos_gain[2 * MODULE_INDEX["knee_left"]] > 0.0
+
+
+def test_an_exception_idles_the_whole_leg(hung: HungRobot, robot: RobotConfig) -> None:
+    def fail() -> None:
+        raise RuntimeError("a test")
+
+    with pytest.raises(RuntimeError):
+        run_ankle(hung, robot, fail)
+    assert all_idle(hung)
+
+
+def test_a_drive_that_raises_while_it_is_idled_leaves_no_other_armed(
+    hung: HungRobot, robot: RobotConfig
+) -> None:
+    def broken() -> None:
+        raise OSError("a test")
+
+    hung.drives["hip_left"].never_arms = True
+    hung.drives[ANKLE].idle = broken  # type: ignore[method-assign]
+    with pytest.raises(OSError, match="a test"):
+        run_ankle(hung, robot)
+    assert all_idle(hung)
+
+
+def test_drives_that_do_not_say_that_they_are_idle_are_named(
+    hung: HungRobot, robot: RobotConfig
+) -> None:
+    hung.drives["knee_left"].deaf = True
+    hung.drives["hip_left"].never_arms = True
+    assert run_ankle(hung, robot)[0].not_idle == ("knee_left",)

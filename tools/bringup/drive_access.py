@@ -1,0 +1,305 @@
+"""Who holds the drives now, and how a verb of bring-up gets at them.
+
+A drive has one master. Before a verb writes to one it asks whether a joint service has it; while
+it works, no fleet can be started in the same run directory.
+
+Emulated drives are looked at by the same code as real ones: over the emulated CAN buses, and with
+the genuine `odrive` package over the stand-in of libusb. A fleet that is up is looked at as it is;
+else the simulator runs alone for the while.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Final
+
+from services.simulator.drives.axis_settings import Settings, preset
+from services.simulator.fronts import usb_standin
+from shared import places
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import FleetError, XrlError
+from shared.extras import require
+from shared.joints import MODULES
+from tools.bringup.boards import FoundBoards
+from tools.bringup.can_monitor import bus_config, listen
+from tools.fleet import procfs
+from tools.fleet.process_table import SIMULATED_CAN, is_simulated
+from tools.fleet.run_dir import RunDir
+from tools.fleet.supervise import SupervisedFleet
+
+STARTED_S: Final = 15.0
+"""Longest wait for the first frames of a simulator that was started."""
+UP_S: Final = 3.0
+"""The same where a fleet is up: its simulator may be dead, or another verb's that is starting."""
+SETTLE_S: Final = 1.5
+"""Until an emulated robot hangs still in its hoist."""
+GONE: Final = (
+    "the drives were emulated for this command only, and the written values are gone; "
+    "`xrl up --only simulator` keeps them"
+)
+_POLL_S = 0.05
+
+
+def robot_file(args: argparse.Namespace) -> Path:
+    """Return the robot file: of the fleet that is up in `--run-dir`, else as `places.robot_file`.
+
+    Raises:
+        ConfigError: there is no fleet, and the file found may not be taken.
+        FleetError: `--config` is not the fleet's.
+    """
+    run = RunDir(args.run_dir)
+    manifest = run.read_manifest()
+    if manifest is None or not is_up(run.path):
+        return Path(os.path.abspath(places.robot_file(args.config)))  # noqa: PTH100 - links stay
+    if args.config is None:
+        return Path(manifest.config)
+    given = Path(os.path.abspath(args.config))  # noqa: PTH100 - as the manifest has it
+    if given != Path(manifest.config):
+        raise FleetError(
+            f"the fleet in {run.path} runs with {manifest.config}, not with {given}; "
+            "leave --config out, or name another fleet with --run-dir"
+        )
+    return Path(manifest.config)
+
+
+def is_up(run_dir: Path) -> bool:
+    """Return True if a fleet has a process in this run directory."""
+    return bool(procfs.fleet_pids(RunDir(run_dir).path))
+
+
+def service_on(robot: RobotConfig, module: str, run_dir: Path) -> SupervisedFleet | None:
+    """Return the fleet of this user's that has a joint service on a module's drive, or None.
+
+    In whatever run directory: two fleets may mean the same drive.
+    """
+    drive = _drive_of(robot, module, RunDir(run_dir).path)
+    for path in sorted(map(Path, procfs.fleets())):
+        manifest = RunDir(path).read_manifest()
+        if manifest is None:
+            continue
+        with contextlib.suppress(XrlError):  # a file that has become unreadable since is ignored
+            other = config_file.load_without_schedule(Path(manifest.config))
+            services = [name for name in manifest.services if name in MODULES]
+            if any(_drive_of(other, name, path) == drive for name in services):
+                return SupervisedFleet(path)
+    return None
+
+
+def _drive_of(robot: RobotConfig, module: str, run_dir: Path) -> tuple[str, ...]:
+    """Return a unique id of a drive; of an emulated one with its run directory."""
+    wiring = robot.module_named(module)
+    place = str(run_dir) if is_simulated(robot) else ""
+    if robot.joint_service.driver == "odrive_usb":
+        return (place, wiring.serial_number.upper())
+    bus = bus_config(robot, wiring.bus, run_dir)
+    return (place, bus.interface, bus.channel, *map(str, wiring.node_ids))
+
+
+def refuse_service(robot: RobotConfig, module: str, run_dir: Path) -> None:
+    """Refuse a module whose joint service is up: a drive has one master."""
+    fleet = service_on(robot, module, run_dir)
+    if fleet is not None:
+        raise FleetError(
+            f"{module}: its joint service in {fleet.run.path} has the drive; hang the robot and "
+            f"`xrl down --run-dir {fleet.run.path}` first"
+        )
+
+
+def confirm(question: str, *, yes: bool) -> bool:
+    """Ask on the terminal; True at once if it was answered by `--yes`."""
+    if yes:
+        return True
+    if not sys.stdin.isatty():
+        raise FleetError("no terminal to ask on; give --yes if the robot may be touched unasked")
+    return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
+
+
+def add_plant(parser: argparse.ArgumentParser) -> None:
+    """Add `--plant`: settings that the emulated drives have kept."""
+    parser.add_argument(
+        "--plant", action="append", default=[], metavar="MODULE.NAME=VALUE",
+        help="emulated robot only: a setting that a drive has kept, as "
+        "knee_left.axis0.controller.config.vel_limit=2; may be given several times",
+    )  # fmt: skip
+
+
+def check_plants(robot: RobotConfig, run_dir: Path, plants: Sequence[str]) -> None:
+    """Refuse planted settings with which no emulated drive can start."""
+    if not plants:
+        return
+    if not is_simulated(robot):
+        raise FleetError("--plant is for emulated drives; these are real ones")
+    if is_up(run_dir):
+        raise FleetError(
+            f"--plant is for drives that are started for it, and a fleet is up in {run_dir}: "
+            "`xrl down` first, or give another --run-dir"
+        )
+    scratch = Settings()
+    for words in plants:
+        preset(scratch, words)
+
+
+def refuse_half_emulated(robot: RobotConfig) -> None:
+    """Refuse a robot file some of whose buses are emulated and others real.
+
+    One bus that was forgotten would make its USB the emulated one: emulated drives are as wanted.
+    """
+    emulated = {name: robot.can[name].interface == SIMULATED_CAN for name in sorted(robot.buses)}
+    if len(set(emulated.values())) > 1:
+        some, real = (
+            ", ".join(f"[can.{name}]" for name, is_so in emulated.items() if is_so == wanted)
+            for wanted in (True, False)
+        )
+        raise FleetError(
+            f"robot file: {some} {'are' if ',' in some else 'is'} emulated "
+            f'(interface = "{SIMULATED_CAN}"), {real} not: which drives are meant? Make '
+            "all of them real ones, or all emulated"
+        )
+
+
+@contextlib.contextmanager
+def drives_within_reach(
+    robot: RobotConfig,
+    config_path: Path,
+    run_dir: Path,
+    plants: Sequence[str] = (),
+    *,
+    lifted: float = 0.0,
+) -> Iterator[bool]:
+    """Have the drives there for a while; yields True if the simulator was started for it.
+
+    Real drives are there or not; nothing is started for them. A simulator that is started plants
+    settings that its drives have kept, and hangs the robot higher by `lifted`, m.
+    """
+    refuse_half_emulated(robot)
+    if not is_simulated(robot):
+        yield False
+        return
+    simulator: SupervisedFleet | None = None
+    if not is_up(run_dir):
+        words = [word for planted in plants for word in ("--drive-setting", planted)]
+        # a light foot in the air on a damped drivetrain wants a finer step than a standing robot
+        words += ["--lifted", f"{lifted:g}", "--plant", "steps=4"] if lifted else []
+        simulator = SupervisedFleet.start(
+            config_path, run_dir, overrides={"simulator": words},
+            no_restart=frozenset({"simulator"}), services=["simulator"], leashed=True,
+        )  # fmt: skip
+    try:
+        _await_simulator(robot, run_dir, UP_S if simulator is None else STARTED_S)
+        yield simulator is not None
+        if simulator is not None and not simulator.pids():
+            log = simulator.run.log_of("simulator")
+            tail = "\n".join(log.read_text(encoding="utf-8").splitlines()[-5:])
+            raise FleetError(f"the simulator has ended by itself; its log:\n{tail}")
+    finally:
+        if simulator is not None:
+            simulator.stop()
+
+
+def _await_simulator(robot: RobotConfig, run_dir: Path, seconds: float) -> None:
+    """Wait until an emulated robot's load cells speak: its buses are there, and its loop runs.
+
+    Not for ever: its simulator may be dead.
+    """
+    config = bus_config(robot, robot.harness.bus, RunDir(run_dir).path)
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        if listen(config, (), poll_nodes=False, seconds=_POLL_S).frames:
+            return
+        time.sleep(_POLL_S)
+
+
+@contextlib.contextmanager
+def no_fleet_meanwhile(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
+    """Keep a fleet from being started on real drives for a while, in this run directory.
+
+    A fleet that is up stays; an emulated robot's simulator holds the directory itself.
+    """
+    if is_simulated(robot) or is_up(run_dir):
+        yield
+        return
+    run = RunDir(run_dir)
+    lock = run.claim()
+    try:
+        yield
+    finally:
+        run.clear(keep_logs=True)
+        os.close(lock)
+
+
+@contextlib.contextmanager
+def drives_to_ourselves(
+    robot: RobotConfig,
+    config_path: Path,
+    run_dir: Path,
+    progress: Callable[[str], None],
+    *,
+    lifted: float = 0.0,
+) -> Iterator[bool]:
+    """Have the drives within reach, and no new fleet on them; yields True as the function above."""
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(no_fleet_meanwhile(robot, run_dir))
+        started = stack.enter_context(
+            drives_within_reach(robot, config_path, run_dir, lifted=lifted)
+        )
+        if started:
+            progress(
+                "no fleet is up and the drives are emulated: their simulator runs for the while"
+            )
+            time.sleep(SETTLE_S)
+        if is_simulated(robot) and robot.joint_service.driver == "odrive_usb":
+            stack.enter_context(emulated_usb(run_dir))
+        yield started
+
+
+@contextlib.contextmanager
+def emulated_usb(run_dir: Path) -> Iterator[None]:
+    """Put the emulated drives on this process's USB, before anything imports `odrive`.
+
+    The environment is as it was afterwards; the stand-in stays loaded.
+    """
+    with tempfile.TemporaryDirectory(prefix="xrl-usb-") as folder:
+        usb_standin.load(usb_standin.build(Path(folder)))
+        wanted = {
+            usb_standin.VARIABLE: str(RunDir(run_dir).path / usb_standin.FOLDER),
+            # where the package keeps drives' descriptors: not those of emulated ones at home
+            "XDG_CACHE_HOME": str(Path(folder) / "cache"),
+        }
+        before = {name: os.environ.get(name) for name in wanted}
+        os.environ.update(wanted)
+        try:
+            yield
+        finally:
+            for name, value in before.items():
+                if value is None:
+                    del os.environ[name]
+                else:
+                    os.environ[name] = value
+
+
+@contextlib.contextmanager
+def boards_on_usb(
+    robot: RobotConfig, run_dir: Path, modules: Iterable[str]
+) -> Iterator[FoundBoards]:
+    """Connect to the boards of these modules over USB, or to the emulated ones.
+
+    Modules without a serial number have none.
+    """
+    serials = [robot.module_named(module).serial_number for module in modules]
+    with contextlib.ExitStack() as stack:
+        if is_simulated(robot):
+            stack.enter_context(emulated_usb(run_dir))
+        require("usb")  # not before the stand-in is there
+        from tools.bringup.usb_board import UsbBus  # noqa: PLC0415
+
+        bus = UsbBus()
+        stack.callback(bus.close)
+        yield bus.open([serial for serial in serials if serial])

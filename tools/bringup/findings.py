@@ -1,0 +1,243 @@
+"""The doctor's findings: rows with a verdict and what to do; put together, printed, counted."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from enum import StrEnum
+from itertools import chain
+from typing import Final
+
+import msgspec
+from rich import box
+from rich.console import Group, RenderableType
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
+
+from shared.can.drive_settings import AXES
+from shared.joints import MODULES
+from tools.terminal import Console
+
+
+class FindingKind(StrEnum):
+    """Verdict of a row."""
+
+    OK = "ok"
+    WARNING = "warning"
+    """The robot may run, and somebody should know."""
+    WRONG = "wrong"
+    """The robot must not be let down from its hoist like this."""
+
+
+class Finding(msgspec.Struct, frozen=True):
+    """One finding."""
+
+    subject: str
+    """Module, or "knee_left.axis0", or what else it is about."""
+    what: str
+    found: str
+    wanted: str
+    verdict: FindingKind
+    fix: str = ""
+    """What to do about it; commands in backquotes."""
+    why: str = ""
+    """What happens otherwise."""
+
+
+Groups = dict[str, list[Finding]]
+"""Rows by the heading that they stand under."""
+WIDE: Final = 110
+"""Columns from which what to do stands beside a finding; else it stands below its table."""
+COLOURS: Final = {
+    FindingKind.OK: "green",
+    FindingKind.WARNING: "yellow",
+    FindingKind.WRONG: "bold red",
+}
+NAME_MAX: Final = 22
+"""Longest name on one line."""
+NAMED_MAX: Final = 6
+"""Findings that the last line names."""
+ALL: Final = "all"
+"""Subject of a row that stands for several alike."""
+
+_MODULES: Final = set(MODULES)
+_AXES: Final = {f"{module}.{axis}" for module in MODULES for axis in AXES}
+
+
+def ok(subject: str, what: str, found: str, wanted: str = "") -> Finding:
+    """Return a row that needs nothing."""
+    return Finding(subject, what, found, wanted, FindingKind.OK)
+
+
+def warning(subject: str, what: str, found: str, wanted: str, fix: str, why: str = "") -> Finding:
+    """Return a row that somebody should know of."""
+    return Finding(subject, what, found, wanted, FindingKind.WARNING, fix, why)
+
+
+def wrong(subject: str, what: str, found: str, wanted: str, fix: str, why: str = "") -> Finding:
+    """Return a row that keeps the robot in its hoist."""
+    return Finding(subject, what, found, wanted, FindingKind.WRONG, fix, why)
+
+
+def judged(
+    good: bool, subject: str, what: str, found: str, wanted: str, fix: str, why: str = ""
+) -> Finding:
+    """Return a row that is ok if it is good, else wrong."""
+    if good:
+        return ok(subject, what, found, wanted)
+    return wrong(subject, what, found, wanted, fix, why)
+
+
+def advised(
+    good: bool, subject: str, what: str, found: str, wanted: str, fix: str, why: str = ""
+) -> Finding:
+    """Return a row that is ok if it is good, else a warning."""
+    if good:
+        return ok(subject, what, found, wanted)
+    return warning(subject, what, found, wanted, fix, why)
+
+
+def count(rows: Iterable[Finding], verdict: FindingKind) -> int:
+    """Return how many rows have a verdict."""
+    return sum(row.verdict is verdict for row in rows)
+
+
+def merged(rows: Iterable[Finding]) -> list[Finding]:
+    """Return the rows with those on the same subject merged.
+
+    Rows that are ok become one, from the smallest to the largest value. Rows that are not ok merge
+    where all six modules, all twelve axes, or both axes of a module are equal, so boards with
+    factory settings do not fill the table. Rows that are ok come first, in the order of the first
+    of each.
+    """
+    alike: dict[str, list[Finding]] = {}
+    others: dict[tuple[str, ...], list[Finding]] = {}
+    for row in rows:
+        if row.verdict is FindingKind.OK:
+            alike.setdefault(row.what, []).append(row)
+        else:
+            matter = (row.what, row.wanted, row.verdict, row.why, _anywhere(row))
+            others.setdefault(matter, []).append(row)
+    bad = [row for group in others.values() for row in _of_all_or_both_axes(group)]
+    return [_one(group) for group in alike.values()] + bad
+
+
+def _of_all_or_both_axes(group: list[Finding]) -> list[Finding]:
+    """Return as few rows as can stand for rows of one matter, none of which is ok."""
+    by_subject = {row.subject: row for row in group}
+    if len(by_subject) == len(group) and set(by_subject) in (_MODULES, _AXES):
+        return [msgspec.structs.replace(_one(group), fix=_anywhere(group[0]))]
+    together = []
+    for row in group:
+        module, _, axis = row.subject.partition(".")
+        both = [by_subject[name] for a in AXES if (name := f"{module}.{a}") in by_subject]
+        if axis not in AXES or len(both) != len(AXES):
+            together.append(row)
+        elif row is both[0]:
+            together.append(msgspec.structs.replace(_one(both), subject=f"{module}, both"))
+    return together
+
+
+def _anywhere(row: Finding) -> str:
+    """Return what to do about a row, whichever module it is about."""
+    module = row.subject.partition(".")[0]
+    return row.fix.replace(f" --module {module}", "").replace(module, "MODULE")
+
+
+def _one(group: list[Finding]) -> Finding:
+    """Return the row that stands for rows of one matter: its values from least to largest."""
+    first = group[0]
+    if len(group) == 1:
+        return first
+    values = sorted({row.found for row in group}, key=_by_number)
+    found = values[0] if len(values) == 1 else f"{values[0]} .. {values[-1]}"
+    wanted = first.wanted if len({row.wanted for row in group}) == 1 else ""
+    subject = f"{ALL} {len(group)}"
+    return msgspec.structs.replace(first, subject=subject, found=found, wanted=wanted)
+
+
+def _by_number(text: str) -> tuple[float, str]:
+    """Return what sorts "9 ms" before "10 ms"."""
+    try:
+        return float(text.partition(" ")[0]), text
+    except ValueError:
+        return 0.0, text
+
+
+class Report(msgspec.Struct, frozen=True):
+    """What `xrl doctor --json` prints."""
+
+    ok: bool
+    """Nothing is wrong; there may be warnings."""
+    wrong: int
+    warnings: int
+    groups: dict[str, list[Finding]]
+
+
+def report_of(groups: Groups) -> Report:
+    """Return the findings with their counts."""
+    rows = list(chain(*groups.values()))
+    wrong = count(rows, FindingKind.WRONG)
+    return Report(wrong == 0, wrong, count(rows, FindingKind.WARNING), groups)
+
+
+def show(console: Console, groups: Groups, *, verbose: bool) -> None:
+    """Print the findings, and one line for all of them."""
+    for title, rows in groups.items():
+        console.print(_group(title, rows if verbose else merged(rows), console.width))
+    console.print(Text(verdict_line(groups), style=COLOURS[_worst(chain(*groups.values()))]))
+
+
+def verdict_line(groups: Groups) -> str:
+    """Return "all ok", or how much is wrong and what: the command's answer in a line."""
+    rows = list(chain(*groups.values()))
+    wrong, warnings = count(rows, FindingKind.WRONG), count(rows, FindingKind.WARNING)
+    noted = f"{warnings} warning{'s' * (warnings != 1)}: {_names(groups, FindingKind.WARNING)}"
+    if wrong:
+        text = f"{wrong} wrong: {_names(groups, FindingKind.WRONG)}"
+        return f"{text}; {noted}" if warnings else text
+    return f"nothing wrong; {noted}" if warnings else "all ok"
+
+
+def _group(title: str, rows: list[Finding], width: int) -> RenderableType:
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
+    table.add_column("part", no_wrap=True, min_width=12)
+    table.add_column("what", no_wrap=True, min_width=16)
+    table.add_column("found", overflow="fold")
+    table.add_column("wanted", overflow="fold")
+    table.add_column("", no_wrap=True, min_width=max(len(row.verdict) for row in rows))
+    wide = width >= WIDE and any(row.fix for row in rows)
+    if wide:
+        table.add_column("what to do", overflow="fold")
+    subjects: dict[tuple[str, str], list[str]] = {}
+    for row in rows:
+        head, _, tail = row.what.rpartition(".")
+        is_long = len(row.what) > NAME_MAX and head
+        cells = (row.subject, f"{head}.\n{tail}" if is_long else row.what, row.found, row.wanted)
+        verdict = Text(row.verdict, COLOURS[row.verdict])
+        table.add_row(*cells, verdict, *([row.fix] if wide else []))
+        fix = "" if wide else row.fix
+        if note := f"{fix} ({row.why})" if fix and row.why else fix or row.why:
+            subjects.setdefault((row.what, note), []).append(row.subject)
+    # below the table, a text that several rows share appears once
+    notes = [f"{', '.join(who)} {what}: {note}" for (what, note), who in subjects.items()]
+    below = [Padding(Text(note), (0, 1, 0, 2)) for note in notes]
+    return Group(table, *below, *([Text("")] if below else []))
+
+
+def _names(groups: Groups, verdict: FindingKind) -> str:
+    """Return the first of the rows with a verdict, and how many more lines there are."""
+    rows = [row for group in groups.values() for row in merged(group) if row.verdict is verdict]
+    names = [
+        # the last part of a setting's name
+        f"{row.subject} {row.what.rpartition('.')[2] if 'config.' in row.what else row.what}"
+        for row in rows[:NAMED_MAX]
+    ]
+    more = len(rows) - NAMED_MAX
+    return ", ".join(names) + (f" and {more} more" if more > 0 else "")
+
+
+def _worst(rows: Iterable[Finding]) -> FindingKind:
+    verdicts = {row.verdict for row in rows}
+    order = (FindingKind.WRONG, FindingKind.WARNING)
+    return next((verdict for verdict in order if verdict in verdicts), FindingKind.OK)

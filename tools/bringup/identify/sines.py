@@ -1,0 +1,231 @@
+"""Friction and reflected inertia of one joint, from small sines of a hanging leg. Pure.
+
+The drive's own loop follows sines of a few frequencies, one after the other. Where q moves steadily
+its Fourier series gives rate and acceleration without a filter's lag, and
+
+    tau = I q'' + d q' + c sign(q') + k (q - q_0) + tau_0
+
+is linear in inertia I, viscous friction d, dry friction c, gravity's stiffness k and tau_0; two
+frequencies tell I and k apart. I holds rotor and leg: what hangs on the joint is taken off by the
+masses of the robot file, and so is known to a few percent of itself only. At an ankle that is a
+foot, at a knee or hip it is fifty times the rotor.
+
+A drive holds a target for a period, so its torque is a saw tooth. What counts is its mean about a
+sample: half of the old target's torque and half of the new one's, if the new one came at once
+(lockstep), and more of the old one's the later it comes (over CAN some 1 ms).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.bus.messages import Pair
+from tools.bringup.hanging_leg import HEAVY, HangingJoint
+from tools.bringup.motion import MotionPlan, Sample
+
+Array = NDArray[np.float64]
+
+TONES: Final = ((0.4, 5), (1.0, 8), (2.0, 12))
+"""Hz and cycles of each tone; the first cycle and the last swell and fade, and are not used."""
+HEAVY_TONES: Final = ((0.2, 5), (0.5, 8))
+AMPLITUDE_MAX: Final = 0.06
+"""rad; the lowest tone, where nothing else limits it."""
+TORQUE_SHARE: Final = 0.4
+"""Fraction of the torque limit that a tone may need for inertia and gravity."""
+K_P: Final = (400.0, 3000.0)
+"""N m/rad, for light joints and heavy ones: soft, since a sample's time error shows as k_p times
+itself in the viscous friction."""
+K_D: Final = (8.0, 35.0)
+"""N m s/rad"""
+PER_INERTIA: Final = (1600.0, 50.0)
+"""k_p and k_d of a joint by its inertia: 40 rad/s."""
+AFTER: Final = 0.25
+"""Share of the new target's torque: as if it came 0.5 ms after the sample."""
+TIME_SD: Final = 5e-4
+"""s; how well that is known."""
+YIELDS: Final = 0.05
+"""Share of an inertia that is uncertain: leg and hoist, on the joint's other side, give way."""
+DRY_SD: Final = 0.04
+"""N m; cogging and play show as dry friction of this size."""
+MASS_SD: Final = 0.03
+"""Of the leg's inertia by the robot file."""
+HARMONICS: Final = 9
+MOVING: Final = 0.3
+"""Of a tone's fastest rate: slower samples, about the turns, are not used. There a joint sticks."""
+
+
+class Tone(NamedTuple):
+    """One sine, which swells in its first cycle and fades in its last."""
+
+    frequency_hz: float
+    amplitude: float
+    """rad"""
+    cycles: int
+
+    @property
+    def duration_s(self) -> float:
+        """How long it takes, s."""
+        return self.cycles / self.frequency_hz
+
+    def offset(self, t_s: float) -> tuple[float, float]:
+        """Return the sine, rad, and its rate, rad/s, at a time since its begin."""
+        omega = 2.0 * math.pi * self.frequency_hz
+        inside = min(1.0, t_s * self.frequency_hz, (self.duration_s - t_s) * self.frequency_hz)
+        sign = 1.0 if t_s < 0.5 * self.duration_s else -1.0
+        swell = 0.5 - 0.5 * math.cos(math.pi * inside)
+        rising = 0.0
+        if inside < 1.0:
+            rising = sign * 0.5 * math.pi * self.frequency_hz * math.sin(math.pi * inside)
+        sine, cosine = math.sin(omega * t_s), math.cos(omega * t_s)
+        return (
+            self.amplitude * swell * sine,
+            self.amplitude * (rising * sine + swell * omega * cosine),
+        )
+
+
+class Tones(NamedTuple):
+    """Tones one after the other (`tools.bringup.motion.AxisCourse`)."""
+
+    tones: tuple[Tone, ...]
+
+    @property
+    def duration_s(self) -> float:
+        """Of all tones, s."""
+        return sum(tone.duration_s for tone in self.tones)
+
+    @property
+    def span(self) -> Pair:
+        """Lowest and highest offset, rad."""
+        most = max(tone.amplitude for tone in self.tones)
+        return -most, most
+
+    @property
+    def rate_max(self) -> float:
+        """Fastest rate that it asks for, rad/s."""
+        return max(2.0 * math.pi * tone.frequency_hz * tone.amplitude for tone in self.tones)
+
+    def at(self, t_s: float) -> Pair:
+        """Return offset, rad, and rate, rad/s."""
+        for begin_s, tone in self.begins():
+            if begin_s <= t_s < begin_s + tone.duration_s:
+                return tone.offset(t_s - begin_s)
+        return 0.0, 0.0
+
+    def begins(self) -> list[tuple[float, Tone]]:
+        """Return when each tone begins, s."""
+        found, at = [], 0.0
+        for tone in self.tones:
+            found.append((at, tone))
+            at += tone.duration_s
+        return found
+
+
+SinePlan = MotionPlan[Tones]
+
+
+class JointFit(NamedTuple):
+    """What the sines show; each a value and its standard deviation."""
+
+    inertia: tuple[float, float]
+    """Rotor and leg, kg m^2."""
+    viscous: tuple[float, float]
+    """N m s/rad"""
+    dry: tuple[float, float]
+    """N m"""
+    stiffness: tuple[float, float]
+    """Gravity's, N m/rad."""
+    q: Array
+    """Angle from its mean (n,), rad, at the samples used."""
+    tau: Array
+    """Torque there (n,), N m."""
+    fitted: Array
+    """Torque of the fit (n,), N m."""
+
+
+def plan_for(axis: int, torque: float, armature: float, joint: HangingJoint) -> SinePlan:
+    """Return sines that need a part of a torque, N m, of a joint led inside its limits first.
+
+    What holds the leg at its bias comes on top.
+    """
+    inertia, gravity = joint.inertia + armature, joint.gravity
+    tones = []
+    for hertz, cycles in HEAVY_TONES if inertia > HEAVY else TONES:
+        needed = abs(inertia * (2.0 * math.pi * hertz) ** 2 - gravity)
+        most = TORQUE_SHARE * torque / max(needed, gravity, 1e-9)
+        tones.append(Tone(hertz, float(min(AMPLITUDE_MAX, most)), cycles))
+    k_p = min(max(PER_INERTIA[0] * inertia, K_P[0]), K_P[1])
+    k_d = min(max(PER_INERTIA[1] * inertia, K_D[0]), K_D[1])
+    # alike for both axes: both motors' own loops then do all of it
+    soft = ((k_p, k_p), (k_d, k_d))
+    return SinePlan(axis, Tones(tuple(tones)), torque + joint.held_torque, joint.bias, soft)
+
+
+def fit_sines(samples: Sequence[Sample], plan: SinePlan) -> JointFit | None:
+    """Return what steady samples of a whole motion show; None if there are too few."""
+    parts = []
+    for along_s, tone in plan.course.begins():
+        begin_s = plan.rest_s + along_s
+        period = 1.0 / tone.frequency_hz
+        first, last = begin_s + period, begin_s + tone.duration_s - period
+        rows = [s for s in samples if first <= s.t_s < last]
+        if len(rows) < 20 * (tone.cycles - 2):
+            return None
+        parts.append(_steady(rows, begin_s, tone, plan.axis))
+    q, regressors, tau, cycle, weight = map(np.concatenate, zip(*parts, strict=True))
+    weighted = regressors * weight[:, None]
+    H = np.linalg.inv(weighted.T @ regressors)
+    x = H @ (weighted.T @ tau)
+    left = tau - regressors @ x
+    scores = np.array([weighted[cycle == k].T @ left[cycle == k] for k in np.unique(cycle)])
+    covariance = H @ scores.T @ scores @ H
+    inertia_sd, viscous_sd, dry_sd, stiffness_sd = np.sqrt(np.diag(covariance)[:4]).tolist()
+    assert plan.own_gains is not None  # noqa: S101 - `plan_for` gives them
+    (k_p, _), (k_d, _) = plan.own_gains
+    inertia, viscous, dry, stiffness = x[:4].tolist()
+    inertia_sd = math.hypot(inertia_sd, k_d * TIME_SD, YIELDS * inertia)
+    viscous_sd = math.hypot(viscous_sd, k_p * TIME_SD)
+    dry_sd = math.hypot(dry_sd, DRY_SD)
+    return JointFit(
+        (inertia, inertia_sd),
+        (viscous, viscous_sd),
+        (dry, dry_sd),
+        (stiffness, stiffness_sd),
+        q,
+        tau,
+        regressors @ x,
+    )
+
+
+def _steady(
+    samples: Sequence[Sample], begin_s: float, tone: Tone, axis: int
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return angle (n,), regressors (n, 5), torque, cycle and weight of a tone's steady part.
+
+    A sample weighs as the way that it stands for: cogging slows a joint where it opposes, and to
+    count by time would take it for friction.
+    """
+    t = np.array([s.t_s - begin_s for s in samples])
+    q = np.array([s.q[axis] for s in samples])
+    before, after = (np.array([row[axis] for row in rows]) for rows in zip(
+        *((s.tau_before, s.tau) for s in samples), strict=True
+    ))  # fmt: skip
+    tau = before + AFTER * (after - before)
+    omega = 2.0 * math.pi * tone.frequency_hz
+    k = omega * np.arange(1, HARMONICS + 1)
+    cosine, sine = np.cos(np.outer(t, k)), np.sin(np.outer(t, k))
+    basis = np.hstack([np.ones((len(t), 1)), t[:, None], cosine, sine])
+    a, *_ = np.linalg.lstsq(basis, q, rcond=None)
+    a_cos, a_sin = a[2 : 2 + HARMONICS], a[2 + HARMONICS :]
+    v = sine @ (-k * a_cos) + cosine @ (k * a_sin)
+    acceleration = cosine @ (-k * k * a_cos) + sine @ (-k * k * a_sin)
+    smooth = basis @ a
+    rows = np.stack([acceleration, v, np.sign(v), smooth, np.ones(len(t))], axis=1)
+    cycle = np.floor(t * tone.frequency_hz) + 1000.0 * tone.frequency_hz
+    moving = np.abs(v) > MOVING * np.max(np.abs(v))
+    way = np.abs(np.gradient(q)) / np.mean(np.abs(v)) / np.mean(np.diff(t))
+    return (smooth - a[0])[moving], rows[moving], tau[moving], cycle[moving], way[moving]
