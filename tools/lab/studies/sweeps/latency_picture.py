@@ -63,22 +63,13 @@ def _shares() -> colors.Colormap:
     return colors.LinearSegmentedColormap.from_list("falls", ["#e3f1e7", "#f2b7a0", "#b3261e"])
 
 
-def draw(rows: Sequence[Row], force_max: float, what: str, folder: Path) -> tuple[Path, ...]:
-    """Draw both pictures into PNG files.
+def draw(rows: Sequence[Row], force_max: float, what: str, folder: Path) -> None:
+    """Draw both pictures into PNG files of a folder.
 
-    Args:
-        rows: of the table.
-        force_max: all that the hand gives, N.
-        what: what else there is to say of the study, such as its seed.
-        folder: of the files.
-
-    Returns:
-        The files.
+    The hand gives `force_max` N at most; `what` is what else there is to say, such as the seed.
     """
-    paths = folder / FALLS, folder / EFFORT
-    _draw_falls(rows, what, paths[0])
-    _draw_effort(without_loss(rows), force_max, what, paths[1])
-    return paths
+    _draw_falls(rows, what, folder / FALLS)
+    _draw_effort(without_loss(rows), force_max, what, folder / EFFORT)
 
 
 def _draw_falls(rows: Sequence[Row], what: str, path: Path) -> None:

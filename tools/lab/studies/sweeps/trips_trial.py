@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
 
 import msgspec
 
@@ -66,12 +66,30 @@ class Trouble(NamedTuple):
     """With the gains of before the dynamic certificate, and joints that believe any command."""
 
 
+class TripTrial(msgspec.Struct, frozen=True, kw_only=True):
+    """A trouble on a plant."""
+
+    number: int
+    trouble: str
+    """Of `TROUBLES`."""
+    on: str
+    """Of `PLANTS`."""
+
+    @property
+    def words(self) -> str:
+        """The trial in words."""
+        return f"{self.trouble} on {self.on}"
+
+
+KNOWN: Final = "|".join((*Trip.__members__, *Cause.__members__))
+
+
 class TripResult(msgspec.Struct, frozen=True, kw_only=True):
     """How it came out."""
 
     led: bool
     """The scenario came to `BEGINS_S`; a robot that shakes at once never does."""
-    tripped: str
+    tripped: Annotated[str, msgspec.Meta(pattern=rf"^(({KNOWN})( |$))*$")]
     """The trips and causes that came, in their order; empty: none."""
     tripped_after_s: float | None
     """To the first, from `BEGINS_S`, or from being led first if it was before that."""
@@ -208,19 +226,12 @@ class _Seen:
                 self.trips.setdefault(Cause(event.cause).name, event.t_ns)
 
 
-def run_trial(trouble: str, plant: str, robot: RobotConfig, seed: int) -> TripResult:
-    """Run one trouble on one plant, with trips and without.
-
-    Args:
-        trouble: of `TROUBLES`.
-        plant: of `PLANTS`.
-        robot: ready to run, with its gain schedule.
-        seed: of the noise.
-    """
-    scenario = TROUBLES[trouble]
-    robot = unfiltered(robot) if scenario.unfiltered else robot
-    seen = _Seen(robot, scenario, PLANTS[plant], seed)
-    without = _Seen(untripped(robot), scenario, PLANTS[plant], seed)
+def run_trial(trial: TripTrial, robot: RobotConfig, seed: int) -> TripResult:
+    """Run a trouble on a plant, with trips and without; `seed` is the noise's."""
+    trouble, plant = TROUBLES[trial.trouble], PLANTS[trial.on]
+    robot = unfiltered(robot) if trouble.unfiltered else robot
+    seen = _Seen(robot, trouble, plant, seed)
+    without = _Seen(untripped(robot), trouble, plant, seed)
     return TripResult(
         led=seen.fleet.world.scenario_s > BEGINS_S,
         tripped=" ".join(sorted(seen.trips, key=lambda name: seen.trips[name])),
