@@ -41,7 +41,7 @@ def test_a_case_starts_at_rest_in_its_posture_on_flat_soles(
     """p by the oracle's own kinematics, and by where the simulated robot is."""
     for case in (drawn[0], drawn[DRAWN // 2], drawn[-1]):
         loaded = figures.with_payload(robot, case.posture.payload)
-        world = study.world_of(robot, case, 1.0, rigid=False)
+        world = study.world_of(robot, case, rigid=False)
         truth = world.truth(0, 1.0, 0.0)
         p = np.array([*truth.com, *truth.angles])
         np.testing.assert_allclose(p, oracle.pose(loaded, case.posture.q), atol=1e-5)
@@ -81,7 +81,7 @@ def test_on_a_rigid_floor_the_sign_is_right_much_nearer_to_zero(
 
 def test_a_slow_drift_away_is_no_stand(robot: RobotConfig, drawn: list[CertificateCase]) -> None:
     case = drawn[-1]
-    world = study.world_of(robot, case, 1.0, rigid=False)
+    world = study.world_of(robot, case, rigid=False)
     still = world.truth(0, 1.0, 0.0)
 
     def course(*com_x: float) -> list[SimTruth]:

@@ -217,26 +217,20 @@ class _Module:
 
 
 def world_of(
-    robot: RobotConfig,
-    case: CertificateCase,
-    nudge_share: float,
-    *,
-    rigid: bool,
-    plant: PlantConfig = FRICTIONLESS,
+    robot: RobotConfig, case: CertificateCase, *, rigid: bool, plant: PlantConfig = FRICTIONLESS
 ) -> World:
     """Return the world with the robot in the case's posture, the nudge to come.
 
     The payload is the case's. `rigid`: the floor is hard, as the certificate has it.
     """
-    posture, (x, y) = case.posture, case.nudge
-    force = (nudge_share * x, nudge_share * y, 0.0)
+    posture = case.posture
     scenario = Scenario(
         name="certificate",
         about="a posture held by local gains alone, and a nudge",
         duration=DURATION_S,
         keyframe=(Keyframe(at=0.0, height=posture.height, assist=posture.assist),),
         hand=False,
-        push=(Push(at=NUDGE_AT, duration=NUDGE_S, force=force),),
+        push=(Push(at=NUDGE_AT, duration=NUDGE_S, force=(*case.nudge, 0.0)),),
     )
     world = World(body_of(with_payload(robot, posture.payload), plant), scenario)
     if rigid:
@@ -266,13 +260,12 @@ def row_of(case: CertificateCase) -> dict[str, object]:
 def run_case(
     case: CertificateCase,
     robot: RobotConfig,
-    nudge_share: float = 1.0,
     *,
     rigid: bool = False,
     plant: PlantConfig = FRICTIONLESS,
 ) -> CertificateResult:
     """Simulate a case; arguments as for `world_of`."""
-    world = world_of(robot, case, nudge_share, rigid=rigid, plant=plant)
+    world = world_of(robot, case, rigid=rigid, plant=plant)
     modules = [_Module(robot, case, index) for index in range(len(MODULES))]
     steps = round(1.0 / (robot.joint_service.rate_hz * world.timestep))
     motor = np.zeros(N_JOINTS)

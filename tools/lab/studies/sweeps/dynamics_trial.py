@@ -32,6 +32,7 @@ from shared.joints import N_LEG
 from tools.lab.design.dynamic_certificate import Condition, DynamicCertificate, nodes_of
 from tools.lab.design.sampled_loop import NOMINAL, HandModel
 from tools.lab.design.split_program import design_of
+from tools.lab.studies.sweeps.figures import scalars
 from tools.sim.lockstep import Lockstep
 
 HEIGHTS: Final = (0.95, 1.188)
@@ -127,9 +128,8 @@ def draw(seed: int, number: int) -> DynamicsTrial:
 
 def row_of(trial: DynamicsTrial) -> dict[str, object]:
     """Return a trial's draws by column."""
-    row = msgspec.structs.asdict(trial)
-    factors = row.pop("damping")
-    return row | {f"damping_{joint}": factor for joint, factor in enumerate(factors)}
+    factors = {f"damping_{joint}": factor for joint, factor in enumerate(trial.damping)}
+    return scalars(trial) | factors
 
 
 def _log(dice: random.Random, low: float, high: float) -> float:

@@ -104,6 +104,12 @@ def with_payload(robot: RobotConfig, payload: float) -> RobotConfig:
     return msgspec.structs.replace(robot, mass=mass)
 
 
+def scalars(case: msgspec.Struct) -> dict[str, object]:
+    """Return the draws of a case that fill one column each."""
+    values = msgspec.structs.asdict(case)
+    return {name: value for name, value in values.items() if not isinstance(value, tuple)}
+
+
 def step_nm(before: Sequence[float], after: Sequence[float]) -> float:
     """Return the largest change of a joint's torque, N m."""
     return max(abs(b - a) for a, b in zip(before, after, strict=True))

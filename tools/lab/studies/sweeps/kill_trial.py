@@ -39,6 +39,7 @@ from tools.lab.studies.sweeps.figures import (
     ending_of,
     event_steps_nm,
     operator_peak_n,
+    scalars,
     sole_tilt_max_rad,
     that_count,
     unwatched,
@@ -239,17 +240,7 @@ def scenario_of(robot: RobotConfig, case: KillCase) -> Scenario:
 
 def row_of(case: KillCase) -> dict[str, object]:
     """Return every draw by its column; None where there was no such draw."""
-    row: dict[str, object] = {
-        "number": case.number,
-        "seed": case.seed,
-        "payload_kg": case.payload_kg,
-        "pace": case.pace,
-        "moving": int(case.moving),
-        "way_end_s": case.way_end_s,
-        "kill_s": case.kill_s,
-        "let_go_s": case.let_go_s,
-        "delay_ms": case.delay_ms,
-    }
+    row = scalars(case) | {"moving": int(case.moving)}
     for index in range(POSES_MAX):
         pose = case.poses[index] if index < len(case.poses) else None
         for key in LeadPose.__struct_fields__:
@@ -445,9 +436,8 @@ def _handover(events: list[tuple[str, JointEvent]], kill_ns: int) -> dict[str, f
     figures = {}
     if len(late) == len(MODULES):
         figures["hold_ms"] = max(event.t_ns - kill_ns for event in late.values()) / NS_PER_MS
-    steps = event_steps_nm(late.values())
-    if steps:
-        figures["torque_step_nm"] = max(steps)
+    if late:
+        figures["torque_step_nm"] = max(event_steps_nm(late.values()))
     return figures
 
 

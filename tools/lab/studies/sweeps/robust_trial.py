@@ -20,6 +20,7 @@ from tools.lab.studies.sweeps.figures import (
     ending_of,
     event_steps_nm,
     operator_peak_n,
+    scalars,
     sole_tilt_max_rad,
     that_count,
     unwatched,
@@ -107,25 +108,16 @@ def plant_of(trial: RobustTrial) -> PlantConfig:
 def scenario_of(robot: RobotConfig, trial: RobustTrial) -> Scenario:
     """Return what happens."""
     stand = robot.simulation.stand_height
-    frames: tuple[Keyframe, ...]
-    if trial.kind == "crawl":
-        frames = (
-            Keyframe(at=0.0, height=stand),
-            Keyframe(at=2.0 * LEAD_S, height=0.79, pitch=1.2, assist=robot.assist.force_max),
-        )
-    elif trial.kind == "squat":
-        frames = (
-            Keyframe(at=0.0, height=stand),
-            Keyframe(at=LEAD_S, height=0.948),
-            Keyframe(at=2.0 * LEAD_S, height=stand),
-        )
-    else:
-        frames = (Keyframe(at=0.0, height=stand), Keyframe(at=LEAD_S, height=1.05))
+    ways = {
+        "crawl": (Keyframe(2.0 * LEAD_S, 0.79, pitch=1.2, assist=robot.assist.force_max),),
+        "squat": (Keyframe(LEAD_S, 0.948), Keyframe(2.0 * LEAD_S, stand)),
+        "lean": (Keyframe(LEAD_S, 1.05),),
+    }
     return Scenario(
         name=f"robust-{trial.seed}-{trial.number}",
         about=f"trial {trial.number} of `xrl sweep robust --seed {trial.seed}`",
         duration=round(trial.kill_s + AFTER_KILL_S, 3),
-        keyframe=frames,
+        keyframe=(Keyframe(0.0, stand), *ways[trial.kind]),
         kill=(Kill(service="planner", at=trial.kill_s),),
         push=trial.pushes,
     )
@@ -168,15 +160,7 @@ def run_trial(
 
 def row_of(trial: RobustTrial) -> dict[str, object]:
     """Return every draw by its column: the trial's, then the plant's errors."""
-    row: dict[str, object] = {
-        "number": trial.number,
-        "seed": trial.seed,
-        "beyond": trial.beyond,
-        "slope_deg": trial.slope_deg,
-        "kind": trial.kind,
-        "kill_s": trial.kill_s,
-        "delay_ms": trial.delay_ms,
-    }
+    row = scalars(trial)
     for name, push in zip(("led", "held"), trial.pushes, strict=True):
         row |= {f"push_{name}_x_n": push.force[0], f"push_{name}_y_n": push.force[1]}
     return row | dict(plants.errors_of(plant_of(trial)))

@@ -230,7 +230,7 @@ def _run_alone(
     command: str,
     console: Console,
 ) -> int:
-    """Run a case under a progress bar, recorded and judged like a run of `xrl sim` if asked for."""
+    """Run a case, recorded and judged like a run of `xrl sim` if it is asked for."""
     begin = study.row(case)
     (robot,) = study.robots([case], robot, 1, console)
     show(f"{study.case.capitalize()} {begin['number']}, drawn", begin, console)
