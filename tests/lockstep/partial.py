@@ -22,7 +22,8 @@ from shared.exceptions import RunError
 from shared.joints import MODULE_INDEX, MODULES
 from shared.links import Pair as Link
 from tools.lab.studies.sweeps.figures import Ending, com_max_mm, ending_of, operator_peak_n, step_nm
-from tools.sim.lockstep import FleetMoment, Lockstep, Record, forget
+from tools.sim.lockstep import FleetMoment, Lockstep, forget
+from tools.sim.virtual_time import Record
 
 FailureKind = Literal["links", "commands", "states", "frozen"]
 KINDS: Final[Mapping[FailureKind, str]] = {

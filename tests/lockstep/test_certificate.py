@@ -8,12 +8,9 @@ import pytest
 from shared.bus.messages import SimTruth
 from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
-from tools.lab.studies.sweeps import certificate_study as study
-from tools.lab.studies.sweeps.certificate_study import (
-    CertificateCase,
-    CertificateCases,
-    CertificateResult,
-)
+from tools.lab.studies.sweeps import certificate, figures
+from tools.lab.studies.sweeps import certificate_trial as study
+from tools.lab.studies.sweeps.certificate_trial import CertificateCase, CertificateCases
 
 SEED = 1
 DRAWN = 300
@@ -33,14 +30,6 @@ def margin_of(case: CertificateCase) -> float:
     return case.weakest.margin
 
 
-def outcome(
-    case: CertificateCase, *, stood: bool, margin: float | None = None
-) -> CertificateResult:
-    predicted = case.weakest.margin if margin is None else margin
-    case = case._replace(weakest=case.weakest._replace(margin=predicted))
-    return CertificateResult(case, stood, not stood, 1.0, 0.01, 0.01, 0.5)
-
-
 def test_the_cases_are_about_half_of_either_kind(drawn: list[CertificateCase]) -> None:
     positive = sum(margin_of(case) > 0.0 for case in drawn)
     assert 0.4 * DRAWN < positive < 0.6 * DRAWN
@@ -51,8 +40,8 @@ def test_a_case_starts_at_rest_in_its_posture_on_flat_soles(
 ) -> None:
     """p by the oracle's own kinematics, and by where the simulated robot is."""
     for case in (drawn[0], drawn[DRAWN // 2], drawn[-1]):
-        loaded = study.with_payload(robot, case.posture.payload)
-        world = study.world_of(robot, case, 1.0, rigid=False)
+        loaded = figures.with_payload(robot, case.posture.payload)
+        world = study.world_of(robot, case, rigid=False)
         truth = world.truth(0, 1.0, 0.0)
         p = np.array([*truth.com, *truth.angles])
         np.testing.assert_allclose(p, oracle.pose(loaded, case.posture.q), atol=1e-5)
@@ -67,7 +56,7 @@ def test_what_the_certificate_lets_stand_stands(
 ) -> None:
     nearest = [case for case in drawn if margin_of(case) > CLEAR][:TRIED]
     assert len(nearest) == TRIED
-    fell = [case.number for case in nearest if not study.run(robot, case).stood]
+    fell = [case.number for case in nearest if not study.run_case(case, robot).stood]
     assert fell == []
 
 
@@ -76,7 +65,7 @@ def test_what_the_certificate_refuses_falls(
 ) -> None:
     nearest = [case for case in drawn if margin_of(case) < -CLEAR][-TRIED:]
     assert len(nearest) == TRIED
-    stood = [case.number for case in nearest if study.run(robot, case).stood]
+    stood = [case.number for case in nearest if study.run_case(case, robot).stood]
     assert stood == []
 
 
@@ -85,14 +74,14 @@ def test_on_a_rigid_floor_the_sign_is_right_much_nearer_to_zero(
 ) -> None:
     near = [case for case in drawn if 0.005 < abs(margin_of(case)) < 0.03]
     assert {margin_of(case) > 0.0 for case in near} == {True, False}
-    outcomes = [study.run(robot, case, rigid=True) for case in near]
-    wrong = [o.case.number for o in outcomes if o.stood is not (o.margin > 0.0)]
+    outcomes = [(case, study.run_case(case, robot, rigid=True)) for case in near]
+    wrong = [case.number for case, o in outcomes if o.stood is not (margin_of(case) > 0.0)]
     assert wrong == []
 
 
 def test_a_slow_drift_away_is_no_stand(robot: RobotConfig, drawn: list[CertificateCase]) -> None:
     case = drawn[-1]
-    world = study.world_of(robot, case, 1.0, rigid=False)
+    world = study.world_of(robot, case, rigid=False)
     still = world.truth(0, 1.0, 0.0)
 
     def course(*com_x: float) -> list[SimTruth]:
@@ -103,9 +92,9 @@ def test_a_slow_drift_away_is_no_stand(robot: RobotConfig, drawn: list[Certifica
         return rows
 
     assert not still.fallen
-    assert study.judge(case, course(0.0, 0.02, 0.03, 0.02, 0.01, 0.01)).stood
-    assert not study.judge(case, course(0.0, 0.01, 0.02, 0.03, 0.04, 0.05)).stood
-    assert not study.judge(case, course(0.0, 0.1, 0.2, 0.1, 0.0, 0.0)).stood
+    assert study.judge(course(0.0, 0.02, 0.03, 0.02, 0.01, 0.01)).stood
+    assert not study.judge(course(0.0, 0.01, 0.02, 0.03, 0.04, 0.05)).stood
+    assert not study.judge(course(0.0, 0.1, 0.2, 0.1, 0.0, 0.0)).stood
 
 
 def test_the_same_number_is_the_same_case_whatever_was_drawn_before(
@@ -127,5 +116,5 @@ def test_confusion_counts_predictions_against_outcomes() -> None:
         (-0.4, False),
         (-0.5, False),
     ]
-    assert study.confusion(predicted) == (2, 1, 0, 3)
-    assert study.threshold(predicted) == pytest.approx(0.15)
+    assert certificate.confusion(predicted) == (2, 1, 0, 3)
+    assert certificate.threshold(predicted) == pytest.approx(0.15)

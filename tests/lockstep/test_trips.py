@@ -22,7 +22,8 @@ from shared.config.scenarios import Keyframe, Push, Scenario
 from shared.robot.trip_table import JOINT_TRIPS, untripped
 from tests.lockstep.runs import still, variant
 from tools.lab.studies.sweeps.trips_trial import PLANTS, unfiltered
-from tools.sim.lockstep import Lockstep, Record, forget
+from tools.sim.lockstep import Lockstep, forget
+from tools.sim.virtual_time import Record
 from tools.sim.standing_start import begin_standing
 
 RESTS_TWICE = changed(PlantConfig(), {"person.load_scale": 2.0})

@@ -10,7 +10,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Final
 
-from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from rich.progress import BarColumn, Progress, TextColumn
 
 from shared import revision
 from shared.config.robot_config import RobotConfig
@@ -106,13 +106,8 @@ def select(
 ) -> list[CrashCase]:
     """Return the selected cases, in their order.
 
-    Args:
-        cases: the matrix.
-        quick: those of the short run only.
-        only: names or patterns; None for all.
-
     Raises:
-        RunError: a name fits no case.
+        RunError: a name or pattern of `only` fits no case.
     """
     for name in only or ():
         if not any(fnmatchcase(case.name, name) for case in cases):
@@ -151,41 +146,36 @@ def _run_all(
         RunError: no fleet can be run here.
     """
     about = _about(robot)
-    with _bar(console) as bar:
+    bar = Progress(
+        BarColumn(bar_width=20),
+        TextColumn("{task.completed}/{task.total}  {task.fields[left]} left"),
+        TextColumn("{task.fields[case]}  {task.fields[now]}"),
+        console=console,
+        transient=True,
+    )
+    with bar:
         shown = bar.add_task("", total=len(cases), case="", left="", now="")
+
+        def show(snapshot: LiveSnapshot) -> None:
+            if snapshot.truth is not None:
+                now_s, modes = max(0.0, snapshot.truth.scenario_s), "".join(snapshot.modes)
+                height = snapshot.truth.torso[2]
+                bar.update(shown, now=f"{now_s:4.1f} s {height:.2f} m {modes}")
+
         for number, case in enumerate(cases):
             left = _minutes(_left_s(results, len(cases) - number))
             bar.update(shown, case=case.name, left=left, now="starting")
-            view = _View(bar, shown)
-            outcome = run_case(case, robot, out / case.name, view.show, seed=seed)
+            outcome = run_case(case, robot, out / case.name, show, seed=seed)
             results.append(Result(case, outcome))
             report.write(results, out, about, planned=len(cases))
             bar.update(shown, advance=1)
             left = _minutes(_left_s(results, len(cases) - number - 1))
             place = marked("[dim]{}/{}, {} left[/]", number + 1, len(cases), left)
             bar.console.print(report.line_of(results[-1]), place, highlight=False, soft_wrap=True)
-            last = results[-UNJUDGED_MAX:]
-            if len(last) == UNJUDGED_MAX and all(_is_unjudged(result) for result in last):
+            last = [result.outcome.verdict for result in results[-UNJUDGED_MAX:]]
+            if last == [CrashVerdict.UNJUDGED] * UNJUDGED_MAX:
                 reason = outcome.remarks[0]
                 raise RunError(f"{UNJUDGED_MAX} cases in a row cannot be judged: {reason}")
-
-
-def _is_unjudged(result: Result) -> bool:
-    return result.outcome.verdict is CrashVerdict.UNJUDGED
-
-
-class _View:
-    """Shows a run in the progress line."""
-
-    def __init__(self, bar: Progress, task: TaskID) -> None:
-        self._bar, self._task = bar, task
-
-    def show(self, snapshot: LiveSnapshot) -> None:
-        """Show the run as it is now."""
-        if snapshot.truth is not None:
-            now_s, modes = max(0.0, snapshot.truth.scenario_s), "".join(snapshot.modes)
-            height = snapshot.truth.torso[2]
-            self._bar.update(self._task, now=f"{now_s:4.1f} s {height:.2f} m {modes}")
 
 
 def _left_s(results: Sequence[Result], cases: int) -> float:
@@ -210,21 +200,7 @@ def _about(robot: RobotConfig) -> dict[str, str]:
 
 
 def _make_out(out: Path | None) -> Path:
-    """Make the folder of the results.
-
-    Raises:
-        RunError: it cannot be made, or holds results already.
-    """
+    """Make the folder of the results, unless it holds some already."""
     if out is not None and (out / RESULTS).exists():
         raise RunError(f"{out}: holds results already; choose another --out, or remove it")
     return experiment.make_out(out, "crashtest")
-
-
-def _bar(console: Console) -> Progress:
-    return Progress(
-        BarColumn(bar_width=20),
-        TextColumn("{task.completed}/{task.total}  {task.fields[left]} left"),
-        TextColumn("{task.fields[case]}  {task.fields[now]}"),
-        console=console,
-        transient=True,
-    )

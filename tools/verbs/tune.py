@@ -12,8 +12,8 @@ import numpy as np
 
 from services.simulator.physics.plant import IDEAL, PlantConfig, plant_from
 from shared import places
-from shared.bus.messages import Pair
 from shared.bus.credentials import require_operator
+from shared.bus.messages import Pair
 from shared.bus.session import open_session
 from shared.config import files as config_file
 from shared.config import gain_schedule

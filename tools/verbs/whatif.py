@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Final
 
 import msgspec
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
 from services.simulator.physics.plant import PlantConfig
@@ -19,10 +18,10 @@ from shared.extras import require
 from shared.joints import MODULES
 from shared.toml_file import parse_toml
 from tools.judge.run_parts import add_part, read_asked
-from tools.lab.studies.counterfactual import picture
 from tools.lab.studies.counterfactual.moments import moments_of
-from tools.lab.studies.counterfactual.run import Counterfactual, Task, counterfactual_of
+from tools.lab.studies.counterfactual.run import Counterfactual, Task, counterfactual_of, draw
 from tools.lab.studies.sweeps.pool import cores, results
+from tools.lab.studies.sweeps.study import bar
 from tools.live.experiment import PLANT_FILE
 from tools.logs.hand_path import hand_path
 from tools.logs.recorded_robot import refuse_own_controller, robot_of, text_of
@@ -94,27 +93,23 @@ def run(args: argparse.Namespace) -> int:
     led = hand_path(log)
     tasks = [Task(robot, scenario, true_plant, moment, kill, args.for_s, led) for moment in moments]
     counterfactuals: list[Counterfactual] = []
-    bar = Progress(
-        TextColumn("{task.fields[fell]}"), BarColumn(), MofNCompleteColumn(),
-        TimeRemainingColumn(), console=console, transient=True,
-    )  # fmt: skip
-    with bar as progress:
-        shown = progress.add_task("", total=len(tasks), fell="0 fell")
+    text = "{task.completed} of {task.total} moments, {task.fields[fell]} fell"
+    with bar(text, console) as progress:
+        shown = progress.add_task("", total=len(tasks), fell=0)
         for _, counterfactual in results(
             counterfactual_of, tasks, args.workers, lambda task: f"{task.moment.at_s:g} s"
         ):
             counterfactuals.append(counterfactual)
             fell = sum(not one.stood for one in counterfactuals)
-            progress.update(shown, advance=1, fell=f"{fell} fell")
+            progress.update(shown, advance=1, fell=fell)
     counterfactuals.sort(key=lambda one: one.at_s)
     out = args.out or log.files[0].parent
     out.mkdir(parents=True, exist_ok=True)
     names = " and ".join(kill)
     content = msgspec.json.encode({"kill": kill, "for_s": args.for_s, "fates": counterfactuals})
     replace_file(out / "whatif.json", msgspec.json.format(content))
-    picture.draw(
-        log, counterfactuals, f"{names} killed at each moment", args.every, out / "whatif.png"
-    )
+    title = f"{names} killed at each moment"
+    draw(log, counterfactuals, title, args.every, out / "whatif.png")
     show(counterfactuals, names, args.for_s, console)
     console.print(f"{out}/whatif.json, whatif.png", style="dim")
     return 0 if all(one.stood for one in counterfactuals) else FELL_EXIT_CODE

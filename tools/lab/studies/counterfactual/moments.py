@@ -102,14 +102,11 @@ def _copy(execution: JointExecution) -> DriveManagerState | None:
 
 
 def _at(
-    moments: Sequence[Moment], rows: Iterable[tuple[int, R]], take: Callable[[R], T]
+    moments: Sequence[Moment], rows: Iterable[tuple[int, R]], kept: Callable[[R], T]
 ) -> Iterator[tuple[Moment, T]]:
-    """Yield moments with the last row before each, if it is near.
+    """Yield moments with what `kept` takes of the last row before each, if it is near.
 
-    Args:
-        moments: in their order.
-        rows: times and rows, in order; a row is valid only until the next one.
-        take: returns the part of a row to keep.
+    Rows come with their times, in order; a row is valid only until the next one.
     """
     index = 0
     last: list[T] = []
@@ -121,6 +118,6 @@ def _at(
         if index == len(moments):
             return
         if moments[index].state.t_ns - t_ns <= NEAR_NS:
-            last = [take(row)]
+            last = [kept(row)]
     if index < len(moments):
         yield from ((moments[index], value) for value in last)

@@ -1,21 +1,30 @@
-"""One counterfactual: from a moment of a run on, with something dead in it."""
+"""One counterfactual: from a moment of a run on, with something dead in it; and all, drawn."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Final
 
 import msgspec
+import numpy as np
 
 from services.simulator.physics.plant import PlantConfig
-from shared.bus.messages import SimTruth
+from shared.bus import topics
+from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Kill, Scenario
 from tools.lab.studies.counterfactual.moments import Moment
+from tools.lab.studies.sweeps.figures import sole_tilt_max_rad, that_count, unwatched
 from tools.logs.hand_path import HandRow
+from tools.logs.run_log import RunLog
+from tools.output import new_figure, save_figure
 from tools.sim.lockstep import FleetMoment, Lockstep
 from tools.sim.network import BASE
 
 KILL_AFTER_S: Final = 1e-3
+STOOD, FELL = "#2e7d32", "#c0392b"
 
 
 class Task(msgspec.Struct, frozen=True):
@@ -73,21 +82,51 @@ def counterfactual_of(task: Task) -> Counterfactual:
     scenario = scenario_from(task.scenario, moment.at_s, task.kill, task.for_s)
     fleet = Lockstep(task.robot, scenario, BASE, plant=task.plant, hand=task.hand)
     fleet.resume(FleetMoment(moment.state, moment.modules, moment.planner))
-    fell_at_s = None
-    rows: list[SimTruth] = []
-    for truth in fleet.run():
-        if truth.fallen:
-            fell_at_s = truth.scenario_s
-            break
-        rows.append(truth)
+    rows = list(that_count(fleet.run(), -math.inf, unwatched, 0.0))
+    fell = rows.pop() if rows and rows[-1].fallen else None
     return Counterfactual(
         at_s=moment.at_s,
-        stood=fell_at_s is None,
-        fell_after_s=None if fell_at_s is None else fell_at_s - moment.at_s,
+        stood=fell is None,
+        fell_after_s=None if fell is None else fell.scenario_s - moment.at_s,
         com_x_max_mm=1e3 * max((abs(row.over[0]) for row in rows), default=0.0),
         com_y_max_mm=1e3 * max((abs(row.over[1]) for row in rows), default=0.0),
-        sole_tilt_max_rad=max(
-            (max(row.foot_right_tilt, row.foot_left_tilt) for row in rows), default=0.0
-        ),
+        sole_tilt_max_rad=sole_tilt_max_rad(rows) if rows else 0.0,
         margin=moment.margin,
     )
+
+
+def draw(
+    log: RunLog, counterfactuals: Sequence[Counterfactual], title: str, every_s: float, path: Path
+) -> None:
+    """Draw the fates over the recorded height into a PNG file."""
+    truth = [row for row in log.messages(topics.SIM_TRUTH) if row.scenario_s >= 0.0]
+    figure = new_figure(11, 7.0)
+    height, ended, com, margin = figure.subplots(
+        4, 1, sharex=True, gridspec_kw={"height_ratios": [1.6, 0.4, 1.6, 1.2]}
+    )
+    height.plot([row.scenario_s for row in truth], [row.torso[2] for row in truth], lw=1.1)
+    height.set_ylabel("torso height as recorded, m", fontsize=8)
+    for one in counterfactuals:
+        colour = STOOD if one.stood else FELL
+        ended.axvspan(one.at_s, one.at_s + every_s, color=colour, lw=0)
+    ended.set_yticks([])
+    ended.set_ylabel("killed then", fontsize=8, rotation=0, ha="right", va="center")
+    at = np.array([one.at_s for one in counterfactuals])
+    com.plot(at, [one.com_x_max_mm for one in counterfactuals], ".-", ms=4, lw=0.8, label="x")
+    com.plot(at, [one.com_y_max_mm for one in counterfactuals], ".-", ms=4, lw=0.8, label="y")
+    com.set_ylabel("then COM at most, mm", fontsize=8)
+    com.legend(loc="upper right", fontsize=8, ncols=2)
+    known = [(one.at_s, one.margin) for one in counterfactuals if one.margin is not None]
+    if known:
+        margin.plot(*zip(*known, strict=True), ".-", ms=4, lw=0.8)
+    margin.axhline(0.0, color=FELL, lw=0.8, ls="--")
+    margin.set_ylabel("certificate's margin", fontsize=8)
+    margin.set_xlabel("scenario time of the kill, s")
+    for axis in (height, com, margin):
+        axis.grid(visible=True, lw=0.3, color="#bbbbbb")
+        axis.tick_params(labelsize=8)
+    for event in log.messages(topics.RUN_EVENT):
+        if event.scenario_s > 0.0 and event.t_ns < truth[-1].t_ns + NS_PER_S:
+            height.axvline(event.scenario_s, color="#7f7f7f", lw=0.6, ls=":")
+    figure.suptitle(title, fontsize=11, x=0.01, ha="left")
+    save_figure(figure, path)

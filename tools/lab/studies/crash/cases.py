@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import StrEnum
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 
@@ -73,7 +73,7 @@ class CrashCase(msgspec.Struct, frozen=True, kw_only=True):
     kind: str
     """What sort of crash; `--quick` has at least one of each."""
     crash: tuple[Kill | Fault, ...]
-    expected: CrashVerdict
+    expected: CrashVerdict = CrashVerdict.STOOD
     """The worst that is allowed."""
     why: str
     """Why no better is expected, or why so much is."""
@@ -122,40 +122,6 @@ def scenario_of(case: CrashCase) -> Scenario:
     )
 
 
-def killed(*services: str, signal: str = "KILL") -> tuple[Kill, ...]:
-    """Return these services crashed at once."""
-    row = {"at": CRASH_S, "signal": signal}
-    return tuple(msgspec.convert({**row, "service": name}, Kill) for name in services)
-
-
-def fault(module: str, kind: FaultKind) -> Fault:
-    """Return a drive's fault at the time of the crash."""
-    lasts = FAULT_LASTS_S if kind in ("encoder", "link_lost", "over_temperature") else None
-    return Fault(module=module, kind=kind, at=CRASH_S, duration=lasts)
-
-
-def _of_service(service: str, signal: str) -> CrashCase:
-    """Return the case of one service that dies, or is frozen."""
-    is_joint, is_planner = service in MODULES, service == "planner"
-    if is_joint:
-        why = "its drive holds the module by its own loop; the planner has the others hold"
-    elif is_planner:
-        why = "commands grow old, and all six modules hold on their own gains"
-    else:
-        why = "balance needs nothing from it"
-    how = "kill" if signal == "KILL" else "stop"
-    vital = is_joint or is_planner
-    return CrashCase(
-        name=f"{how}-{service}",
-        kind=f"{how} {'joint service' if is_joint else service}" if vital else f"{service} lost",
-        crash=killed(service, signal=signal),
-        expected=CrashVerdict.STOOD,
-        why=why,
-        holds=vital,
-        quick=service in ("knee_left", "planner") or (signal == "KILL" and not vital),
-    )
-
-
 LIMP: Final = {
     "ankle": (
         CrashVerdict.FELL,
@@ -168,27 +134,6 @@ LIMP: Final = {
     "hip": (CrashVerdict.STOOD, "the other hip carries the torso's pitch alone"),
 }
 """Allowed outcomes of a robot with one limp module, by the kind of module, and why."""
-
-
-def _of_drive(module: str, kind: FaultKind, *, quick: bool = False, sort: str = "") -> CrashCase:
-    """Return the case of one drive's fault; `sort` of crash, if it is not its own."""
-    if kind == "link_lost":
-        expected = CrashVerdict.STOOD
-        why = "the drive holds its last target; its service has lost contact"
-    else:
-        expected, reason = LIMP[kind_of(module)]
-        why = f"limp ({FAULT_KINDS[kind].about}): {reason}"
-    name = "unplugged" if kind == "link_lost" else kind
-    return CrashCase(
-        name=f"{name}-{module}",
-        kind=sort or name,
-        crash=(fault(module, kind),),
-        expected=expected,
-        why=why,
-        leads_again=not DRIVE_FAULTS[kind].zero_lost,
-        quick=quick,
-    )
-
 
 EACH_DRIVE: Final[tuple[tuple[FaultKind, str], ...]] = (
     ("link_lost", "knee_left"),
@@ -211,125 +156,142 @@ LEFT_ONLY: Final[tuple[tuple[FaultKind, str], ...]] = (
 """Faults that leave a module limp as `disarmed` does: left and right are mirrored, and one
 module is enough where only the error's name differs."""
 
-
-def _drives() -> list[CrashCase]:
-    cases = [
-        _of_drive(module, kind, quick=module == quick)
-        for kind, quick in EACH_DRIVE
-        for module in MODULES
-    ]
-    for kind, module in LEFT_ONLY:
-        quick = module == "hip_left" and kind in ("brown_out", "over_voltage")
-        sort = "" if kind == "brown_out" else "drive trips"
-        cases.append(_of_drive(module, kind, quick=quick, sort=sort))
-    return cases
-
-
-def _reengaging() -> list[CrashCase]:
-    """Return the planner killed again as it comes back."""
-    before = (Kill(service="planner", at=0.8), Restart(service="planner", at=0.9))
-    return [
-        CrashCase(
-            name=f"reengaging-{name}",
-            kind="planner killed during re-engagement",
-            crash=(),
-            before=before,
-            triggered_kill=TriggeredKill("planner", modules=modules, after_s=after_s),
-            expected=CrashVerdict.STOOD,
-            why=why,
-            quick=name == "blend",
-        )
-        for name, modules, after_s, why in (
-            ("first", 1, 0.0, "the first module tracks, and others may hold: all hold again"),
-            ("blend", 6, 0.15, "half way from HOLD to TRACK: the blend freezes where it is"),
-        )
-    ]
-
-
 _FREE: Final = "each drive holds by its own loop, and needs neither its service nor the others'"
-_UNNEEDED: Final = "balance needs neither"
+_NEITHER: Final = "HOLD needs neither"
 
 
-def _together() -> list[CrashCase]:
-    """Return what happens to all joint services at once."""
-    rows: tuple[tuple[str, tuple[Kill | Fault, ...]], ...] = (
-        ("kill-all-joints", killed(*MODULES)),
-        ("stop-all-joints", killed(*MODULES, signal="STOP")),
-        ("kill-all-and-planner", killed("planner", *MODULES)),
-        ("unplugged-all", tuple(fault(module, "link_lost") for module in MODULES)),
-    )
-    return [
-        CrashCase(
-            name=name,
-            kind="all joint services",
-            crash=crash,
-            expected=CrashVerdict.STOOD,
-            why=_FREE,
-            quick=name == "kill-all-joints",
-        )
-        for name, crash in rows
-    ]
+def killed(*services: str, signal: str = "KILL") -> tuple[Kill, ...]:
+    """Return these services crashed at once."""
+    row = {"at": CRASH_S, "signal": signal}
+    return tuple(msgspec.convert({**row, "service": name}, Kill) for name in services)
 
 
-def _pair(
-    name: str,
-    *crash: Kill | Fault,
-    expected: CrashVerdict = CrashVerdict.STOOD,
-    why: str = _FREE,
-    holds: bool = True,
-    quick: bool = False,
-) -> CrashCase:
-    """Return the case of two things that are lost at once."""
+def fault(module: str, kind: FaultKind) -> Fault:
+    """Return a drive's fault at the time of the crash."""
+    lasts = FAULT_LASTS_S if kind in ("encoder", "link_lost", "over_temperature") else None
+    return Fault(module=module, kind=kind, at=CRASH_S, duration=lasts)
+
+
+def _lost(service: str, signal: str) -> CrashCase:
+    """Return the case of one service that dies, or is frozen."""
+    is_joint, is_planner = service in MODULES, service == "planner"
+    if is_joint:
+        why = "its drive holds the module by its own loop; the planner has the others hold"
+    elif is_planner:
+        why = "commands grow old, and all six modules hold on their own gains"
+    else:
+        why = "balance needs nothing from it"
+    how = "kill" if signal == "KILL" else "stop"
+    vital = is_joint or is_planner
     return CrashCase(
-        name=f"pair-{name}",
-        kind="pair",
-        crash=crash,
+        name=f"{how}-{service}",
+        kind=f"{how} {'joint service' if is_joint else service}" if vital else f"{service} lost",
+        crash=killed(service, signal=signal),
+        why=why,
+        holds=vital,
+        quick=service in ("knee_left", "planner") or (signal == "KILL" and not vital),
+    )
+
+
+def _faulted(module: str, kind: FaultKind, *, quick: bool, sort: str = "") -> CrashCase:
+    """Return the case of one drive's fault; `sort` of crash, if it is not its own."""
+    name: str = kind
+    expected = CrashVerdict.STOOD
+    if kind == "link_lost":
+        name = "unplugged"
+        why = "the drive holds its last target; its service has lost contact"
+    else:
+        expected, reason = LIMP[kind_of(module)]
+        why = f"limp ({FAULT_KINDS[kind].about}): {reason}"
+    return CrashCase(
+        name=f"{name}-{module}",
+        kind=sort or name,
+        crash=(fault(module, kind),),
         expected=expected,
         why=why,
-        holds=holds,
+        leads_again=not DRIVE_FAULTS[kind].zero_lost,
         quick=quick,
     )
 
 
-def _pairs() -> list[CrashCase]:
-    fell, knees = CrashVerdict.FELL, ("knee_right", "knee_left")
-    limp_hip = fault("hip_left", "disarmed")
-    return [
-        _pair("knees", *killed(*knees)),
-        _pair("ankles", *killed("ankle_right", "ankle_left")),
-        _pair("hips", *killed("hip_right", "hip_left")),
-        _pair("ankle-knee", *killed("ankle_left", "knee_left")),
-        _pair("planner-knee", *killed("planner", "knee_left"), quick=True),
-        _pair("planner-harness", *killed("planner", "harness"), why="HOLD needs neither"),
-        _pair("planner-recorder", *killed("planner", "recorder"), why="HOLD needs neither"),
-        _pair("harness-recorder", *killed("harness", "recorder"), why=_UNNEEDED, holds=False),
-        _pair("stopped-planner-knee", *killed("planner", signal="STOP"), *killed("knee_left")),
-        _pair("knee-unplugged-hip", *killed("knee_left"), fault("hip_right", "link_lost")),
-        _pair("knee-and-its-link", *killed("knee_left"), fault("knee_left", "link_lost")),
-        _pair("unplugged-knees", *(fault(module, "link_lost") for module in knees)),
-        _pair("planner-limp-hip", *killed("planner"), limp_hip, why=LIMP["hip"][1]),
-        _pair(
-            "limp-hips",
-            fault("hip_right", "disarmed"),
-            limp_hip,
-            expected=fell,
-            why="nothing holds the torso's pitch any more but the hand",
-        ),
-        _pair(
-            "limp-knees",
-            *(fault(module, "disarmed") for module in knees),
-            expected=fell,
-            why="both legs fold",
-        ),
-    ]
+def _reengaging(name: str, why: str, modules: int, after_s: float) -> CrashCase:
+    """Return the planner killed again as it comes back."""
+    return CrashCase(
+        name=f"reengaging-{name}",
+        kind="planner killed during re-engagement",
+        crash=(),
+        before=(Kill(service="planner", at=0.8), Restart(service="planner", at=0.9)),
+        triggered_kill=TriggeredKill("planner", modules=modules, after_s=after_s),
+        why=why,
+        quick=name == "blend",
+    )
 
+
+def _all_joints(name: str, *crash: Kill | Fault, quick: bool = False) -> CrashCase:
+    return CrashCase(name=name, kind="all joint services", crash=crash, why=_FREE, quick=quick)
+
+
+def _pair(name: str, *crash: Kill | Fault, why: str = _FREE, **changes: Any) -> CrashCase:
+    """Return the case of two things that are lost at once."""
+    return CrashCase(name=f"pair-{name}", kind="pair", crash=crash, why=why, **changes)
+
+
+_KNEES: Final = ("knee_right", "knee_left")
+_HIP: Final = fault("hip_left", "disarmed")
 
 CASES: Final[Sequence[CrashCase]] = (
-    *(_of_service(service, "KILL") for service in CRASHED),
-    *(_of_service(service, "STOP") for service in CRASHED),
-    *_drives(),
-    *_reengaging(),
-    *_together(),
-    *_pairs(),
+    *(_lost(service, "KILL") for service in CRASHED),
+    *(_lost(service, "STOP") for service in CRASHED),
+    *(
+        _faulted(module, kind, quick=module == quick)
+        for kind, quick in EACH_DRIVE
+        for module in MODULES
+    ),
+    *(
+        _faulted(
+            module,
+            kind,
+            quick=module == "hip_left" and kind in ("brown_out", "over_voltage"),
+            sort="" if kind == "brown_out" else "drive trips",
+        )
+        for kind, module in LEFT_ONLY
+    ),
+    _reengaging("first", "the first module tracks, and others may hold: all hold again", 1, 0.0),
+    _reengaging("blend", "half way from HOLD to TRACK: the blend freezes where it is", 6, 0.15),
+    _all_joints("kill-all-joints", *killed(*MODULES), quick=True),
+    _all_joints("stop-all-joints", *killed(*MODULES, signal="STOP")),
+    _all_joints("kill-all-and-planner", *killed("planner", *MODULES)),
+    _all_joints("unplugged-all", *(fault(module, "link_lost") for module in MODULES)),
+    _pair("knees", *killed(*_KNEES)),
+    _pair("ankles", *killed("ankle_right", "ankle_left")),
+    _pair("hips", *killed("hip_right", "hip_left")),
+    _pair("ankle-knee", *killed("ankle_left", "knee_left")),
+    _pair("planner-knee", *killed("planner", "knee_left"), quick=True),
+    _pair("planner-harness", *killed("planner", "harness"), why=_NEITHER),
+    _pair("planner-recorder", *killed("planner", "recorder"), why=_NEITHER),
+    _pair(
+        "harness-recorder",
+        *killed("harness", "recorder"),
+        why="balance needs neither",
+        holds=False,
+    ),
+    _pair("stopped-planner-knee", *killed("planner", signal="STOP"), *killed("knee_left")),
+    _pair("knee-unplugged-hip", *killed("knee_left"), fault("hip_right", "link_lost")),
+    _pair("knee-and-its-link", *killed("knee_left"), fault("knee_left", "link_lost")),
+    _pair("unplugged-knees", *(fault(module, "link_lost") for module in _KNEES)),
+    _pair("planner-limp-hip", *killed("planner"), _HIP, why=LIMP["hip"][1]),
+    _pair(
+        "limp-hips",
+        fault("hip_right", "disarmed"),
+        _HIP,
+        expected=CrashVerdict.FELL,
+        why="nothing holds the torso's pitch any more but the hand",
+    ),
+    _pair(
+        "limp-knees",
+        *(fault(module, "disarmed") for module in _KNEES),
+        expected=CrashVerdict.FELL,
+        why="both legs fold",
+    ),
 )
 """The whole matrix, in the order in which it is run."""

@@ -18,11 +18,11 @@ from shared.robot.trip_table import JOINT_TRIPS
 from tools.judge.standing import is_tipping
 from tools.judge.verdict import LATE_MAX_S, REAL_TIME_FACTOR_MIN
 from tools.lab.studies.crash.cases import CRASH_S, REQUEST_S, CrashCase, CrashVerdict, scenario_of
+from tools.lab.studies.sweeps.figures import END_TOLERANCE_S, event_steps_nm, sole_tilt_max_rad
 
 SANK_M: Final = 0.05
 """So far below where the torso was, and where the hand led, a robot has sunk. HOLD's springs
 and the hand give way by 0.01 m."""
-END_TOLERANCE_S: Final = 0.1
 UNSAFE: Final = (Mode.FAULT, Mode.DAMP, Mode.DISARMED)
 """What no module that was not hit may come to."""
 
@@ -99,8 +99,8 @@ def measure(case: CrashCase, heard: Heard, robot: RobotConfig) -> CrashResult:
     request_ns = zero_ns + round(REQUEST_S * NS_PER_S)
     reaction = [(name, e) for name, e in heard.events if crash_ns <= e.t_ns < request_ns]
     safe_ms = _safe_ms(case, heard.events, crash_ns, request_ns)
-    steps = [_step(e) for name, e in reaction if name in case.others and e.mode_after == Mode.HOLD]
-    later = [(name, e) for name, e in heard.events if e.t_ns >= request_ns]
+    holds = [e for name, e in reaction if name in case.others and e.mode_after == Mode.HOLD]
+    later = [event for _, event in heard.events if event.t_ns >= request_ns]
     fell_at = next((row.scenario_s for row in truth if row.fallen), None)
     standing = [row for row in after if not row.fallen] or after[:1]
     scenario = scenario_of(case)
@@ -123,27 +123,27 @@ def measure(case: CrashCase, heard: Heard, robot: RobotConfig) -> CrashResult:
     leads = all(mode == "T" for mode in heard.modes)
     if verdict is not CrashVerdict.FELL and not leads and case.leads_again:
         remarks.append(f"does not lead again: {''.join(heard.modes)}")
-    tracks = [e.t_ns for _, e in later if e.mode_after == Mode.TRACK]
-    backs = [row.t_ns for row in heard.said if _is(row, RunEventKind.RESTARTED, REQUEST_S)]
+    tracks = [event.t_ns for event in later if event.mode_after == Mode.TRACK]
+    backs = [
+        row.t_ns
+        for row in heard.said
+        if row.kind == RunEventKind.RESTARTED and row.scenario_s >= REQUEST_S
+    ]
     x, y = ([1e3 * row.over[axis] for row in standing] for axis in (0, 1))
     return CrashResult(
         verdict=verdict,
         fell_after_s=None if fell_at is None else fell_at - crash_s,
         safe_ms=safe_ms,
-        torque_step_nm=max(steps, default=None),
-        torque_step_back_nm=max((_step(e) for _, e in later), default=None),
+        torque_step_nm=max(event_steps_nm(holds), default=None),
+        torque_step_back_nm=max(event_steps_nm(later), default=None),
         leads_again_s=(max(tracks) - backs[0]) / NS_PER_S if leads and tracks and backs else None,
         com_x_mm=(min(x), max(x)),
         com_y_mm=(min(y), max(y)),
         sank_mm=1e3 * sank,
-        sole_tilt_max_rad=max(max(row.foot_right_tilt, row.foot_left_tilt) for row in standing),
+        sole_tilt_max_rad=sole_tilt_max_rad(standing),
         in_real_time=last.real_time_factor >= REAL_TIME_FACTOR_MIN and last.late_s <= LATE_MAX_S,
         remarks=tuple(remarks),
     )
-
-
-def _is(row: RunEvent, kind: RunEventKind, since_s: float) -> bool:
-    return row.kind == kind and row.scenario_s >= since_s
 
 
 def _crash_s(case: CrashCase, said: Sequence[RunEvent]) -> float | None:
@@ -163,23 +163,16 @@ def _safe_ms(
     case: CrashCase, events: Sequence[tuple[str, JointEvent]], crash_ns: int, request_ns: int
 ) -> float | None:
     """Return the time until every module that was not hit has left TRACK for HOLD, ms."""
-    slowest = None
+    took = []
     for module in case.others:
-        own = [event for name, event in events if name == module]
-        before = [event.mode_after for event in own if event.t_ns < crash_ns]
-        if before and before[-1] == Mode.HOLD:
-            took = 0.0
-        else:
-            holds = [
-                event.t_ns
-                for event in own
-                if crash_ns <= event.t_ns < request_ns and event.mode_after == Mode.HOLD
-            ]
-            if not holds:
-                return None
-            took = (holds[0] - crash_ns) / NS_PER_MS
-        slowest = max(slowest or 0.0, took)
-    return slowest
+        own = [event for name, event in events if name == module and event.t_ns < request_ns]
+        before = [event for event in own if event.t_ns < crash_ns]
+        held = before[-1:] + own[len(before) :]
+        holds = [max(0, e.t_ns - crash_ns) for e in held if e.mode_after == Mode.HOLD]
+        if not holds:
+            return None
+        took.append(holds[0] / NS_PER_MS)
+    return max(took, default=None)
 
 
 def _remarks(
@@ -203,7 +196,3 @@ def _remarks(
         if event.cause in JOINT_TRIPS
     ]
     return words
-
-
-def _step(event: JointEvent) -> float:
-    return max(abs(b - a) for a, b in zip(event.tau_before, event.tau_after, strict=True))

@@ -64,7 +64,7 @@ def describe(case: CrashCase) -> str:
 
 
 def list_cases(cases: Sequence[CrashCase], console: Console) -> None:
-    """Print the cases that would be run."""
+    """Print cases."""
     table = Table(title=f"{len(cases)} cases", title_justify="left")
     table.add_column("name", no_wrap=True)
     table.add_column("at worst")
@@ -80,12 +80,13 @@ def line_of(result: Result) -> Text:
     case, outcome = result
     verdict = Text(f"{outcome.verdict.upper():8}", COLOUR[outcome.verdict])
     words = [marked("{} {}", verdict, case.name)]
-    if outcome.fell_after_s is not None:
-        words.append(Text(f"{outcome.fell_after_s:.2f} s after the crash"))
-    if outcome.safe_ms is not None:
-        words.append(Text(f"safe after {outcome.safe_ms:.0f} ms"))
-    if outcome.leads_again_s is not None:
-        words.append(Text(f"leads again {outcome.leads_again_s:.2f} s after the request"))
+    for value, text in (
+        (outcome.fell_after_s, "{:.2f} s after the crash"),
+        (outcome.safe_ms, "safe after {:.0f} ms"),
+        (outcome.leads_again_s, "leads again {:.2f} s after the request"),
+    ):
+        if value is not None:
+            words.append(Text(text.format(value)))
     if outcome.tries > 1:
         words.append(Text(f"at try {outcome.tries}"))
     if not result.good:
@@ -118,22 +119,12 @@ def show(results: Sequence[Result], console: Console) -> None:
             console.print(marked("[yellow]{}[/]: {}", case.name, text), highlight=False)
     bad = [result for result in results if not result.good]
     for case, outcome in bad:
-        console.print(
-            marked("[bold red]{}[/] {}: {}", outcome.verdict.upper(), case.name, case.why)
-        )
-    counts = ", ".join(
-        f"{number} {name}" for name, number in count_by_verdict(results).items() if number
-    )
-    colour = "red" if bad else "green"
-    console.print(
-        marked(
-            f"[bold {colour}]{{}} of {{}} as expected or better[/]: {{}}",
-            len(results) - len(bad),
-            len(results),
-            counts,
-        ),
-        highlight=False,
-    )
+        verdict = outcome.verdict.upper()
+        console.print(marked("[bold red]{}[/] {}: {}", verdict, case.name, case.why))
+    counts = ", ".join(f"{many} {name}" for name, many in count_by_verdict(results).items() if many)
+    good = len(results) - len(bad)
+    text = f"[bold {'red' if bad else 'green'}]{{}} of {{}} as expected or better[/]: {{}}"
+    console.print(marked(text, good, len(results), counts), highlight=False)
 
 
 def count_by_verdict(results: Sequence[Result]) -> dict[str, int]:
@@ -143,14 +134,7 @@ def count_by_verdict(results: Sequence[Result]) -> dict[str, int]:
 
 
 def write(results: Sequence[Result], out: Path, about: Mapping[str, str], *, planned: int) -> None:
-    """Rewrite JSON and JUnit atomically.
-
-    Args:
-        results: so far.
-        out: the folder.
-        about: code, machine and robot.
-        planned: the selected cases.
-    """
+    """Rewrite JSON and JUnit of the results so far; `about`: code, machine and robot."""
     replace_file(out / RESULTS, as_json(results, about, planned=planned))
     replace_file(out / JUNIT, as_junit(results, about))
 
@@ -183,7 +167,9 @@ def as_junit(results: Sequence[Result], about: Mapping[str, str]) -> bytes:
     """Return the results as JUnit XML: worse than expected is a failure, unjudged an error."""
     bad = [result for result in results if not result.good]
     errors = sum(outcome.verdict is CrashVerdict.UNJUDGED for _, outcome in bad)
-    suite = ET.Element(
+    suites = ET.Element("testsuites")
+    suite = ET.SubElement(
+        suites,
         "testsuite",
         name=SUITE,
         tests=str(len(results)),
@@ -197,13 +183,8 @@ def as_junit(results: Sequence[Result], about: Mapping[str, str]) -> bytes:
         ET.SubElement(properties, "property", name=name, value=value)
     for result in results:
         case, outcome = result
-        row = ET.SubElement(
-            suite,
-            "testcase",
-            classname=f"crashtest.{case.kind}",
-            name=case.name,
-            time=f"{outcome.wall_s:.1f}",
-        )
+        row = ET.SubElement(suite, "testcase", classname=f"crashtest.{case.kind}", name=case.name)
+        row.set("time", f"{outcome.wall_s:.1f}")
         if not result.good:
             tag = "error" if outcome.verdict is CrashVerdict.UNJUDGED else "failure"
             words = f"{outcome.verdict}; expected at worst: {case.expected}"
@@ -213,8 +194,6 @@ def as_junit(results: Sequence[Result], about: Mapping[str, str]) -> bytes:
         figures.text = f"{describe(case)}\n" + "\n".join(
             f"{name}: {value}" for name, value in msgspec.to_builtins(outcome).items()
         )
-    suites = ET.Element("testsuites")
-    suites.append(suite)
     ET.indent(suites)
     text: bytes = ET.tostring(suites, encoding="utf-8", xml_declaration=True)
     return text + b"\n"

@@ -67,17 +67,10 @@ def run_case(
     show: Show,
     *,
     seed: int = 0,
-    true_plant: PlantConfig | None = None,
 ) -> CrashResult:
     """Run a case, a second time if the first was disturbed and the robot stood.
 
-    Args:
-        case: what dies.
-        robot: the robot.
-        out: the case's folder; made here.
-        show: sees the run as it goes on.
-        seed: of the sensors' noise.
-        true_plant: how the simulated robot differs from `robot`; None: the default.
+    Its folder `out` is made here; `show` sees the run as it goes on.
     """
     begin_s = time.monotonic()
     tries = 0
@@ -85,7 +78,7 @@ def run_case(
         tries += 1
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir(parents=True)
-        outcome = _run_once(case, robot, out, show, seed, true_plant or PlantConfig())
+        outcome = _run_once(case, robot, out, show, seed)
         judged = outcome.in_real_time and outcome.verdict is not CrashVerdict.UNJUDGED
         if judged or outcome.verdict is CrashVerdict.FELL:
             break
@@ -97,9 +90,7 @@ def run_case(
     return outcome
 
 
-def _run_once(
-    case: CrashCase, robot: RobotConfig, out: Path, show: Show, seed: int, true_plant: PlantConfig
-) -> CrashResult:
+def _run_once(case: CrashCase, robot: RobotConfig, out: Path, show: Show, seed: int) -> CrashResult:
     scenario = scenario_of(case)
     down = {row.service for row in scenario.kill}
 
@@ -119,7 +110,7 @@ def _run_once(
             lead,
             verb="crash",
             seed=seed,
-            true_plant=true_plant,
+            true_plant=PlantConfig(),
             no_restart=down,
         )
     except (RunError, FleetError) as error:
@@ -129,12 +120,7 @@ def _run_once(
 
 
 def died_of(services: Sequence[ServiceInfo], said: Sequence[RunEvent]) -> list[str]:
-    """Return the services that have ended, now or before, without a request.
-
-    Args:
-        services: their states at the end of the run.
-        said: the actions on them.
-    """
+    """Return the services that ended without a request, by their states and the actions on them."""
     last = {row.subject: row.kind for row in said}
     return [
         service.name

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import random
-from typing import Final
+from typing import Final, Literal
 
 import msgspec
 import numpy as np
@@ -32,6 +32,7 @@ from shared.joints import N_LEG
 from tools.lab.design.dynamic_certificate import Condition, DynamicCertificate, nodes_of
 from tools.lab.design.sampled_loop import NOMINAL, HandModel
 from tools.lab.design.split_program import design_of
+from tools.lab.studies.sweeps.figures import scalars
 from tools.sim.lockstep import Lockstep
 
 HEIGHTS: Final = (0.95, 1.188)
@@ -64,7 +65,6 @@ STILL_RAD_S: Final = 0.02
 """rad/s; the encoders' counts alone cause this much at rest."""
 SHAKES_RAD_S: Final = 0.1
 """More than this, long after the tap, has grown at once and is held by the torque limits."""
-ENDINGS: Final = frozenset(("tracked", "left", "fell", "unready"))
 
 
 class DynamicsTrial(msgspec.Struct, frozen=True, kw_only=True):
@@ -94,21 +94,20 @@ class DynamicsResult(msgspec.Struct, frozen=True, kw_only=True):
     early_rad_s: float
     """Root mean square of the joints' rates after the tap."""
     late_rad_s: float
-    ended: str
+    ended: Literal["tracked", "left", "fell", "unready"]
     """tracked, left (a module left TRACK), fell, or unready: with the shipped gains it did not
     stand and track in a pose for which the certificate can be evaluated, and nothing was tried.
     """
+    said_stable: bool
+    """The certificate says that every motion fades."""
+    grew: bool
+    """The motion grew (`has_grown`)."""
 
-    @property
-    def said_stable(self) -> bool:
-        """True if the certificate says that every motion fades."""
-        return self.rate < 0.0
 
-    @property
-    def grew(self) -> bool:
-        """True if the motion grew."""
-        least = min(SHAKES_RAD_S, max(GREW * self.early_rad_s, STILL_RAD_S))
-        return self.late_rad_s > least or self.ended in ("left", "fell")
+def has_grown(early_rad_s: float, late_rad_s: float, ended: str) -> bool:
+    """Return True for motion that rises, stays large, or ends the lead."""
+    least = min(SHAKES_RAD_S, max(GREW * early_rad_s, STILL_RAD_S))
+    return late_rad_s > least or ended in ("left", "fell")
 
 
 def draw(seed: int, number: int) -> DynamicsTrial:
@@ -125,6 +124,12 @@ def draw(seed: int, number: int) -> DynamicsTrial:
         bandwidth_hz=round(_log(dice, *BANDWIDTH_HZ), 3),
         coupling=round(_log(dice, *COUPLING), 3),
     )
+
+
+def row_of(trial: DynamicsTrial) -> dict[str, object]:
+    """Return a trial's draws by column."""
+    factors = {f"damping_{joint}": factor for joint, factor in enumerate(trial.damping)}
+    return scalars(trial) | factors
 
 
 def _log(dice: random.Random, low: float, high: float) -> float:
@@ -187,8 +192,9 @@ def scenario_of(robot: RobotConfig, trial: DynamicsTrial) -> Scenario:
 
 
 UNREADY: Final = DynamicsResult(
-    rate=0.0, frequency_hz=0.0, mode="", early_rad_s=0.0, late_rad_s=0.0, ended="unready"
-)
+    rate=0.0, frequency_hz=0.0, mode="", early_rad_s=0.0, late_rad_s=0.0, ended="unready",
+    said_stable=False, grew=False,
+)  # fmt: skip
 
 
 def run_trial(trial: DynamicsTrial, robot: RobotConfig) -> DynamicsResult:
@@ -203,7 +209,7 @@ def run_trial(trial: DynamicsTrial, robot: RobotConfig) -> DynamicsResult:
     rates: list[float] = []
     times: list[float] = []
     predicted: DynamicsResult | None = None
-    ended = "tracked"
+    ended: Literal["tracked", "left", "fell"] = "tracked"
     for row in fleet.run():
         if row.fallen or any(c.failsafe.mode is not Mode.TRACK for c in fleet.controllers):
             if row.scenario_s >= TAKEN_OVER_S:
@@ -223,13 +229,14 @@ def run_trial(trial: DynamicsTrial, robot: RobotConfig) -> DynamicsResult:
         return UNREADY
     t, squares = np.array(times), np.array(rates)
     begin = TAP_S + TAP_LASTS_S
-    early = squares[t < begin + WINDOW_S]
-    late = squares[t > DURATION_S - WINDOW_S] if ended == "tracked" else squares[-5:]
+    early = _root(squares[t < begin + WINDOW_S])
+    late = _root(squares[t > DURATION_S - WINDOW_S] if ended == "tracked" else squares[-5:])
     return msgspec.structs.replace(
         predicted,
-        early_rad_s=_root(early),
-        late_rad_s=_root(late),
+        early_rad_s=early,
+        late_rad_s=late,
         ended=ended,
+        grew=has_grown(early, late, ended),
     )
 
 
@@ -276,11 +283,10 @@ def _said(fleet: Lockstep, robot: RobotConfig, trial: DynamicsTrial) -> Dynamics
         for half in (0, 1)
     ]
     worst = max(verdicts, key=lambda verdict: verdict.excess)
-    return DynamicsResult(
+    return msgspec.structs.replace(
+        UNREADY,
         rate=worst.excess,
         frequency_hz=worst.growth.frequency_hz,
         mode=worst.condition.words().partition(":")[0],
-        early_rad_s=0.0,
-        late_rad_s=0.0,
-        ended="",
+        said_stable=worst.excess < 0.0,
     )

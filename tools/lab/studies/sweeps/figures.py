@@ -1,4 +1,4 @@
-"""Shared by kill and latency study: which rows count, how a case ends, figures."""
+"""What the trials measure alike: which rows count, how a case ends, figures."""
 
 from __future__ import annotations
 
@@ -18,6 +18,10 @@ from tools.sim.lockstep import Watch
 END_TOLERANCE_S: Final = 0.1
 
 
+def unwatched(_row: SimTruth) -> None:
+    """Watch nothing."""
+
+
 class Ending(StrEnum):
     """How a case came out."""
 
@@ -29,13 +33,10 @@ class Ending(StrEnum):
     """The robot stands, but the six modules never came to track: there was no scenario."""
 
 
-ENDINGS: Final = frozenset(str(ending) for ending in Ending)
-
-
 class Ended(msgspec.Struct, frozen=True, kw_only=True):
     """What every outcome says first."""
 
-    ending: str
+    ending: Ending
     fell_at_s: float | None = None
     """Scenario time."""
 
@@ -54,7 +55,7 @@ def exit_code(endings: Iterable[str]) -> int:
 
 
 def that_count(
-    run: Iterable[SimTruth], from_s: float, watch: Watch | None, after_fall_s: float
+    run: Iterable[SimTruth], from_s: float, watch: Watch, after_fall_s: float
 ) -> Iterator[SimTruth]:
     """Run to the end or to the fall; yield what counts of it, a fall included.
 
@@ -66,8 +67,7 @@ def that_count(
     """
     fell_at_s: float | None = None
     for row in run:
-        if watch is not None:
-            watch(row)
+        watch(row)
         if fell_at_s is not None:
             if row.scenario_s > fell_at_s + after_fall_s:
                 return
@@ -77,13 +77,7 @@ def that_count(
 
 
 def ending_of(last: SimTruth, end_s: float, robot: RobotConfig) -> Ending:
-    """Return how a case came out, by the last row that counts.
-
-    Args:
-        last: that row.
-        end_s: when the case is over, scenario time, s.
-        robot: for the size of its feet.
-    """
+    """Return how a case came out that ends at a scenario time, by the last row that counts."""
     if last.fallen or last.scenario_s < end_s - END_TOLERANCE_S:
         return Ending.FELL
     return Ending.TIPPING if is_tipping(last, robot) else Ending.STOOD
@@ -102,6 +96,18 @@ def operator_peak_n(rows: Sequence[SimTruth]) -> float:
 def sole_tilt_max_rad(rows: Sequence[SimTruth]) -> float:
     """Return the largest tilt of a sole, rad."""
     return max(max(row.foot_right_tilt, row.foot_left_tilt) for row in rows)
+
+
+def with_payload(robot: RobotConfig, payload: float) -> RobotConfig:
+    """Return the robot with another payload, kg; its gain schedule may then be stale."""
+    mass = msgspec.structs.replace(robot.mass, payload=payload)
+    return msgspec.structs.replace(robot, mass=mass)
+
+
+def scalars(case: msgspec.Struct) -> dict[str, object]:
+    """Return the draws of a case that fill one column each."""
+    values = msgspec.structs.asdict(case)
+    return {name: value for name, value in values.items() if not isinstance(value, tuple)}
 
 
 def step_nm(before: Sequence[float], after: Sequence[float]) -> float:

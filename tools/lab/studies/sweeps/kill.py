@@ -3,44 +3,39 @@
 from __future__ import annotations
 
 import argparse
-from functools import partial
-from typing import Final, TypeAlias
+from collections.abc import Callable, Sequence
+from typing import Final
 
-import msgspec
+from rich.table import Table
 
 from shared.config.robot_config import RobotConfig
-from tools.lab.studies.sweeps import cases, picture, plants, push_range, report, study
-from tools.lab.studies.sweeps.figures import ENDINGS, Ending, exit_code
-from tools.lab.studies.sweeps.outcome import KillResult, plant_of, run_case
-from tools.lab.studies.sweeps.prepare import needs_schedule, prepare
-from tools.lab.studies.sweeps.record import run_alone
-from tools.lab.studies.sweeps.table import code_of
+from tools.lab.studies.sweeps import kill_picture, kill_trial, plants, push_range
+from tools.lab.studies.sweeps.figures import Ending, exit_code, with_payload
+from tools.lab.studies.sweeps.kill_trial import PUSHES_MAX, KillCase, KillCases, KillResult
+from tools.lab.studies.sweeps.report import parted, show_falls, show_share
+from tools.lab.studies.sweeps.study import CaseLog, Finished, Study, bar
+from tools.lab.studies.sweeps.table import Row
 from tools.live import experiment
-from tools.number_arguments import count, natural
 from tools.terminal import Console
-from tools.verb_table import add_config
 
-N: Final = 500
-TABLE: Final = "cases.csv"
 PICTURE: Final = "cases.png"
-CODE: Final = code_of("tools.lab.studies.sweeps.outcome", "tools.lab.studies.sweeps.prepare")
-"""What decides how a case comes out."""
-COLUMNS_OUT: Final = KillResult.__struct_fields__
-LABELS: Final = {"ending": ENDINGS}
-Task: TypeAlias = "tuple[cases.KillCase, RobotConfig]"
-
-EXAMPLES: Final = """
-    xrl sweep kill
-    xrl sweep kill --n 500 --seed 1 --out out/kill
-    xrl sweep kill --only 137 --seed 1
-    xrl sweep kill --only 137 --seed 1 --out out/case137
-"""
+WORST: Final = (
+    ("com_x_max_mm", "COM forward", 1.0, "mm"),
+    ("com_x_min_mm", "COM backward", -1.0, "mm"),
+    ("com_y_max_mm", "COM to the left", 1.0, "mm"),
+    ("com_y_min_mm", "COM to the right", -1.0, "mm"),
+    ("sole_tilt_max_rad", "tilt of a sole", 1.0, "rad"),
+    ("foot_load_min_n", "load on the lighter foot", -1.0, "N"),
+    ("slip_max_mm", "slip of a foot", 1.0, "mm"),
+    ("torque_step_nm", "torque step at the hand-over", 1.0, "N m"),
+    ("hold_ms", "kill to HOLD", 1.0, "ms"),
+    ("operator_peak_before_n", "operator's force before the kill", 1.0, "N"),
+)
+"""Column, in words, which sign is worse, unit."""
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the study's flags."""
-    add_config(parser)
-    parser.add_argument("--n", type=count, default=N, help=f"cases ({N})")
+    """Add the study's own flags."""
     parser.add_argument(
         "--split", choices=experiment.choices("split"), help="gain split of the law"
     )
@@ -49,114 +44,110 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     )
     push_range.add_flag(parser)
     experiment.add_imu(parser)
-    parser.add_argument(
-        "--only",
-        type=natural,
-        metavar="CASE",
-        help="run this case alone and print all of it; exit code 1 if it fell",
-    )
-    alone = "; with --only: where the case's log goes (default: none)"
-    study.add_flags(parser, "kill", f"{TABLE} and {PICTURE}", alone)
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run the study, or one case of it; 0 if none fell."""
+def load(args: argparse.Namespace) -> RobotConfig:
+    """Check the flags and return the robot."""
     push_range.check(args)
-    executor = study.executor_of(args, CODE)
-    robot = experiment.make_robot(args)
-    console = Console()
-    if args.only is not None:
-        return _run_one(args, robot, console)
-    return _run_all(args, robot, executor, console)
+    return experiment.make_robot(args)
 
 
-def _run_all(
-    args: argparse.Namespace, robot: RobotConfig, executor: study.Executor, console: Console
-) -> int:
-    study_of = cases.KillCases(robot, args.push)
-    drawn = [study_of.draw(args.seed, number) for number in range(args.n)]
-    rows_begin = [cases.row_of(case) for case in drawn]
-    columns = [*rows_begin[0], *COLUMNS_OUT]
-
-    def tasks(done: set[int]) -> list[Task]:
-        missing = [case for case in drawn if case.number not in done]
-        robots = _robots({case.payload_kg for case in missing}, robot, executor.workers, console)
-        return [(case, robots[case.payload_kg]) for case in missing]
-
-    inputs = study.inputs(
-        "kill", robot, CODE, seed=str(args.seed), push=f"{args.push:g}", ranges=plants.digest()
-    )
-    finished = study.run(
-        study.Study(
-            "kill", TABLE, columns, LABELS, inputs, rows_begin, args.n, JOB,
-            f"{_command(args)} --n {args.n}",
-        ),
-        tasks, args.out, executor, console,
-    )  # fmt: skip
-    rows = finished.rows
-    fallen = report.falls(rows)
-    title = f"Planner killed, {len(rows)} random cases, seed {args.seed}, "
-    title += f"{push_range.describe(args)}: {len(fallen)} fell"
-    picture.draw(rows, robot, title, finished.out / PICTURE)
-    report.show(rows, _command(args), console)
-    finished.show_files(f"{TABLE}, {PICTURE}", "case", console)
-    return exit_code(row["ending"] for row in rows)
+def cases(args: argparse.Namespace, robot: RobotConfig) -> tuple[int, Callable[[int], KillCase]]:
+    """Return how many cases there are, and which has a number."""
+    drawn = KillCases(robot, args.push)
+    return args.n, lambda number: drawn.draw(args.seed, number)
 
 
 def _robots(
-    payloads: set[float], robot: RobotConfig, workers: int, console: Console
-) -> dict[float, RobotConfig]:
-    """Return the robot with each payload, ready to run."""
-    ordered = sorted(payloads)
-    loaded = [cases.with_payload(robot, payload) for payload in ordered]
-    if not any(needs_schedule(one) for one in loaded):
-        return dict(zip(ordered, loaded, strict=True))
-    with study.bar("{task.completed} of {task.total} gain schedules", console) as bar:
-        shown = bar.add_task("", total=None)
-        ready = prepare(
-            loaded, workers, lambda done, of: bar.update(shown, completed=done, total=of)
+    cases: Sequence[KillCase], robot: RobotConfig, workers: int, console: Console
+) -> list[RobotConfig]:
+    """Return the robot with the payload of each case, and a gain schedule that fits."""
+    payloads = sorted({case.payload_kg for case in cases})
+    loaded = [with_payload(robot, payload) for payload in payloads]
+    if any(kill_trial.needs_schedule(one) for one in loaded):
+        with bar("{task.completed} of {task.total} gain schedules", console) as shown:
+            line = shown.add_task("", total=None)
+            loaded = kill_trial.prepare(
+                loaded, workers, lambda done, of: shown.update(line, completed=done, total=of)
+            )
+    by_payload = dict(zip(payloads, loaded, strict=True))
+    return [by_payload[case.payload_kg] for case in cases]
+
+
+def _metadata(case: KillCase, command: str) -> dict[str, str]:
+    hand = "hand on" if case.let_go_s is None else f"hand off at {case.let_go_s:g} s"
+    return {"lockstep": f"{command}; delay {case.delay_ms:g} ms, {hand}"}
+
+
+def report(finished: Finished) -> None:
+    """Draw and print what came of the study."""
+    rows, console, command = finished.rows, finished.console, finished.command
+    standing, fallen = parted(rows)
+    title = f"Planner killed, {len(rows)} random cases, seed {finished.args.seed}, "
+    title += f"{push_range.describe(finished.args)}: {len(fallen)} fell"
+    kill_picture.draw(rows, finished.robot, title, finished.out / PICTURE)
+    show_falls(fallen, command, describe, console)
+    if standing:
+        table = Table(title="Worst of those that stood", title_justify="left")
+        for name in ("what", "figure", "case"):
+            table.add_column(name, justify="left" if name == "what" else "right")
+        for column, what, sign, unit in WORST:
+            known = [row for row in standing if row[column] is not None]
+            if known:
+                worst = max(known, key=lambda row: sign * float(row[column]))
+                table.add_row(what, f"{worst[column]:.3g} {unit}", str(worst["number"]))
+        console.print(table)
+        console.print(f"one case alone: {command} --only CASE", style="dim", soft_wrap=True)
+    show_share(len(fallen), len(rows), console)
+
+
+def describe(row: Row) -> str:
+    """Return a case in a line."""
+    words = [f"case {row['number']}: payload {row['payload_kg']:g} kg"]
+    if row["kill_height_m"] is not None:
+        words.append(
+            f"killed at {row['kill_s']:g} s, {row['kill_height_m']:.2f} m, "
+            f"pitch {row['kill_pitch_rad']:.2f} rad"
         )
-    return dict(zip(ordered, ready, strict=True))
-
-
-def _run_one(args: argparse.Namespace, robot: RobotConfig, console: Console) -> int:
-    case = cases.KillCases(robot, args.push).draw(args.seed, args.only)
-    loaded = _robots({case.payload_kg}, robot, 1, console)[case.payload_kg]
-    study.show(f"Case {case.number}, drawn", cases.row_of(case), console)
-    words = f"{_command(args)} --only {case.number}; delay {case.delay_ms:g} ms, " + (
-        "hand on" if case.let_go_s is None else f"hand off at {case.let_go_s:g} s"
-    )
-    return run_alone(
-        partial(run_case, case, loaded),
-        cases.scenario_of(loaded, case),
-        loaded,
-        args.out,
-        {"lockstep": words},
-        console,
-        plant_of(case),
-    )
-
-
-def _run_task(task: Task) -> KillResult:
-    case, robot = task
-    return run_case(case, robot)
-
-
-def _name(task: Task) -> str:
-    return f"case {task[0].number} (xrl sweep kill --seed {task[0].seed} --only {task[0].number})"
-
-
-def _rows(task: Task, outcome: KillResult) -> list[dict[str, object]]:
-    return [cases.row_of(task[0]) | msgspec.structs.asdict(outcome)]
-
-
-JOB: Final = study.Job(_run_task, _name, _rows, lambda row: row["ending"] != Ending.STOOD)
-
-
-def _command(args: argparse.Namespace) -> str:
-    """Return the command of this study, but for --n, --only and --out."""
-    flags = [f"--seed {args.seed}", *push_range.flags(args)]
-    flags += [
-        f"--{name} {getattr(args, name)}" for name in ("split", "jacobian") if getattr(args, name)
+    if row["fell_at_s"] is not None:
+        words.append(f"fell at {row['fell_at_s']:.2f} s")
+    elif row["ending"] is Ending.FELL:
+        words.append("fell before the scenario began")
+    words.append(f"delay {row['delay_ms']:g} ms")
+    hand_off = row["let_go_s"]
+    words.append("hand on" if hand_off is None else f"hand off at {hand_off:g} s")
+    assist = row["pose1_assist_n"] if row["pose2_assist_n"] is None else row["pose2_assist_n"]
+    words.append(f"assist to {assist:g} N")
+    pushes = [
+        f"{row[f'push{i}_x_n']:g},{row[f'push{i}_y_n']:g} N at {row[f'push{i}_at_s']:g} s"
+        for i in range(1, PUSHES_MAX + 1)
+        if row[f"push{i}_at_s"] is not None
     ]
-    return study.command("kill", args, *flags, *(["--imu"] if args.imu else []))
+    words.append("push " + " and ".join(pushes))
+    return ", ".join(words)
+
+
+STUDY: Final = Study[KillCase](
+    name="kill",
+    table="cases.csv",
+    pictures=(PICTURE,),
+    code=("tools.lab.studies.sweeps.kill_trial",),
+    n=500,
+    only="run this case alone and print all of it; exit code 1 if it fell",
+    add_flags=add_flags,
+    load=load,
+    cases=cases,
+    inputs=lambda args: {
+        "seed": str(args.seed),
+        "push": f"{args.push:g}",
+        "ranges": plants.digest(),
+    },
+    row=kill_trial.row_of,
+    figures=KillResult,
+    trial=kill_trial.run_case,
+    robots=_robots,
+    log=CaseLog(kill_trial.scenario_of, kill_trial.plant_of, _metadata),
+    fell=lambda row: row["ending"] is not Ending.STOOD,
+    report=report,
+    exit_code=lambda rows: exit_code(row["ending"] for row in rows),
+)

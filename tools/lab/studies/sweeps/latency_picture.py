@@ -8,6 +8,8 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+import numpy as np
+
 from shared.extras import late
 from tools.lab.studies.sweeps.latency_report import (
     Falls,
@@ -63,22 +65,13 @@ def _shares() -> colors.Colormap:
     return colors.LinearSegmentedColormap.from_list("falls", ["#e3f1e7", "#f2b7a0", "#b3261e"])
 
 
-def draw(rows: Sequence[Row], force_max: float, what: str, folder: Path) -> tuple[Path, ...]:
-    """Draw both pictures into PNG files.
+def draw(rows: Sequence[Row], force_max: float, what: str, folder: Path) -> None:
+    """Draw both pictures into PNG files of a folder.
 
-    Args:
-        rows: of the table.
-        force_max: all that the hand gives, N.
-        what: what else there is to say of the study, such as its seed.
-        folder: of the files.
-
-    Returns:
-        The files.
+    The hand gives `force_max` N at most; `what` is what else there is to say, such as the seed.
     """
-    paths = folder / FALLS, folder / EFFORT
-    _draw_falls(rows, what, paths[0])
-    _draw_effort(without_loss(rows), force_max, what, paths[1])
-    return paths
+    _draw_falls(rows, what, folder / FALLS)
+    _draw_effort(without_loss(rows), force_max, what, folder / EFFORT)
 
 
 def _draw_falls(rows: Sequence[Row], what: str, path: Path) -> None:
@@ -117,7 +110,8 @@ def _draw_map(axis: Any, rows: Sequence[Row], name: str) -> None:
                     x, y, _in_cell(cell, len(delays)), ha="center", va="center", fontsize=7.5,
                     color="white" if cell.fallen > 0.7 * cell.of else "#333333",
                 )  # fmt: skip
-    title = f"{name}: {_in_all(rows, name)}"
+    whole = falls(chosen(rows, name))
+    title = f"{name}: {whole.fallen} of {whole.of} fell"
     if len(jitters := values_in(rows, "jitter_ms")) > 1:
         title += f"; {', '.join(f'{jitter:g}' for jitter in jitters)} ms of jitter together"
     if len(delays) > BOUNDS_COLUMNS:
@@ -149,16 +143,10 @@ def _draw_shares(axis: Any, rows: Sequence[Row]) -> None:
         counted = [falls(chosen(rows, name, delay_ms=delay)) for delay in delays]
         places = [x + look.shift for x, count in enumerate(counted) if count.of]
         counted = [count for count in counted if count.of]
-        shares = [100 * count.fallen / count.of for count in counted]
-        low, high = zip(*(count.bounds for count in counted), strict=True)
-        axis.fill_between(
-            places, [100 * v for v in low], [100 * v for v in high], color=look.colour, alpha=0.13,
-            lw=0,
-        )  # fmt: skip
-        spread = [
-            [max(0.0, s - 100 * v) for s, v in zip(shares, low, strict=True)],
-            [max(0.0, 100 * v - s) for s, v in zip(shares, high, strict=True)],
-        ]
+        shares = np.array([100 * count.fallen / count.of for count in counted])
+        low, high = 100 * np.transpose([count.bounds for count in counted])
+        axis.fill_between(places, low, high, color=look.colour, alpha=0.13, lw=0)
+        spread = np.maximum(0.0, (shares - low, high - shares))
         axis.errorbar(
             places, shares, yerr=spread, color=look.colour, marker=look.marker, ms=6, lw=1.6,
             elinewidth=1.2, capsize=3, label=name,
@@ -182,11 +170,6 @@ def _each(rows: Sequence[Row]) -> str:
     } - {0}
     some = f"{max(counts)}" if len(counts) == 1 else f"{min(counts)} to {max(counts)}"
     return f"{some} trials a point"
-
-
-def _in_all(rows: Sequence[Row], name: str) -> str:
-    count = falls(chosen(rows, name))
-    return f"{count.fallen} of {count.of} fell"
 
 
 def _draw_effort(rows: Sequence[Row], force_max: float, what: str, path: Path) -> None:
@@ -237,9 +220,7 @@ def _draw_control(effort: Any, hold: Any, rows: Sequence[Row], name: str) -> Non
         points.append((place, min(forces), middle, max(forces)))
         held.append((place, 100 * share))
         face = "white" if share > HOLDS else look.colour
-        effort.plot(
-            place, middle, marker=look.marker, ms=6, mfc=face, color=look.colour, zorder=4
-        )  # fmt: skip
+        effort.plot(place, middle, look.marker, ms=6, mfc=face, color=look.colour, zorder=4)
         if falls(own).fallen:
             effort.plot(place, middle, "x", color="#222222", ms=9, mew=1.8, zorder=5)
     if not points:

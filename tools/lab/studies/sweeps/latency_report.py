@@ -8,10 +8,9 @@ from typing import Final, NamedTuple
 
 from rich.table import Table
 
-from tools.lab.studies.sweeps.figures import Ending
 from tools.lab.studies.sweeps.latency_trial import CONTROLS
+from tools.lab.studies.sweeps.report import parted, wilson
 from tools.lab.studies.sweeps.table import Row
-from tools.lab.studies.sweeps.wilson import wilson
 from tools.terminal import Console, marked
 
 WORST: Final = (
@@ -65,7 +64,7 @@ def chosen(rows: Sequence[Row], control: str, **where: float) -> list[Row]:
 
 def falls(rows: Sequence[Row]) -> Falls:
     """Count the trials that did not stand to the end."""
-    return Falls(sum(row["ending"] != Ending.STOOD for row in rows), len(rows))
+    return Falls(len(parted(rows)[1]), len(rows))
 
 
 def without_loss(rows: Sequence[Row]) -> list[Row]:
@@ -76,7 +75,7 @@ def without_loss(rows: Sequence[Row]) -> list[Row]:
 
 def figures(rows: Sequence[Row], column: str) -> list[float]:
     """Return a column's numbers, where there are any."""
-    return [float(row[column]) for row in rows if row[column]]
+    return [row[column] for row in rows if row[column] is not None]
 
 
 def mix(rows: Sequence[Row]) -> str:
@@ -93,13 +92,7 @@ def _listed(values: Sequence[float]) -> str:
 
 
 def show(rows: Sequence[Row], command: str, console: Console) -> None:
-    """Print what came of the study.
-
-    Args:
-        rows: of the table.
-        command: that runs one trial alone, but for the trial's number.
-        console: to print on.
-    """
+    """Print what came of the study; `command` and a number run one trial alone."""
     console.print(_falls_table(rows))
     console.print(_lead_table(rows))
     for name in controls_in(rows):
@@ -118,11 +111,11 @@ def show(rows: Sequence[Row], command: str, console: Console) -> None:
                 there.of,
             )
         console.print(words, highlight=False)
-        standing = [row for row in own if row["ending"] == Ending.STOOD]
+        standing, fallen = parted(own)
         if standing:
             worst = [words.format(max(figures(standing, key))) for key, words in WORST]
             console.print(f"  standing: {', '.join(worst)}", highlight=False)
-        if first := next((row for row in own if row["ending"] != Ending.STOOD), None):
+        for first in fallen[:1]:
             again = f"{command} --only {first['number']}"
             console.print(f"  {first['ending']}: {again}", style="dim", soft_wrap=True)
 

@@ -44,10 +44,12 @@ from tools.lab.studies.sweeps.figures import (
     sole_tilt_max_rad,
     step_nm,
     that_count,
+    unwatched,
 )
-from tools.lab.studies.sweeps.push_range import SHARE, PushRange
+from tools.lab.studies.sweeps.push_range import SHARE, PushRange, uniform
+from tools.lab.studies.sweeps.table import plain
 from tools.sim.centralised.fleet import CentralisedLockstep
-from tools.sim.lockstep import Lockstep, Watch
+from tools.sim.lockstep import Lockstep, Watch, forget
 from tools.sim.virtual_time import Record
 
 SQUATS: Final = ((0.5, 0.0), (3.0, 0.24), (5.5, 0.0), (8.0, 0.24))
@@ -60,9 +62,6 @@ PUSH_S: Final = 0.3
 PUSHES: Final = 3
 PUSHED_UNTIL_S: Final = 5.3
 """The pushes come over the bad network, one in each third of the time, at random."""
-DIGITS: Final = 3
-FLAG_DIGITS: Final = 9
-"""Decimals to which a number of a flag is taken."""
 
 
 class ControlKind(msgspec.Struct, frozen=True):
@@ -86,11 +85,6 @@ CONTROLS: Final = {
     ),
 }
 """By name."""
-
-
-def plain(value: float) -> str:
-    """Return a number as the flags take it: in full, without an exponent."""
-    return f"{value:.{FLAG_DIGITS}f}".rstrip("0").rstrip(".")
 
 
 class Network(msgspec.Struct, frozen=True):
@@ -138,7 +132,7 @@ class LatencyTrial(msgspec.Struct, frozen=True, kw_only=True):
         """Random draws, the same for every delay and control."""
         jitter, loss = plain(self.network.jitter_ms), plain(self.network.loss)
         dice = random.Random(f"latency {self.seed} {self.repeat} {jitter} {loss}")
-        begin = round(dice.uniform(*IMPAIRED_FROM_S), DIGITS)
+        begin = uniform(dice, *IMPAIRED_FROM_S)
         third = (PUSHED_UNTIL_S - begin) / PUSHES
         shoves = []
         for index in range(PUSHES):
@@ -184,6 +178,18 @@ class LatencyResult(Ended, frozen=True, kw_only=True):
     sole_tilt_max_rad: float | None = None
 
 
+def row_of(trial: LatencyTrial) -> dict[str, object]:
+    """Return a trial by column; the network as its flags have it, to the last digit."""
+    network = msgspec.structs.asdict(trial.network)
+    return {
+        "number": trial.number,
+        "repeat": trial.repeat,
+        "control": trial.control,
+        **{name: plain(value) for name, value in network.items()},
+        "impaired_from_s": trial.draw.impaired_from_s,
+    }
+
+
 def robot_of(robot: RobotConfig, control: str) -> RobotConfig:
     """Return the robot with the gain split of a control."""
     split = CONTROLS[control].split
@@ -195,8 +201,7 @@ def robot_of(robot: RobotConfig, control: str) -> RobotConfig:
 class LatencyRecorder:
     """Collects from the messages what the figures need, and passes all of them on."""
 
-    def __init__(self, on_to: Record | None, impaired_from_s: float) -> None:
-        """Take the next receiver, and the scenario time from which messages count."""
+    def __init__(self, on_to: Record, impaired_from_s: float) -> None:
         self._on_to = on_to
         self._tau: dict[str, Pair] = {}
         self._after_ns = round(impaired_from_s * NS_PER_S)
@@ -216,25 +221,16 @@ class LatencyRecorder:
             self._tau[module] = message.tau
         elif isinstance(message, RunEvent) and message.kind == RunEventKind.STARTED:
             self.from_ns = message.t_ns + self._after_ns
-        if self._on_to is not None:
-            self._on_to(topic, module, message)
+        self._on_to(topic, module, message)
 
 
 def fleet_of(trial: LatencyTrial, robot: RobotConfig, record: Record) -> Lockstep:
-    """Return the fleet of a trial, before its first step.
-
-    Args:
-        trial: what happens.
-        robot: as `robot_of` gives it.
-        record: takes every message.
-    """
-    fleet_type = CONTROLS[trial.control].fleet
-    seed = trial.draw.fleet_seed
-    return fleet_type(
+    """Return the fleet of a trial, before its first step."""
+    return CONTROLS[trial.control].fleet(
         robot,
         trial.scenario(robot),
         Impairment(),
-        seed=seed,
+        seed=trial.draw.fleet_seed,
         record=record,
         plant=plant_of(trial),
     )
@@ -249,19 +245,11 @@ def run_trial(
     trial: LatencyTrial,
     robot: RobotConfig,
     *,
-    record: Record | None = None,
-    watch: Watch | None = None,
+    record: Record = forget,
+    watch: Watch = unwatched,
     after_fall_s: float = 0.0,
 ) -> LatencyResult:
-    """Run a trial to its end or to the fall.
-
-    Args:
-        trial: the trial.
-        robot: as `robot_of` gives it.
-        record: takes every message.
-        watch: sees the world at its rate.
-        after_fall_s: time to continue after a fall; measurement ends with the fall.
-    """
+    """Run a trial to its end, or so long beyond the fall, at which measurement ends."""
     impaired_from_s = trial.draw.impaired_from_s
     monitor = LatencyRecorder(record, impaired_from_s)
     fleet = fleet_of(trial, robot, monitor)
@@ -278,14 +266,7 @@ def measure(
     monitor: LatencyRecorder,
     robot: RobotConfig,
 ) -> LatencyResult:
-    """Return the figures of a run.
-
-    Args:
-        rows: the world since the impairment began, to the fall if there was one.
-        events: every change of mode since the start, by module.
-        monitor: the other messages.
-        robot: for the size of its feet.
-    """
+    """Return the figures of a run, by the world since the impairment began and all messages."""
     if not rows or monitor.from_ns is None:
         return LatencyResult(ending=Ending.FELL if rows else Ending.UNREADY)
     last = rows[-1]
@@ -308,13 +289,7 @@ def measure(
 
 
 def hold_share(events: Sequence[tuple[str, JointEvent]], from_ns: int, to_ns: int) -> float:
-    """Return the share of the time in which at least one module held.
-
-    Args:
-        events: every change of mode since the start, by module.
-        from_ns: beginning.
-        to_ns: end.
-    """
+    """Return the share of a time in which a module held, by all changes since the start."""
     if to_ns <= from_ns:
         return 0.0
     holding: set[str] = set()

@@ -17,8 +17,6 @@ from shared.places import FILES
 from shared.toml_file import Section, read_toml
 
 RANGES_FILE: Final = FILES / "plants" / "ranges.toml"
-
-
 LEAST_SHARE: Final = 0.5
 """Fraction of a range's low end below which a wider draw does not go."""
 
@@ -65,12 +63,7 @@ def digest() -> str:
 
 
 def draw(seed: str, ranges: Ranges | None = None, beyond: float = 1.0) -> PlantConfig:
-    """Return a plant.
-
-    Args:
-        seed: the same text draws the same plant.
-        ranges: to draw from; None: the shipped ones.
-        beyond: how many times as wide as they are.
+    """Return a plant: the same text draws the same one; `beyond` widens the ranges.
 
     Raises:
         ConfigError: a key is none of the plant's, or a drawn value is impossible.

@@ -30,15 +30,7 @@ class PushRange:
     """
 
     def __init__(self, robot: RobotConfig, most: float = SHARE) -> None:
-        """Take the stand.
-
-        Args:
-            robot: as its file has it, level floor.
-            most: share of the limit up to which `draw` goes.
-
-        Raises:
-            RunError: the robot does not reach it.
-        """
+        """Stand the robot of a file on a level floor; `draw` goes up to `most` of the limit."""
         poses = Poses(robot)
         height = robot.simulation.stand_height
         z = com_height(poses, height, 0.0)
@@ -53,14 +45,7 @@ class PushRange:
         return self._stand.limit_of_body((math.cos(angle), math.sin(angle))).force_n
 
     def push(self, at: float, duration: float, share: float, angle: float) -> Push:
-        """Return a push of a share of the limit along its direction.
-
-        Args:
-            at: s, scenario time at which it begins.
-            duration: s.
-            share: 1 is the limit.
-            angle: rad from x (forwards) to y (left).
-        """
+        """Return a push of a share of the limit along an angle as for `limit_n`."""
         force = share * self.limit_n(angle)
         x, y = (round(force * axis, DIGITS) for axis in (math.cos(angle), math.sin(angle)))
         return Push(at=round(at, DIGITS), duration=duration, force=(x, y, 0.0))
@@ -71,6 +56,11 @@ class PushRange:
         """Return a push in any direction, of a share between the two of the hardest drawn."""
         share, angle = self._most * dice.uniform(*shares), dice.uniform(-math.pi, math.pi)
         return self.push(at, duration, share, angle)
+
+
+def uniform(dice: random.Random, low: float, high: float) -> float:
+    """Return a number that a table holds exactly as it was drawn."""
+    return round(dice.uniform(low, high), DIGITS)
 
 
 def add_flag(parser: argparse.ArgumentParser) -> None:
@@ -86,18 +76,9 @@ def add_flag(parser: argparse.ArgumentParser) -> None:
 
 
 def check(args: argparse.Namespace) -> None:
-    """Refuse a share that cannot be drawn.
-
-    Raises:
-        RunError: says which shares can.
-    """
+    """Refuse a share that cannot be drawn."""
     if not 0.0 < args.push <= SHARE_MAX:
         raise RunError(f"--push {args.push:g}: more than 0, at most {SHARE_MAX:g}")
-
-
-def flags(args: argparse.Namespace) -> list[str]:
-    """Return the flag as it was given, if it is not the default."""
-    return [] if args.push == SHARE else [f"--push {args.push:g}"]
 
 
 def describe(args: argparse.Namespace) -> str:

@@ -7,20 +7,18 @@ begins from that same moment.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Final
 
 import msgspec
 
 from services.planner.law.split import ScheduledGains
 from services.simulator.physics.plant import PlantConfig
-from shared.bus.messages import SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Kill, Push, Scenario
 from shared.exceptions import RunError
 from tools.lab.design.poses import Poses
 from tools.lab.design.push_limit import LoadedStand, PushLimits, limits_along
-from tools.lab.studies.sweeps.figures import Ending, ending_of
+from tools.lab.studies.sweeps.figures import Ending, ending_of, that_count, unwatched
 from tools.lab.studies.sweeps.push_range import com_height
 from tools.sim.lockstep import FleetMoment, Lockstep
 from tools.sim.network import BASE
@@ -50,6 +48,11 @@ class PushTrial(msgspec.Struct, frozen=True, kw_only=True):
     """Direction of the push: 0 forwards, 90 to the left."""
     duration_s: float
     mode: str
+
+    @property
+    def words(self) -> str:
+        """The point in words."""
+        return f"{self.pose}, {self.angle_deg} degrees, {self.duration_s:g} s, {self.mode}"
 
 
 class PushResult(msgspec.Struct, frozen=True, kw_only=True):
@@ -91,11 +94,6 @@ def scenario_of(trial: PushTrial, force_n: float) -> Scenario:
 
 def run_trial(trial: PushTrial, robot: RobotConfig, plant: PlantConfig) -> PushResult:
     """Find the hardest push by bisection.
-
-    Args:
-        trial: the point.
-        robot: ready to run.
-        plant: how the true robot differs.
 
     Raises:
         RunError: the robot does not come to the pose.
@@ -156,12 +154,5 @@ def _stands(
     scenario = scenario_of(trial, force_n)
     fleet = Lockstep(robot, msgspec.structs.replace(scenario, kill=()), BASE, plant=plant)
     fleet.resume(start)
-    rows = list(_until_down(fleet.run()))
+    rows = list(that_count(fleet.run(), -math.inf, unwatched, 0.0))
     return bool(rows) and ending_of(rows[-1], scenario.duration, robot) is Ending.STOOD
-
-
-def _until_down(rows: Iterator[SimTruth]) -> Iterator[SimTruth]:
-    for row in rows:
-        yield row
-        if row.fallen:
-            return

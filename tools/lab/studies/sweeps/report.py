@@ -1,105 +1,88 @@
-"""The kill study in words: falls, with their bound, and the cases that came closest."""
+"""What the studies' reports have alike: falls and their share, and predictions that came true."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Final
-
-from rich.table import Table
 
 from tools.lab.studies.sweeps.figures import Ending
 from tools.lab.studies.sweeps.table import Row
-from tools.lab.studies.sweeps.wilson import wilson
+from tools.output import new_figure, save_figure
 from tools.terminal import Console, marked
 
 FALLS_SHOWN: Final = 10
+Z_95: Final = 1.959964
+"""Two-sided 95 % of a normal distribution, in standard deviations."""
+FALL_COLOUR: Final = "#c0392b"
 
 
-WORST: Final = (
-    ("com_x_max_mm", "COM forward", 1.0, "mm"),
-    ("com_x_min_mm", "COM backward", -1.0, "mm"),
-    ("com_y_max_mm", "COM to the left", 1.0, "mm"),
-    ("com_y_min_mm", "COM to the right", -1.0, "mm"),
-    ("sole_tilt_max_rad", "tilt of a sole", 1.0, "rad"),
-    ("foot_load_min_n", "load on the lighter foot", -1.0, "N"),
-    ("slip_max_mm", "slip of a foot", 1.0, "mm"),
-    ("torque_step_nm", "torque step at the hand-over", 1.0, "N m"),
-    ("hold_ms", "kill to HOLD", 1.0, "ms"),
-    ("operator_peak_before_n", "operator's force before the kill", 1.0, "N"),
-)
-"""Column, in words, which sign is worse, unit."""
+def wilson(hits: int, of: int) -> tuple[float, float]:
+    """Return the 95 % interval of a share that was seen in some trials (E. B. Wilson, 1927).
 
-
-def falls(rows: Sequence[Row]) -> list[Row]:
-    """Return the cases that did not stand to the end."""
-    return [row for row in rows if row["ending"] != Ending.STOOD]
-
-
-def show(rows: Sequence[Row], command: str, console: Console) -> None:
-    """Print what came of the study.
+    It is one share's: of several intervals, the worst is missed more often than once in 20.
 
     Args:
-        rows: of the table.
-        command: that runs one case alone, but for the case's number.
-        console: to print on.
+        hits: how often it was so.
+        of: trials, independent of each other; at least 1.
     """
-    fallen = falls(rows)
+    share, z2 = hits / of, Z_95 * Z_95
+    middle = (share + z2 / (2 * of)) / (1.0 + z2 / of)
+    half = Z_95 / (1.0 + z2 / of) * math.sqrt(share * (1.0 - share) / of + z2 / (4 * of * of))
+    return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def parted(rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
+    """Return the cases that stood to the end, and the others."""
+    standing = [row for row in rows if row["ending"] is Ending.STOOD]
+    return standing, [row for row in rows if row["ending"] is not Ending.STOOD]
+
+
+def show_falls(
+    fallen: Sequence[Row], command: str, describe: Callable[[Row], str], console: Console
+) -> None:
+    """Print each case that did not stand, with the command that runs it alone."""
     for row in fallen[:FALLS_SHOWN]:
         console.print(marked("[red]{}[/] {}", row["ending"], describe(row)), highlight=False)
         console.print(f"    {command} --only {row['number']}", style="dim", soft_wrap=True)
     if len(fallen) > FALLS_SHOWN:
         console.print(f"... and {len(fallen) - FALLS_SHOWN} more in the table")
-    standing = [row for row in rows if row["ending"] == Ending.STOOD]
-    if standing:
-        console.print(_worst(standing))
-        console.print(f"one case alone: {command} --only CASE", style="dim", soft_wrap=True)
-    low, high = wilson(len(fallen), len(rows))
+
+
+def show_share(fallen: int, of: int, console: Console) -> None:
+    """Print how many fell, and the bounds of their share."""
+    low, high = wilson(fallen, of)
     colour = "red" if fallen else "green"
-    console.print(
-        marked(
-            f"[bold {colour}]{{}} falls of {{}}[/]; share of falls {{:.2f}} to {{:.2f}} % "
-            "(95 %, Wilson)",
-            len(fallen),
-            len(rows),
-            100 * low,
-            100 * high,
-        ),
-        highlight=False,
+    text = (
+        f"[bold {colour}]{{}} falls of {{}}[/]; share of falls {{:.2f}} to {{:.2f}} % "
+        "(95 %, Wilson)"
     )
+    console.print(marked(text, fallen, of, 100 * low, 100 * high), highlight=False)
 
 
-def describe(row: Row) -> str:
-    """Return a case in a line."""
-    words = [f"case {row['number']}: payload {row['payload_kg']} kg"]
-    if row["kill_height_m"]:
-        words.append(
-            f"killed at {row['kill_s']} s, {float(row['kill_height_m']):.2f} m, "
-            f"pitch {float(row['kill_pitch_rad']):.2f} rad"
-        )
-    if row["fell_at_s"]:
-        words.append(f"fell at {float(row['fell_at_s']):.2f} s")
-    elif row["ending"] == Ending.FELL:
-        words.append("fell before the scenario began")
-    words.append(f"delay {row['delay_ms']} ms")
-    words.append(f"hand off at {row['let_go_s']} s" if row["let_go_s"] else "hand on")
-    assist = row["pose2_assist_n"] or row["pose1_assist_n"]
-    words.append(f"assist to {assist} N")
-    pushes = [
-        f"{row[f'push{i}_x_n']},{row[f'push{i}_y_n']} N at {row[f'push{i}_at_s']} s"
-        for i in (1, 2, 3)
-        if row[f"push{i}_at_s"]
-    ]
-    words.append("push " + " and ".join(pushes))
-    return ", ".join(words)
+def draw_predictions(
+    groups: Mapping[str, Sequence[tuple[float, float]]],
+    labels: tuple[str, str],
+    title: str,
+    path: Path,
+) -> None:
+    """Draw what was measured over what was predicted, into a PNG file.
 
-
-def _worst(rows: Sequence[Row]) -> Table:
-    table = Table(title="Worst of those that stood", title_justify="left")
-    for name in ("what", "figure", "case"):
-        table.add_column(name, justify="left" if name == "what" else "right")
-    for column, what, sign, unit in WORST:
-        known = [row for row in rows if row[column]]
-        if known:
-            worst = max(known, key=lambda row: sign * float(row[column]))
-            table.add_row(what, f"{float(worst[column]):.3g} {unit}", worst["number"])
-    return table
+    Args:
+        groups: points by what came of them, the good first.
+        labels: of the axes; a prediction of 0 parts good from bad.
+        title: of the picture.
+        path: of the file.
+    """
+    figure = new_figure(9, 5.5)
+    axis = figure.subplots()
+    for (name, points), colour in zip(groups.items(), ("#4c9f70", FALL_COLOUR), strict=True):
+        x, y = [point[0] for point in points], [point[1] for point in points]
+        axis.scatter(x, y, s=18, color=colour, alpha=0.7, label=f"{name} ({len(points)})")
+    axis.axvline(0.0, color="#7f7f7f", lw=1.0, ls="--")
+    axis.set(xscale="symlog", yscale="log", xlabel=labels[0], ylabel=labels[1])
+    axis.grid(visible=True, lw=0.3, color="#bbbbbb")
+    axis.legend(fontsize=8, framealpha=0.8)
+    figure.suptitle(title, fontsize=11, x=0.01, ha="left")
+    save_figure(figure, path)

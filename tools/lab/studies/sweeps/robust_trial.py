@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Sequence
 from typing import Final
 
 import msgspec
 
 from services.simulator.physics.plant import PlantConfig, changed
-from shared.bus.messages import SimTruth
 from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Kill, Push, Scenario
@@ -22,10 +20,12 @@ from tools.lab.studies.sweeps.figures import (
     ending_of,
     event_steps_nm,
     operator_peak_n,
+    scalars,
     sole_tilt_max_rad,
     that_count,
+    unwatched,
 )
-from tools.lab.studies.sweeps.push_range import PushRange
+from tools.lab.studies.sweeps.push_range import PushRange, uniform
 from tools.sim.lockstep import Lockstep, Watch, forget
 from tools.sim.virtual_time import Record
 
@@ -40,7 +40,6 @@ PUSH_SHARE: Final = (0.3, 1.0)
 """Shares of the hardest push that is drawn (`PushRange`)."""
 PUSH_S: Final = 0.3
 AFTER_KILL_S: Final = 2.5
-DIGITS: Final = 3
 
 
 class RobustTrial(msgspec.Struct, frozen=True, kw_only=True):
@@ -79,10 +78,10 @@ def draw(
     dice = random.Random(f"robust {seed} {number}")
     kind = KINDS[number % len(KINDS)]
     way = 2.0 * LEAD_S
-    kill = _uniform(dice, 0.6 * way, 1.2 * way)
+    kill = uniform(dice, 0.6 * way, 1.2 * way)
     share, lasting = (LEAN_SHARE, LEAN_S) if kind == "lean" else (PUSH_SHARE, PUSH_S)
     led = pushes.draw(dice, share, 1.0, lasting)
-    held = pushes.draw(dice, PUSH_SHARE, kill + _uniform(dice, 0.2, 0.8), PUSH_S)
+    held = pushes.draw(dice, PUSH_SHARE, kill + uniform(dice, 0.2, 0.8), PUSH_S)
     return RobustTrial(
         number=number,
         seed=seed,
@@ -90,13 +89,9 @@ def draw(
         slope_deg=slope_deg,
         kind=kind,
         kill_s=kill,
-        delay_ms=_uniform(dice, 0.5, DELAY_MAX_MS),
+        delay_ms=uniform(dice, 0.5, DELAY_MAX_MS),
         pushes=(led, held),
     )
-
-
-def _uniform(dice: random.Random, low: float, high: float) -> float:
-    return round(dice.uniform(low, high), DIGITS)
 
 
 def plant_of(trial: RobustTrial) -> PlantConfig:
@@ -105,7 +100,7 @@ def plant_of(trial: RobustTrial) -> PlantConfig:
     plant = plants.draw(seed, beyond=trial.beyond)
     if trial.slope_deg == 0.0:
         return plant
-    angle = _uniform(random.Random(f"slope {seed}"), -math.pi, math.pi)
+    angle = uniform(random.Random(f"slope {seed}"), -math.pi, math.pi)
     slope = math.radians(trial.slope_deg)
     towards = [round(slope * part, 6) for part in (math.cos(angle), math.sin(angle))]
     return changed(plant, {"floor.slope": towards})
@@ -114,25 +109,16 @@ def plant_of(trial: RobustTrial) -> PlantConfig:
 def scenario_of(robot: RobotConfig, trial: RobustTrial) -> Scenario:
     """Return what happens."""
     stand = robot.simulation.stand_height
-    frames: tuple[Keyframe, ...]
-    if trial.kind == "crawl":
-        frames = (
-            Keyframe(at=0.0, height=stand),
-            Keyframe(at=2.0 * LEAD_S, height=0.79, pitch=1.2, assist=robot.assist.force_max),
-        )
-    elif trial.kind == "squat":
-        frames = (
-            Keyframe(at=0.0, height=stand),
-            Keyframe(at=LEAD_S, height=0.948),
-            Keyframe(at=2.0 * LEAD_S, height=stand),
-        )
-    else:
-        frames = (Keyframe(at=0.0, height=stand), Keyframe(at=LEAD_S, height=1.05))
+    ways = {
+        "crawl": (Keyframe(2.0 * LEAD_S, 0.79, pitch=1.2, assist=robot.assist.force_max),),
+        "squat": (Keyframe(LEAD_S, 0.948), Keyframe(2.0 * LEAD_S, stand)),
+        "lean": (Keyframe(LEAD_S, 1.05),),
+    }
     return Scenario(
         name=f"robust-{trial.seed}-{trial.number}",
         about=f"trial {trial.number} of `xrl sweep robust --seed {trial.seed}`",
-        duration=round(trial.kill_s + AFTER_KILL_S, DIGITS),
-        keyframe=frames,
+        duration=round(trial.kill_s + AFTER_KILL_S, 3),
+        keyframe=(Keyframe(0.0, stand), *ways[trial.kind]),
         kill=(Kill(service="planner", at=trial.kill_s),),
         push=trial.pushes,
     )
@@ -142,35 +128,20 @@ def run_trial(
     trial: RobustTrial,
     robot: RobotConfig,
     *,
-    record: Record | None = None,
-    watch: Watch | None = None,
+    record: Record = forget,
+    watch: Watch = unwatched,
     after_fall_s: float = 0.0,
 ) -> RobustResult:
-    """Run a trial to its end or to the fall; arguments as for the other studies."""
-    scenario = scenario_of(robot, trial)
+    """Run a trial to its end, or so long beyond the fall, at which measurement ends."""
     fleet = Lockstep(
         robot,
-        scenario,
+        scenario_of(robot, trial),
         Impairment(delay_ms=trial.delay_ms),
         seed=trial.number,
-        record=record or forget,
+        record=record,
         plant=plant_of(trial),
     )
     rows = list(that_count(fleet.run(), 0.0, watch, after_fall_s))
-    return measure(trial, rows, fleet, robot)
-
-
-def measure(
-    trial: RobustTrial, rows: Sequence[SimTruth], fleet: Lockstep, robot: RobotConfig
-) -> RobustResult:
-    """Return the figures of a run.
-
-    Args:
-        trial: the trial.
-        rows: the world since the scenario's start, or the fall before it.
-        fleet: at its end.
-        robot: for the size of its feet.
-    """
     if not rows or rows[0].scenario_s < 0.0:
         return RobustResult(ending=Ending.FELL if rows else Ending.UNREADY)
     last = rows[-1]
@@ -190,15 +161,7 @@ def measure(
 
 def row_of(trial: RobustTrial) -> dict[str, object]:
     """Return every draw by its column: the trial's, then the plant's errors."""
-    row: dict[str, object] = {
-        "number": trial.number,
-        "seed": trial.seed,
-        "beyond": trial.beyond,
-        "slope_deg": trial.slope_deg,
-        "kind": trial.kind,
-        "kill_s": trial.kill_s,
-        "delay_ms": trial.delay_ms,
-    }
+    row = scalars(trial)
     for name, push in zip(("led", "held"), trial.pushes, strict=True):
         row |= {f"push_{name}_x_n": push.force[0], f"push_{name}_y_n": push.force[1]}
     return row | dict(plants.errors_of(plant_of(trial)))

@@ -1,4 +1,8 @@
-"""The frame of every study: flags, workers, the table of cases, resuming, the progress bar."""
+"""A study as a table, and the one runner of all of them.
+
+The runner adds the flags that all have, draws the cases, runs those that the table lacks on this
+machine or on a cluster, writes each row as it is done, and reports.
+"""
 
 from __future__ import annotations
 
@@ -6,101 +10,124 @@ import argparse
 import hashlib
 import shlex
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Final, Generic, NamedTuple, Protocol, TypeVar
 
 import msgspec
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from services.simulator.physics.plant import PlantConfig
+from shared.bus.messages import SimTruth
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Scenario
 from shared.exceptions import RunError
 from shared.places import DEFAULT_CONFIG
-from tools.lab.studies.sweeps import cluster, pool
-from tools.lab.studies.sweeps.table import CaseTable, Row, Words, code_digest
+from tools.lab.studies.sweeps import pool
+from tools.lab.studies.sweeps.table import CaseTable, Row, code_digest, code_of, plain
+from tools.live import experiment
 from tools.number_arguments import count, natural
+from tools.sim.recorded_lockstep import AFTER_FALL_S, judge_in_lockstep, record_run
 from tools.terminal import Console, marked
-
-T = TypeVar("T")
-R = TypeVar("R")
+from tools.verb_table import add_config
 
 
-class Executor(NamedTuple):
-    """Who runs a study."""
+class Numbered(Protocol):
+    """A case."""
 
-    workers: int
-    """Processes of this machine."""
-    cluster: str | None
-    """Address of a Dask scheduler; None: this machine alone."""
-    code: tuple[str, ...]
-    """What decides an outcome: a cluster's workers must have the same."""
+    @property
+    def number(self) -> int:
+        """From 0 on."""
 
 
-class Job(NamedTuple, Generic[T, R]):
-    """How a task is done."""
+C = TypeVar("C", bound=Numbered)
 
-    work: Callable[[T], R]
-    """A function of a module; it runs in the workers."""
-    name: Callable[[T], str]
-    """Name of a task in an error."""
-    rows: Callable[[T, R], Sequence[Mapping[str, object]]]
-    """Its rows of the table."""
-    fell: Callable[[Mapping[str, object]], bool]
-    """True for the row of a fall."""
-
-
-class Study(NamedTuple, Generic[T, R]):
-    """A study to run: one row per case, appended on completion; an interrupted study resumes."""
-
-    name: str
-    """Its name after `xrl sweep`."""
-    table: str
-    """File name of the table."""
-    columns: Sequence[str]
-    """The first is the case's number."""
-    words: Words
-    """Columns that hold words, and the words that each may hold."""
-    inputs: Mapping[str, str]
-    """Parameters of the rows; a folder with others is refused."""
-    drawn: Sequence[Mapping[str, object]]
-    """By case: the start of its row, known before it runs."""
-    total: int
-    """Number of cases."""
-    job: Job[T, R]
-    command: str
-    """Resumes it, but for `--out`."""
+HOW_MANY: Final = ("n", "trials")
+"""Flags that say how many cases there are: a case alone does without."""
 
 
 class Finished(NamedTuple):
-    """A study that has run."""
+    """A study that has run, for its report."""
 
+    args: argparse.Namespace
+    robot: RobotConfig
     rows: list[Row]
     out: Path
-    case_s: float
-    """Wall time for each new case, s; 0 if there was none."""
-
-    def show_files(self, files: str, case: str, console: Console) -> None:
-        """Print where the results are and the time that a case took.
-
-        Args:
-            files: the table and the pictures, as text.
-            case: name of a case, such as "trial".
-            console: to print on.
-        """
-        pace = f"; {self.case_s:.2f} s a {case}" if self.case_s else ""
-        console.print(f"{self.out}/{files}{pace}", style="dim", soft_wrap=True)
+    command: str
+    """Runs one case alone, but for `--only` and its number."""
+    console: Console
 
 
-def add_flags(parser: argparse.ArgumentParser, name: str, files: str, more: str = "") -> None:
-    """Add the flags that each study has.
+class CaseLog(NamedTuple, Generic[C]):
+    """What the log of a case that runs alone needs."""
 
-    Args:
-        parser: the study's.
-        name: of the study.
-        files: what `--out` will hold, in words.
-        more: what else there is to say of `--out`.
-    """
+    scenario: Callable[[RobotConfig, C], Scenario]
+    plant: Callable[[C], PlantConfig]
+    metadata: Callable[[C, str], dict[str, str]]
+    """By the case and its command, as for `record_run`."""
+
+
+class Study(msgspec.Struct, Generic[C], frozen=True, kw_only=True):
+    """What one study has of its own."""
+
+    name: str
+    """After `xrl sweep`."""
+    case: str = "case"
+    """What a case is called."""
+    table: str
+    """File name of the table."""
+    pictures: tuple[str, ...] = ()
+    code: tuple[str, ...]
+    """Modules that decide how a case comes out (`code_of`)."""
+    n: int = 0
+    """Default of `--n`; 0: its own flags say how many cases there are."""
+    only: str = ""
+    """What `--only` does, for its help; empty: there is none."""
+    add_flags: Callable[[argparse.ArgumentParser], None] = lambda _parser: None
+    load: Callable[[argparse.Namespace], RobotConfig] = lambda args: experiment.load_robot(
+        args.config
+    )
+    """Checks the flags and returns the robot."""
+    cases: Callable[[argparse.Namespace, RobotConfig], tuple[int, Callable[[int], C]]]
+    """How many there are, and which has a number."""
+    inputs: Callable[[argparse.Namespace], Mapping[str, str]]
+    """Parameters of the rows, beside robot and code; a folder with others is refused."""
+    row: Callable[[C], dict[str, object]]
+    """The draws of a case by column, its number first."""
+    words: Callable[[C], str] = lambda _case: ""
+    """Says which case it is, where `--only` cannot."""
+    figures: type[msgspec.Struct]
+    """What comes of a case: the other columns."""
+    trial: Callable[..., msgspec.Struct]
+    """Runs a case: a function of a module, of the case, its robot, and the options."""
+    options: Callable[[argparse.Namespace], dict[str, Any]] = lambda _args: {}
+    robots: Callable[[Sequence[C], RobotConfig, int, Console], Sequence[RobotConfig]] = (
+        lambda cases, robot, _workers, _console: [robot] * len(cases)
+    )
+    """The robot of each case, prepared by so many processes."""
+    log: CaseLog[C] | None = None
+    """None: a case alone has no log."""
+    fell: Callable[[Row], bool] = lambda _row: False
+    report: Callable[[Finished], None]
+    """Prints what came of it and draws the pictures."""
+    counts: Callable[[Row], bool] = lambda _row: True
+    """True for a row of the study that decides its exit code."""
+    exit_code: Callable[[Sequence[Row]], int] = lambda _rows: 0
+
+
+def add_flags(parser: argparse.ArgumentParser, study: Study[Any]) -> None:
+    """Add all flags of a study."""
+    add_config(parser)
+    if study.n:
+        parser.add_argument("--n", type=count, default=study.n, help=f"{study.case}s ({study.n})")
+    study.add_flags(parser)
+    log = ""
+    if study.only:
+        parser.add_argument("--only", type=natural, metavar=study.case.upper(), help=study.only)
+    if study.log is not None:
+        log = f"; with --only: where the {study.case}'s log goes (default: none)"
     parser.add_argument("--seed", type=natural, default=1, help="of the cases (1)")
     parser.add_argument(
         "--workers", type=count, help=f"processes of this machine (one a core: {pool.cores()})"
@@ -115,105 +142,168 @@ def add_flags(parser: argparse.ArgumentParser, name: str, files: str, more: str 
         "--out",
         type=Path,
         metavar="DIR",
-        help=f"where {files} go (default: out/sweep-{name}-<time>); an interrupted study resumes "
-        f"there{more}",
+        help=f"folder of {', '.join((study.table, *study.pictures))} (default: "
+        f"out/sweep-{study.name}-<time>); an interrupted study resumes there{log}",
     )
 
 
-def executor_of(args: argparse.Namespace, code: tuple[str, ...]) -> Executor:
-    """Return who runs the study, by its flags.
+def run(study: Study[C], args: argparse.Namespace) -> int:
+    """Run a study, or one case of it; return the exit code.
 
     Raises:
-        RunError: the flags do not go together, or make no sense.
+        RunError: flags do not go together or make no sense, the folder holds another study, a
+            case failed, or a worker was lost.
     """
+    only = getattr(args, "only", None)
     if args.cluster is not None and args.workers is not None:
         raise RunError("--workers are of this machine, --cluster has its own; leave one out")
-    if args.cluster is not None and getattr(args, "only", None) is not None:
+    if args.cluster is not None and only is not None:
         raise RunError("--only runs here, in one process; leave --cluster out")
-    return Executor(args.workers or pool.cores(), args.cluster, code)
+    robot = study.load(args)
+    total, case_of = study.cases(args, robot)
+    console, command = Console(), command_of(study, args)
+    if only is not None:
+        return _run_alone(study, args, robot, case_of(only), f"{command} --only {only}", console)
+    drawn = [case_of(number) for number in range(total)]
+    begins = [study.row(case) for case in drawn]
+    out = args.out or Path("out") / time.strftime(f"sweep-{study.name}-%Y%m%d-%H%M%S")
+    code = code_of(*study.code)
+    inputs = {
+        "study": study.name,
+        **study.inputs(args),
+        "robot": digest_of(robot),
+        "code": code_digest(code),
+    }
+    with CaseTable(out / study.table, begins, study.figures, inputs) as table:
+        try:
+            done = table.rows
+            if done:
+                console.print(f"{len(done)} of {total} cases are done already")
+            missing = [case for case in drawn if case.number not in table.numbers]
+            workers = args.workers or pool.cores()
+            robots = study.robots(missing, robot, workers, console)
+            tasks = list(zip(missing, robots, strict=True))
+            results = pool.results(
+                partial(_run_task, partial(study.trial, **study.options(args))),
+                tasks,
+                pool.Cluster(args.cluster, code) if args.cluster else workers,
+                lambda task: _name_of(study, task[0], command),
+            )
+            begin, fallen = time.monotonic(), sum(map(study.fell, done))
+            text = "{task.completed} of {task.total} cases, {task.fields[fallen]} fell"
+            with bar(text, console) as shown:
+                line = shown.add_task("", total=total, completed=len(done), fallen=fallen)
+                for (case, _), figures in results:
+                    fallen += study.fell(table.add(study.row(case), figures))
+                    shown.update(line, advance=1, fallen=fallen)
+        except (KeyboardInterrupt, SystemExit, RunError):
+            if table.numbers:
+                many = [f"--{name} {getattr(args, name)}" for name in HOW_MANY if name in args]
+                many += [f"--cluster {args.cluster}"] if args.cluster else []
+                again = " ".join([command, *many, f"--out {shlex.quote(str(out))}"])
+                words = f"{len(table.numbers)} cases are in {out}; resume with: {again}"
+                console.print(words, soft_wrap=True)
+            raise
+        rows, took_s = table.rows, time.monotonic() - begin
+    study.report(Finished(args, robot, rows, out, command, console))
+    pace = f"; {took_s / len(tasks):.2f} s a {study.case}" if tasks else ""
+    files = ", ".join((study.table, *study.pictures))
+    console.print(f"{out}/{files}{pace}", style="dim", soft_wrap=True)
+    return study.exit_code([row for row in rows if study.counts(row)])
+
+
+def _run_task(trial: Callable[..., msgspec.Struct], task: tuple[C, RobotConfig]) -> msgspec.Struct:
+    return trial(*task)
+
+
+def _name_of(study: Study[C], case: C, command: str) -> str:
+    """Return the name of a case in an error."""
+    alone = f"{command} --only {case.number}" if study.only else study.words(case)
+    return f"{study.case} {case.number} ({alone})"
+
+
+def _run_alone(
+    study: Study[C],
+    args: argparse.Namespace,
+    robot: RobotConfig,
+    case: C,
+    command: str,
+    console: Console,
+) -> int:
+    """Run a case, recorded and judged like a run of `xrl sim` if it is asked for."""
+    begin = study.row(case)
+    (robot,) = study.robots([case], robot, 1, console)
+    show(f"{study.case.capitalize()} {begin['number']}, drawn", begin, console)
+    trial = partial(study.trial, case, robot, **study.options(args))
+    asked, out = study.log, args.out
+    if asked is None:
+        figures = trial()
+    else:
+        scenario = asked.scenario(robot, case)
+        with bar("{task.completed:.1f} of {task.total:.1f} s", console) as shown:
+            line = shown.add_task("", total=scenario.duration)
+
+            def watch(truth: SimTruth) -> None:
+                shown.update(line, completed=max(0.0, truth.scenario_s))
+
+            if out is None:
+                figures = trial(watch=watch)
+            else:
+                experiment.make_out(out, "sweep")
+                figures = record_run(
+                    scenario,
+                    robot,
+                    out,
+                    asked.metadata(case, command),
+                    lambda record, look: trial(
+                        record=record, watch=look, after_fall_s=AFTER_FALL_S
+                    ),
+                    watch,
+                    asked.plant(case),
+                )
+                judge_in_lockstep(scenario, out)
+    row = {**begin, **msgspec.structs.asdict(figures)}
+    show("Measured", msgspec.structs.asdict(figures), console)
+    if asked is not None and out is not None:
+        console.print(f"{out}/run.mcap, run.png, summary.json", style="dim", soft_wrap=True)
+    if "ending" in row:
+        console.print(marked("[bold]{}[/]", row["ending"]))
+    return study.exit_code([row])
+
+
+def command_of(study: Study[Any], args: argparse.Namespace) -> str:
+    """Return the command of a study with the flags that differ from their defaults.
+
+    Not in it: `--only`, how many cases there are, who runs them, and `--out`.
+    """
+    own = argparse.ArgumentParser()
+    study.add_flags(own)
+    words = [f"xrl sweep {study.name} --seed {args.seed}"]
+    for name, default in vars(own.parse_args([])).items():
+        value, flag = getattr(args, name), f"--{name.replace('_', '-')}"
+        if value == default or name in HOW_MANY:
+            continue
+        if value is True:
+            words.append(flag)
+        else:
+            several = value if isinstance(value, list) else [value]
+            words += [f"{flag} {shlex.quote(_text(one))}" for one in several]
+    if args.config != DEFAULT_CONFIG:
+        words.append(f"--config {args.config}")
+    return " ".join(words)
+
+
+def _text(value: object) -> str:
+    """Return a flag's value as it is written."""
+    if isinstance(value, tuple):
+        return ",".join(plain(one) if isinstance(one, float) else str(one) for one in value)
+    return f"{value:.12g}" if isinstance(value, float) else str(value)
 
 
 def digest_of(robot: RobotConfig) -> str:
     """Return the SHA-256 of a robot file and of the gain schedule beside it."""
     schedule = msgspec.json.encode(robot.gain_schedule)
     return hashlib.sha256(config_file.to_toml(robot).encode() + schedule).hexdigest()
-
-
-def inputs(name: str, robot: RobotConfig, code: tuple[str, ...], **more: str) -> dict[str, str]:
-    """Return the parameters of a study's rows: robot, code, and those given."""
-    return {"study": name, **more, "robot": digest_of(robot), "code": code_digest(code)}
-
-
-def command(name: str, args: argparse.Namespace, *flags: str) -> str:
-    """Return the command of a study, with `--config` if it is not the shipped robot's."""
-    config = [] if args.config == DEFAULT_CONFIG else [f"--config {args.config}"]
-    return " ".join([f"xrl sweep {name}", *flags, *config])
-
-
-def run(
-    study: Study[T, R],
-    tasks_but: Callable[[set[int]], Sequence[T]],
-    out: Path | None,
-    executor: Executor,
-    console: Console,
-) -> Finished:
-    """Run the cases that the table lacks; at an interruption, print how to resume.
-
-    Args:
-        study: what to run.
-        tasks_but: returns the tasks, but for those of cases that are done.
-        out: folder of the results; None: a new one.
-        executor: who runs the tasks.
-        console: for the bar.
-
-    Raises:
-        RunError: the folder holds another study, a task failed, or a worker was lost.
-    """
-    folder = out or Path("out") / time.strftime(f"sweep-{study.name}-%Y%m%d-%H%M%S")
-    with CaseTable(
-        folder, study.table, study.columns, study.inputs, study.words, study.drawn
-    ) as table:
-        try:
-            case_s = _fill(table, study, tasks_but(table.numbers), executor, console)
-        except (KeyboardInterrupt, SystemExit, RunError):
-            if done := len(table.numbers):
-                flag = f" --cluster {executor.cluster}" if executor.cluster else ""
-                again = f"{study.command}{flag} --out {shlex.quote(str(folder))}"
-                console.print(f"{done} cases are in {folder}; resume with: {again}", soft_wrap=True)
-            raise
-    return Finished(table.rows(study.total), folder, case_s)
-
-
-def _fill(
-    table: CaseTable,
-    study: Study[T, R],
-    tasks: Sequence[T],
-    executor: Executor,
-    console: Console,
-) -> float:
-    """Run tasks into a table; return the wall time for each new row, s."""
-    job, done = study.job, table.rows(study.total)
-    if done:
-        console.print(f"{len(done)} of {study.total} cases are done already")
-    start, new = time.monotonic(), 0
-    fallen = sum(job.fell(row) for row in done)
-    text = "{task.completed} of {task.total} cases, {task.fields[fallen]} fell"
-    with bar(text, console) as shown:
-        line = shown.add_task("", total=study.total, completed=len(done), fallen=fallen)
-        for task, result in _results(job, tasks, executor):
-            rows = job.rows(task, result)
-            for row in rows:
-                table.add(row)
-                fallen += job.fell(row)
-            new += len(rows)
-            shown.update(line, advance=len(rows), fallen=fallen)
-    return (time.monotonic() - start) / new if new else 0.0
-
-
-def _results(job: Job[T, R], tasks: Sequence[T], executor: Executor) -> Iterator[tuple[T, R]]:
-    if executor.cluster is None:
-        return pool.results(job.work, tasks, executor.workers, job.name)
-    return cluster.results(job.work, tasks, executor.cluster, job.name, executor.code)
 
 
 def bar(text: str, console: Console) -> Progress:
@@ -223,10 +313,10 @@ def bar(text: str, console: Console) -> Progress:
     )
 
 
-def show(title: str, figures: Mapping[str, object], console: Console) -> None:
-    """Print figures, one a line, but for those that are None."""
+def show(title: str, values: Mapping[str, object], console: Console) -> None:
+    """Print values, one a line, but for those that are None."""
     console.print(marked("[bold]{}[/]", title))
-    for name, value in figures.items():
+    for name, value in values.items():
         if value is not None:
             text = f"{value:.4g}" if isinstance(value, float) else str(value)
             console.print(f"  {name:24} {text}", highlight=False)

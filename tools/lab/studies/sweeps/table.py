@@ -14,20 +14,21 @@ import hashlib
 import io
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType, TracebackType
-from typing import IO, Final, TypeAlias
+from typing import IO, Any, Final, TypeAlias
+
+import msgspec
 
 from shared.atomic_file import atomic_file
 from shared.exceptions import RunError
 from shared.places import CHECKOUT
 
 INPUTS_FILE: Final = "inputs.json"
-Row: TypeAlias = Mapping[str, str]
-Words: TypeAlias = Mapping[str, Set[str]]
-"""The columns that hold words, and all that each may hold."""
-NO_WORDS: Final[Words] = MappingProxyType({})
+DECIMALS: Final = 9
+"""To which a number of a flag is taken."""
+Row: TypeAlias = Mapping[str, Any]
+"""A case's draws as they were drawn, then its figures as the table has them."""
 
 
 def code_of(*modules: str) -> tuple[str, ...]:
@@ -70,59 +71,56 @@ class CaseTable:
 
     def __init__(
         self,
-        folder: Path,
-        name: str,
-        columns: Sequence[str],
+        path: Path,
+        drawn: Sequence[Mapping[str, object]],
+        figures: type[msgspec.Struct],
         inputs: Mapping[str, str],
-        words: Words = NO_WORDS,
-        drawn: Iterable[Mapping[str, object]] = (),
     ) -> None:
-        """Open a table, new or to resume; its first column is the case's number.
+        """Open a table, new or to resume.
 
-        Incomplete or damaged rows are left out: their cases are run again.
+        Incomplete or damaged rows are left out, and those of other draws: their cases run again.
 
         Args:
-            folder: of the results; made if it is not there.
-            name: of the CSV file.
-            columns: of the table.
+            path: of the CSV file; its folder is made if it is not there.
+            drawn: by case, the start of its row; the first column is the case's number.
+            figures: the rest of a row.
             inputs: parameters of the rows, by name.
-            words: columns that hold words, and which.
-            drawn: by case, the start of its row.
 
         Raises:
             RunError: the folder cannot be used, another study is writing to it, or its parameters
                 are others or unknown.
         """
-        self._path, self._columns = folder / name, tuple(columns)
+        folder = path.parent
+        self._path, self._figures = path, figures
+        self._columns = [*drawn[0], *figures.__struct_fields__]
+        self._words = {
+            field.name
+            for field in msgspec.structs.fields(figures)
+            if getattr(field.type, "__origin__", field.type) is str
+        }
+        self._drawn = {str(case[self._columns[0]]): case for case in drawn}
+        self._rows: dict[int, dict[str, str]] = {}
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            _refuse_foreign(folder, self._path)
+            if any(folder.iterdir()) and not (folder / INPUTS_FILE).exists() and not path.exists():
+                raise RunError(f"{folder}: holds other files than a study's; choose another --out")
             self._inputs = (folder / INPUTS_FILE).open("a+", encoding="utf-8")
+            try:
+                _claim(self._inputs, path, inputs)
+                self._read()
+                self._write()
+                self._file = path.open("a", encoding="utf-8", newline="")
+            except BaseException:
+                self._inputs.close()  # and no longer locked
+                raise
         except OSError as error:
-            raise _unusable(folder, error) from None
-        try:
-            _claim(self._inputs, self._path, inputs)
-            self._rows = _whole_rows(self._path, self._columns, words)
-            for case in drawn:
-                self._check({name: _text(value) for name, value in case.items()})
-            self._write()
-            self._file = self._path.open("a", encoding="utf-8", newline="")
-        except BaseException as error:
-            self._inputs.close()  # and no longer locked
-            if isinstance(error, OSError):
-                raise _unusable(folder, error) from None
-            raise
+            raise RunError(f"{folder}: {error.strerror}; choose another --out") from None
 
     def __enter__(self) -> CaseTable:
         """Return the table."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Sort the rows and close the file; however the study ended."""
         self._file.close()
         self._write()
@@ -130,26 +128,56 @@ class CaseTable:
 
     @property
     def numbers(self) -> set[int]:
-        """The cases that are done."""
+        """The cases that are done, also those that are not asked for now."""
         return set(self._rows)
 
-    def rows(self, below: int) -> list[Row]:
-        """Return the rows of the cases with a number below this one, in order."""
-        return [row for number, row in sorted(self._rows.items()) if number < below]
+    @property
+    def rows(self) -> list[Row]:
+        """The rows of the cases that are done, in order."""
+        asked = sorted(number for number in self._rows if str(number) in self._drawn)
+        return [self._typed(self._rows[number]) for number in asked]
 
-    def add(self, values: Mapping[str, object]) -> None:
-        """Write a row; a value that is None is left empty."""
-        row = {name: _text(values[name]) for name in self._columns}
+    def add(self, case: Mapping[str, object], figures: msgspec.Struct) -> Row:
+        """Write a row and return it; a value that is None is left empty."""
+        values = {**case, **msgspec.structs.asdict(figures)}
+        row = {name: _text(value) for name, value in values.items()}
         self._rows[int(row[self._columns[0]])] = row
         csv.DictWriter(self._file, self._columns).writerow(row)
         self._file.flush()
+        return self._typed(row)
 
-    def _check(self, case: Row) -> None:
-        """Leave out the row of a case if it is of another one."""
-        number = int(case[self._columns[0]])
-        there = self._rows.get(number, case)
-        if any(there[name] != value for name, value in case.items()):
-            del self._rows[number]
+    def _typed(self, row: Mapping[str, str]) -> Row:
+        """Return a row with its values; raise `msgspec.ValidationError` if it is damaged."""
+        figures = {
+            name: row[name] if row[name] or name in self._words else None
+            for name in self._figures.__struct_fields__
+        }
+        typed = msgspec.convert(figures, self._figures, strict=False)
+        drawn = self._drawn.get(row[self._columns[0]], row)
+        return {**drawn, **msgspec.structs.asdict(typed)}
+
+    def _read(self) -> None:
+        """Read the rows that are whole, and of the cases that are drawn.
+
+        Raises:
+            RunError: the file has other columns.
+        """
+        if not self._path.exists():
+            return
+        text = self._path.read_text(encoding="utf-8-sig", errors="replace")
+        lines = map(_cells, text.split("\n")[:-1])  # a line without an end is incomplete
+        if next(lines, self._columns) != self._columns:
+            raise RunError(f"{self._path}: has other columns; choose another --out")
+        for cells in lines:
+            if len(cells) == len(self._columns) and cells[0].isdecimal():
+                row = dict(zip(self._columns, cells, strict=True))
+                case = self._drawn.get(cells[0], {})
+                try:
+                    self._typed(row)
+                except msgspec.ValidationError:
+                    continue
+                if all(row[name] == _text(value) for name, value in case.items()):
+                    self._rows[int(cells[0])] = row
 
     def _write(self) -> None:
         """Rewrite all rows atomically."""
@@ -159,20 +187,6 @@ class CaseTable:
             writer.writeheader()
             writer.writerows(row for _, row in sorted(self._rows.items()))
             file.detach()
-
-
-def _refuse_foreign(folder: Path, table: Path) -> None:
-    """Refuse a folder that holds something, and no study.
-
-    Raises:
-        RunError: it does.
-    """
-    if any(folder.iterdir()) and not (folder / INPUTS_FILE).exists() and not table.exists():
-        raise RunError(f"{folder}: holds other files than a study's; choose another --out")
-
-
-def _unusable(folder: Path, error: OSError) -> RunError:
-    return RunError(f"{folder}: {error.strerror}; choose another --out")
 
 
 def _claim(file: IO[str], table: Path, inputs: Mapping[str, str]) -> None:
@@ -215,35 +229,6 @@ def _short(value: object) -> str:
     return text if len(text) <= 20 else f"{text[:8]}..."
 
 
-def _whole_rows(path: Path, columns: Sequence[str], words: Words) -> dict[int, Row]:
-    """Read the rows that are whole, by number.
-
-    Raises:
-        RunError: the file has other columns.
-    """
-    if not path.exists():
-        return {}
-    text = path.read_text(encoding="utf-8-sig", errors="replace")
-    lines = map(_cells, text.split("\n")[:-1])  # a line without an end is incomplete
-    if next(lines, list(columns)) != list(columns):
-        raise RunError(f"{path}: has other columns; choose another --out")
-    return {int(row[columns[0]]): row for row in _whole(lines, columns, words)}
-
-
-def _whole(lines: Iterator[list[str]], columns: Sequence[str], words: Words) -> Iterator[Row]:
-    for cells in lines:
-        row = dict(zip(columns, cells, strict=False))
-        if (
-            len(cells) == len(columns)
-            and cells[0].isdecimal()
-            and all(
-                value in words[name] if name in words else _is_number(value)
-                for name, value in row.items()
-            )
-        ):
-            yield row
-
-
 def _cells(line: str) -> list[str]:
     """Return the cells of a line; none if it is malformed."""
     try:
@@ -252,16 +237,12 @@ def _cells(line: str) -> list[str]:
         return []
 
 
-def _is_number(value: str) -> bool:
-    """Return True for a number, and for none."""
-    try:
-        float(value or "0")
-    except ValueError:
-        return False
-    return True
-
-
 def _text(value: object) -> str:
     if value is None:
         return ""
     return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def plain(value: float) -> str:
+    """Return a number in full, to 9 decimals and without an exponent."""
+    return f"{value:.{DECIMALS}f}".rstrip("0").rstrip(".")

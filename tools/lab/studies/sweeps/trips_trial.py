@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
 
 import msgspec
 
@@ -57,7 +57,7 @@ class Trouble(NamedTuple):
     about: str
     trip: Trip | Cause | None
     """Trip that it must cause; None: none."""
-    told: Scenario
+    scenario: Scenario
     errors: Mapping[str, Any] = {}
     """Errors of the plant that come with it."""
     let_go_s: float = math.inf
@@ -66,12 +66,30 @@ class Trouble(NamedTuple):
     """With the gains of before the dynamic certificate, and joints that believe any command."""
 
 
+class TripTrial(msgspec.Struct, frozen=True, kw_only=True):
+    """A trouble on a plant."""
+
+    number: int
+    trouble: str
+    """Of `TROUBLES`."""
+    on: str
+    """Of `PLANTS`."""
+
+    @property
+    def words(self) -> str:
+        """The trial in words."""
+        return f"{self.trouble} on {self.on}"
+
+
+KNOWN: Final = "|".join((*Trip.__members__, *Cause.__members__))
+
+
 class TripResult(msgspec.Struct, frozen=True, kw_only=True):
     """How it came out."""
 
     led: bool
     """The scenario came to `BEGINS_S`; a robot that shakes at once never does."""
-    tripped: str
+    tripped: Annotated[str, msgspec.Meta(pattern=rf"^(({KNOWN})( |$))*$")]
     """The trips and causes that came, in their order; empty: none."""
     tripped_after_s: float | None
     """To the first, from `BEGINS_S`, or from being led first if it was before that."""
@@ -109,7 +127,7 @@ def unfiltered(robot: RobotConfig) -> RobotConfig:
     return believing(msgspec.structs.replace(robot, gain_schedule=weak, law=law))
 
 
-def _told(duration: float, *frames: Keyframe, push: tuple[Push, ...] = ()) -> Scenario:
+def _led(duration: float, *frames: Keyframe, push: tuple[Push, ...] = ()) -> Scenario:
     begin = (Keyframe(at=0.0, height=UP), Keyframe(at=BEGINS_S, height=UP))
     return Scenario(
         name="trips", about="of one trial", duration=duration, keyframe=(*begin, *frames), push=push
@@ -128,23 +146,23 @@ _SHOVE: Final = Push(at=3.0, duration=0.3, force=(40.0, 0.0, 0.0))
 TROUBLES: Final[Mapping[str, Trouble]] = {
     "shakes": Trouble(
         "gains of before the dynamic certificate, pushed with 40 N", Cause.SHAKING,
-        _told(4.0, push=(_SHOVE,)), unfiltered=True,
+        _led(4.0, push=(_SHOVE,)), unfiltered=True,
     ),
     "sags": Trouble(
         "a person rests 200 N where 100 were requested, and lets go", Trip.SAGGING,
-        _told(5.0, _at(1.2, assist=100.0)), {"person.load_scale": 2.0}, let_go_s=0.9,
+        _led(5.0, _at(1.2, assist=100.0)), {"person.load_scale": 2.0}, let_go_s=0.9,
     ),
     "sags slowly": Trouble(
         "300 N within 4 s where 100 were requested, hand off", Trip.SAGGING,
-        _told(7.0, _at(5.0, assist=100.0)), {"person.load_scale": 3.0}, let_go_s=0.8,
+        _led(7.0, _at(5.0, assist=100.0)), {"person.load_scale": 3.0}, let_go_s=0.8,
     ),
-    "drops": Trouble("led down by 0.39 m in 0.3 s", Trip.SAGGING, _told(3.0, _at(1.3, 0.8))),
+    "drops": Trouble("led down by 0.39 m in 0.3 s", Trip.SAGGING, _led(3.0, _at(1.3, 0.8))),
     "is thrown about": Trouble(
-        "led by 1.2 rad of pitch in 0.6 s", Trip.TURNING, _told(4.0, _at(1.6, 1.1, pitch=1.2))
+        "led by 1.2 rad of pitch in 0.6 s", Trip.TURNING, _led(4.0, _at(1.6, 1.1, pitch=1.2))
     ),
     "is let go": Trouble(
         "30 % of its payload gone, and nobody's hand on it", Trip.UNATTENDED,
-        _told(6.0), {"body.payload_scale": 0.7}, let_go_s=BEGINS_S,
+        _led(6.0), {"body.payload_scale": 0.7}, let_go_s=BEGINS_S,
     ),
     "squats": Trouble("as shipped: pushed, planner killed", None, _shipped("squat")),
     "crawls": Trouble("as shipped", None, _shipped("crawl")),
@@ -157,12 +175,12 @@ class _Seen:
 
     def __init__(self, robot: RobotConfig, trouble: Trouble, plant: PlantConfig, seed: int) -> None:
         self.trips: dict[str, int] = {}
-        """Trips of the planner by name, and when, virtual ns."""
+        """By name, and when, virtual ns."""
         self.fell_at_s: float | None = None
         self.speed_max = self.pitch_max = 0.0
         self.fleet = Lockstep(
             robot,
-            trouble.told,
+            trouble.scenario,
             seed=seed,
             plant=changed(plant, trouble.errors),
             record=self._record,
@@ -170,7 +188,9 @@ class _Seen:
         if not trouble.unfiltered:  # what shakes may never be led so far
             begin_standing(self.fleet)
         self._run(trouble.let_go_s)
-        self._joints()
+        for _, event in self.fleet.events:
+            if event.mode_before == Mode.TRACK and event.cause in JOINT_TRIPS:
+                self.trips.setdefault(Cause(event.cause).name, event.t_ns)
 
     def _record(self, _topic: Topic, _module: str, message: Message) -> None:
         if isinstance(message, PlannerStatus) and message.trip:
@@ -201,26 +221,13 @@ class _Seen:
             began_ns = min(tracks, default=first_ns)
         return (first_ns - began_ns) / NS_PER_S
 
-    def _joints(self) -> None:
-        """Add the joint services' trips."""
-        for _, event in self.fleet.events:
-            if event.mode_before == Mode.TRACK and event.cause in JOINT_TRIPS:
-                self.trips.setdefault(Cause(event.cause).name, event.t_ns)
 
-
-def run_trial(trouble: str, plant: str, robot: RobotConfig, seed: int) -> TripResult:
-    """Run one trouble on one plant, with trips and without.
-
-    Args:
-        trouble: of `TROUBLES`.
-        plant: of `PLANTS`.
-        robot: ready to run, with its gain schedule.
-        seed: of the noise.
-    """
-    scenario = TROUBLES[trouble]
-    robot = unfiltered(robot) if scenario.unfiltered else robot
-    seen = _Seen(robot, scenario, PLANTS[plant], seed)
-    without = _Seen(untripped(robot), scenario, PLANTS[plant], seed)
+def run_trial(trial: TripTrial, robot: RobotConfig, seed: int) -> TripResult:
+    """Run a trouble on a plant, with trips and without; `seed` is the noise's."""
+    trouble, plant = TROUBLES[trial.trouble], PLANTS[trial.on]
+    robot = unfiltered(robot) if trouble.unfiltered else robot
+    seen = _Seen(robot, trouble, plant, seed)
+    without = _Seen(untripped(robot), trouble, plant, seed)
     return TripResult(
         led=seen.fleet.world.scenario_s > BEGINS_S,
         tripped=" ".join(sorted(seen.trips, key=lambda name: seen.trips[name])),

@@ -1,141 +1,109 @@
-"""`xrl sweep`: the pool, the words and the verb around them."""
+"""`xrl sweep`: what the one runner does for every study, and the verb around it."""
 
 from __future__ import annotations
 
-import csv
 import json
-import multiprocessing
 import os
 import re
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import msgspec
 import pytest
 
-from shared.config import gain_schedule
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from tests.tools.exit_codes import exit_code
+from tests.tools.lab.studies.sweeps.tables import rows_of, sweep
 from tools import cli
-from tools.lab.studies.sweeps import cases, pool
-from tools.lab.studies.sweeps.prepare import prepare
-from tools.lab.studies.sweeps.wilson import wilson
+from tools.lab.studies.sweeps import kill, latency, study
+from tools.lab.studies.sweeps.kill_trial import KillCases
+from tools.lab.studies.sweeps.report import wilson
+from tools.lab.studies.sweeps.table import code_of
+from tools.verbs.sweep import STUDIES
+
+KILL = ("kill", "--split", "diagonal")
+"""The paper's split needs no gain schedule."""
+SOON_DOWN = (
+    "latency", "--control", "centralised", "--delay", "200", "--loss", "0", "--trials", "1",
+)  # fmt: skip
+"""One trial, in which the baseline falls: no failure of the shipped control."""
 
 
-def sweep(*flags: str) -> int:
-    """Run the verb; the paper's split needs no gain schedule."""
-    return cli.main(["sweep", "kill", "--split", "diagonal", *flags])
-
-
-def rows_of(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def square(number: int) -> int:
-    return number * number
-
-
-def stumble(number: int) -> int:
-    if number == 2:
-        raise ValueError("two")
-    return number
-
-
-def die(_number: int) -> int:
-    os.kill(os.getpid(), signal.SIGKILL)
-    return 0
-
-
-def sleep(seconds: float) -> float:
-    time.sleep(seconds)
-    return seconds
-
-
-def test_every_task_comes_back_with_its_result() -> None:
-    assert dict(pool.results(square, range(10), 2, str)) == {n: n * n for n in range(10)}
-
-
-def test_an_error_names_its_task_and_leaves_no_worker() -> None:
-    with pytest.raises(RunError, match="case 2: ValueError: two"):
-        list(pool.results(stumble, range(4), 2, lambda n: f"case {n}"))
-    assert multiprocessing.active_children() == []
-
-
-def test_a_killed_worker_is_an_error_and_no_wait() -> None:
-    with pytest.raises(RunError, match="fewer --workers"):
-        list(pool.results(die, [1, 2], 2, str))
-
-
-def test_a_loop_left_early_leaves_no_worker() -> None:
-    done = pool.results(sleep, [0.0, 60.0], 2, str)
-    next(done)
-    begin = time.monotonic()
-    done.close()  # type: ignore[attr-defined]  # a generator
-    assert time.monotonic() - begin < 30.0
-    assert multiprocessing.active_children() == []
+def _certificate_was_right(row: Mapping[str, str]) -> bool:
+    return (float(row["margin"]) > 0.0) == (row["stood"] == "True")
 
 
 @pytest.mark.parametrize(
-    ("flags", "words"),
-    [(("--workers", "2"), "--workers"), (("--only", "1"), "--only")],
-)
-def test_flags_that_a_cluster_would_not_heed_are_refused(
-    flags: tuple[str, str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ("flags", "numbers", "true", "words", "other"),
+    [
+        (
+            ("certificate", "--n", "2", "--rigid"), 2, _certificate_was_right,
+            "said to fall", ("--seed", "2"),
+        ),
+        (("dynamics", "--n", "2"), 2, lambda _row: True, "said to fade", ("--seed", "2")),
+        (
+            ("push", "--pose", "squat", "--angle", "90", "--duration", "0.3"), 2,
+            lambda row: row["mode"] == ("led", "dead")[int(row["number"])]
+            and float(row["stood_n"]) > 20.0,
+            "gives way", ("--plant", "ideal"),
+        ),
+        (
+            ("trips", "--trouble", "drops", "--on", "rigid"), 1,
+            lambda row: row["tripped"] == "SAGGING",
+            "led down by 0.39 m in 0.3 s", ("--trouble", "sags"),
+        ),
+        (
+            SOON_DOWN, 1,
+            lambda row: row["ending"] == "fell" and 0.5 < float(row["fell_at_s"]) < 7.0
+            and float(row["hold_share"]) == 0.0,
+            "centralised: 1 of 1 fell", ("--delay", "100"),
+        ),
+    ],
+    ids=lambda value: value[0] if isinstance(value, tuple) and len(value) > 2 else "",
+)  # fmt: skip
+def test_a_study_is_tabled_drawn_gone_on_with_and_another_is_refused_in_its_folder(
+    flags: tuple[str, ...],
+    numbers: int,
+    true: Callable[[Mapping[str, str]], bool],
+    words: str,
+    other: tuple[str, str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    out = tmp_path / "out"
-    assert sweep("--cluster", "tcp://127.0.0.1:1", *flags, "--out", str(out)) == 2
-    assert words in capsys.readouterr().err
-    assert not out.exists()
-
-
-@pytest.mark.parametrize(("hits", "of"), [(0, 500), (3, 200), (1, 1), (20, 20)])
-def test_wilsons_bounds_solve_his_equation(hits: int, of: int) -> None:
-    """A bound p is as far from what was seen as 1.96 deviations of a share p allow."""
-    for p in wilson(hits, of):
-        share = hits / of
-        assert (share - p) ** 2 == pytest.approx(1.959964**2 * p * (1 - p) / of, abs=1e-12)
-    low, high = wilson(hits, of)
-    assert 0.0 <= low <= hits / of <= high <= 1.0
-    assert low < high
-
-
-def test_a_payload_gets_a_schedule_that_fits(robot: RobotConfig) -> None:
-    other = cases.with_payload(robot, 10.2)
-    reported: list[tuple[int, int]] = []
-    ready = prepare([robot, other], 2, lambda done, of: reported.append((done, of)))
-    assert ready[0] is robot, "its schedule was made for it"
-    assert [gain_schedule.why_stale(one) for one in ready] == ["", ""]
-    assert ready[1].mass.payload == 10.2
-    assert reported == [(0, 1), (1, 1)]
-
-
-def test_the_papers_split_needs_no_schedule(robot: RobotConfig) -> None:
-    law = msgspec.structs.replace(robot.law, split="diagonal")
-    other = cases.with_payload(msgspec.structs.replace(robot, law=law), 10.2)
-    assert prepare([other], 2) == [other]
+    assert sweep(*flags, "--workers", 2, "--out", tmp_path) == 0
+    assert words in capsys.readouterr().out
+    (path,) = tmp_path.glob("*.csv")
+    table = path.read_bytes()
+    assert [int(row["number"]) for row in rows_of(path)] == list(range(numbers))
+    assert all(true(row) for row in rows_of(path))
+    pictures = list(tmp_path.glob("*.png"))
+    assert all(picture.stat().st_size > 10_000 for picture in pictures)
+    assert pictures or flags[0] == "trips"
+    assert sweep(*flags, "--out", tmp_path) == 0
+    assert f"{numbers} of {numbers} cases are done already" in capsys.readouterr().out
+    assert path.read_bytes() == table
+    assert sweep(*flags, *other, "--out", tmp_path) == 2
+    assert "holds a study of another" in capsys.readouterr().err
 
 
 def test_the_same_seed_gives_the_same_table_gone_on_with_and_with_any_number_of_workers(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    a, b = (("--out", str(tmp_path / name)) for name in "ab")
-    sweep("--n", "1", "--workers", "1", *a)
+    a, b = (("--out", tmp_path / name) for name in "ab")
+    sweep(*KILL, "--n", 1, "--workers", 1, *a)
     first = rows_of(tmp_path / "a" / "cases.csv")
     capsys.readouterr()
-    sweep("--n", "2", "--workers", "1", *a)
+    sweep(*KILL, "--n", 2, "--workers", 1, *a)
     assert "1 of 2 cases are done already" in capsys.readouterr().out
     both = rows_of(tmp_path / "a" / "cases.csv")
     assert both[0] == first[0]
     assert [row["number"] for row in both] == ["0", "1"]
-    assert sweep("--n", "2", "--seed", "2", *a) == 2
-    assert "another seed" in capsys.readouterr().err
-    sweep("--n", "2", "--workers", "2", *b)
+    sweep(*KILL, "--n", 2, "--workers", 2, *b)
     tables = [(tmp_path / name / "cases.csv").read_bytes() for name in "ab"]
     assert tables[0] == tables[1]
     assert all((tmp_path / name / "cases.png").stat().st_size > 20_000 for name in "ab")
@@ -143,8 +111,8 @@ def test_the_same_seed_gives_the_same_table_gone_on_with_and_with_any_number_of_
 
 def test_a_single_case_equals_the_case_of_the_study_and_so_does_its_log(tmp_path: Path) -> None:
     """The log is judged by the code that judges live runs: another way to the same figures."""
-    sweep("--n", "1", "--out", str(tmp_path / "all"))
-    assert sweep("--only", "0", "--out", str(tmp_path / "one")) == 0
+    sweep(*KILL, "--n", 1, "--out", tmp_path / "all")
+    assert sweep(*KILL, "--only", 0, "--out", tmp_path / "one") == 0
     (row,) = rows_of(tmp_path / "all" / "cases.csv")
     summary = json.loads((tmp_path / "one" / "summary.json").read_text())
     # such a push keeps motors at their limit: sound it is not, and the study asks for standing
@@ -163,14 +131,29 @@ def test_a_single_case_equals_the_case_of_the_study_and_so_does_its_log(tmp_path
         assert float(figure) == pytest.approx(summary[key], rel=1e-4, abs=1e-9), key
 
 
+def test_a_case_alone_that_falls_is_exit_code_1_whatever_the_study_says(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert sweep(*SOON_DOWN, "--out", tmp_path) == 0, "the shipped control did not fall"
+    capsys.readouterr()
+    assert sweep(*SOON_DOWN, "--only", 0) == 1
+    lines = (line.split() for line in capsys.readouterr().out.splitlines())
+    alone = {words[0]: words[1] for words in lines if len(words) == 2}
+    (row,) = rows_of(tmp_path / "latency.csv")
+    for name in ("ending", "control"):
+        assert alone[name] == row[name]
+    for name in ("fell_at_s", "operator_peak_n", "com_max_mm", "torque_step_nm"):
+        assert float(alone[name]) == pytest.approx(float(row[name]), rel=1e-3)
+
+
 def test_a_fall_is_exit_code_1_with_the_command_that_shows_it(
     robot: RobotConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A plain average of the legs cannot carry the whole payload: it falls at the start."""
-    some = cases.KillCases(robot)
+    some = KillCases(robot)
     seed = next(s for s in range(100) if some.draw(s, 0).payload_kg == 20.4)
-    average = ("--n", "1", "--seed", str(seed), "--jacobian", "average")
-    assert sweep(*average, "--out", str(tmp_path)) == 1
+    average = ("--n", 1, "--seed", seed, "--jacobian", "average")
+    assert sweep(*KILL, *average, "--out", tmp_path) == 1
     output = " ".join(capsys.readouterr().out.split())
     assert "1 falls of 1" in output
     command = f"xrl sweep kill --seed {seed} --split diagonal --jacobian average --only 0"
@@ -178,13 +161,80 @@ def test_a_fall_is_exit_code_1_with_the_command_that_shows_it(
     assert cli.main(command.split()[1:]) == 1
 
 
-@pytest.mark.parametrize("flags", [("--n", "0"), ("--workers", "0"), ("--only", "-1")])
-def test_a_number_that_makes_no_sense_is_refused(
-    flags: tuple[str, str], capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("study_name", sorted(STUDIES))
+def test_a_study_and_the_verb_have_help_with_examples_that_are_right(
+    study_name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert exit_code(["sweep", "kill", "--split", "diagonal", *flags]) == 2
-    error = capsys.readouterr().err.splitlines()[-1]
-    assert re.search(rf"{flags[0]}: '{flags[1]}': must be a whole number of at least \d", error)
+    for words in ((), (study_name,)):
+        with pytest.raises(SystemExit) as left:
+            cli.main(["sweep", *words, "--help"])
+        assert left.value.code == 0
+        shown = capsys.readouterr().out
+        assert f"\n  xrl sweep {study_name}\n" in shown.partition("examples:")[2]
+    for flag in re.findall(r"xrl sweep \w+ (--\w[\w-]*)", shown):
+        assert f"  {flag} " in shown.partition("examples:")[0]
+
+
+def test_the_verbs_help_imports_no_study() -> None:
+    code = (
+        "import sys\nfrom tools import cli\ntry:\n    cli.main(['sweep', '--help'])\n"
+        "except SystemExit:\n    pass\n"
+        "assert not [name for name in sys.modules if name.startswith('tools.lab')]"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (("kill", "--n", "0"), r"--n: '0': must be a whole number of at least 1"),
+        (("robust", "--n", "0"), r"--n: '0': must be"),
+        (("certificate", "--n", "0"), r"--n: '0': must be"),
+        (("latency", "--trials", "0"), r"--trials: '0': must be a whole number of at least 1"),
+        (("kill", "--workers", "0"), r"--workers: '0': must be"),
+        (("kill", "--only", "-1"), r"--only: '-1': must be a whole number of at least 0"),
+        (("kill", "--cluster", "tcp://127.0.0.1:1", "--workers", "2"), "--workers are of this"),
+        (("kill", "--cluster", "tcp://127.0.0.1:1", "--only", "1"), "--only runs here"),
+        *(((name, "--push", share), "--push") for name in ("kill", "robust")
+          for share in ("0", "-1", "4", "nan")),
+        (("robust", "--slope", "40"), "--slope 40"),
+        (("push", "--duration", "0"), "--duration 0"),
+        (("latency", "--loss", "1.5"), "from 0 to 1"),
+        (("latency", "--control", "distributed,mine"),
+         "'mine'; some of distributed, diagonal, centralised"),
+        (("latency", "--delay", "0-200"), "FROM:TO:STEP"),
+        (("latency", "--lead-easing", "2"), "lead_easing"),
+    ],
+    ids=" ".join,
+)  # fmt: skip
+def test_flags_that_make_no_sense_are_refused_and_nothing_is_written(
+    flags: tuple[str, ...], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert exit_code(["sweep", *flags, "--out", str(out)]) == 2
+    assert re.search(words, capsys.readouterr().err)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("error", [RunError("a worker was killed"), KeyboardInterrupt()])
+def test_an_interrupted_study_prints_how_to_resume(
+    tmp_path: Path,
+    error: BaseException,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def one_and_stop(_work: object, tasks: list[object], *_: object) -> Iterator[object]:
+        yield tasks[0], kill.KillResult(ending=kill.Ending.FELL)
+        raise error
+
+    monkeypatch.setattr(study.pool, "results", one_and_stop)
+    out, address = tmp_path / "a b", "tcp://host:8786"
+    flags = (*KILL, "--n", "2", "--push", "0.5", "--cluster", address, "--out", str(out))
+    assert sweep(*flags) == (2 if isinstance(error, RunError) else 130)
+    again = f"xrl sweep kill --seed 1 --split diagonal --push 0.5 --n 2 --cluster {address}"
+    words = f"1 cases are in {out}; resume with: {again} --out '{out}'\n"
+    assert words in capsys.readouterr().out
+    assert [row["number"] for row in rows_of(out / "cases.csv")] == ["0"]
 
 
 def session(sid: int) -> list[int]:
@@ -212,7 +262,7 @@ def test_a_study_that_is_stopped_keeps_its_rows_and_leaves_no_process(
     tmp_path: Path, number: signal.Signals, code: int
 ) -> None:
     """Ctrl-C goes to every process of the terminal; SIGKILL here to the first only."""
-    command = [sys.executable, "-m", "tools.cli", "sweep", "kill", "--split", "diagonal"]
+    command = [sys.executable, "-m", "tools.cli", "sweep", *KILL]
     process = subprocess.Popen(
         [*command, "--n", "200", "--workers", "2", "--out", str(tmp_path)],
         start_new_session=True,
@@ -237,13 +287,41 @@ def test_a_study_that_is_stopped_keeps_its_rows_and_leaves_no_process(
             os.kill(pid, signal.SIGKILL)
 
 
-@pytest.mark.parametrize("words", [("sweep",), ("sweep", "kill"), ("sweep", "certificate")])
-def test_the_verb_and_its_study_have_help_with_examples(
-    words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(("hits", "of"), [(0, 500), (3, 200), (1, 1), (20, 20)])
+def test_wilsons_bounds_solve_his_equation(hits: int, of: int) -> None:
+    """A bound p is as far from what was seen as 1.96 deviations of a share p allow."""
+    for p in wilson(hits, of):
+        share = hits / of
+        assert (share - p) ** 2 == pytest.approx(1.959964**2 * p * (1 - p) / of, abs=1e-12)
+    low, high = wilson(hits, of)
+    assert 0.0 <= low <= hits / of <= high <= 1.0
+    assert low < high
+
+
+def test_another_gain_schedule_is_another_robot(robot: RobotConfig) -> None:
+    other = msgspec.structs.replace(robot, gain_schedule=None)
+    assert study.digest_of(robot) == study.digest_of(msgspec.structs.replace(robot))
+    assert study.digest_of(robot) != study.digest_of(other)
+
+
+def test_the_digest_has_every_tool_that_decides_a_run_and_no_picture() -> None:
+    """Whatever lockstep imports, and so on from there, with no list to be kept."""
+    sweeps = "tools/lab/studies/sweeps"
+    for one, own in (
+        (kill.STUDY, {f"{sweeps}/kill_trial.py", "tools/lab/design/split_program.py"}),
+        (latency.STUDY, {f"{sweeps}/latency_trial.py", "tools/sim/centralised/control.py"}),
+    ):
+        code = code_of(*one.code)
+        runs = ("lockstep", "network", "virtual_drive", "virtual_harness", "virtual_network")
+        assert {"services", "shared", *(f"tools/sim/{name}.py" for name in runs)} | own <= {*code}
+        assert [part for part in code if "picture" in part or "report" in part] == []
+
+
+def test_the_code_of_a_study_is_all_that_it_imports_in_either_way(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    with pytest.raises(SystemExit) as left:
-        cli.main([*words, "--help"])
-    assert left.value.code == 0
-    shown = capsys.readouterr().out
-    assert f"examples:\n  xrl sweep {words[1] if len(words) > 1 else ''}" in shown
-    assert f"xrl sweep {words[-1] if len(words) > 1 else 'kill'}" in shown
+    monkeypatch.setattr("tools.lab.studies.sweeps.table.CHECKOUT", tmp_path)
+    (tmp_path / "tools").mkdir()
+    for name, text in (("a", "import tools.b"), ("b", "from tools import c"), ("c", ""), ("d", "")):
+        (tmp_path / "tools" / f"{name}.py").write_text(text)
+    assert code_of("tools.a") == ("services", "shared", "tools/a.py", "tools/b.py", "tools/c.py")

@@ -1,11 +1,11 @@
-"""`xrl sweep latency`: its grid, its trials, its figures, and the verb around them."""
+"""`xrl sweep latency`: its grid, its trials, its figures, its words and its pictures."""
 
 from __future__ import annotations
 
 import argparse
-import csv
 import math
-from itertools import pairwise
+from collections.abc import Callable
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,8 @@ from shared.bus.messages import JointEvent, Mode
 from shared.config import scenarios
 from shared.config.robot_config import RobotConfig
 from shared.links import DIRECTIONS
-from tools import cli
-from tools.lab.studies.sweeps import kill, latency, latency_picture
+from tools.lab.studies.sweeps import latency, latency_picture, latency_report
+from tools.lab.studies.sweeps.figures import Ending
 from tools.lab.studies.sweeps.latency_trial import (
     CONTROLS,
     DURATION_S,
@@ -26,24 +26,29 @@ from tools.lab.studies.sweeps.latency_trial import (
     fleet_of,
     hold_share,
     robot_of,
+    row_of,
 )
+from tools.lab.studies.sweeps.study import add_flags, command_of
+from tools.lab.studies.sweeps.table import Row
 from tools.sim.lockstep import Lockstep
+from tools.terminal import Console
 
-ROOT = Path(__file__).resolve().parents[5]
 GOOD = Network(0.0, 0.0, 0.0)
-SOON_DOWN = (
-    "--control", "centralised", "--delay", "200", "--loss", "0", "--trials", "1", "--workers", "1",
-)  # fmt: skip
-
-
-def sweep(*flags: str) -> int:
-    return cli.main(["sweep", "latency", *flags])
 
 
 def grid(*flags: str) -> list[LatencyTrial]:
+    return trials_of(parsed(*flags))
+
+
+def parsed(*flags: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
-    latency.add_flags(parser)
-    return latency.trials_of(parser.parse_args(flags))
+    add_flags(parser, latency.STUDY)
+    return parser.parse_args(flags)
+
+
+def trials_of(args: argparse.Namespace) -> list[LatencyTrial]:
+    total, trial = latency.cases(args)
+    return [trial(number) for number in range(total)]
 
 
 def trial(**changes: Any) -> LatencyTrial:
@@ -80,27 +85,6 @@ def test_steps_of_a_tenth_end_at_their_end() -> None:
 def test_values_that_make_no_sense_are_refused(text: str) -> None:
     with pytest.raises(argparse.ArgumentTypeError):
         latency.values_in(0.0, 1.0)(text)
-
-
-@pytest.mark.parametrize(
-    ("flags", "words"),
-    [
-        (("--loss", "1.5"), "from 0 to 1"),
-        (("--control", "distributed,mine"), "'mine'; some of distributed, diagonal, centralised"),
-        (("--delay", "0-200"), "FROM:TO:STEP"),
-        (("--trials", "0"), "--trials: '0': must be a whole number of at least 1"),
-        (("--lead-easing", "2"), "lead_easing"),
-    ],
-)
-def test_bad_input_is_refused_with_what_would_be_right(
-    flags: tuple[str, str], words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    try:
-        code = sweep(*flags)
-    except SystemExit as left:
-        code = int(left.code or 0)
-    assert code == 2
-    assert words in capsys.readouterr().err
 
 
 def test_the_default_grid_has_300_trials_and_goes_to_200_ms_and_half_lost() -> None:
@@ -151,29 +135,17 @@ def test_another_loss_loses_other_messages_and_another_delay_the_same(robot: Rob
     assert lost(robot, 4000, loss=0.1, jitter_ms=5.0) != few
 
 
-def test_the_command_is_of_this_study_whatever_its_numbers_are(robot: RobotConfig) -> None:
-    flags = (
-        "--loss",
-        "0.1234567,0.1234568",
-        "--delay",
-        "12345.67,0.00001",
-        "--lead-easing",
-        "1e-7",
-    )
-    parser = argparse.ArgumentParser()
-    latency.add_flags(parser)
-    args = parser.parse_args(flags)
-    command = latency._command(args)
+def test_the_command_is_of_this_study_whatever_its_numbers_are() -> None:
+    flags = "--loss 0.1234567,0.1234568 --delay 12345.67,0.00001 --lead-easing 1e-7"
+    args = parsed(*flags.split())
+    command = command_of(latency.STUDY, args)
     assert "--delay 0.00001,12345.67 --loss 0.1234567,0.1234568" in command
-    again = parser.parse_args(command.split()[3:])
-    assert latency.trials_of(again) == latency.trials_of(args)
+    again = parsed(*command.split()[3:])
+    assert trials_of(again) == trials_of(args)
     assert again.lead_easing == args.lead_easing
-    assert latency._joined(args.loss) == "0.1234567,0.1234568"
-    assert len({(t.draw, t.repeat) for t in latency.trials_of(args)}) == 2 * 4
-    assert {latency.row_of(t)["delay_ms"] for t in latency.trials_of(args)} == {
-        "0.00001",
-        "12345.67",
-    }
+    assert latency.STUDY.inputs(args)["loss"] == "0.1234567,0.1234568"
+    assert len({(t.draw, t.repeat) for t in trials_of(args)}) == 2 * 4
+    assert {row_of(t)["delay_ms"] for t in trials_of(args)} == {"0.00001", "12345.67"}
 
 
 def test_no_draw_is_beyond_the_study() -> None:
@@ -257,64 +229,70 @@ def test_the_robot_holds_while_any_module_does_that_did_before_the_network_got_b
     assert hold_share(events, 0, 100) == pytest.approx(share)
 
 
-def test_the_digest_has_every_tool_that_decides_a_run_and_no_picture() -> None:
-    """Whatever lockstep imports, and so on from there, with no list to be kept."""
-    design = "tools/lab/design/split_program.py"
-    for code, own in (
-        (
-            kill.CODE,
-            {*(f"tools/lab/studies/sweeps/{name}.py" for name in ("cases", "outcome")), design},
-        ),
-        (
-            latency.CODE,
-            {"tools/lab/studies/sweeps/latency_trial.py", "tools/sim/centralised/control.py"},
-        ),
-    ):
-        runs = ("lockstep", "network", "virtual_drive", "virtual_harness", "virtual_network")
-        assert {"services", "shared", *(f"tools/sim/{name}.py" for name in runs)} | own <= {*code}
-        assert [part for part in code if "picture" in part or "report" in part] == []
+def made_up(fell: Callable[[str, float, float], bool]) -> list[Row]:
+    """Return rows of a whole grid, two trials each."""
+    columns = ("operator_peak_n", "hold_share", "com_max_mm", "torque_step_nm", "hold_step_nm")
+    grid = product(("centralised", "distributed"), (0.0, 50.0), (0.0, 0.5), range(2))
+    return [
+        {
+            "number": number,
+            "control": control,
+            "delay_ms": f"{delay:g}",
+            "jitter_ms": "0",
+            "loss": f"{loss:g}",
+            "ending": Ending.FELL if fell(control, delay, loss) else Ending.STOOD,
+            **dict.fromkeys(columns, 10.0 + number),
+        }
+        for number, (control, delay, loss, _) in enumerate(grid)
+    ]
 
 
-@pytest.fixture(scope="module")
-def fallen(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A study of one trial, in which the baseline falls: no failure of the shipped control."""
-    out = tmp_path_factory.mktemp("latency")
-    assert sweep(*SOON_DOWN, "--out", str(out)) == 0
-    return out
+def test_falls_are_counted_where_they_were(capsys: pytest.CaptureFixture[str]) -> None:
+    rows = made_up(lambda control, delay, _loss: control == "centralised" and delay == 50.0)
+    assert latency_report.controls_in(rows) == ["distributed", "centralised"]
+    own = latency_report.chosen(rows, "centralised", delay_ms=50.0)
+    assert latency_report.falls(own) == (4, 4)
+    assert latency_report.falls(latency_report.chosen(rows, "centralised")) == (4, 8)
+    assert latency_report.falls(own).bounds[0] > 0.3
+    assert {row["loss"] for row in latency_report.without_loss(rows)} == {"0"}
+    latency_report.show(rows, "xrl sweep latency", Console(width=120))
+    output = capsys.readouterr().out
+    assert "centralised: 4 of 8 fell; most at 50 ms, 4 of 4" in output
+    assert "distributed: none of 8 fell" in output
+    assert "xrl sweep latency --only 4" in output
 
 
-def row_in(out: Path) -> dict[str, str]:
-    with (out / "latency.csv").open(newline="") as file:
-        (row,) = csv.DictReader(file)
-    return row
-
-
-def test_a_study_is_tabled_and_drawn(fallen: Path) -> None:
-    row = row_in(fallen)
-    assert row["ending"] == "fell"
-    assert 0.5 < float(row["fell_at_s"]) < DURATION_S
-    assert float(row["hold_share"]) == 0.0
-    for name in (latency_picture.FALLS, latency_picture.EFFORT):
-        assert (fallen / name).stat().st_size > 10_000
-
-
-def test_a_study_is_gone_on_with_and_another_one_is_refused(
-    fallen: Path, capsys: pytest.CaptureFixture[str]
+def test_each_delay_has_bounds_of_its_own_and_names_their_mix(
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert sweep(*SOON_DOWN, "--out", str(fallen)) == 0
-    assert "1 of 1 cases are done already" in capsys.readouterr().out
-    assert sweep(*SOON_DOWN, "--delay", "100", "--out", str(fallen)) == 2
-    assert "another delay" in capsys.readouterr().err
+    """The worst of several delays is chosen: 95 % of it would be 83 %."""
+    rows = made_up(lambda control, delay, _loss: control == "centralised" and delay == 50.0)
+    latency_report.show(rows, "xrl sweep latency", Console(width=80))
+    table, _, rest = capsys.readouterr().out.partition("Hand's peak force")
+    assert "in this mix: 0, 50 % lost" in " ".join(table.split())
+    assert [" ".join(line.split()) for line in table.splitlines() if " of 4" in line] == [
+        "0 0 of 4 0-49 % 0 of 4 0-49 %",
+        "50 0 of 4 0-49 % 4 of 4 51-100 %",
+    ]
+    assert "Wilson" not in rest
+    both = [{**row, "jitter_ms": jitter} for row in rows for jitter in ("0", "5")]
+    assert latency_report.mix(both) == "0, 50 % lost, 0, 5 ms of jitter"
 
 
-def test_one_trial_alone_is_the_trial_of_the_study(
-    fallen: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert sweep(*SOON_DOWN, "--only", "0") == 1
-    lines = (line.split() for line in capsys.readouterr().out.splitlines())
-    alone = {words[0]: words[1] for words in lines if len(words) == 2}
-    row = row_in(fallen)
-    for name in ("ending", "control"):
-        assert alone[name] == row[name]
-    for name in ("fell_at_s", "operator_peak_n", "com_max_mm", "torque_step_nm"):
-        assert float(alone[name]) == pytest.approx(float(row[name]), rel=1e-3)
+def test_a_study_with_trials_missing_reports_how_many_there_are() -> None:
+    rows = made_up(lambda *_: False)
+    assert latency_picture._each(rows) == "4 trials a point"
+    assert latency_picture._each(rows[:-1]) == "3 to 4 trials a point"
+
+
+def test_pictures_are_drawn_of_what_there_is(tmp_path: Path) -> None:
+    """A study that was stopped early, and one in which everything fell at once."""
+    rows = made_up(lambda *_: True)
+    short = [{**row, "operator_peak_n": None, "hold_share": None} for row in rows[:3]]
+    for name, some in (("all", rows), ("few", short)):
+        folder = tmp_path / name
+        folder.mkdir()
+        latency_picture.draw(some, 150.0, "made up", folder)
+        sizes = [path.stat().st_size for path in folder.iterdir()]
+        assert len(sizes) == 2
+        assert all(10_000 < size < 150_000 for size in sizes)

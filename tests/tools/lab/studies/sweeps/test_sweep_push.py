@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import csv
+import math
+import random
 from pathlib import Path
 
 import msgspec
@@ -12,8 +13,8 @@ import pytest
 from services.simulator.physics.plant import PlantConfig
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from tools import cli
 from tools.lab.studies.sweeps import push, push_trial
+from tools.lab.studies.sweeps.push_range import PushRange
 from tools.lab.studies.sweeps.push_trial import (
     PushResult,
     PushTrial,
@@ -28,6 +29,11 @@ def asked(**changes: object) -> argparse.Namespace:
     return argparse.Namespace(**(given | changes))
 
 
+def trials_of(**changes: object) -> list[PushTrial]:
+    total, trial = push.cases(asked(**changes))
+    return [trial(number) for number in range(total)]
+
+
 def point(**changes: object) -> PushTrial:
     given: dict[str, object] = {
         "number": 0, "pose": "squat", "angle_deg": 90, "duration_s": 3.0, "mode": "dead",
@@ -36,17 +42,12 @@ def point(**changes: object) -> PushTrial:
 
 
 def test_the_grid_has_every_pose_duration_angle_and_mode_once() -> None:
-    trials = push.trials_of(asked())
+    trials = trials_of()
     assert len(trials) == len({(t.pose, t.duration_s, t.angle_deg, t.mode) for t in trials})
     assert len(trials) == 3 * 2 * 5 * 2
-    some = push.trials_of(asked(pose=["crawl"], angle=[0, 90], duration=[1.0]))
+    some = trials_of(pose=["crawl"], angle=[0, 90], duration=[1.0])
     assert {(t.pose, t.duration_s) for t in some} == {("crawl", 1.0)}
     assert [t.number for t in some] == list(range(4))
-
-
-def test_a_duration_of_nothing_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["sweep", "push", "--duration", "0"]) == 2
-    assert "--duration 0" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("falls_from", [3.0, 100.0, 1e9])
@@ -94,26 +95,42 @@ def test_the_push_is_in_the_direction_that_was_asked_for() -> None:
 
 
 def test_a_table_is_drawn_with_both_modes_and_the_limits(tmp_path: Path) -> None:
-    trials = push.trials_of(asked(pose=["stand", "crawl"]))
+    trials = trials_of(pose=["stand", "crawl"])
     outcome = PushResult(
         stood_n=50.0, fell_n=55.0, held_limit_n=40.0, held_part="left sole's toe", body_limit_n=90.0
     )
-    rows = [
-        {key: str(value) for key, value in push._rows((trial, None, None), outcome)[0].items()}  # type: ignore[arg-type]
-        for trial in trials
-    ]
+    figures = msgspec.structs.asdict(outcome)
+    rows = [msgspec.structs.asdict(trial) | figures for trial in trials]
     push.draw(rows, tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 30_000
 
 
-def test_a_study_of_one_point_is_tabled_and_goes_on(tmp_path: Path) -> None:
-    words = ["sweep", "push", "--pose", "squat", "--angle", "90", "--duration", "0.3"]
-    out = tmp_path / "push"
-    assert cli.main([*words, "--workers", "2", "--out", str(out)]) == 0
-    with (out / push.TABLE).open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    assert [row["mode"] for row in rows] == ["led", "dead"]
-    assert all(float(row["stood_n"]) > 20.0 for row in rows)
-    stamp = (out / push.TABLE).read_bytes()
-    assert cli.main([*words, "--workers", "2", "--out", str(out)]) == 0
-    assert (out / push.TABLE).read_bytes() == stamp
+@pytest.fixture(scope="module")
+def pushes(robot: RobotConfig) -> PushRange:
+    return PushRange(robot, 1.0)
+
+
+@pytest.mark.parametrize("angle_deg", [0, 45, 90, 180, -90])
+def test_the_limit_is_that_of_the_push_study_in_the_stand(
+    robot: RobotConfig, pushes: PushRange, angle_deg: int
+) -> None:
+    borne = limits_of(point(pose="stand", angle_deg=angle_deg, mode="led"), robot).body.force_n
+    assert pushes.limit_n(math.radians(angle_deg)) == pytest.approx(borne, rel=0.02)
+
+
+def test_a_push_is_its_share_of_the_limit_in_its_direction(pushes: PushRange) -> None:
+    push = pushes.push(1.0, 0.3, 0.5, math.pi / 2)
+    assert push.force == pytest.approx((0.0, 0.5 * pushes.limit_n(math.pi / 2), 0.0), abs=1e-3)
+    assert (push.at, push.duration) == (1.0, 0.3)
+
+
+def test_what_is_drawn_reaches_the_limit_in_every_direction(pushes: PushRange) -> None:
+    dice, reached = random.Random(1), {-2: 0.0, -1: 0.0, 0: 0.0, 1: 0.0}
+    for _ in range(300):
+        x, y, _ = pushes.draw(dice, (0.3, 1.0), 1.0, 0.3).force
+        angle = math.atan2(y, x)
+        share = math.hypot(x, y) / pushes.limit_n(angle)
+        assert 0.299 <= share <= 1.001
+        quarter = math.floor(2.0 * angle / math.pi)
+        reached[quarter] = max(reached[quarter], share)
+    assert min(reached.values()) > 0.95

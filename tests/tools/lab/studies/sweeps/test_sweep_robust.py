@@ -12,8 +12,6 @@ import msgspec
 import pytest
 
 from shared.config.robot_config import RobotConfig
-from tests.tools.exit_codes import exit_code
-from tools import cli
 from tools.lab.studies.sweeps import plants, robust
 from tools.lab.studies.sweeps.figures import Ending
 from tools.lab.studies.sweeps.push_range import PushRange
@@ -25,6 +23,7 @@ from tools.lab.studies.sweeps.robust_trial import (
     run_trial,
     scenario_of,
 )
+from tools.lab.studies.sweeps.study import Finished
 from tools.terminal import Console
 
 
@@ -69,11 +68,15 @@ def test_the_ranking_finds_the_error_that_moves_the_com(pushes: PushRange, cause
 
 
 @pytest.mark.parametrize("few", [True, False])
-def test_of_a_few_trials_no_error_is_ranked(pushes: PushRange, few: bool) -> None:
-    figures = dict.fromkeys((key for key, _, _ in robust.FIGURES), "")
+def test_of_a_few_trials_no_error_is_ranked(
+    robot: RobotConfig, pushes: PushRange, few: bool, tmp_path: Path
+) -> None:
+    figures = dict.fromkeys(key for key, _, _ in robust.FIGURES)
     rows = [figures | row for row in rows_by(pushes, "drive.lag_s")[: robust.RANKED_LEAST - few]]
     printed = io.StringIO()
-    robust._show(rows, "xrl sweep robust", Console(width=200, file=printed))
+    args = argparse.Namespace(beyond=1.0, seed=1, push=0.75)
+    console = Console(width=200, file=printed)
+    robust.report(Finished(args, robot, rows, tmp_path, "xrl sweep robust", console))
     assert ("too few to tell" in printed.getvalue()) is few
     assert ("drive.lag_s" in printed.getvalue()) is not few
 
@@ -81,13 +84,8 @@ def test_of_a_few_trials_no_error_is_ranked(pushes: PushRange, few: bool) -> Non
 def test_a_picture_is_drawn_and_falls_are_in_it(pushes: PushRange, tmp_path: Path) -> None:
     rows = rows_by(pushes, "drive.lag_s")
     rows[3] |= {"ending": Ending.FELL, "com_led_max_mm": None}
-    robust._draw(rows, argparse.Namespace(beyond=1.0, seed=1, push=0.75), tmp_path / "a.png")
+    robust.draw(rows, "made up", tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 20_000
-
-
-def test_an_impossible_width_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert exit_code(["sweep", "robust", "--n", "0"]) == 2
-    assert "--n: '0'" in capsys.readouterr().err
 
 
 @pytest.mark.sampled(2)
@@ -105,11 +103,6 @@ def test_with_every_error_drawn_it_is_led_pushed_killed_and_stands(
 def test_errors_are_reported_as_one_number_each() -> None:
     errors = plants.errors_of(plants.draw("one"))
     assert set(errors) == {row.key for row in plants.shipped().error}
-
-
-def test_an_impossible_slope_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["sweep", "robust", "--slope", "40"]) == 2
-    assert "--slope 40" in capsys.readouterr().err
 
 
 def test_a_slope_that_is_asked_for_has_its_size_and_any_direction_and_all_else_as_drawn(

@@ -16,15 +16,20 @@ from services.simulator.physics.plant import IDEAL
 from services.simulator.physics.world import World
 from shared.bus.messages import SimTruth
 from shared.clock import NS_PER_S
-from shared.config import scenarios
+from shared.config import gain_schedule, scenarios
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.config.scenarios import Keyframe, Push, Scenario, lead
 from shared.robot.robot_model import stand_pose
 from tools.judge.standing import is_tipping
-from tools.lab.studies.sweeps import cases
-from tools.lab.studies.sweeps.cases import KillCase, KillCases
-from tools.lab.studies.sweeps.figures import Ending, exit_code
-from tools.lab.studies.sweeps.outcome import FootLoads, run_case
+from tools.lab.studies.sweeps import kill_trial as cases
+from tools.lab.studies.sweeps.figures import Ending, exit_code, with_payload
+from tools.lab.studies.sweeps.kill_trial import (
+    FootLoads,
+    KillCase,
+    KillCases,
+    prepare,
+    run_case,
+)
 from tools.lab.studies.sweeps.push_range import PushRange
 from tools.sim import lockstep
 from tools.sim.lockstep import Lockstep
@@ -41,6 +46,21 @@ def diagonal(robot: RobotConfig) -> RobotConfig:
     """The paper's split: it needs no gain schedule, whatever the payload."""
     law = msgspec.structs.replace(robot.law, split="diagonal")
     return msgspec.structs.replace(robot, law=law)
+
+
+def test_a_payload_gets_a_schedule_that_fits(robot: RobotConfig) -> None:
+    other = with_payload(robot, 10.2)
+    reported: list[tuple[int, int]] = []
+    ready = prepare([robot, other], 2, lambda done, of: reported.append((done, of)))
+    assert ready[0] is robot, "its schedule was made for it"
+    assert [gain_schedule.why_stale(one) for one in ready] == ["", ""]
+    assert ready[1].mass.payload == 10.2
+    assert reported == [(0, 1), (1, 1)]
+
+
+def test_the_papers_split_needs_no_schedule(diagonal: RobotConfig) -> None:
+    other = with_payload(diagonal, 10.2)
+    assert prepare([other], 2) == [other]
 
 
 def frames(scenario: Scenario, case: KillCase) -> Iterator[tuple[cases.LeadPose, Keyframe]]:
@@ -72,7 +92,7 @@ def test_no_two_cases_are_alike(robot: RobotConfig, drawn: list[KillCase]) -> No
 
 
 def test_no_draw_is_beyond_the_study(robot: RobotConfig, drawn: list[KillCase]) -> None:
-    borne = {kg: PushRange(cases.with_payload(robot, kg)) for kg in cases.payloads(robot)}
+    borne = {kg: PushRange(with_payload(robot, kg)) for kg in cases.payloads(robot)}
     for case in drawn:
         assert case.payload_kg in (0.0, 5.1, 10.2, 15.3, 20.4)
         assert 0.0 <= case.delay_ms <= 20.0
@@ -177,7 +197,7 @@ def test_the_hand_is_off_from_the_time_in_the_case(
 ) -> None:
     case = msgspec.structs.replace(drawn[0], kill_s=0.9, let_go_s=0.8, delay_ms=1.0, pushes=())
     rows: list[SimTruth] = []
-    run_case(case, cases.with_payload(diagonal, case.payload_kg), watch=rows.append)
+    run_case(case, with_payload(diagonal, case.payload_kg), watch=rows.append)
     on = [row.operator_force[2] for row in rows if 0.6 < row.scenario_s < 0.79]
     off = [row.operator_force[2] for row in rows if row.scenario_s > 0.82]
     assert max(abs(force) for force in on) > 1.0
@@ -227,7 +247,7 @@ def test_a_case_that_ends_in_mid_fall_is_a_fall(
         short = _Until4s(
             **{name: getattr(case, name) for name in case.__struct_fields__} | {"pushes": pushes}
         )
-        outcome = run_case(short, cases.with_payload(diagonal, case.payload_kg))
+        outcome = run_case(short, with_payload(diagonal, case.payload_kg))
         assert outcome.ending == ending
         assert outcome.fell_at_s is None
 
@@ -246,6 +266,6 @@ def test_a_robot_that_never_tracks_is_no_stand(
     """At 30 ms each way every command is older than 50 ms: it holds, and nothing can begin."""
     monkeypatch.setattr(lockstep, "READY_NS", 6 * NS_PER_S)
     case = msgspec.structs.replace(drawn[0], delay_ms=30.0)
-    outcome = run_case(case, cases.with_payload(diagonal, case.payload_kg))
+    outcome = run_case(case, with_payload(diagonal, case.payload_kg))
     assert outcome.ending == Ending.UNREADY
     assert not outcome.stood

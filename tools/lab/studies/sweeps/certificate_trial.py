@@ -1,4 +1,4 @@
-"""Tests the certificate: the sign of K_fail against a simulated fall or stand.
+"""One case of the certificate's test: the sign of K_fail against a simulated fall or stand.
 
 A case is a random posture, payload, assist and set of local gains. The robot starts in the
 posture, on free feet, with the law that remains without a planner (docs/law.md#certificate):
@@ -12,8 +12,7 @@ falls. A margin above zero predicts that it stands.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import msgspec
@@ -36,7 +35,7 @@ from shared.config.scenarios import Keyframe, Push, Scenario
 from shared.exceptions import RunError
 from shared.joints import MODULES, N_JOINTS, N_LEG
 from shared.robot.robot_model import stand_pose
-from tools.output import new_figure, save_figure
+from tools.lab.studies.sweeps.figures import sole_tilt_max_rad, with_payload
 
 Array = NDArray[np.float64]
 
@@ -115,47 +114,24 @@ class CertificateCase(NamedTuple):
     """With tier 2's margin (`services.planner.law.certificate`)."""
 
 
-class CertificateResult(NamedTuple):
+class CertificateResult(msgspec.Struct, frozen=True, kw_only=True):
     """Result of the simulation."""
 
-    case: CertificateCase
     stood: bool
-    fallen: bool
-    """True if it lay on the floor within the time; False also for a drift away."""
-    ended_s: float
-    com_m: float
+    """False for a fall, and for a drift away."""
+    com_mm: float
     """The COM's farthest from the posture."""
     angle_rad: float
     """The torso's farthest, about any axis."""
     growth: float
     """As for `GROWTH_BOUND`."""
-
-    @property
-    def margin(self) -> float:
-        """Margin of the certificate: above 0 it predicts a stand."""
-        return self.case.weakest.margin
-
-
-class Confusion(NamedTuple):
-    """Counts of predictions and results."""
-
-    stand_stood: int
-    stand_fell: int
-    """The certificate said stand, and it fell: the dangerous mistake."""
-    fall_stood: int
-    fall_fell: int
+    ended_s: float
 
 
 FRICTIONLESS: Final = changed(
     IDEAL, {"drivetrain.motor_friction": 0.0, "drivetrain.joint_friction": 0.0}
 )
 """Falls predicted, stood: dry friction holds a robot that is slightly too soft."""
-
-
-def with_payload(robot: RobotConfig, payload: float) -> RobotConfig:
-    """Return the robot with another payload, kg."""
-    mass = msgspec.structs.replace(robot.mass, payload=payload)
-    return msgspec.structs.replace(robot, mass=mass)
 
 
 class CertificateCases:
@@ -241,26 +217,20 @@ class _Module:
 
 
 def world_of(
-    robot: RobotConfig,
-    case: CertificateCase,
-    nudge_share: float,
-    *,
-    rigid: bool,
-    plant: PlantConfig = FRICTIONLESS,
+    robot: RobotConfig, case: CertificateCase, *, rigid: bool, plant: PlantConfig = FRICTIONLESS
 ) -> World:
     """Return the world with the robot in the case's posture, the nudge to come.
 
     The payload is the case's. `rigid`: the floor is hard, as the certificate has it.
     """
-    posture, (x, y) = case.posture, case.nudge
-    force = (nudge_share * x, nudge_share * y, 0.0)
+    posture = case.posture
     scenario = Scenario(
         name="certificate",
         about="a posture held by local gains alone, and a nudge",
         duration=DURATION_S,
         keyframe=(Keyframe(at=0.0, height=posture.height, assist=posture.assist),),
         hand=False,
-        push=(Push(at=NUDGE_AT, duration=NUDGE_S, force=force),),
+        push=(Push(at=NUDGE_AT, duration=NUDGE_S, force=(*case.nudge, 0.0)),),
     )
     world = World(body_of(with_payload(robot, posture.payload), plant), scenario)
     if rigid:
@@ -270,16 +240,32 @@ def world_of(
     return world
 
 
-def run(
-    robot: RobotConfig,
+def row_of(case: CertificateCase) -> dict[str, object]:
+    """Return a case by column: what is predicted of it, and how it begins."""
+    row = {
+        "number": case.number,
+        "margin": case.weakest.margin,
+        "weakest": case.weakest.direction,
+        "stiffness": case.weakest.stiffness,
+        "height_m": case.posture.height,
+        "pitch_rad": case.posture.pitch,
+        "payload_kg": case.posture.payload,
+        "assist_n": case.posture.assist,
+        "nudge_x_n": case.nudge[0],
+        "nudge_y_n": case.nudge[1],
+    }
+    return row | {f"D{joint}": float(value) for joint, value in enumerate(case.D[:6])}
+
+
+def run_case(
     case: CertificateCase,
-    nudge_share: float = 1.0,
+    robot: RobotConfig,
     *,
     rigid: bool = False,
     plant: PlantConfig = FRICTIONLESS,
 ) -> CertificateResult:
     """Simulate a case; arguments as for `world_of`."""
-    world = world_of(robot, case, nudge_share, rigid=rigid, plant=plant)
+    world = world_of(robot, case, rigid=rigid, plant=plant)
     modules = [_Module(robot, case, index) for index in range(len(MODULES))]
     steps = round(1.0 / (robot.joint_service.rate_hz * world.timestep))
     motor = np.zeros(N_JOINTS)
@@ -295,66 +281,24 @@ def run(
             rows.append(world.truth(0, 1.0, 0.0))
             if rows[-1].fallen:
                 break
-    return judge(case, rows)
+    return judge(rows)
 
 
-def judge(case: CertificateCase, rows: Sequence[SimTruth]) -> CertificateResult:
+def judge(rows: Sequence[SimTruth]) -> CertificateResult:
     """Return the outcome of a run, whose first row is from before the nudge."""
     com = np.array([row.com for row in rows])
     angles = np.array([row.angles for row in rows])
     com_m = np.linalg.norm(com - com[0], axis=1)
     angle_rad = np.abs(angles - angles[0]).max(axis=1)
-    tilt = max(max(row.foot_right_tilt, row.foot_left_tilt) for row in rows)
+    tilt = sole_tilt_max_rad(rows)
     departure = np.maximum(com_m / COM_BOUND, angle_rad / ANGLE_BOUND)
     late = 2 * len(rows) // 3
     growth = float(departure[late:].max(initial=0.0) / departure[:late].max(initial=STILL))
     stays = departure.max() < 1.0 and tilt < TILT_BOUND and growth < GROWTH_BOUND
     return CertificateResult(
-        case=case,
         stood=bool(stays and not rows[-1].fallen),
-        fallen=rows[-1].fallen,
-        ended_s=rows[-1].scenario_s,
-        com_m=float(com_m.max()),
+        com_mm=1e3 * float(com_m.max()),
         angle_rad=float(angle_rad.max()),
         growth=growth,
+        ended_s=rows[-1].scenario_s,
     )
-
-
-def confusion(said: Sequence[tuple[float, bool]]) -> Confusion:
-    """Count predictions and results from pairs of a margin and whether the robot stood."""
-    pairs = [(margin > 0.0, stood) for margin, stood in said]
-    return Confusion(*(pairs.count((says, was)) for says in (True, False) for was in (True, False)))
-
-
-def threshold(said: Sequence[tuple[float, bool]]) -> float:
-    """Return the margin that parts falls from stands with the fewest mistakes.
-
-    In the middle of the gap between two cases; not a number with fewer than two.
-    """
-    if len(said) < 2:
-        return math.nan
-    ordered = sorted(said)
-    stood = np.array([was for _, was in ordered])
-    # of a cut above each case: stands up to it, falls beyond it
-    mistakes = np.cumsum(stood) + np.sum(~stood) - np.cumsum(~stood)
-    cut = int(mistakes[:-1].argmin())
-    return 0.5 * (ordered[cut][0] + ordered[cut + 1][0])
-
-
-def draw_picture(rows: Sequence[Mapping[str, str]], title: str, path: Path) -> None:
-    """Draw margin against how far the COM went, into a PNG file; rows as in the table."""
-    figure = new_figure(9, 5.5)
-    axis = figure.subplots()
-    for stood, colour in ((True, "#4c9f70"), (False, "#c0392b")):
-        some = [row for row in rows if row["stood"] == str(stood)]
-        x, y = ([float(row[name]) for row in some] for name in ("margin", "com_mm"))
-        label = f"{'stood' if stood else 'fell'} ({len(some)})"
-        axis.scatter(x, y, s=18, color=colour, alpha=0.7, label=label)
-    axis.axvline(0.0, color="#7f7f7f", lw=1.0, ls="--")
-    axis.set(xscale="symlog", yscale="log")
-    axis.set_xlabel("the certificate's margin, in shares of what is required")
-    axis.set_ylabel("COM, farthest from the posture in mm")
-    axis.grid(visible=True, lw=0.3, color="#bbbbbb")
-    axis.legend(fontsize=8, framealpha=0.8)
-    figure.suptitle(title, fontsize=11, x=0.01, ha="left")
-    save_figure(figure, path)

@@ -1,0 +1,490 @@
+"""One case of the kill study: drawn from the seed and its number alone, run and measured."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from services.simulator.physics.plant import PlantConfig
+from services.simulator.physics.world import World
+from shared.bus.messages import (
+    JointEvent,
+    Message,
+    Mode,
+    PlannerStatus,
+    RunEvent,
+    RunEventKind,
+    SimTruth,
+)
+from shared.bus.topics import Topic
+from shared.clock import NS_PER_MS
+from shared.config import gain_schedule
+from shared.config.gain_table import GainSchedule
+from shared.config.impairment import Impairment
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Keyframe, Kill, Push, Scenario
+from shared.extras import require
+from shared.joints import MODULES, SIDES
+from shared.robot.robot_model import stand_pose
+from tools.lab.design import split_program
+from tools.lab.studies.sweeps import plants, pool
+from tools.lab.studies.sweeps.figures import (
+    Ended,
+    Ending,
+    com_max_mm,
+    ending_of,
+    event_steps_nm,
+    operator_peak_n,
+    scalars,
+    sole_tilt_max_rad,
+    that_count,
+    unwatched,
+    with_payload,
+)
+from tools.lab.studies.sweeps.push_range import DIGITS, SHARE, PushRange, uniform
+from tools.sim.lockstep import Lockstep, Watch, forget
+from tools.sim.virtual_time import Record
+
+PAYLOADS: Final = 5
+"""kg, evenly spaced from none to `mass.payload_max`: each needs a gain schedule of its own."""
+HEIGHT: Final = (0.79, 1.2)
+"""m, torso above the ankles: from the crawl to standing."""
+HEIGHT_UPRIGHT: Final = (0.85, 1.2)
+"""m: the person squats, the torso stays upright."""
+PITCH_MAX: Final = 1.2
+"""rad: the crawl's."""
+LIMIT_MARGIN: Final = 0.05
+"""rad that a posture keeps from the joint limits."""
+PACE: Final = (0.8, 1.6)
+"""Times `SPEED`."""
+SPEED: Final = (0.1, 0.24, 40.0)
+"""m/s, rad/s, N/s: mean speeds of the squat (height) and of the crawl (pitch, assist)."""
+LEG_MIN_S: Final = 1.0
+START_S: Final = 0.5
+"""Standing still before the first leg."""
+STILL_S: Final = (0.3, 1.0)
+"""Standing still before the kill, in the cases that are not moving."""
+LET_GO_S: Final = 1.0
+"""At most so long before the kill."""
+PUSH_SHARE: Final = (0.1, 1.0)
+"""Shares of the hardest push that is drawn (`PushRange`)."""
+PUSH_S: Final = 0.3
+PUSHES_MAX: Final = 3
+POSES_MAX: Final = 2
+AFTER_KILL_S: Final = 3.0
+AFTER_PUSH_S: Final = 1.7
+AFTER_LEAD_S: Final = 2.0
+"""How long a case goes on after the kill, the last push and, hand on, the end of the way: an
+operator who leads on against a robot that holds tips it slowly."""
+DELAY_MAX_MS: Final = 20.0
+
+
+class LeadPose(msgspec.Struct, frozen=True):
+    """Where the operator leads."""
+
+    height_m: float
+    pitch_rad: float
+    assist_n: float
+
+
+class KillCase(msgspec.Struct, frozen=True, kw_only=True):
+    """A drawn case. SI units; times are the scenario's."""
+
+    number: int
+    seed: int
+    payload_kg: float
+    poses: tuple[LeadPose, ...]
+    """One or two, led to one after the other from standing."""
+    pace: float
+    moving: bool
+    """True: killed on the way to the last pose; False: after it has been reached."""
+    way_end_s: float
+    """When the operator is at the last pose, if he holds on."""
+    kill_s: float
+    let_go_s: float | None
+    """When the operator takes the hand off; None: never. The weight he rests stays."""
+    delay_ms: float
+    pushes: tuple[Push, ...]
+
+    @property
+    def end_s(self) -> float:
+        """When there is nothing more to wait for."""
+        quiet = [push.at + push.duration + AFTER_PUSH_S for push in self.pushes]
+        if self.let_go_s is None:
+            quiet.append(self.way_end_s + AFTER_LEAD_S)
+        return max([self.kill_s + AFTER_KILL_S, *quiet])
+
+
+def payloads(robot: RobotConfig) -> tuple[float, ...]:
+    """Return the payloads that are drawn from, kg."""
+    highest = robot.mass.payload_max
+    return tuple(round(highest * i / (PAYLOADS - 1), DIGITS) for i in range(PAYLOADS))
+
+
+class KillCases:
+    """The cases of a robot."""
+
+    def __init__(self, robot: RobotConfig, push: float = SHARE) -> None:
+        """Take the robot, and up to which share of what it bears it is pushed."""
+        self._robot, self._push = robot, push
+        self._by_payload: dict[float, tuple[RobotConfig, PushRange]] = {}
+
+    def draw(self, seed: int, number: int) -> KillCase:
+        """Return one case; no other case has to be drawn for it."""
+        dice = random.Random(f"kill {seed} {number}")
+        payload = dice.choice(payloads(self._robot))
+        loaded, pushes = self._of(payload)
+        poses = tuple(_draw_pose(dice, loaded) for _ in range(dice.choice((1, 1, POSES_MAX))))
+        pace = uniform(dice, *PACE)
+        begin, end = _legs(self._robot, poses, pace)[-1]
+        moving = dice.random() < 0.5
+        kill = uniform(dice, *((begin, end) if moving else (end + STILL_S[0], end + STILL_S[1])))
+        hand_off = dice.random() < 0.5
+        at_the_kill = dice.random() < 0.5
+        let_go = None
+        if hand_off:
+            let_go = kill if at_the_kill else uniform(dice, max(0.0, kill - LET_GO_S), kill)
+        return KillCase(
+            number=number,
+            seed=seed,
+            payload_kg=payload,
+            poses=poses,
+            pace=pace,
+            moving=moving,
+            way_end_s=end,
+            kill_s=kill,
+            let_go_s=let_go,
+            delay_ms=uniform(dice, 0.0, DELAY_MAX_MS),
+            pushes=tuple(_draw_pushes(dice, kill, pushes)),
+        )
+
+    def _of(self, payload: float) -> tuple[RobotConfig, PushRange]:
+        if payload not in self._by_payload:
+            loaded = with_payload(self._robot, payload)
+            self._by_payload[payload] = loaded, PushRange(loaded, self._push)
+        return self._by_payload[payload]
+
+
+def _draw_pose(dice: random.Random, robot: RobotConfig) -> LeadPose:
+    """Draw a posture that the legs reach, and the weight rested on it in half of the cases."""
+    while True:
+        upright = dice.random() < 0.5
+        height = uniform(dice, *(HEIGHT_UPRIGHT if upright else HEIGHT))
+        pitch = 0.0 if upright else uniform(dice, 0.0, PITCH_MAX)
+        if reachable(robot, height, pitch):
+            break
+    resting = dice.random() < 0.5
+    return LeadPose(height, pitch, uniform(dice, 0.0, robot.assist.force_max) if resting else 0.0)
+
+
+def _draw_pushes(dice: random.Random, kill_s: float, drawn_from: PushRange) -> list[Push]:
+    """Draw pushes around and after the kill, none over another."""
+    count = dice.randint(1, PUSHES_MAX)
+    around = dice.random() < 0.3
+    early, late = (-0.5, 0.05) if around else (0.1, 0.8)
+    at = uniform(dice, kill_s + early, kill_s + late)
+    pushes = []
+    for _ in range(count):
+        pushes.append(drawn_from.draw(dice, PUSH_SHARE, at, PUSH_S))
+        at = uniform(dice, at + PUSH_S + 0.2, at + PUSH_S + 0.9)
+    return pushes
+
+
+def reachable(robot: RobotConfig, height: float, pitch: float) -> bool:
+    """Return True if the legs hold the torso so, COM over the ankles, inside the limits.
+
+    The torso's masses lie at its origin: its pitch moves no COM, only the hips.
+    """
+    pose = list(stand_pose(robot, height))
+    for hip in (5, 11):
+        pose[hip] += pitch
+    return all(
+        low + LIMIT_MARGIN <= angle <= high - LIMIT_MARGIN
+        for angle, (low, high) in zip(pose, robot.joint_limits(), strict=True)
+    )
+
+
+def _legs(
+    robot: RobotConfig, poses: tuple[LeadPose, ...], pace: float
+) -> list[tuple[float, float]]:
+    """Return when the way to each pose begins and ends, s."""
+    legs, t = [], START_S
+    before = LeadPose(robot.simulation.stand_height, 0.0, 0.0)
+    for pose in poses:
+        ways = zip(msgspec.structs.astuple(before), msgspec.structs.astuple(pose), strict=True)
+        times = [abs(b - a) / speed for (a, b), speed in zip(ways, SPEED, strict=True)]
+        legs.append((t, round(t + max(LEG_MIN_S, max(times) / pace), DIGITS)))
+        before, t = pose, legs[-1][1]
+    return legs
+
+
+def scenario_of(robot: RobotConfig, case: KillCase) -> Scenario:
+    """Return the case as a scenario; the hand that lets go is not in it."""
+    frames = [Keyframe(at=START_S, height=robot.simulation.stand_height)]
+    for pose, (_, end) in zip(case.poses, _legs(robot, case.poses, case.pace), strict=True):
+        frames.append(
+            Keyframe(at=end, height=pose.height_m, pitch=pose.pitch_rad, assist=pose.assist_n)
+        )
+    return Scenario(
+        name=f"kill-{case.seed}-{case.number}",
+        about=f"case {case.number} of `xrl sweep kill --seed {case.seed}`",
+        duration=case.end_s,
+        keyframe=tuple(frames),
+        kill=(Kill(service="planner", at=case.kill_s),),
+        push=case.pushes,
+    )
+
+
+def row_of(case: KillCase) -> dict[str, object]:
+    """Return every draw by its column; None where there was no such draw."""
+    row = scalars(case) | {"moving": int(case.moving)}
+    for index in range(POSES_MAX):
+        pose = case.poses[index] if index < len(case.poses) else None
+        for key in LeadPose.__struct_fields__:
+            row[f"pose{index + 1}_{key}"] = getattr(pose, key, None)
+    for index in range(PUSHES_MAX):
+        push = case.pushes[index] if index < len(case.pushes) else None
+        row[f"push{index + 1}_at_s"] = push.at if push else None
+        row[f"push{index + 1}_x_n"] = push.force[0] if push else None
+        row[f"push{index + 1}_y_n"] = push.force[1] if push else None
+    return row
+
+
+class KillResult(Ended, frozen=True, kw_only=True):
+    """The figures of a case; None where there is nothing to measure.
+
+    "After" is from the kill on, "before" from the scenario's start to the kill.
+    """
+
+    kill_height_m: float | None = None
+    """Torso, as it was at the kill."""
+    kill_pitch_rad: float | None = None
+    kill_margin: float | None = None
+    """Failsafe certificate of the last commands (docs/law.md#certificate)."""
+    kill_margin_onboard: float | None = None
+    holds_before: int = 0
+    """Drop-outs from TRACK of the busiest module, the planner alive."""
+    operator_peak_before_n: float | None = None
+    """Vertical force of the hand."""
+    com_before_max_mm: float | None = None
+    """Largest horizontal distance of the COM from the middle of the ankles."""
+    hold_ms: float | None = None
+    """From the kill to HOLD, slowest module; None if one held already."""
+    torque_step_nm: float | None = None
+    """Largest step of a joint's torque at the hand-over."""
+    foot_load_min_n: float | None = None
+    """Smallest normal force under either foot, after."""
+    com_x_min_mm: float | None = None
+    com_x_max_mm: float | None = None
+    com_y_min_mm: float | None = None
+    com_y_max_mm: float | None = None
+    com_max_mm: float | None = None
+    roll_max_rad: float | None = None
+    yaw_max_rad: float | None = None
+    sole_tilt_max_rad: float | None = None
+    slip_max_mm: float | None = None
+    """Largest distance of an ankle from its first place, mm."""
+
+
+class KillRecorder:
+    """Collects from the messages what the verdict needs, and passes all of them on."""
+
+    def __init__(self, on_to: Record) -> None:
+        self._on_to = on_to
+        self.kill_ns: int | None = None
+        self.status: PlannerStatus | None = None
+        """The planner's last."""
+
+    def __call__(self, topic: Topic, module: str, message: Message) -> None:
+        """Take a message as the bus would."""
+        if isinstance(message, PlannerStatus):
+            self.status = message
+        elif isinstance(message, RunEvent) and message.kind == RunEventKind.KILLED:
+            self.kill_ns = message.t_ns
+        self._on_to(topic, module, message)
+
+
+def plant_of(case: KillCase) -> PlantConfig:
+    """Return the case's true robot: all errors drawn."""
+    return plants.draw(f"kill {case.seed} {case.number}")
+
+
+def run_case(
+    case: KillCase,
+    robot: RobotConfig,
+    *,
+    record: Record = forget,
+    watch: Watch = unwatched,
+    after_fall_s: float = 0.0,
+) -> KillResult:
+    """Run a case to its end, or so long beyond the fall, at which measurement ends.
+
+    The robot has the case's payload and is ready to run (`prepare`).
+    """
+    monitor = KillRecorder(record)
+    fleet = Lockstep(
+        robot,
+        scenario_of(robot, case),
+        Impairment(delay_ms=case.delay_ms),
+        seed=case.number,
+        record=monitor,
+        plant=plant_of(case),
+    )
+    feet = FootLoads(fleet.world)
+    rows: list[SimTruth] = []
+    loads: list[float] = []
+
+    def see(row: SimTruth) -> None:
+        if case.let_go_s is not None and row.scenario_s >= case.let_go_s:
+            fleet.world.let_go()
+        watch(row)
+
+    for row in that_count(fleet.run(), 0.0, see, after_fall_s):
+        rows.append(row)
+        loads.append(min(feet.read()))
+    return measure(case, rows, loads, fleet.events, monitor, robot)
+
+
+class FootLoads:
+    """The normal force under each foot."""
+
+    def __init__(self, world: World) -> None:
+        """Find the soles."""
+        self._data = world.data
+        self._soles = [world.model.geom(f"sole_{side}").id for side in SIDES]
+
+    def read(self) -> tuple[float, float]:
+        """Return (right, left), N.
+
+        With the model's elliptic friction cones a contact's first constraint force is its
+        normal force.
+        """
+        contact, force = self._data.contact, self._data.efc_force
+        loads = [0.0, 0.0]
+        for (a, b), address in zip(contact.geom, contact.efc_address, strict=True):
+            for foot, sole in enumerate(self._soles):
+                if sole in (a, b) and address >= 0:
+                    loads[foot] += float(force[address])
+        return loads[0], loads[1]
+
+
+def measure(
+    case: KillCase,
+    rows: list[SimTruth],
+    loads: list[float],
+    events: list[tuple[str, JointEvent]],
+    monitor: KillRecorder,
+    robot: RobotConfig,
+) -> KillResult:
+    """Return the figures of a run, by the world since it began and all messages.
+
+    `loads` has for each row the load of the lighter foot, N.
+    """
+    if not rows or rows[0].scenario_s < 0.0:
+        return KillResult(ending=Ending.FELL if rows else Ending.UNREADY)
+    last = rows[-1]
+    before = [row for row in rows if row.scenario_s < case.kill_s]
+    figures: dict[str, float] = {}
+    if before:
+        figures["operator_peak_before_n"] = operator_peak_n(before)
+        figures["com_before_max_mm"] = com_max_mm(before)
+    after = [row for row in rows if row.scenario_s >= case.kill_s]
+    if after and monitor.kill_ns is not None:
+        figures |= _after(after) | _handover(events, monitor.kill_ns)
+        figures["foot_load_min_n"] = min(loads[-len(after) :])
+    if monitor.status is not None:
+        figures["kill_margin"] = monitor.status.margin
+        figures["kill_margin_onboard"] = monitor.status.margin_onboard
+    until_ns = monitor.kill_ns if monitor.kill_ns is not None else last.t_ns
+    return KillResult(
+        ending=ending_of(last, case.end_s, robot),
+        fell_at_s=last.scenario_s if last.fallen else None,
+        holds_before=_drop_outs(events, rows[0].t_ns, until_ns),
+        **figures,
+    )
+
+
+def _after(rows: list[SimTruth]) -> dict[str, float]:
+    x, y = 1e3 * np.array([row.over for row in rows]).T
+    return {
+        "kill_height_m": rows[0].torso[2],
+        "kill_pitch_rad": rows[0].angles[1],
+        "com_x_min_mm": float(x.min()),
+        "com_x_max_mm": float(x.max()),
+        "com_y_min_mm": float(y.min()),
+        "com_y_max_mm": float(y.max()),
+        "com_max_mm": com_max_mm(rows),
+        "roll_max_rad": max(abs(row.angles[0]) for row in rows),
+        "yaw_max_rad": max(abs(row.angles[2]) for row in rows),
+        "sole_tilt_max_rad": sole_tilt_max_rad(rows),
+        "slip_max_mm": 1e3 * max(row.feet_slip for row in rows),
+    }
+
+
+def _drop_outs(events: list[tuple[str, JointEvent]], from_ns: int, to_ns: int) -> int:
+    count = dict.fromkeys(MODULES, 0)
+    for module, event in events:
+        count[module] += from_ns <= event.t_ns < to_ns and _into_hold(event)
+    return max(count.values())
+
+
+def _handover(events: list[tuple[str, JointEvent]], kill_ns: int) -> dict[str, float]:
+    late = {m: e for m, e in reversed(events) if e.t_ns >= kill_ns and _into_hold(e)}
+    figures = {}
+    if len(late) == len(MODULES):
+        figures["hold_ms"] = max(event.t_ns - kill_ns for event in late.values()) / NS_PER_MS
+    if late:
+        figures["torque_step_nm"] = max(event_steps_nm(late.values()))
+    return figures
+
+
+def _into_hold(event: JointEvent) -> bool:
+    return event.mode_before == Mode.TRACK and event.mode_after == Mode.HOLD
+
+
+def prepare(
+    robots: Sequence[RobotConfig],
+    workers: int,
+    progress: Callable[[int, int], None] = lambda _done, _of: None,
+) -> list[RobotConfig]:
+    """Return the robots in the same order, each with a schedule that fits it if it uses one.
+
+    A certified schedule depends on the payload and takes seconds: one for each robot, over
+    processes. `progress` receives how many are finished, and of how many.
+
+    Raises:
+        RunError: a robot has no local gains that meet the certificate; says which.
+        MissingPackageError: a schedule is to be computed, and there is no CVXPY.
+    """
+    ready = list(robots)
+    tasks = [(index, robot) for index, robot in enumerate(robots) if needs_schedule(robot)]
+    if tasks:
+        require("design")
+    progress(0, len(tasks))
+    solved = pool.results(
+        _solve,
+        tasks,
+        workers,
+        lambda task: f"gain schedule with a payload of {task[1].mass.payload:g} kg",
+    )
+    for done, ((index, robot), schedule) in enumerate(solved, start=1):
+        ready[index] = msgspec.structs.replace(robot, gain_schedule=schedule)
+        progress(done, len(tasks))
+    return ready
+
+
+def needs_schedule(robot: RobotConfig) -> bool:
+    """Return True if the robot's gain split uses a schedule and its own does not fit."""
+    return robot.law.split == "certified" and bool(gain_schedule.why_stale(robot))
+
+
+def _solve(task: tuple[int, RobotConfig]) -> GainSchedule:
+    robot = task[1]
+    shipped = robot.gain_schedule
+    # damping and coupling hardly depend on the payload, and their search takes minutes
+    design = None if shipped is None else split_program.design_of(shipped)
+    return split_program.solve(robot, design=design, check=False)
