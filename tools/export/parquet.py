@@ -22,7 +22,6 @@ class ParquetFile:
     suffix: Final = ".parquet"
 
     def __init__(self, path: Path, kinds: Kinds) -> None:
-        """Begin it; the suffix is added to the path."""
         types = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string()}
         self._schema = pa.schema([(name, types[kind]) for name, kind in kinds.items()])
         path = path.with_name(path.name + self.suffix)

@@ -47,16 +47,7 @@ def write_bag(
 ) -> int:
     """Write a bag; return how many messages it has. Its times are the log's, ns since 1970.
 
-    Args:
-        index: of the run.
-        part: what of it to write.
-        robot: of the run.
-        folder: of the bag; must not exist.
-        rate_hz: of joint states, transforms and wrench.
-        done: is told how much of the run is written, s.
-
-    Raises:
-        RunError: the times are beyond those of ROS 2, or there is no message.
+    `rate_hz` is that of joint states, transforms and wrench; `done` takes the s that are written.
     """
     if not TIME_FIRST_NS <= index.began_ns <= index.ended_ns <= TIME_LAST_NS:
         raise RunError(

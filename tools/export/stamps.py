@@ -18,13 +18,8 @@ def stamped(
     """Yield time, monotonic ns of the recorder's clock, and message of a key.
 
     The time is the sender's stamp. Where that is more than a second off, because the sender is on
-    another host or had none yet, it is the reception, which is up to 20 ms late.
-
-    Args:
-        log: a run, or a part of it.
-        topic: of the key.
-        module: of the key, or "".
-        margins: with the messages before and behind the part.
+    another host or had none yet, it is the reception, which is up to 20 ms late. `margins` are the
+    messages before and behind the part.
     """
     received = log.received_ns(topic, module)
     for at_ns, message in zip(received, log.messages(topic, module), strict=True):

@@ -66,7 +66,6 @@ class CsvFile:
     suffix = ".csv"
 
     def __init__(self, path: Path, kinds: Kinds) -> None:
-        """Begin it with its heading; the suffix is added to the path."""
         path = path.with_name(path.name + self.suffix)
         self._file = path.open("w", newline="", encoding="utf-8")
         self._writer = csv.writer(self._file)
@@ -100,13 +99,7 @@ def write_tables(
 ) -> dict[str, int]:
     """Write a file for each key that has messages; return the rows of each file.
 
-    Args:
-        index: of the run.
-        part: what of it to write.
-        keys: from `tools.topic_keys`.
-        folder: to write into.
-        make: begins a file at a path without suffix, with the types of its columns.
-        done: is told how much of the run is written, s.
+    `make` begins a file at a path without suffix; `done` takes the s that are written.
     """
     zero = zero_ns(index)
     open_files: dict[str, TableFile] = {}
@@ -149,18 +142,6 @@ def write_grid(
     """Write one table on a grid of time: at each time the newest message of each key.
 
     Topics of events, which have no rate, are left out. Returns the number of rows.
-
-    Args:
-        index: of the run.
-        part: what of it to write.
-        keys: from `tools.topic_keys`.
-        rate_hz: of the grid.
-        path: without suffix.
-        make: as for `write_tables`.
-        done: as for `write_tables`.
-
-    Raises:
-        RunError: no key has a rate, or none a message.
     """
     steady = [key for key in keys if key.topic.rate_hz]
     if not steady:

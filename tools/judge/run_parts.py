@@ -31,11 +31,7 @@ def add_part(parser: argparse.ArgumentParser, what: str = "of the part to read")
 
 
 def part_of(args: argparse.Namespace, index: RunIndex) -> RunPart:
-    """Return the part that a command line asks for.
-
-    Raises:
-        RunError: it is empty, or outside of the run.
-    """
+    """Return the part that a command line asks for."""
     begin_s, end_s = args.begin_s, args.end_s
     if math.isinf(begin_s) and math.isinf(end_s):
         return RunPart()
@@ -52,11 +48,7 @@ def part_of(args: argparse.Namespace, index: RunIndex) -> RunPart:
 
 
 def read_asked(args: argparse.Namespace, index: RunIndex, *, as_sent: bool = False) -> RunLog:
-    """Read the part that a command line asks for, at once; `as_sent` as for `RunLog`.
-
-    Raises:
-        RunError: it is empty, outside of the run, or too long for that.
-    """
+    """Read the part that a command line asks for, at once; `as_sent` as for `RunLog`."""
     return read_part(index, part_of(args, index), as_sent=as_sent)
 
 

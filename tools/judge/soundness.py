@@ -28,13 +28,7 @@ _HELD: Final = (Mode.HOLD, Mode.TRACK, Mode.DAMP)
 
 
 def soundness(log: RunLog, truth: Sequence[SimTruth], robot: RobotConfig) -> dict[str, Any]:
-    """Return the figures of a run from its first row on; None where the log has no data.
-
-    Args:
-        log: the run.
-        truth: its world, in order.
-        robot: of the run.
-    """
+    """Return the figures of a run from its first row on; None where the log has no data."""
     start_ns = truth[0].t_ns
     longest, shaking = [], []
     for module in MODULES:
@@ -68,9 +62,7 @@ def why_not_sound(figures: Mapping[str, Any]) -> str:
 def shaking_of(t_ns: NDArray[np.int64], tau: Array) -> Array:
     """Return the root mean square above `SHAKE_ABOVE_HZ` (n, 2), N m, as `services.joint.trips`.
 
-    Args:
-        t_ns: when each was sent (n,).
-        tau: of a module's axes (n, 2), N m.
+    `tau` (n, 2), N m, is that of a module's axes at `t_ns` (n,).
     """
     slow, mean = tau[0].copy(), np.zeros(2)
     found = np.zeros_like(tau)

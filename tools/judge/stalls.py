@@ -122,12 +122,7 @@ def disturbances(log: RunLog, begin_ns: int, end_ns: int) -> list[Disturbance]:
 
     A drop-out is a stall's doing only if commands grew too old right after it, it was long enough,
     and not the joint services alone stood still: what makes all six wait may be our own fault.
-    After a kill or a fault none is: it may be that one's.
-
-    Args:
-        log: the run.
-        begin_ns: of the part, monotonic.
-        end_ns: of the part; what a stall made ends there at the latest.
+    After a kill or a fault none is: it may be that one's. What a stall made ends at `end_ns`.
     """
     events: list[RunEvent] = log.messages(topics.RUN_EVENT)
     stalls = [row for row in stalls_of(events) if row.begin_ns <= end_ns]
@@ -184,14 +179,7 @@ def inside(rows: Iterable[Disturbance], times_ns: NDArray[np.int64]) -> NDArray[
 def as_dicts(
     log: RunLog, rows: Sequence[Disturbance], truth: Sequence[SimTruth], zero_ns: int
 ) -> list[dict[str, Any]]:
-    """Return disturbances as plain values, with what the robot did meanwhile.
-
-    Args:
-        log: the run.
-        rows: in order.
-        truth: of the part that is judged.
-        zero_ns: of the times, which are s.
-    """
+    """Return disturbances as plain values, with what the robot did meanwhile."""
     times_ns = np.array([row.t_ns for row in truth])
     rows = [row for row in rows if row.begin_ns >= times_ns[0]]
     lost = _lost(log, rows)
@@ -252,15 +240,7 @@ def _lost(log: RunLog, rows: Sequence[Disturbance]) -> list[int]:
 def drop_outs(
     log: RunLog, rows: Sequence[Disturbance], zero_ns: int, begin_ns: int, end_ns: int
 ) -> list[str]:
-    """Return a line for each time that modules held for old commands, and no stall was the reason.
-
-    Args:
-        log: the run.
-        rows: what the stalls made of it.
-        zero_ns: of the times, which are s.
-        begin_ns: from here on.
-        end_ns: up to here.
-    """
+    """Return a line for each time that modules held for old commands without a stall."""
     excused = [row.stall for row in rows if row.held]
     found = sorted(
         (event.t_ns, module)

@@ -16,12 +16,7 @@ PITCH: Final = (-0.5, 1.6)
 
 
 def why_not_standing(row: SimTruth, robot: RobotConfig) -> str:
-    """Return in words why the robot does not stand at a moment, or is about to fall; "": it stands.
-
-    Args:
-        row: the world at that moment.
-        robot: for the size of its feet.
-    """
+    """Return why the robot does not stand at a moment, or is about to fall; "": it stands."""
     if row.fallen:
         return "it is down"
     (x, y), geometry = row.over, robot.geometry

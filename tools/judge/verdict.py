@@ -72,11 +72,7 @@ class Course(NamedTuple):
 
 
 def course(log: RunLog) -> Course:
-    """Return a run's course.
-
-    Raises:
-        RunError: the log holds no simulated world, or nothing to judge.
-    """
+    """Return a run's course."""
     rows: list[SimTruth] = log.messages(topics.SIM_TRUTH)
     scenario = [row for row in rows if row.scenario_s >= 0.0]
     if scenario:
@@ -95,15 +91,7 @@ def course(log: RunLog) -> Course:
 
 
 def summarise(log: RunLog, duration_s: float) -> Summary:
-    """Return the figures of a run.
-
-    Args:
-        log: the run.
-        duration_s: how long the scenario was to be, s.
-
-    Raises:
-        RunError: the log holds no simulated world, or the scenario never began.
-    """
+    """Return the figures of a run."""
     t, truth, began, zero_ns = course(log)
     events: list[RunEvent] = log.messages(topics.RUN_EVENT)
     kills = [row for row in events if row.kind == RunEventKind.KILLED]
@@ -240,10 +228,6 @@ def joined(parts: Sequence[Summary], counts: Iterable[KeyCount]) -> Summary:
 
     Extremes are those of the run. A percentile or a mean is that of the worst part, a median
     the median of the parts.
-
-    Args:
-        parts: at least one; the scenario of each is that of the whole run.
-        counts: of every key, over the whole run.
     """
     if len(parts) == 1:
         return parts[0]
@@ -338,10 +322,6 @@ def leading(log: RunLog, times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
 
     True until the first kill. While the network is impaired on purpose, only while all six modules
     track: HOLD is expected then. A module that drops out at any other time is judged.
-
-    Args:
-        log: the run.
-        times_ns: monotonic, as of messages.
     """
     events: list[RunEvent] = log.messages(topics.RUN_EVENT)
     kills = [row.t_ns for row in events if row.kind == RunEventKind.KILLED]

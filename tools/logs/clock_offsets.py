@@ -65,11 +65,6 @@ class ClockOffsets:
     """Bounds of the offsets between hosts, tightened message by message."""
 
     def __init__(self, hosts: tuple[str, ...]) -> None:
-        """Begin with nothing known.
-
-        Args:
-            hosts: their names.
-        """
         self._place = {host: index for index, host in enumerate(hosts)}
         self._most = [[math.inf] * len(hosts) for _ in hosts]
         """[a][b]: offset_a - offset_b is at most this, ns."""

@@ -27,9 +27,6 @@ def hand_path(log: RunLog) -> tuple[HandRow, ...]:
     """Return how the hand was led while the scenario ran, in order; empty if nobody led it.
 
     Where it was led last before the scenario began is its first row: there it stayed.
-
-    Raises:
-        RunError: a message of the record cannot be read.
     """
     led: list[HandLead] = log.messages(topics.OPERATOR_HAND)
     truths: list[SimTruth] = log.messages(topics.SIM_TRUTH) if led else []

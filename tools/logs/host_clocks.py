@@ -80,23 +80,10 @@ class HostClocks:
     def __init__(
         self, hosts: Mapping[str, str], lives: Mapping[str, tuple[ClockLife, ...]]
     ) -> None:
-        """Take what was found in the run's messages.
-
-        Args:
-            hosts: host of each service.
-            lives: of each host that was heard.
-        """
         self.hosts, self.lives = hosts, lives
 
     def offset_ns(self, topic: Topic, module: str, t_ns: int, received_ns: int) -> int:
-        """Return what brings a message's times to the recorder's clock.
-
-        Args:
-            topic: of the message.
-            module: its module, or "".
-            t_ns: of the message.
-            received_ns: when the recorder got it, on its own clock.
-        """
+        """Return what brings a message's times to the recorder's clock."""
         late_ns = received_ns - t_ns
         if abs(late_ns) >= TIME_MAX_NS:
             return 0
@@ -170,8 +157,7 @@ def hosts_of(endpoints: Mapping[str, Any]) -> dict[str, str]:
 def spans_of_lives(samples: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
     """Return from when to when each life of a clock was seen, recorder's clock.
 
-    Args:
-        samples: at some times, in their order, the smallest of reception less sender's time.
+    A sample is a time and the smallest of reception less sender's time there.
     """
     if not samples:
         return []
@@ -185,12 +171,7 @@ def spans_of_lives(samples: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def bounds_in(log: Messages, hosts: Mapping[str, str]) -> dict[str, OffsetBounds]:
-    """Return what a short part of a run says of each host's clock.
-
-    Args:
-        log: the part, a few seconds.
-        hosts: host of each service.
-    """
+    """Return what a short part of a run says of each host's clock."""
     clocks = ClockOffsets(tuple(dict.fromkeys(hosts.values())))
     for sender, sent_ns, receiver, received_ns in _heard(log):
         if sender in hosts and receiver in hosts:

@@ -68,8 +68,7 @@ class HostRecord(NamedTuple):
 def host_record(fleets: RunIndex, index: RunIndex) -> HostRecord:
     """Return how a record joins the fleet's.
 
-    Raises:
-        RunError: it is no host's own, another robot's, of another time, or its clock is not known.
+    Refuses what is no host's own, another robot's, of another time, or of an unknown clock.
     """
     if fleets.metadata["run"].get("of"):
         raise RunError(f"{fleets.path}: is a host's own record; the fleet's comes first")
@@ -115,19 +114,9 @@ def join(
     out: Path,
     progress: Callable[[float], None] = lambda _done: None,
 ) -> dict[str, int]:
-    """Write the joined run into a folder.
+    """Write the joined run into a folder that holds no run; return what each key gained.
 
-    Args:
-        fleets: the fleet's record.
-        records: of single hosts.
-        out: folder that holds no run.
-        progress: takes the fraction that is done.
-
-    Returns:
-        How many messages each key gained.
-
-    Raises:
-        RunError: a file cannot be read or written; what was written so far is gone then.
+    `progress` takes the fraction that is done. What was written is gone after an error (RunError).
     """
     gained: dict[str, int] = {}
     metadata = {name: row for name, row in fleets.metadata.items() if name not in _OF_A_FILE}
@@ -182,10 +171,6 @@ def in_order(own: Sequence[Timed], new: Sequence[Timed]) -> list[tuple[int, byte
 
     A message that the fleet's recorder had keeps its time there, however late it came; one that it
     gains is put between its neighbours.
-
-    Args:
-        own: of the fleet's record, in its order.
-        new: of a host's record.
     """
     rows = [(t_ns, payload, False) for t_ns, payload in own]
     if not new:
@@ -208,10 +193,8 @@ def in_order(own: Sequence[Timed], new: Sequence[Timed]) -> list[tuple[int, byte
 def _sent_ns(payloads: Sequence[bytes], count: int) -> list[tuple[int, int]] | None:
     """Return each message's own time and number; None if they tell no order.
 
-    Args:
-        payloads: of one key.
-        count: how many of them, the first, were recorded in their order: in that their times go
-            back only if the sender's host started again, or has had no sample of its drive yet.
+    The first `count` were recorded in their order: in that their times go back only if the sender's
+    host started again, or has had no sample of its drive yet.
     """
     decode = msgspec.json.Decoder(MessageHead).decode
     try:

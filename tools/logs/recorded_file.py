@@ -22,11 +22,6 @@ class RecordedFile:
     """A file, skimmed."""
 
     def __init__(self, path: Path) -> None:
-        """Skim a file, whatever its version.
-
-        Raises:
-            RunError: it is missing, empty or no MCAP file.
-        """
         self.path = path
         self.metadata: MetadataByName = {}
         """Metadata records by name: `run`, `clock`, `packages`, at the end `counts`."""
@@ -49,11 +44,7 @@ class RecordedFile:
             self.damage += reader.damage
 
     def required(self, record: str, field: str) -> str:
-        """Return a field of a metadata record.
-
-        Raises:
-            RunError: the file has none.
-        """
+        """Return a field of a metadata record."""
         value = self.metadata.get(record, {}).get(field)
         if value is None:
             raise RunError(
@@ -64,11 +55,7 @@ class RecordedFile:
 
     @property
     def offset_ns(self) -> int:
-        """Wall clock in ns since 1970 = `t_ns` of a message + this.
-
-        Raises:
-            RunError: the file does not say it, or its messages' times do not fit it.
-        """
+        """Wall clock in ns since 1970 = `t_ns` of a message + this."""
         text = self.required("clock", "offset_ns")
         if not _OFFSET.fullmatch(text):
             raise RunError(f"{self.path}: clock.offset_ns is {text[:40]!r}; an integer is right")
@@ -94,18 +81,7 @@ class RecordedFile:
     def records(
         self, begin_ns: int, end_ns: int, keys: frozenset[str] | None = None
     ) -> Iterator[LogRecord]:
-        """Yield the chunks that may hold messages of a time and of some keys.
-
-        What turns out damaged is left out and noted.
-
-        Args:
-            begin_ns: log time, inclusive.
-            end_ns: log time, exclusive.
-            keys: full keys; None: all.
-
-        Raises:
-            RunError: the file expands to far more than any run of its size.
-        """
+        """Yield chunks that may hold messages of a log time (end exclusive) and of some keys."""
         wanted = self._among(begin_ns, end_ns, keys)
         if not wanted:
             return

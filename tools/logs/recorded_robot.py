@@ -15,12 +15,7 @@ from tools.logs.run_log import RunLog
 
 
 def robot_of(log: RunLog | RunIndex) -> RobotConfig:
-    """Return the robot that a log was made with.
-
-    Raises:
-        RunError: the log does not hold it.
-        ConfigError: it is of another version.
-    """
+    """Return the robot that a log was made with."""
     raw = text_of(log, "robot.toml")
     robot = config_file.parse(raw, f"{log.path}: robot.toml")
     schedule = log.attachments.get("robot.gains.json")
@@ -34,11 +29,7 @@ def robot_of(log: RunLog | RunIndex) -> RobotConfig:
 
 
 def text_of(log: RunLog | RunIndex, name: str) -> str:
-    """Return a text file that is in a log.
-
-    Raises:
-        RunError: the log does not hold it, or it is no text.
-    """
+    """Return a text file that is in a log."""
     try:
         return decoded(log.attachments[name])
     except KeyError:
@@ -53,11 +44,7 @@ def has_own_controller(log: RunLog | RunIndex) -> bool:
 
 
 def refuse_own_controller(log: RunLog | RunIndex) -> None:
-    """Refuse a log whose planner was led by a controller of somebody's own.
-
-    Raises:
-        RunError: the shipped law would be computed in its place.
-    """
+    """Refuse a log whose planner was led by a controller of somebody's own."""
     if has_own_controller(log):
         raise RunError(
             f"{log.path}: a controller of somebody's own led ({ATTACHED} in it), and this computes "

@@ -38,12 +38,7 @@ SAMPLES_MAX: Final = 400
 def find_clocks(index: RunIndex, read: Callable[[float, float], Messages]) -> HostClocks | None:
     """Compare the clocks of a run's hosts; None if all its services ran on one.
 
-    Args:
-        index: of the run.
-        read: reads a part with all times as they were sent, from and to s since its first message.
-
-    Raises:
-        RunError: a message cannot be read.
+    `read` gives a part with all times as they were sent, from and to s since its first message.
     """
     hosts = index.hosts
     if RECORDER not in hosts or len(set(hosts.values())) == 1:

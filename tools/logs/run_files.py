@@ -15,11 +15,7 @@ MetadataByName = dict[str, dict[str, str]]
 
 
 def head_of(path: Path) -> MetadataByName:
-    """Return the metadata at the start of a file, up to its first messages.
-
-    Raises:
-        RunError: it is missing, empty, or no MCAP file.
-    """
+    """Return the metadata at the start of a file, up to its first messages."""
     found: MetadataByName = {}
     with open_log(path) as reader:
         for record in reader:
@@ -34,10 +30,6 @@ def files_of_run(path: Path, metadata: MetadataByName) -> list[Path]:
     """Return the files of the run that one of them belongs to, in order; that one at least.
 
     A recovered copy stands in for nothing: only if the original is gone it is taken.
-
-    Args:
-        path: the file.
-        metadata: its metadata.
     """
     run = metadata.get("split", {}).get("run")
     if not run:
@@ -61,11 +53,7 @@ def further_files(path: Path) -> list[Path]:
 
 
 def files_in(directory: Path) -> list[Path]:
-    """Return the files of the one run in a directory, in order.
-
-    Raises:
-        RunError: it holds no run, or several.
-    """
+    """Return the files of the one run in a directory, in order."""
     runs = runs_in(directory)
     if len(runs) > 1:
         first = ", ".join(run[0].name for run in runs)
@@ -74,11 +62,7 @@ def files_in(directory: Path) -> list[Path]:
 
 
 def runs_in(directory: Path) -> list[list[Path]]:
-    """Return the files of each run in a directory, in order: a recorder that restarts begins one.
-
-    Raises:
-        RunError: it holds none that can be read.
-    """
+    """Return the files of each run in a directory: a recorder that restarts begins one."""
     names = sorted(directory.glob(f"*{SUFFIX}"), key=lambda file: (len(file.name), file.name))
     plain = [path for path in names if "." not in path.stem]  # not recovered or executed again
     runs: list[list[Path]] = []

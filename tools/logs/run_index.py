@@ -24,16 +24,6 @@ class RunIndex:
     """A run's files: what is said about it, and the places of its messages."""
 
     def __init__(self, path: Path, files: Sequence[Path] = ()) -> None:
-        """Skim a file, or the files of the run in a directory.
-
-        Args:
-            path: of it.
-            files: of the run, where a directory holds several runs.
-
-        Raises:
-            RunError: a file is missing, empty, no MCAP file or no run; or the directory holds
-                no run, or several.
-        """
         self.path = path
         self.files = list(files) or (files_in(path) if path.is_dir() else [path])
         """The files of the run, in order: several if it was split."""
@@ -92,16 +82,7 @@ class RunIndex:
     def records(
         self, begin_ns: int, end_ns: int, keys: frozenset[str] | None = None
     ) -> Iterator[tuple[LogRecord, dict[int, str]]]:
-        """Yield the chunks that may hold messages of a time and of some keys.
-
-        Args:
-            begin_ns: log time, inclusive.
-            end_ns: log time, exclusive.
-            keys: full keys; None: all.
-
-        Yields:
-            A chunk, and the full keys of the channels in it.
-        """
+        """Yield those chunks of all files, each with the full keys of its channels."""
         for file in self._files:
             for record in file.records(begin_ns, end_ns, keys):
                 yield record, file.keys

@@ -85,17 +85,6 @@ class RunLog:
         *,
         as_sent: bool = False,
     ) -> None:
-        """Read the messages; `read_run` is the name to use.
-
-        Args:
-            index: of the run.
-            part: what of it to read.
-            margin_s: how much before and behind it is read as well.
-            as_sent: leave all times as they were sent.
-
-        Raises:
-            RunError: a file has gone, or is no log any more.
-        """
         self.index = index
         self.path, self.files = index.path, index.files
         self.metadata, self.attachments = index.metadata, index.attachments
@@ -132,13 +121,7 @@ class RunLog:
     def messages(self, topic: Topic, module: str = "") -> list[Any]:
         """Return the messages of a topic as `topic.type`, in the order of the file.
 
-        Args:
-            topic: a row of `shared.bus.topics`.
-            module: for a topic with one key for each module.
-
-        Raises:
-            RunError: a message is not of that type: another version wrote the file;
-                or a module is needed and missing, or the other way round.
+        Raises RunError if another version wrote them, or the module does not fit the topic.
         """
         key = self._key(topic, module)
         series = self._of(key)
@@ -241,14 +224,7 @@ class RunLog:
         *,
         others: bool = True,
     ) -> None:
-        """Sort the messages of a time by key.
-
-        Args:
-            first_ns: monotonic clock, inclusive.
-            last_ns: the same, exclusive.
-            keys: full keys.
-            others: take the messages of all other keys; else of these.
-        """
+        """Sort the messages of a time by key."""
         offset_ns = self.offset_ns
         first_ns, last_ns = first_ns + offset_ns, last_ns + offset_ns
         for record, keys_by_channel in self.index.records(
@@ -270,39 +246,21 @@ class RunLog:
 
 @lru_cache(maxsize=8)
 def clocks_of(index: RunIndex) -> HostClocks | None:
-    """Compare the clocks of a run's hosts; None if all its services ran on one.
-
-    Raises:
-        RunError: a message cannot be read.
-    """
+    """Compare the clocks of a run's hosts; None if all its services ran on one."""
     return find_clocks(index, lambda *part: RunLog(index, RunPart(*part), as_sent=True))
 
 
 def read_run(path: Path, *, as_sent: bool = False) -> RunLog:
-    """Read a run, finished or killed.
+    """Read a run, finished or killed: a file, or all files of the run in a directory.
 
-    Args:
-        path: a file; or a directory: all files of the run in it.
-        as_sent: leave all times as they were sent, see `RunLog`.
-
-    Raises:
-        RunError: a file is missing, empty, no MCAP file or no run; or the directory holds no
-            run, or several; or the run is longer than is read at once.
+    Raises RunError if a file is missing, empty or no run, the directory holds none or several, or
+    the run is longer than is read at once. `as_sent` leaves all times as they were sent.
     """
     return read_part(RunIndex(path), WHOLE, as_sent=as_sent)
 
 
 def read_part(index: RunIndex, part: RunPart, *, as_sent: bool = False) -> RunLog:
-    """Read a part of a run at once.
-
-    Args:
-        index: of the run.
-        part: what of it to read.
-        as_sent: leave all times as they were sent, see `RunLog`.
-
-    Raises:
-        RunError: the part is empty, or longer than is read at once.
-    """
+    """Read a part of a run at once."""
     length_s = index.length_s
     if part.begin_s > length_s:
         raise RunError(f"{index.path}: --from {part.begin_s:g}: the run is {length_s:.1f} s long")
@@ -325,14 +283,7 @@ def parts_of(
 ) -> Iterator[RunLog]:
     """Yield a run, or a part of it, in parts that follow each other: one in memory at a time.
 
-    Each forgets its messages when the next is asked for.
-
-    Args:
-        index: of the run.
-        part: what of it to read.
-        part_s: length of each part.
-        margin_s: how much before and behind each is read as well.
-        as_sent: leave all times as they were sent, see `RunLog`.
+    Each forgets its messages when the next is asked for; `margin_s` before and behind is read too.
     """
     begin_s, end_s = max(part.begin_s, 0.0), min(part.end_s, index.length_s)
     count = max(1, math.ceil((end_s - begin_s) / part_s))

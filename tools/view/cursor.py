@@ -35,14 +35,7 @@ class TimelineCursor:
     def control(
         self, now_s: float, play: bool | None, seek_s: float | None, rate: float | None
     ) -> None:
-        """Change what is not None.
-
-        Args:
-            now_s: on the clock of `at`.
-            play: go on, from the begin if it is at the end; or pause.
-            seek_s: go to a place; outside the record to its nearer end.
-            rate: recorded seconds for each second, within `RATES`.
-        """
+        """Change what is not None; play at the end begins again, a rate stays within `RATES`."""
         place, moving = self.at(now_s), self.playing
         if seek_s is not None and math.isfinite(seek_s):
             place = min(max(seek_s, self._begin_s), self._end_s)

@@ -152,11 +152,7 @@ class Newest:
         return self._truth.scenario_s if self._truth is not None else -1.0
 
     def frame(self, now_ns: int) -> Frame | None:
-        """Return what is known now; None until each module was heard once.
-
-        Args:
-            now_ns: on the clock of the messages.
-        """
+        """Return what is known now; None until each module was heard once."""
         states = [state for state in self._states if state is not None and state.t_ns > 0]
         if len(states) < len(MODULES):
             return None

@@ -28,16 +28,6 @@ class LiveSource(Source):
     kind = "live"
 
     def __init__(self, robot: RobotConfig, fleet: SupervisedFleet, *, act: bool = False) -> None:
-        """Take a fleet that is up.
-
-        Args:
-            robot: its robot file.
-            fleet: the fleet.
-            act: a page may do something to it.
-
-        Raises:
-            BusError, FleetError: this host has no key that may act.
-        """
         super().__init__(robot)
         self.title = f"live, {fleet.run.path}"
         self._fleet = fleet
@@ -54,11 +44,7 @@ class LiveSource(Source):
         self._looker: threading.Thread | None = None
 
     def connect(self) -> None:
-        """Subscribe.
-
-        Raises:
-            BusError: the bus cannot be opened.
-        """
+        """Subscribe."""
         if self._session is not None:
             return
         session = self._session = open_session(self.robot, "view", self._fleet.run.path)

@@ -34,16 +34,6 @@ class LiveOrders:
     def __init__(
         self, robot: RobotConfig, fleet: SupervisedFleet, scenario_s: Callable[[], float]
     ) -> None:
-        """Take a fleet that is up.
-
-        Args:
-            robot: its robot file.
-            fleet: the fleet.
-            scenario_s: returns the scenario time, s; negative: no scenario runs.
-
-        Raises:
-            BusError, FleetError: this host has no key that may act.
-        """
         require_operator(robot, "view")
         self._robot, self._fleet, self._scenario_s = robot, fleet, scenario_s
         self.services = tuple(sorted(fleet.manifest.services, key=lambda name: name != "planner"))
@@ -95,11 +85,7 @@ class LiveOrders:
         publisher.put(msgspec.structs.replace(asked, t_ns=now_ns(), seq=self._led))
 
     def _estop(self, _order: Order) -> None:
-        """Stop all, first by shared memory.
-
-        Raises:
-            FleetError: a module has not stopped.
-        """
+        """Stop all, first by shared memory."""
         request_here(self._fleet.run.path)
         stop = self._stop
         if stop is None:
@@ -138,11 +124,7 @@ class LiveOrders:
             events.put(event)
 
     def _cut(self, order: Order) -> None:
-        """Cut links for a while.
-
-        Raises:
-            FleetError: there are no such links, or the network proxy refuses.
-        """
+        """Cut links for a while."""
         links = CUTS.get(order.service)
         if links is None:
             raise FleetError(f"{order.service!r}: one of {', '.join(CUTS)}")

@@ -57,11 +57,7 @@ class LockstepSource(Source):
         self._thread.join()
 
     def frame(self, t_s: float) -> Frame | None:  # noqa: ARG002 - it has no other time
-        """Return the newest frame; None until it stands.
-
-        Raises:
-            RunError: the robot's thread has ended.
-        """
+        """Return the newest frame; None until it stands."""
         if self._failed:
             raise RunError(self._failed)
         with self._lock:

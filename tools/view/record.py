@@ -39,11 +39,6 @@ class RecordSource(Source):
     kind = "record"
 
     def __init__(self, log: RunLog, robot: RobotConfig) -> None:
-        """Take a record; reads all of it that a frame shows.
-
-        Raises:
-            RunError: a message of the record cannot be read.
-        """
         super().__init__(robot)
         self.title = str(log.path)
         self._data = RunData(log)

@@ -57,13 +57,6 @@ class ViewServer:
     """Serves one source to some pages."""
 
     def __init__(self, source: Source, port: int = PORT, token: str = "") -> None:
-        """Make a server; `running` starts it.
-
-        Args:
-            source: of the frames.
-            port: 0 for a free one.
-            token: of the address; made up if empty.
-        """
         self._source = source
         self._port = port
         self._token = token or secrets.token_urlsafe(16)
@@ -82,11 +75,7 @@ class ViewServer:
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """Serve meanwhile.
-
-        Raises:
-            FleetError: the port is in use.
-        """
+        """Serve meanwhile."""
         app = web.Application(middlewares=[self._guard], client_max_size=MESSAGE_MAX)
         app.router.add_get("/{token}/ws", self._socket)
         app.router.add_get("/{token}/{file:.*}", self._file)

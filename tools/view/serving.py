@@ -36,12 +36,7 @@ def _port(text: str) -> int:
 
 
 def serve(source: Source, port: int) -> None:
-    """Serve until Ctrl-C or SIGTERM, and print the address.
-
-    Raises:
-        FleetError: the port is in use.
-        MissingPackageError: there is no aiohttp.
-    """
+    """Serve until Ctrl-C or SIGTERM, and print the address."""
     asyncio.run(_serve(source, port))
 
 
@@ -61,14 +56,7 @@ async def _serve(source: Source, port: int) -> None:
 
 @contextlib.contextmanager
 def served_beside(run_dir: Path, port: int) -> Iterator[str]:
-    """Serve a fleet that is up from a process of its own, in which a page may act; end it after.
-
-    Yields:
-        The address.
-
-    Raises:
-        FleetError: it does not begin.
-    """
+    """Serve a fleet that is up from a process of its own, in which a page may act; end it after."""
     command = [sys.executable, "-m", "tools.view.leashed", str(os.getpid())]
     command += ["view", "--act", "--run-dir", str(run_dir), "--port", str(port)]
     log = run_dir / "logs" / "view.log"

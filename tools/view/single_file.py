@@ -30,15 +30,7 @@ import(urls["./main.js"]);
 
 
 def single_file(source: RecordSource, done: Callable[[float], None] = lambda _s: None) -> bytes:
-    """Return the page with a whole record in it.
-
-    Args:
-        source: the record, or a part of it.
-        done: takes the time that is drawn so far, s.
-
-    Raises:
-        RunError: no module was heard in it.
-    """
+    """Return the page with a whole record in it."""
     model = source.model()
     count = round((model.end_s - model.begin_s) * FRAMES_S) + 1
     frames = []

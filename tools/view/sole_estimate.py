@@ -30,18 +30,12 @@ class SoleEstimate:
     """Both soles, with the feet where the robot file has them."""
 
     def __init__(self, config: RobotConfig) -> None:
-        """Read the legs' geometry."""
         self._legs = leg_geometry(config)
         self._foot_height = config.geometry.foot_height
         self._leg_weight = 2.0 * config.mass.module * GRAVITY  # knee and ankle
 
     def of(self, q: Sequence[float], tau: Sequence[float]) -> tuple[SoleLoad, SoleLoad] | None:
-        """Return the loads of the right and the left sole; None where a leg is too straight.
-
-        Args:
-            q: joint angles (12,), rad.
-            tau: joint torques (12,), N m.
-        """
+        """Return the loads of the right and the left sole; None where a leg is too straight."""
         found = []
         for index, leg in enumerate(self._legs):
             part = slice(index * N_LEG, (index + 1) * N_LEG)

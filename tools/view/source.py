@@ -130,11 +130,7 @@ class Source(ABC):
 
     @abstractmethod
     def frame(self, t_s: float) -> Frame | None:
-        """Return the newest frame, or of a record that at a time of its timeline; None: not yet.
-
-        Raises:
-            XrlError: there will be no more.
-        """
+        """Return the newest frame, or of a record that at a time of its timeline; None: not yet."""
 
     def carry_out(self, order: Order) -> str:
         """Do what a person asks for; return why not, or nothing. May block."""

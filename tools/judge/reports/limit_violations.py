@@ -100,11 +100,7 @@ def limit_violations(run: RunData) -> list[TimelineEvent]:
 def first_violation(what: str, name: str, t: Array, beyond: NDArray[np.bool_]) -> Violation | None:
     """Return the first time beyond a limit and the total duration; None if there is none.
 
-    Args:
-        what: the limit.
-        name: the figure, module or joint.
-        t: times, s, not falling.
-        beyond: True where the limit is exceeded; one for each time.
+    The times `t`, s, do not fall; `beyond` is True where the limit is exceeded.
     """
     if not beyond.any():
         return None

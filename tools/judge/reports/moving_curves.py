@@ -38,15 +38,6 @@ class Curves:
     def __init__(
         self, poses: Sequence[RobotPose], began_ns: int, left: float, inks: Sequence[str], ink: str
     ) -> None:
-        """Take the run.
-
-        Args:
-            poses: one for each frame.
-            began_ns: time zero.
-            left: where the panels begin, px.
-            inks: of the lines of a panel.
-            ink: of axes and words.
-        """
         self._t = [(pose.t_ns - began_ns) / NS_PER_S for pose in poses]
         self._left, self._inks, self._ink = left + LEFT, inks, ink
         self._columns = [list(zip(*map(panel.values, poses), strict=True)) for panel in PANELS]

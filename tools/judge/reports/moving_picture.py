@@ -65,15 +65,7 @@ def write_gif(
 ) -> int:
     """Draw a run, from its scenario's begin, and return the number of frames.
 
-    Args:
-        log: the run; with the simulated world's truth, or as the legs know the torso.
-        robot: its robot.
-        path: the GIF; replaced if it exists.
-        progress: takes the share that is drawn, 0 .. 1.
-        with_curves: beside it COM, height and hand as they come.
-
-    Raises:
-        RunError: the log lacks states, or the file cannot be written.
+    The pose is the simulated world's, or as the legs know the torso. `progress` takes 0 .. 1.
     """
     began = _began_ns(log)
     chosen = list(_thinned([pose for pose in scene.poses(log, robot) if pose.t_ns >= began]))

@@ -52,10 +52,6 @@ def histories(events: Iterable[LinkEvent], zero_ns: int) -> dict[str, History]:
     """Return (time in s, state from then on) of each direction that was ever impaired.
 
     A partition outweighs all other impairments (`shared.config.impairment.Direction`).
-
-    Args:
-        events: begin and end of impairments, in order.
-        zero_ns: stamp of time 0.
     """
     found: dict[str, list[tuple[float, ImpairedLink]]] = defaultdict(list)
     active: dict[str, dict[int, bool]] = defaultdict(dict)

@@ -56,11 +56,6 @@ class Page:
     """The page of a run, whose parts are taken one after the other."""
 
     def __init__(self, axis: TimeAxis | None = None) -> None:
-        """Begin a page.
-
-        Args:
-            axis: its time axis; None, for a run that is taken at once: that of the run.
-        """
         self._axis = axis
         self._model: PageModel | None = None
         self._about: RunData | None = None
@@ -71,11 +66,7 @@ class Page:
         self._losses = summary.MessageLosses()
 
     def take(self, log: RunLog) -> None:
-        """Take a run, or the next part of it.
-
-        Raises:
-            RunError: a message has another version.
-        """
+        """Take a run, or the next part of it."""
         run = RunData(log, self._axis, self._armed_s)
         armed_s = run.armed_s()
         self._armed_s = armed_s if math.isfinite(armed_s) else None
@@ -117,11 +108,7 @@ class Page:
 
 
 def render(log: RunLog) -> str:
-    """Return the page of a run that is in memory.
-
-    Raises:
-        RunError: a message has another version.
-    """
+    """Return the page of a run that is in memory."""
     page = Page()
     page.take(log)
     return page.html()
@@ -134,17 +121,7 @@ def render_parts(
     part_s: float = PART_S,
     done: Callable[[float], None] = lambda _: None,
 ) -> str:
-    """Return the page of a run, or of a part of it, with little of it in memory at a time.
-
-    Args:
-        index: of the run.
-        part: what of it to show.
-        part_s: length of what is read at a time, s.
-        done: takes the time of the run that is done, s.
-
-    Raises:
-        RunError: a message has another version, or there is none.
-    """
+    """Return the page of a run, or of a part of it, with `part_s` of it in memory at a time."""
     zero = zero_ns(index)
     began_ns = index.began_ns - index.offset_ns
     offset_s = (began_ns - zero) / NS_PER_S

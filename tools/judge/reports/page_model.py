@@ -168,15 +168,8 @@ class PageModel:
     ) -> None:
         """Add a panel of lines; a panel without data is left out.
 
-        Args:
-            title: title of the panel.
-            unit: unit of the value axis.
-            lines: lines; those without data are left out.
-            limits: levels.
-            reach: upper end of the value axis; lines may go beyond it.
-            note: an explanation for readers who do not know the panel.
-            if_empty: reason to state if the panel has no data.
-            needs_count: a panel whose lines are all zero is left out too.
+        The value axis ends at `reach`, and lines may go beyond it. With `needs_count` a panel whose
+        lines are all zero is left out too. `if_empty` says why there is no data.
         """
         panel = self._panel("plot", title, unit, note, if_empty)
         panel.reach, panel.needs_count = reach, needs_count
@@ -196,15 +189,8 @@ class PageModel:
     ) -> None:
         """Add a panel that shows one of several sets of lines at a time.
 
-        Args:
-            title: title of the panel.
-            unit: unit of the value axis.
-            group: panels of one group show the same choice.
-            choices: lines and levels by name.
-            initial: name of the set that is shown first.
-            weight: of several parts of a run, that of the greatest weight says what is first.
-            note: an explanation for readers who do not know the panel.
-            if_empty: reason to state if the panel has no data.
+        Panels of one group show the same choice. Of several parts of a run, that of the greatest
+        weight says what is shown first.
         """
         panel = self._panel("choice", title, unit, note, if_empty)
         panel.group = group
@@ -222,15 +208,7 @@ class PageModel:
         *,
         if_empty: str = "",
     ) -> None:
-        """Add a panel of coloured bars; rows without data are left out.
-
-        Args:
-            title: title of the panel.
-            rows: rows from top to bottom.
-            names: names of the codes.
-            colours: name of the colour of each code.
-            if_empty: reason to state if the panel has no data.
-        """
+        """Add a panel of coloured bars; rows without data are left out."""
         panel = self._panel("bars", title, "", "", if_empty)
         panel.names, panel.colours = names, colours
         for row in rows:

@@ -37,13 +37,6 @@ class RunData:
     def __init__(
         self, log: RunLog, axis: TimeAxis | None = None, armed_before_s: float | None = None
     ) -> None:
-        """Take a log.
-
-        Args:
-            log: a run; or a part of one, read with a margin.
-            axis: of the page; None: that of the log alone.
-            armed_before_s: when all six drives were armed first, in a part before this one.
-        """
         self.armed_before_s = armed_before_s
         self.log = log
         self.course: Course | None = None

@@ -108,15 +108,7 @@ def channels(robot: str) -> list[NewChannel]:
 
 
 def messages(logs: Iterable[RunLog], robot: RobotConfig) -> Iterator[NewMessage]:
-    """Yield the messages of a run's scene in the order of time.
-
-    Args:
-        logs: the run, or its parts one after the other.
-        robot: of the run.
-
-    Raises:
-        RunError: the log does not hold the states of all six modules.
-    """
+    """Yield the messages of a run's scene in the order of time."""
     links_ns: int | None = None
     missing: RunError | None = None
     for log in logs:
@@ -147,9 +139,6 @@ def poses(log: RunLog, robot: RobotConfig) -> Iterator[RobotPose]:
 
     The pose of the torso comes from the simulated world. In a log without one it comes from the
     legs' kinematics, with the planner's stance.
-
-    Raises:
-        RunError: the log does not hold the states of all six modules.
     """
     states: list[list[JointState]] = [log.messages(topics.JOINT_STATE, name) for name in MODULES]
     if not all(states):

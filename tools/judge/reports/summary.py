@@ -73,13 +73,7 @@ class Judge:
             self._why_not = str(error)
 
     def verdict(self, log: RunLog, counts: Iterable[KeyCount], *, whole: bool = True) -> RunVerdict:
-        """Return the verdict.
-
-        Args:
-            log: the run, or any part of it.
-            counts: of every key, over the run.
-            whole: all of the run was taken; False gives the figures alone.
-        """
+        """Return the verdict; a part of a run (`whole` is False) has figures alone."""
         if not self._summaries:
             return RunVerdict(f"No verdict: {self._why_not}", None, [])
         summary = verdict.joined(self._summaries, counts)

@@ -29,13 +29,7 @@ def message(text: str) -> bytes:
 
 
 def urdf(robot: str, frames: Sequence[FramePose], entities: Iterable[Entity]) -> str:
-    """Return the model: a link for each frame and its parents, a visual for each solid.
-
-    Args:
-        robot: name of the robot.
-        frames: frames that form one tree; only parents and children matter.
-        entities: bodies, each in one of these frames; arrows are ignored.
-    """
+    """Return the model: a link for each frame and its parents, a visual for each solid."""
     root = ET.Element("robot", name=robot)
     names = dict.fromkeys(name for row in frames for name in (row.parent, row.child))
     links = {name: ET.SubElement(root, "link", name=name) for name in names}

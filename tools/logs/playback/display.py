@@ -32,14 +32,7 @@ def introduce(recording: Recording, paths: list[Path], note: str, console: Conso
 
 
 def where(keys: Sequence[str], robot: str, part: Window, listening: str) -> str:
-    """Return one line: what is played, onto which keys.
-
-    Args:
-        keys: on the bus.
-        robot: of the log.
-        part: the part that is played.
-        listening: endpoint; empty if there is none.
-    """
+    """Return one line: what is played, onto which keys."""
     common = keys[0] if len(keys) == 1 else f"{_common(keys)}**"
     length_s = (part.end_ns - 1 - part.start_ns) / NS_PER_S
     line = f"{length_s:.2f} s of {robot}, {len(keys)} keys, onto {common}"

@@ -105,15 +105,9 @@ class LiveRobotWatch:
 
 
 def allowed(targets: Mapping[str, str], live: str, *, force: bool) -> dict[str, str]:
-    """Return the keys that may be published.
+    """Return the keys that may be published beside what `LiveRobotWatch.look` found.
 
-    Args:
-        targets: key on the bus of each key of the log.
-        live: from `LiveRobotWatch.look`.
-        force: also topics that a live robot acts on, but for those that move it.
-
-    Raises:
-        FleetError: a key is refused, or none is left.
+    `force` adds topics that a live robot acts on, but for those that move it (else FleetError).
     """
     refused = set(those_of(IN_THE_LOOP if force else ACTED_ON, targets.values()))
     if not live or not refused:

@@ -76,19 +76,6 @@ class Player:
         clock: Port | None = None,
         clock_hz: float = 0.0,
     ) -> None:
-        """Prepare.
-
-        Args:
-            schedule: the messages.
-            head: the position; it starts now.
-            ports: by `Entry.key`.
-            hand: waits and returns keys.
-            now_ns: the clock of `head`.
-            show: called five times a second; an exception from it ends the playback.
-            listening: says whether somebody has subscribed; asked until somebody has.
-            clock: receives the recorded time; None: not published.
-            clock_hz: rate of that, also while paused.
-        """
         self.schedule, self.head = schedule, head
         self.stats = PlaybackStats(counts=[0] * len(ports))
         self._puts = [port.put for port in ports]

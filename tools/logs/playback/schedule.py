@@ -42,12 +42,6 @@ def window(began_ns: int, ended_ns: int, offset_ns: int, duration_ns: int | None
 
     Parts that follow one another hold every message once. An end beyond the log's is the
     log's.
-
-    Args:
-        began_ns: of its first message.
-        ended_ns: of its last.
-        offset_ns: not negative.
-        duration_ns: None: to the end.
     """
     start_ns = began_ns + offset_ns
     end_ns = ended_ns + 1
@@ -60,13 +54,6 @@ class Playhead:
     """The position in the log as a function of the clock."""
 
     def __init__(self, now_ns: int, rate: float, *, paused: bool = False) -> None:
-        """Begin at position 0.
-
-        Args:
-            now_ns: clock.
-            rate: recorded seconds for each second.
-            paused: stand still until `resume`.
-        """
         self.rate = rate
         self.paused = paused
         self._since_ns, self._from_ns = now_ns, 0
@@ -123,13 +110,6 @@ class Schedule:
     """The messages of a window in order, once or for ever."""
 
     def __init__(self, source: EntrySource, part: Window, *, loop: bool) -> None:
-        """Take messages in the order of playback.
-
-        Args:
-            source: those of the window.
-            part: the window.
-            loop: restart at its end.
-        """
         self._source = source
         self._start_ns = part.start_ns
         self.length_ns = max(0, part.end_ns - part.start_ns)

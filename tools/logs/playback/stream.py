@@ -26,14 +26,6 @@ class EntryStream:
         executor: Executor | None = None,
         block_ns: int = BLOCK_NS,
     ) -> None:
-        """Begin at the window's start.
-
-        Args:
-            read: reads a block.
-            part: the window.
-            executor: reads the next block beforehand; None: it is read when it is needed.
-            block_ns: length of a block.
-        """
         self._read, self._part, self._block_ns = read, part, block_ns
         self._executor = executor
         self.rewind()
