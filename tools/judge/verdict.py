@@ -43,8 +43,7 @@ from tools.judge.stalls import (
 from tools.judge.standing import why_not_standing
 from tools.judge.verdict_limits import LIMITS
 from tools.logs.impairment_intervals import Impaired, impairments, touches
-from tools.logs.recorded_robot import robot_of
-from tools.logs.run_log import RunLog
+from tools.logs.run_log import RunLog, robot_of
 
 Array = NDArray[np.float64]
 Summary = dict[str, Any]

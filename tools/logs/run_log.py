@@ -19,13 +19,17 @@ from typing import Any, Final, NamedTuple
 
 import msgspec
 
+from services.planner.controller_file import ATTACHED
 from shared.bus import topics
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_S
+from shared.config import files as config_file
+from shared.config.gain_table import GainSchedule
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.mcap_log.sequence_stats import KeyCount
-from tools.logs.host_clocks import HostClocks
-from tools.logs.run_clocks import find_clocks
+from shared.text_file import decoded
+from tools.logs.host_clocks import HostClocks, find_clocks
 from tools.logs.run_index import RunIndex
 
 PART_S: Final = 30.0
@@ -293,6 +297,44 @@ def parts_of(
         log = RunLog(index, RunPart(first_s, last_s), margin_s, as_sent=as_sent)
         yield log
         log.forget()
+
+
+def robot_of(log: RunLog | RunIndex) -> RobotConfig:
+    """Return the robot that a log was made with."""
+    raw = text_of(log, "robot.toml")
+    robot = config_file.parse(raw, f"{log.path}: robot.toml")
+    schedule = log.attachments.get("robot.gains.json")
+    if schedule is None:
+        return robot
+    try:
+        table = msgspec.json.decode(decoded(schedule), type=GainSchedule)
+    except (msgspec.DecodeError, UnicodeError) as error:
+        raise RunError(f"{log.path}: robot.gains.json in it is no gain schedule: {error}") from None
+    return msgspec.structs.replace(robot, gain_schedule=table)
+
+
+def text_of(log: RunLog | RunIndex, name: str) -> str:
+    """Return a text file that is in a log."""
+    try:
+        return decoded(log.attachments[name])
+    except KeyError:
+        raise RunError(f"{log.path}: holds no {name}; a run of this project has one") from None
+    except UnicodeError as error:
+        raise RunError(f"{log.path}: {name} in it {error}") from None
+
+
+def has_own_controller(log: RunLog | RunIndex) -> bool:
+    """Return True if a controller of somebody's own led in the law's place."""
+    return ATTACHED in log.attachments
+
+
+def refuse_own_controller(log: RunLog | RunIndex) -> None:
+    """Refuse a log whose planner was led by a controller of somebody's own."""
+    if has_own_controller(log):
+        raise RunError(
+            f"{log.path}: a controller of somebody's own led ({ATTACHED} in it), and this computes "
+            "the shipped law; `xrl resim --controller FILE` runs it again"
+        )
 
 
 def _ns(seconds: float) -> int:

@@ -16,7 +16,7 @@ from shared.mcap_log.reader import ChunkPlace, LogReader, LogRecord, LostBytes, 
 from shared.mcap_log.records import Attachment, Channel, Header, McapRecord, Metadata, Schema
 from shared.mcap_log.sequence_stats import KeyCount
 from shared.mcap_log.writer import COUNTS, PROFILE
-from tools.logs.run_files import MetadataByName
+from tools.logs.run_index import MetadataByName
 
 _NEVER: Final = -1
 

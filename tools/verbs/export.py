@@ -21,9 +21,8 @@ from tools.export.parquet import ParquetFile
 from tools.export.tables import FOR_REEXECUTION, GRID_NAME, CsvFile, write_grid, write_tables
 from tools.judge.reports import scene
 from tools.judge.run_parts import add_part, part_of
-from tools.logs.recorded_robot import robot_of
 from tools.logs.run_index import RunIndex
-from tools.logs.run_log import SEE_INFO, RunLog, RunPart, parts_of, read_part
+from tools.logs.run_log import SEE_INFO, RunLog, RunPart, parts_of, read_part, robot_of
 from tools.number_arguments import rate
 from tools.output import progress_along, write_atomically
 from tools.terminal import Console, marked

@@ -35,8 +35,7 @@ from tools.identify.motion import Motion
 from tools.identify.picture import draw_body
 from tools.identify.quasi_static import Moments, TimedRows, moments_of
 from tools.live import experiment
-from tools.logs.recorded_robot import robot_of
-from tools.logs.run_log import RunLog, read_run
+from tools.logs.run_log import RunLog, read_run, robot_of
 from tools.number_arguments import finite
 from tools.output import make_folder
 from tools.terminal import Console

@@ -17,8 +17,8 @@ from shared.process import StopFlag
 from tools.fleet.supervise import SupervisedFleet
 from tools.judge.run_parts import add_part, read_asked
 from tools.live.experiment import load_robot
-from tools.logs.recorded_robot import robot_of
 from tools.logs.run_index import RunIndex
+from tools.logs.run_log import robot_of
 from tools.output import progress_along, write_atomically
 from tools.terminal import Console, marked
 from tools.verb_table import RUN_HELP, Subparsers, add_config, add_run_dir, add_verb

@@ -36,7 +36,7 @@ from tests.tools.logs.three_hosts import (
     states,
     write_record,
 )
-from tools.logs.clock_offsets import ClockOffsets, OffsetBounds
+from tools.logs.host_clocks import OffsetBounds, offset_bounds
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import clocks_of, read_run
 from tools.sim.host_clock import HostClock
@@ -54,12 +54,13 @@ from tools.sim.host_clock import HostClock
 def test_a_true_offset_lies_within_its_bounds_whatever_the_delays_are(
     zeros: list[int], sent: list[tuple[int, int, int]]
 ) -> None:
-    hosts = tuple(f"h{n}" for n in range(len(zeros)))
-    clocks = ClockOffsets(hosts)
-    for t, (a, b, delay) in enumerate(sent):
-        if a < len(hosts) and b < len(hosts):
-            clocks.heard(hosts[a], t + zeros[a], hosts[b], t + delay + zeros[b])
-    for host, bounds in clocks.against("h0").items():
+    hosts = [f"h{n}" for n in range(len(zeros))]
+    heard = [
+        (hosts[a], t + zeros[a], hosts[b], t + delay + zeros[b])
+        for t, (a, b, delay) in enumerate(sent)
+        if a < len(hosts) and b < len(hosts)
+    ]
+    for host, bounds in offset_bounds("h0", hosts, heard).items():
         truth = zeros[0] - zeros[hosts.index(host)]
         assert bounds.low_ns - 1.0 <= truth <= bounds.high_ns + 1.0
         if bounds.known:
@@ -67,22 +68,18 @@ def test_a_true_offset_lies_within_its_bounds_whatever_the_delays_are(
 
 
 def test_a_host_that_hears_nothing_is_bounded_from_one_side() -> None:
-    clocks = ClockOffsets(("body", "leg"))
-    clocks.heard("leg", 1_000, "body", 51_000)
-    clocks.heard("leg", 2_000, "body", 62_000)
-    leg = clocks.against("body")["leg"]
+    heard = [("leg", 1_000, "body", 51_000), ("leg", 2_000, "body", 62_000)]
+    leg = offset_bounds("body", ("body", "leg"), heard)["leg"]
     assert not leg.known
     assert (leg.low_ns, leg.high_ns, leg.best_ns) == (-math.inf, 50_000, 50_000)
 
 
 def test_two_hosts_that_talk_to_a_third_only_are_compared_by_it() -> None:
-    clocks = ClockOffsets(("a", "via", "b"))
-    for sender, sent_ns, receiver, received_ns in (
+    heard = [
         ("a", 100, "via", 1_150), ("via", 1_200, "a", 250), ("b", 50, "via", 2_060),
         ("via", 2_100, "b", 110),
-    ):  # fmt: skip
-        clocks.heard(sender, sent_ns, receiver, received_ns)
-    bounds = clocks.against("a")["b"]
+    ]  # fmt: skip
+    bounds = offset_bounds("a", ("a", "via", "b"), heard)["b"]
     assert bounds.low_ns <= 2_010 - 1_000 <= bounds.high_ns
     assert bounds.known
 
@@ -223,14 +220,12 @@ def test_a_sender_whose_clock_is_not_known_has_the_times_at_which_it_was_heard(
 
 
 def test_clocks_that_contradict_themselves_are_not_known_and_spoil_no_other() -> None:
-    clocks = ClockOffsets(("body", "left", "right"))
-    for sender, sent_ns, receiver, received_ns in (
+    heard = [
         ("left", 0, "body", 10_000_000), ("body", 0, "left", 100_000_000),
         ("left", 900_000_000, "body", 400_000_000),  # its host restarted
         ("right", 0, "body", 51_000_000), ("body", 0, "right", -49_500_000),
-    ):  # fmt: skip
-        clocks.heard(sender, sent_ns, receiver, received_ns)
-    found = clocks.against("body")
+    ]  # fmt: skip
+    found = offset_bounds("body", ("body", "left", "right"), heard)
     assert not math.isfinite(found["left"].best_ns)
     assert (found["right"].low_ns, found["right"].high_ns) == (49_500_000, 51_000_000)
 

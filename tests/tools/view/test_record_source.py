@@ -13,8 +13,7 @@ from shared.joints import MODULES
 from tests.tools.judge.reports.runs import make, rewritten
 from tests.tools.logs.split_runs import recorded_in_parts
 from tools.judge.stalls import MACHINE, Stall
-from tools.logs.recorded_robot import robot_of
-from tools.logs.run_log import RunLog, read_run
+from tools.logs.run_log import RunLog, read_run, robot_of
 from tools.view.record import RecordSource
 from tools.view.source import Order
 

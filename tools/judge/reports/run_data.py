@@ -18,8 +18,7 @@ from shared.joints import MODULES
 from tools.judge import verdict
 from tools.judge.reports.signals import Array, Span, message_times
 from tools.judge.verdict import Course
-from tools.logs.recorded_robot import robot_of
-from tools.logs.run_log import RunLog
+from tools.logs.run_log import RunLog, robot_of
 
 
 class TimeAxis(NamedTuple):

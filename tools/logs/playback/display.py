@@ -11,7 +11,7 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from tools.logs.playback.player import Player
 from tools.logs.playback.reading import Recording
 from tools.logs.playback.schedule import Window
-from tools.logs.run_files import further_files
+from tools.logs.run_index import further_files
 from tools.terminal import Console
 
 

@@ -10,8 +10,7 @@ from typing import Final
 from shared.clock import NS_PER_S
 from shared.exceptions import RunError
 from tools.logs.playback.schedule import Entry
-from tools.logs.recorded_file import RecordedFile
-from tools.logs.run_files import files_in
+from tools.logs.run_index import RecordedFile, files_in
 
 ROBOT_FILE: Final = "robot.toml"
 

@@ -13,11 +13,10 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from tools.logs.recorded_robot import robot_of
 from tools.logs.reexecution.execution import Execution
 from tools.logs.reexecution.outcome import ReexecutionResult
 from tools.logs.run_index import RunIndex
-from tools.logs.run_log import MARGIN_S, NOTHING, RunLog, RunPart, parts_of
+from tools.logs.run_log import MARGIN_S, NOTHING, RunLog, RunPart, parts_of, robot_of
 
 RANGE_S: Final = 60.0
 """Length of a range; shorter ones spend more on their lead-in and on starting."""

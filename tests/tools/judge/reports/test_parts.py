@@ -25,9 +25,8 @@ from tools.judge.reports.page_model import Line, PageModel, PageWindow
 from tools.judge.reports.run_data import RunData
 from tools.judge.reports.signals import Span
 from tools.judge.run_parts import zero_ns
-from tools.logs.recorded_robot import robot_of
 from tools.logs.run_index import RunIndex
-from tools.logs.run_log import RunLog, RunPart, parts_of, read_part
+from tools.logs.run_log import RunLog, RunPart, parts_of, read_part, robot_of
 
 PART_S = 0.9
 

@@ -13,7 +13,7 @@ from tests.shared.mcap_log import runs
 from tests.shared.mcap_log.runs import STATE_KEY, Queue, item, killed_file, write, writer
 from tools.logs.playback import reading
 from tools.logs.playback.reading import files_named, read
-from tools.logs.run_files import further_files
+from tools.logs.run_index import further_files
 
 WRENCH_KEY = topics.WRENCH.key(runs.ROBOT)
 
