@@ -30,7 +30,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.joints import MODULES
 from shared.mcap_log.recover import clock_time
-from tools.export.stamps import stamped
+from tools.export.tables import stamped
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import SEE_INFO, RunLog, RunPart, parts_of
 

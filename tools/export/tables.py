@@ -1,7 +1,7 @@
 """A run as tables, CSV or Parquet: each key with all of its messages, or all on one time grid.
 
 A column is a field, or an element of one: `tau_ff[1]`, as viewers of the log name it. In a table of
-one key, `time_s` is the sender's stamp on the report's axis (`tools.export.stamps`).
+one key, `time_s` is the sender's stamp on the report's axis (`stamped`).
 """
 
 from __future__ import annotations
@@ -9,20 +9,47 @@ from __future__ import annotations
 import bisect
 import csv
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Protocol, get_args, get_origin
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, get_args, get_origin
 
 import msgspec
 
 from shared.bus import topics
+from shared.bus.topics import Topic
 from shared.clock import NS_PER_S
 from shared.exceptions import RunError
-from tools.export.stamps import stamped
+from shared.extras import late
 from tools.judge.run_parts import zero_ns
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import SEE_INFO, RunLog, RunPart, parts_of
 from tools.topic_keys import TopicKey
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from pyarrow import parquet as pq
+else:
+    pa = late("pyarrow")
+    pq = late("pyarrow.parquet")
+
+_CLOCK_NS: Final = NS_PER_S
+
+
+def stamped(
+    log: RunLog, topic: Topic, module: str, *, margins: bool = False
+) -> Iterator[tuple[int, Any]]:
+    """Yield time, monotonic ns of the recorder's clock, and message of a key.
+
+    The time is the sender's stamp. Where that is more than a second off, because the sender is on
+    another host or had none yet, it is the reception, which is up to 20 ms late. `margins` are the
+    messages before and behind the part.
+    """
+    received = log.received_ns(topic, module)
+    for at_ns, message in zip(received, log.messages(topic, module), strict=True):
+        if margins or log.holds(at_ns):
+            alike = abs(at_ns - message.t_ns) <= _CLOCK_NS
+            yield (message.t_ns if alike else at_ns), message
+
 
 TIME: Final = "time_s"
 GRID_NAME: Final = "run"
@@ -78,6 +105,26 @@ class CsvFile:
     def close(self) -> None:
         """Finish it."""
         self._file.close()
+
+
+class ParquetFile:
+    """A Parquet file; each part of the run is a row group."""
+
+    suffix: Final = ".parquet"
+
+    def __init__(self, path: Path, kinds: Kinds) -> None:
+        types = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string()}
+        self._schema = pa.schema([(name, types[kind]) for name, kind in kinds.items()])
+        path = path.with_name(path.name + self.suffix)
+        self._writer: Any = pq.ParquetWriter(path, self._schema)
+
+    def add(self, columns: Columns) -> None:
+        """Append rows."""
+        self._writer.write_table(pa.table(dict(columns), schema=self._schema))
+
+    def close(self) -> None:
+        """Finish it."""
+        self._writer.close()
 
 
 def columns_of(kind: type[msgspec.Struct]) -> dict[str, Column]:

@@ -29,7 +29,6 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE, ConfigError, RunError
 from shared.joints import MODULES
 from shared.mcap_log.sequence_stats import KeyCount
-from tools.judge.soundness import soundness, why_not_sound
 from tools.judge.stalls import (
     WORLD_STOPS,
     Disturbance,
@@ -40,8 +39,7 @@ from tools.judge.stalls import (
     inside,
     stalls_of,
 )
-from tools.judge.standing import why_not_standing
-from tools.judge.verdict_limits import LIMITS
+from tools.judge.standing import LIMITS, soundness, why_not_sound, why_not_standing
 from tools.logs.impairment_intervals import Impaired, impairments, touches
 from tools.logs.run_log import RunLog, robot_of
 

@@ -7,8 +7,8 @@ from typing import Final
 from rich.table import Table
 from rich.text import Text
 
+from tools.judge.standing import LIMITS, SOUND, VerdictLimit
 from tools.judge.verdict import Summary
-from tools.judge.verdict_limits import LIMITS, SOUND, VerdictLimit
 from tools.terminal import Console, marked
 
 OK: Final = "ok"

@@ -17,8 +17,14 @@ from shared.mcap_log.extended_copy import write_extended
 from shared.mcap_log.files import SUFFIX
 from shared.places import FILES
 from tools.export.folders import whole_folder
-from tools.export.parquet import ParquetFile
-from tools.export.tables import FOR_REEXECUTION, GRID_NAME, CsvFile, write_grid, write_tables
+from tools.export.tables import (
+    FOR_REEXECUTION,
+    GRID_NAME,
+    CsvFile,
+    ParquetFile,
+    write_grid,
+    write_tables,
+)
 from tools.judge.reports import scene
 from tools.judge.run_parts import add_part, part_of
 from tools.logs.run_index import RunIndex

@@ -24,12 +24,9 @@ from tools.cli import INTERRUPTED
 from tools.fleet.supervise import SupervisedFleet
 from tools.keyboard import Keyboard
 from tools.logs.playback import arguments, guard, reading, selection
-from tools.logs.playback.display import Display, introduce, summary, where
-from tools.logs.playback.player import Player
-from tools.logs.playback.press import PRESSES, Press
+from tools.logs.playback.player import PRESSES, Display, Player, Press, introduce, summary, where
 from tools.logs.playback.reading import Recording
-from tools.logs.playback.schedule import Entry, Playhead, Schedule, Window, window
-from tools.logs.playback.stream import EntryStream
+from tools.logs.playback.schedule import Entry, EntryStream, Playhead, Schedule, Window, window
 from tools.terminal import Console
 from tools.verb_table import Subparsers, add_verb
 

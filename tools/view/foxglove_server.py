@@ -16,8 +16,7 @@ from tools.judge.reports import foxglove as encoding
 from tools.judge.reports import scene
 from tools.judge.reports.scene import RobotPose
 from tools.view.frame import Frame
-from tools.view.settings import FOXGLOVE_PORT, FRAMES_S, HOST
-from tools.view.source import Source
+from tools.view.source import FOXGLOVE_PORT, FRAMES_S, HOST, Source
 
 LINKS_EVERY: Final = 30
 """Frames between two messages of the robot's bodies, which do not change."""

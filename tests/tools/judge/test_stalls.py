@@ -46,7 +46,7 @@ from tools.judge.stalls import (
     drop_outs,
     stalls_of,
 )
-from tools.judge.verdict_limits import LIMITS
+from tools.judge.standing import LIMITS
 from tools.live.live_stalls import (
     A_THREAD,
     MERGE_NS,

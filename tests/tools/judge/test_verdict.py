@@ -17,9 +17,14 @@ from shared.config.scenarios import Push
 from tests.lockstep.runs import still
 from tools import cli
 from tools.judge import verdict, verdict_table
-from tools.judge.soundness import _longest_s, shaking_of, why_not_sound
-from tools.judge.standing import why_not_standing
-from tools.judge.verdict_limits import LIMITS, SOUND
+from tools.judge.standing import (
+    LIMITS,
+    SOUND,
+    _longest_s,
+    shaking_of,
+    why_not_sound,
+    why_not_standing,
+)
 from tools.logs.run_log import read_run
 from tools.terminal import Console
 

@@ -7,7 +7,7 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tools.view.cursor import RATES, TimelineCursor
+from tools.view.server import RATES, TimelineCursor
 
 NUMBERS = st.none() | st.floats(allow_nan=True, allow_infinity=True)
 CONTROLS = st.tuples(st.floats(0.0, 10.0), st.none() | st.booleans(), NUMBERS, NUMBERS)

@@ -19,8 +19,8 @@ from tools.judge import stalls
 from tools.judge.reports.page_model import TimelineEvent
 from tools.judge.reports.run_data import RunData
 from tools.judge.reports.signals import Array
+from tools.judge.standing import LIMITS
 from tools.judge.verdict import leading
-from tools.judge.verdict_limits import LIMITS
 
 TOGETHER_S: Final = 0.1
 """Equal violations of several modules or joints within this time share one row."""

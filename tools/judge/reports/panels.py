@@ -13,7 +13,7 @@ from shared.joints import MODULES
 from tools.judge.reports.page_model import BarRow, LevelLine, Line, PageModel
 from tools.judge.reports.run_data import RunData
 from tools.judge.reports.signals import Array
-from tools.judge.verdict_limits import LIMITS
+from tools.judge.standing import LIMITS
 
 NO_WORLD: Final = "no sim/truth in this log"
 NO_PLANNER: Final = "no planner/status in this log"

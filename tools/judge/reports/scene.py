@@ -1,15 +1,18 @@
 """3-D scene of the robot: a frame for each module, a body for each link, COM and forces.
 
 The frames are those of `shared.robot.frames`, and `com` with the axes of the world. The links are
-those of `shared.robot.robot_model`.
+those of `shared.robot.robot_model`. Rerun draws bodies from URDF alone, in a ROS 2 message; all its
+joints are floating: the transforms give the poses of the frames.
 """
 
 from __future__ import annotations
 
 import bisect
 import math
-from collections.abc import Iterable, Iterator
+import struct
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Final, NamedTuple
+from xml.etree import ElementTree as ET
 
 import numpy as np
 
@@ -30,7 +33,7 @@ from shared.robot.frames import (
     torso_rotation,
 )
 from shared.robot.robot_model import MODULE_RADIUS
-from tools.judge.reports import foxglove, urdf
+from tools.judge.reports import foxglove
 from tools.judge.reports.foxglove import Arrow, Colour, Entity, Solid
 from tools.logs.run_log import RunLog
 
@@ -48,6 +51,12 @@ COM: Final[Colour] = (0.05, 0.37, 0.65, 1.0)
 HAND: Final[Colour] = (0.77, 0.31, 0.11, 1.0)
 PUSH: Final[Colour] = (0.55, 0.20, 0.60, 1.0)
 UNKNOWN: Final[Colour] = (0.4, 0.4, 0.4, 1.0)
+URDF_SCHEMA_NAME: Final = "std_msgs/msg/String"
+URDF_SCHEMA: Final = b"string data\n"
+URDF_SCHEMA_ENCODING: Final = "ros2msg"
+URDF_ENCODING: Final = "cdr"
+"""Encoding of the message."""
+_LITTLE_ENDIAN: Final = b"\x00\x01\x00\x00"
 NO_MODE: Final = -1
 MODES: Final[dict[int, Colour]] = {
     Mode.DISARMED: (0.70, 0.74, 0.77, 1.0),
@@ -98,10 +107,10 @@ def channels(robot: str) -> list[NewChannel]:
     ]
     model = NewChannel(
         f"xrl/{robot}/robot_description",  # the name that Rerun expects
-        urdf.SCHEMA_NAME,
-        urdf.SCHEMA_ENCODING,
-        urdf.SCHEMA,
-        urdf.ENCODING,
+        URDF_SCHEMA_NAME,
+        URDF_SCHEMA_ENCODING,
+        URDF_SCHEMA,
+        URDF_ENCODING,
         {"why": "bodies of the robot as URDF, once"},
     )
     return [*found, model]
@@ -116,7 +125,7 @@ def messages(logs: Iterable[RunLog], robot: RobotConfig) -> Iterator[NewMessage]
             for pose in poses(log, robot):
                 ns = pose.t_ns + log.offset_ns
                 if links_ns is None:
-                    yield NewMessage(MODEL, ns, urdf.message(model(log.robot, robot, pose)))
+                    yield NewMessage(MODEL, ns, urdf_message(model(log.robot, robot, pose)))
                 yield NewMessage(FRAMES, ns, foxglove.transforms(ns, frames(robot, pose)))
                 if links_ns is None or ns - links_ns >= LINKS_PERIOD_S * NS_PER_S:
                     links_ns = ns
@@ -131,7 +140,7 @@ def messages(logs: Iterable[RunLog], robot: RobotConfig) -> Iterator[NewMessage]
 def model(name: str, robot: RobotConfig, pose: RobotPose) -> str:
     """Return all bodies of a robot as URDF; the modules have the colour of no mode."""
     still = pose._replace(modes=(NO_MODE,) * len(MODULES))
-    return urdf.urdf(name, frames(robot, pose), [*links(robot), *state(still)])
+    return urdf(name, frames(robot, pose), [*links(robot), *state(still)])
 
 
 def poses(log: RunLog, robot: RobotConfig) -> Iterator[RobotPose]:
@@ -255,3 +264,44 @@ def _arrows(force: Vector3, colour: Colour, position: Vector3 = ORIGIN) -> tuple
 
 def _vector(values: Any) -> Vector3:
     return float(values[0]), float(values[1]), float(values[2])
+
+
+def urdf_message(text: str) -> bytes:
+    """Return a `std_msgs/msg/String` in CDR."""
+    data = text.encode() + b"\0"
+    return _LITTLE_ENDIAN + struct.pack("<I", len(data)) + data
+
+
+def urdf(robot: str, frames: Sequence[FramePose], entities: Iterable[Entity]) -> str:
+    """Return the model: a link for each frame and its parents, a visual for each solid."""
+    root = ET.Element("robot", name=robot)
+    names = dict.fromkeys(name for row in frames for name in (row.parent, row.child))
+    links = {name: ET.SubElement(root, "link", name=name) for name in names}
+    for entity in entities:
+        for solid in entity.solids:
+            _add_visual(links[entity.frame], entity.name, solid)
+    for row in frames:
+        joint = ET.SubElement(root, "joint", name=f"to_{row.child}", type="floating")
+        ET.SubElement(joint, "parent", link=row.parent)
+        ET.SubElement(joint, "child", link=row.child)
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode")
+
+
+def _add_visual(link: ET.Element, name: str, solid: Solid) -> None:
+    visual = ET.SubElement(link, "visual", name=name)
+    ET.SubElement(visual, "origin", xyz=_listed(solid.position))
+    geometry = ET.SubElement(visual, "geometry")
+    x, _, z = solid.size
+    if solid.shape == "cube":
+        ET.SubElement(geometry, "box", size=_listed(solid.size))
+    elif solid.shape == "cylinder":
+        ET.SubElement(geometry, "cylinder", radius=str(x / 2), length=str(z))
+    else:
+        ET.SubElement(geometry, "sphere", radius=str(x / 2))
+    material = ET.SubElement(visual, "material", name=name)
+    ET.SubElement(material, "color", rgba=_listed(solid.colour))
+
+
+def _listed(values: Iterable[float]) -> str:
+    return " ".join(map(str, values))

@@ -17,8 +17,8 @@ from shared.mcap_log.sequence_stats import KeyCount
 from shared.text_file import decoded
 from tools.judge import verdict, verdict_table
 from tools.judge.reports.run_data import RunData
+from tools.judge.standing import LIMITS
 from tools.judge.verdict import Summary
-from tools.judge.verdict_limits import LIMITS
 from tools.logs.run_log import RunLog
 from tools.terminal import Console
 

@@ -19,7 +19,7 @@ from mcap.reader import make_reader
 from shared.config.robot_config import RobotConfig
 from tests.tools.judge.reports.runs import Made
 from tools import cli
-from tools.judge.reports import scene, urdf
+from tools.judge.reports import scene
 from tools.judge.reports.foxglove import Entity, Solid
 from tools.judge.reports.scene import RobotPose
 from tools.logs.run_log import RunLog
@@ -104,5 +104,5 @@ def test_the_bodies_of_the_model_are_those_of_the_scene(
 def test_names_with_xml_characters_are_kept(robot: RobotConfig, first: RobotPose) -> None:
     name = 'a<b>&"c'
     solid = Solid("sphere", (0.1, 0.1, 0.1), (1.0, 0.0, 0.0, 1.0))
-    text = urdf.urdf(name, scene.frames(robot, first), [Entity("torso", name, (solid,))])
+    text = scene.urdf(name, scene.frames(robot, first), [Entity("torso", name, (solid,))])
     assert pin.buildModelFromXML(text).name == name

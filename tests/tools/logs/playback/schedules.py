@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from shared.clock import NS_PER_S
-from tools.logs.playback.schedule import Entry, Schedule, Window
-from tools.logs.playback.stream import EntryStream
+from tools.logs.playback.schedule import Entry, EntryStream, Schedule, Window
 
 
 def schedule_of(rows: Sequence[Entry], part: Window, *, loop: bool) -> Schedule:
