@@ -46,10 +46,7 @@ from tools.sim.host_clock import HostClock
 
 @given(
     st.lists(st.integers(-(10**15), 10**15), min_size=2, max_size=5),
-    st.lists(
-        st.tuples(st.integers(0, 4), st.integers(0, 4), st.integers(0, 10**7)),
-        max_size=40,
-    ),
+    st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4), st.integers(0, 10**7)), max_size=40),
 )
 def test_a_true_offset_lies_within_its_bounds_whatever_the_delays_are(
     zeros: list[int], sent: list[tuple[int, int, int]]

@@ -86,9 +86,7 @@ def test_joined_with_a_hosts_own_record_the_fleets_has_what_a_cut_network_kept_f
     assert exit_code(["info", tmp_path / "joined" / "run.mcap"]) == 0
 
 
-@given(
-    st.lists(st.tuples(st.booleans(), st.integers(0, 300), st.integers(0, 300)), max_size=30),
-)
+@given(st.lists(st.tuples(st.booleans(), st.integers(0, 300), st.integers(0, 300)), max_size=30))
 def test_joined_messages_of_a_key_are_in_the_order_in_which_they_were_sent(
     rows: list[tuple[bool, int, int]],
 ) -> None:

@@ -216,11 +216,7 @@ def _thinned(poses: Sequence[RobotPose]) -> Iterator[RobotPose]:
 
 
 def _draw_frame(
-    canvas: Canvas,
-    robot: RobotConfig,
-    pose: RobotPose,
-    seconds: float,
-    captions: Sequence[Caption],
+    canvas: Canvas, robot: RobotConfig, pose: RobotPose, seconds: float, captions: Sequence[Caption]
 ) -> None:
     frames = world_frames(robot, pose)
     canvas.line([(20.0, GROUND_Y), (SIZE[0] - 20.0, GROUND_Y)], INK, 1.5)

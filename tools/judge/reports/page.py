@@ -12,7 +12,7 @@ from typing import Final
 from shared.clock import NS_PER_S
 from shared.exceptions import RunError
 from tools.judge import verdict_table
-from tools.judge.reports import network, panels, summary, times, torques
+from tools.judge.reports import panels, summary, times, torques
 from tools.judge.reports.page_model import PageModel, PageWindow, TimelineEvent
 from tools.judge.reports.run_data import RunData, TimeAxis
 from tools.judge.reports.signals import Span
@@ -30,6 +30,11 @@ SCRIPTS: Final = tuple(
     HERE / f"{name}.js" for name in ("signals", "format", "overlay", "panel", "view", "page")
 )
 
+PANELS: Final = (
+    panels.body, panels.hand, panels.feet, panels.states, panels.network, times.ages,
+    panels.certificate, torques.joints, panels.harness, times.times,
+)  # fmt: skip
+"""What makes the panels, in the order of the page."""
 BEFORE_FALL_S: Final = 3.0
 """A click on a fall shows this time before it."""
 
@@ -77,7 +82,9 @@ class Page:
         self._model = self._model or PageModel(run.span)
         span = None if log.is_whole else run.span
         self._model.window = PageWindow(run.begin_s, run.end_s, span)
-        add_panels(run, self._model)
+        for make in PANELS:
+            for panel in make(run):
+                self._model.add(panel)
         self._timeline.take(run)
         self._judge.take(run)
         self._losses.take(run)
@@ -89,6 +96,7 @@ class Page:
         assert model is not None  # noqa: S101
         log = run.log
         events = self._timeline.events(run.span)
+        plots, left_out = model.as_data(events)
         verdict = self._judge.verdict(
             log, self._losses.counts.values(), whole=self._has_first and self._has_last
         )
@@ -98,11 +106,11 @@ class Page:
             _head(run, verdict, name),
             _tools(run, fell_s),
             f'<div class="work">{_timeline(events)}<main id="panels"></main></div>',
-            _left_out(model),
+            _left_out(left_out),
             _message_losses(run, self._losses.rows(log.robot)),
             _inputs(run),
         )
-        data = json.dumps(model.as_data(events), separators=(",", ":"), allow_nan=False)
+        data = json.dumps(plots, separators=(",", ":"), allow_nan=False)
         prefix = "" if verdict.good is None else f"{verdict.sentence}: "
         return _document(f"{prefix}{name}, {log.robot}", "\n".join(parts), data)
 
@@ -135,18 +143,6 @@ def render_parts(
     if not heard:
         raise RunError(f"{index.path}: has no message in this part; {SEE_INFO}")
     return page.html()
-
-
-def add_panels(run: RunData, model: PageModel) -> None:
-    """Add all panels of a run, in the order of the page."""
-    panels.add_body(run, model)
-    panels.add_states(run, model)
-    network.add_network(run, model)
-    times.add_ages(run, model)
-    panels.add_certificate(run, model)
-    torques.add_joints(run, model)
-    panels.add_harness(run, model)
-    times.add_times(run, model)
 
 
 def _document(title: str, body: str, data: str) -> str:
@@ -228,10 +224,10 @@ def _tools(run: RunData, fell_s: float | None) -> str:
     )
 
 
-def _left_out(model: PageModel) -> str:
-    if not model.left_out:
+def _left_out(panels_without_data: Sequence[tuple[str, str]]) -> str:
+    if not panels_without_data:
         return ""
-    rows = "".join(f"<li>{escape(title)}: {escape(why)}</li>" for title, why in model.left_out)
+    rows = "".join(f"<li>{escape(title)}: {escape(why)}</li>" for title, why in panels_without_data)
     return f'<section id="left-out"><h2>Panels without data</h2><ul>{rows}</ul></section>'
 
 

@@ -112,6 +112,11 @@ class RunData:
             for name in names
         ]
 
+    def wide(self, topic: Topic, name: str, width: int, module: str = "") -> Array:
+        """Return a field of some numbers (n, width), even without messages."""
+        (values,) = self.columns(topic, module, name)
+        return values.reshape(-1, width)
+
     def armed_s(self) -> float:
         """Return when all six drives were armed for the first time, s; if never, the begin.
 

@@ -24,14 +24,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.joints import MODULES, SIDES
 from shared.mcap_log.extended_copy import NewChannel, NewMessage
-from shared.robot.frames import (
-    ORIGIN,
-    UPRIGHT,
-    FramePose,
-    Quaternion,
-    body_frames,
-    torso_rotation,
-)
+from shared.robot.frames import ORIGIN, UPRIGHT, FramePose, Quaternion, body_frames, torso_rotation
 from shared.robot.robot_model import MODULE_RADIUS
 from tools.judge.reports import foxglove
 from tools.judge.reports.foxglove import Arrow, Colour, Entity, Solid

@@ -159,11 +159,7 @@ class EntryStream:
     """The messages of a window; while one block is given, the next is read."""
 
     def __init__(
-        self,
-        read: Read,
-        part: Window,
-        executor: Executor | None = None,
-        block_ns: int = BLOCK_NS,
+        self, read: Read, part: Window, executor: Executor | None = None, block_ns: int = BLOCK_NS
     ) -> None:
         self._read, self._part, self._block_ns = read, part, block_ns
         self._executor = executor

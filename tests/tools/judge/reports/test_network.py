@@ -10,7 +10,7 @@ from shared.clock import NS_PER_S
 from shared.config.impairment import Direction, Impairment
 from shared.links import DIRECTIONS, WRENCHES
 from shared.network.impairment_schedule import ImpairmentSchedule
-from tools.judge.reports.network import ImpairedLink, histories
+from tools.judge.reports.panels import ImpairedLink, histories
 
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(1, 6), st.integers(1, 9)), max_size=8))

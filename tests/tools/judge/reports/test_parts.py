@@ -21,7 +21,7 @@ from tools.judge import verdict
 from tools.judge.judgement import summarise_parts
 from tools.judge.reports import scene
 from tools.judge.reports.page import render, render_parts
-from tools.judge.reports.page_model import Line, PageModel, PageWindow
+from tools.judge.reports.page_model import Line, PageModel, PageWindow, Plot
 from tools.judge.reports.run_data import RunData
 from tools.judge.reports.signals import Span
 from tools.judge.run_parts import zero_ns
@@ -178,12 +178,13 @@ def test_time_zero_is_that_of_the_scenario(log: RunLog) -> None:
 
 def test_a_panel_without_data_in_the_first_part_has_its_unit_and_note_from_a_later_one() -> None:
     model = PageModel(Span(0.0, 2.0))
-    model.leave_out("Age", "nothing yet")
-    assert model.left_out == [("Age", "nothing yet")]
+    model.add(Plot("Age", if_empty="nothing yet", lines=[]))
+    assert model.as_data([])[1] == [("Age", "nothing yet")]
     line = Line("x", np.array([1.2, 1.4]), np.array([0.0, 3.0]), 0)
-    model.plot("Age", "ms", [line], note="how old", if_empty="none")
-    assert model.left_out == []
-    (panel,) = model.as_data([])["panels"]
+    model.add(Plot("Age", "ms", "how old", "none", lines=[line]))
+    data, left_out = model.as_data([])
+    assert left_out == []
+    (panel,) = data["panels"]
     assert (panel["unit"], panel["note"]) == ("ms", "how old")
 
 
@@ -197,8 +198,8 @@ def test_a_counter_goes_on_from_where_the_part_before_it_ended() -> None:
     for window, t, values in parts:
         model.window = window
         line = Line("late", np.array(t), np.array(values), 0, counts_up=True)
-        model.plot("Late", "count", [line], needs_count=True)
-    data = model.as_data([])
+        model.add(Plot("Late", "count", lines=[line], needs_count=True))
+    data, _ = model.as_data([])
     _, seen = pages.line(data, "Late", "late")
     assert seen[-1] == pytest.approx(9.0, abs=1e-3), "3 in the first part, 6 in the second"
     assert (np.diff(seen) >= 0.0).all()

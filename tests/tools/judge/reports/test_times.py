@@ -14,8 +14,8 @@ from shared.bus.messages import DriveStatus, PlannerMode, Trip
 from shared.bus.traces import LinkEvent
 from shared.joints import MODULES
 from tests.tools.judge.reports import pages, runs
-from tools.judge.reports.network import ImpairedLink
 from tools.judge.reports.page import render
+from tools.judge.reports.panels import ImpairedLink
 from tools.judge.reports.run_data import RunData
 from tools.judge.reports.timeline import timeline_events
 from tools.logs.run_log import RunLog
