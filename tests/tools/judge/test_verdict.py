@@ -25,7 +25,7 @@ from tools.judge.standing import (
     why_not_sound,
     why_not_standing,
 )
-from tools.logs.run_log import read_run
+from tools.logs.run_log import RunLog, read_run
 from tools.terminal import Console
 
 
@@ -80,9 +80,8 @@ def test_a_run_is_judged_by_how_it_stands_at_its_end(
     assert "DOES NOT STAND" in capsys.readouterr().out
 
 
-def test_a_sound_run_has_figures_within_their_limits(tmp_path: Path) -> None:
-    assert cli.main(["sim", "--duration", "4", "--out", str(tmp_path)]) == 0
-    summary = verdict.summarise(read_run(tmp_path / "run.mcap"), 4.0)
+def test_a_sound_run_has_figures_within_their_limits(log: RunLog) -> None:
+    summary = verdict.summarise(log, 4.0)
     assert summary["torque_at_limit_ms"] == 0.0
     assert 0.05 < summary["shaking_nm"] < 5.0
     assert 0.05 < summary["sinking_m_s"] < 0.3, "it is led down"

@@ -10,7 +10,7 @@ import pytest
 from shared.bus import topics
 from shared.bus.messages import JointState, SimTruth
 from shared.joints import MODULES
-from tests.tools.judge.reports.runs import make, rewritten
+from tests.tools.judge.reports.runs import rewritten
 from tests.tools.logs.split_runs import recorded_in_parts
 from tools.judge.stalls import MACHINE, Stall
 from tools.logs.run_log import RunLog, read_run, robot_of
@@ -18,12 +18,6 @@ from tools.view.record import RecordSource
 from tools.view.source import Order
 
 LOG = Path(__file__).parents[1] / "logs" / "reexecution" / "golden" / "stand-v6c.mcap"
-
-
-@pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> RunLog:
-    """Return four seconds in virtual time: a planner killed and started, a push, a fault."""
-    return read_run(make(tmp_path_factory.mktemp("run")).path)
 
 
 @pytest.fixture(scope="module")

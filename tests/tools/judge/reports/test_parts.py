@@ -5,16 +5,16 @@ from __future__ import annotations
 import re
 from functools import partial
 from pathlib import Path
+from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 
 from shared.bus import topics
-from shared.bus.messages import DriveStatus, JointState
+from shared.bus.messages import DriveStatus
 from shared.clock import NS_PER_S
 from shared.exceptions import RunError
-from tests.tools.judge.reports import pages, runs
+from tests.tools.judge.reports import runs
 from tests.tools.judge.reports.runs import Made
 from tools import cli
 from tools.judge import verdict
@@ -63,13 +63,13 @@ def test_the_messages_counted_are_those_of_the_whole(page: str, in_parts: str) -
 
 
 def test_panels_and_lines_are_those_of_the_whole(page: str, in_parts: str) -> None:
-    whole, parts = pages.data_of(page), pages.data_of(in_parts)
+    whole, parts = runs.data_of(page), runs.data_of(in_parts)
     assert [panel["title"] for panel in parts["panels"]] == [
         panel["title"] for panel in whole["panels"]
     ]
     for title, label in (("COM", "x"), ("Height", "torso"), ("Command age", "knee_left")):
         (t, values), (t_all, values_all) = (
-            pages.line(data, title, label) for data in (parts, whole)
+            runs.line(data, title, label) for data in (parts, whole)
         )
         # at a scale of hours a bin's extremes are shown; every one of them is kept
         assert np.nanmin(values) == pytest.approx(np.nanmin(values_all), abs=1e-3)
@@ -79,7 +79,7 @@ def test_panels_and_lines_are_those_of_the_whole(page: str, in_parts: str) -> No
 
 def test_the_bars_are_those_of_the_whole(page: str, in_parts: str) -> None:
     title = "Modes of the six services"
-    whole, parts = (pages.panel(pages.data_of(one), title) for one in (page, in_parts))
+    whole, parts = (runs.panel(runs.data_of(one), title) for one in (page, in_parts))
     for row, row_all in zip(parts["rows"], whole["rows"], strict=True):
         assert [span[2] for span in row["spans"]] == [span[2] for span in row_all["spans"]]
         edges, edges_all = (np.array([span[:2] for span in r["spans"]]) for r in (row, row_all))
@@ -128,9 +128,9 @@ def test_a_part_of_a_run_has_the_time_of_the_whole_and_all_events(
     words = ["--from", "1", "--to", "2", "-o", str(out), "--open", "no"]
     assert cli.main(["report", str(made.path), *words]) == 0
     assert 'id="verdict">A part of a run, and its figures: no verdict<' in out.read_text()
-    data = pages.data_of(out.read_text())
+    data = runs.data_of(out.read_text())
     assert data["span"] == pytest.approx([1.0, 2.0], abs=1e-6)
-    t, values = pages.line(data, "COM", "x")
+    t, values = runs.line(data, "COM", "x")
     assert t[0] >= 1.0
     assert t[-1] <= 2.001
     assert np.isfinite(values).any()
@@ -200,7 +200,7 @@ def test_a_counter_goes_on_from_where_the_part_before_it_ended() -> None:
         line = Line("late", np.array(t), np.array(values), 0, counts_up=True)
         model.add(Plot("Late", "count", lines=[line], needs_count=True))
     data, _ = model.as_data([])
-    _, seen = pages.line(data, "Late", "late")
+    _, seen = runs.line(data, "Late", "late")
     assert seen[-1] == pytest.approx(9.0, abs=1e-3), "3 in the first part, 6 in the second"
     assert (np.diff(seen) >= 0.0).all()
 
@@ -208,17 +208,11 @@ def test_a_counter_goes_on_from_where_the_part_before_it_ended() -> None:
 def test_before_the_drives_are_armed_no_soft_stop_is_passed(log: RunLog, tmp_path: Path) -> None:
     """A robot that hangs unarmed has its joints anywhere."""
 
-    def hanging(name: str, payload: bytes) -> bytes:
-        if not name.endswith("/state") or "joint" not in name:
-            return payload
-        state = msgspec.json.decode(payload, type=JointState)
-        if state.t_ns > armed_ns:
-            return payload
-        beyond = msgspec.structs.replace(state, q=(9.0, 9.0), drive=int(DriveStatus.IDLE))
-        return msgspec.json.encode(beyond)
+    def hanging(t: float, state: dict[str, Any]) -> None:
+        if t <= -1.0:
+            state |= {"q": (9.0, 9.0), "drive": int(DriveStatus.IDLE)}
 
-    armed_ns = RunData(log).zero_ns - NS_PER_S
-    hung = runs.rewritten(log, tmp_path, payload=hanging)
+    hung = runs.changed(log, tmp_path, "joint/*/state", hanging)
     for page in (render(hung), render_parts(hung.index, part_s=PART_S)):
         assert "beyond a soft stop" not in page
 

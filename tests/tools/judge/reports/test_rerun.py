@@ -17,8 +17,6 @@ import pytest
 from mcap.reader import make_reader
 
 from shared.config.robot_config import RobotConfig
-from tests.tools.judge.reports.runs import Made
-from tools import cli
 from tools.judge.reports import scene
 from tools.judge.reports.foxglove import Entity, Solid
 from tools.judge.reports.scene import RobotPose
@@ -29,13 +27,6 @@ SIZES: dict[str, Callable[[pin.GeometryObject], list[float]]] = {
     "cylinder": lambda body: [2 * body.geometry.radius] * 2 + [2 * body.geometry.halfLength],
     "sphere": lambda body: [2 * body.geometry.radius] * 3,
 }
-
-
-@pytest.fixture(scope="module")
-def shown(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("rerun") / "shown.mcap"
-    assert cli.main(["export", str(made.path), "--scene", "-o", str(out)]) == 0
-    return out
 
 
 @pytest.fixture(scope="module")

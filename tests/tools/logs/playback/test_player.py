@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shared.clock import NS_PER_MS, NS_PER_S
-from tests.tools.logs.playback.schedules import schedule_of
+from tests.tools.logs.playback.test_schedule import schedule_of
 from tools.logs.playback.player import BURST, STEP_NS, ClockMessage, Player, Press, summary
 from tools.logs.playback.schedule import Entry, Playhead, window
 
