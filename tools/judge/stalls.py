@@ -8,8 +8,8 @@ there.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from typing import Any, Final, NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -252,11 +252,7 @@ def drop_outs(
         and begin_ns <= event.t_ns < end_ns
         and not any(_is_excused(event, stall) for stall in excused)
     )
-    groups: list[list[tuple[int, str]]] = []
-    for row in found:
-        if not groups or row[0] - groups[-1][0][0] > TOGETHER_NS:
-            groups.append([])
-        groups[-1].append(row)
+    groups = together(found, lambda _: None, TOGETHER_NS)
     statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS) if groups else []
     sent_ns = np.array([row.t_ns for row in statuses], np.int64)
     lines = []
@@ -267,6 +263,22 @@ def drop_outs(
         at_s = (group[0][0] - zero_ns) / NS_PER_S
         lines.append(f"{at_s:.2f} s: {who} held without a stall; {known}")
     return lines
+
+
+Row = TypeVar("Row", bound=tuple[Any, ...])
+
+
+def together(rows: Iterable[Row], key: Callable[[Row], Any], within: float) -> list[list[Row]]:
+    """Group rows with equal keys at about the same time, which is the first field of a row."""
+    groups: list[list[Row]] = []
+    open_: dict[Any, list[Row]] = {}
+    for row in rows:
+        group = open_.get(key(row))
+        if group is None or row[0] - group[0][0] > within:
+            group = open_[key(row)] = []
+            groups.append(group)
+        group.append(row)
+    return groups
 
 
 def _planners_silence(sent_ns: NDArray[np.int64], at_ns: int) -> str:
