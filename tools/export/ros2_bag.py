@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable, Iterator
+from operator import itemgetter
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 from rosbags.interfaces import (
@@ -88,15 +89,11 @@ def _in_order(log: RunLog) -> Iterator[tuple[int, Topic, str, Message]]:
     streams = [
         sorted(
             ((at_ns, topic, module, message) for at_ns, message in stamped(log, topic, module)),
-            key=_time,
+            key=itemgetter(0),
         )
         for topic, module in keys
     ]
-    return heapq.merge(*streams, key=_time)
-
-
-def _time(row: tuple[int, Any, Any, Any]) -> int:
-    return row[0]
+    return heapq.merge(*streams, key=itemgetter(0))
 
 
 def _connection(writer: Writer, topic: RosTopic, types: RosTypes) -> Connection:

@@ -6,10 +6,10 @@ one key, `time_s` is the sender's stamp on the report's axis (`stamped`).
 
 from __future__ import annotations
 
-import bisect
 import csv
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, get_args, get_origin
 
@@ -22,7 +22,7 @@ from shared.exceptions import RunError
 from shared.extras import late
 from tools.judge.run_parts import zero_ns
 from tools.logs.run_index import RunIndex
-from tools.logs.run_log import SEE_INFO, RunLog, RunPart, parts_of
+from tools.logs.run_log import SEE_INFO, NewestAt, RunLog, RunPart, parts_of
 from tools.topic_keys import TopicKey
 
 if TYPE_CHECKING:
@@ -33,24 +33,7 @@ else:
     pq = late("pyarrow.parquet")
 
 _CLOCK_NS: Final = NS_PER_S
-
-
-def stamped(
-    log: RunLog, topic: Topic, module: str, *, margins: bool = False
-) -> Iterator[tuple[int, Any]]:
-    """Yield time, monotonic ns of the recorder's clock, and message of a key.
-
-    The time is the sender's stamp. Where that is more than a second off, because the sender is on
-    another host or had none yet, it is the reception, which is up to 20 ms late. `margins` are the
-    messages before and behind the part.
-    """
-    received = log.received_ns(topic, module)
-    for at_ns, message in zip(received, log.messages(topic, module), strict=True):
-        if margins or log.holds(at_ns):
-            alike = abs(at_ns - message.t_ns) <= _CLOCK_NS
-            yield (message.t_ns if alike else at_ns), message
-
-
+"""A stamp that is further from its reception is of another clock."""
 TIME: Final = "time_s"
 GRID_NAME: Final = "run"
 """File of the table on a grid, without its suffix."""
@@ -125,6 +108,22 @@ class ParquetFile:
     def close(self) -> None:
         """Finish it."""
         self._writer.close()
+
+
+def stamped(
+    log: RunLog, topic: Topic, module: str, *, margins: bool = False
+) -> Iterator[tuple[int, Any]]:
+    """Yield time, monotonic ns of the recorder's clock, and message of a key.
+
+    The time is the sender's stamp. Where that is more than a second off, because the sender is on
+    another host or had none yet, it is the reception, which is up to 20 ms late. `margins` are the
+    messages before and behind the part.
+    """
+    received = log.received_ns(topic, module)
+    for at_ns, message in zip(received, log.messages(topic, module), strict=True):
+        if margins or log.holds(at_ns):
+            alike = abs(at_ns - message.t_ns) <= _CLOCK_NS
+            yield (message.t_ns if alike else at_ns), message
 
 
 def columns_of(kind: type[msgspec.Struct]) -> dict[str, Column]:
@@ -224,18 +223,14 @@ def write_grid(
 
 
 def _newest_at(log: RunLog, key: TopicKey, grid: Iterable[int]) -> list[Any | None]:
-    rows = sorted(stamped(log, *key, margins=True), key=_time)
-    times = [at_ns for at_ns, _ in rows]
+    rows = sorted(stamped(log, *key, margins=True), key=itemgetter(0))
+    newest = NewestAt(rows, [at_ns for at_ns, _ in rows])
     found: list[Any | None] = []
     for at_ns in grid:
-        number = bisect.bisect_right(times, at_ns) - 1
-        fresh = number >= 0 and at_ns - times[number] <= HELD_S * NS_PER_S
-        found.append(rows[number][1] if fresh else None)
+        row: Any = newest.at(at_ns)
+        fresh = row is not None and at_ns - row[0] <= HELD_S * NS_PER_S
+        found.append(row[1] if fresh else None)
     return found
-
-
-def _time(row: tuple[int, Any]) -> int:
-    return row[0]
 
 
 def _add_column(found: dict[str, Column], name: str, kind: Any, read: Callable[[Any], Any]) -> None:

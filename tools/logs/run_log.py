@@ -10,8 +10,9 @@ So what may be long is read by `parts_of`, one after the other.
 
 from __future__ import annotations
 
+import bisect
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -68,6 +69,19 @@ class Series:
         """Reception by the recorder, monotonic clock."""
         self.seq: list[int] = []
         self.decoded: list[Any] | None = None
+
+
+class NewestAt:
+    """Finds the newest of rows, which are in the order of their stamps, at a time."""
+
+    def __init__(self, rows: Sequence[Any], stamps: Sequence[int] | None = None) -> None:
+        self._rows = rows
+        self._stamps = [row.t_ns for row in rows] if stamps is None else stamps
+
+    def at(self, t_ns: int) -> Any | None:
+        """Return the newest row at or before a time; None before the first."""
+        index = bisect.bisect_right(self._stamps, t_ns) - 1
+        return self._rows[index] if index >= 0 else None
 
 
 class RunLog:
@@ -141,6 +155,10 @@ class RunLog:
                 ) from None
             series.decoded = self._aligned(decoded, topic, module, series.received_ns)
         return series.decoded
+
+    def newest(self, topic: Topic, module: str = "") -> NewestAt:
+        """Return what finds the newest of `messages(topic, module)` at a time."""
+        return NewestAt(self.messages(topic, module))
 
     def raw(self, key: str) -> list[tuple[int, bytes, int]]:
         """Return (monotonic reception, payload, number) of every message of a key."""

@@ -468,9 +468,3 @@ def test_messages_lost_in_a_stall_name_it_and_stalls_without_effect_share_a_line
     assert re.search(r"messages lost on the way .* in a stall", words)
     assert "6.58 s: x\n2 more stalls were without consequence: 34 ms at most\n" in words
     assert "does not decide" not in words
-
-
-def test_a_run_in_virtual_time_has_no_stalls_and_says_nothing_of_them(log: RunLog) -> None:
-    summary = verdict.summarise(log, 4.0)
-    assert (summary["stalls"], summary["across_stalls"], summary["drop_outs"]) == ([], [], [])
-    assert verdict_table.stalls(summary) == []

@@ -105,7 +105,7 @@ def test_without_a_simulated_world_the_pose_is_what_the_legs_know(log: RunLog) -
     """The planner's own kinematics: within a centimetre of the truth."""
     with_truth = RecordSource(log, robot_of(log))
     without = RecordSource(log, robot_of(log))
-    without._keys = [key for key in without._keys if key.topic is not topics.SIM_TRUTH]
+    without._keys = [row for row in without._keys if row[0] is not topics.SIM_TRUTH]
     t_s = with_truth.model().end_s - 0.2
     known, true = without.frame(t_s), with_truth.frame(t_s)
     assert known is not None

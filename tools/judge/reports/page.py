@@ -252,15 +252,13 @@ def _before(row: TimelineEvent) -> str:
 
 
 def _message_losses(run: RunData, rows: Sequence[TopicLoss]) -> str:
-    missing = sum(row.lost for row in rows)
-    cells = [
-        (
-            row.name, str(row.messages), f"{row.rate_hz:.1f}" if row.rate_hz is not None else "",
-            f"{row.nominal_hz:g}" if row.nominal_hz else "", str(row.lost), str(row.gaps),
-            str(row.restarts),
-        )
-        for row in rows
-    ]  # fmt: skip
+    missing = sum(row.counted.missing for row in rows)
+    cells = []
+    for name, rate_hz, nominal_hz, count in rows:
+        rate = f"{rate_hz:.1f}" if rate_hz is not None else ""
+        nominal = f"{nominal_hz:g}" if nominal_hz else ""
+        counts = map(str, (count.missing, count.gaps, count.restarts))
+        cells.append((name, str(count.count), rate, nominal, *counts))
     title = f"Messages: {missing} lost on the way to the log" if missing else "Messages: none lost"
     names = ("topic", "messages", "Hz", "nominal Hz", "lost", "gaps", "restarts")
     damage = "".join(f"<li>{escape(line)}</li>" for line in summary.damage(run))

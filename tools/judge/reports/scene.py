@@ -7,7 +7,6 @@ joints are floating: the transforms give the poses of the frames.
 
 from __future__ import annotations
 
-import bisect
 import math
 import struct
 from collections.abc import Iterable, Iterator, Sequence
@@ -18,7 +17,7 @@ import numpy as np
 
 from services.planner.law.kinematics import Kinematics
 from shared.bus import topics
-from shared.bus.messages import JointState, Mode, PlannerStatus, SimTruth, Vector3, Wrench
+from shared.bus.messages import JointState, Mode, SimTruth, Vector3
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
@@ -147,11 +146,8 @@ def poses(log: RunLog, robot: RobotConfig) -> Iterator[RobotPose]:
         missing = ", ".join(name for name, rows in zip(MODULES, states, strict=True) if not rows)
         raise RunError(f"{log.path}: no states of {missing}; a scene needs the states of all six")
     truth: list[SimTruth] = log.messages(topics.SIM_TRUTH)
-    wrenches: list[Wrench] = log.messages(topics.WRENCH)
-    newest = [NewestAt(rows) for rows in states]
-    wrench = NewestAt(wrenches)
-    statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
-    status = NewestAt(statuses)
+    newest = [log.newest(topics.JOINT_STATE, name) for name in MODULES]
+    wrenches, statuses = log.newest(topics.WRENCH), log.newest(topics.PLANNER_STATUS)
     kinematics = None if truth else Kinematics(robot)
     # a service without a sample from its drive yet publishes a stamp of 0
     first_ns = max(next((row.t_ns for row in rows if row.t_ns > 0), 0) for rows in states)
@@ -160,34 +156,22 @@ def poses(log: RunLog, robot: RobotConfig) -> Iterator[RobotPose]:
     for row in _thin(truth or states[0], first_ns):
         if row.t_ns >= log.end_ns and not log.is_last:
             break
-        states_now = [one.at(row.t_ns) for one in newest]
+        states_now: list[Any] = [one.at(row.t_ns) for one in newest]
         q = tuple(angle for state_now in states_now for angle in state_now.q)
-        sensed = wrench.at(row.t_ns) if wrenches and wrenches[0].t_ns <= row.t_ns else None
+        sensed = wrenches.at(row.t_ns)
         force = sensed.force if sensed is not None and sensed.valid else (0.0, 0.0, 0.0)
         modes = tuple(state_now.mode for state_now in states_now)
         if kinematics is None:
             yield RobotPose(row.t_ns, row.torso, row.angles, row.com, q, modes, force, row.push)
             continue
-        if statuses and statuses[0].t_ns <= row.t_ns:
-            kinematics.stance[:] = status.at(row.t_ns).stance
+        if (status := statuses.at(row.t_ns)) is not None:
+            kinematics.stance[:] = status.stance
         kinematics.update(np.array(q))
         torso, com, angles = kinematics.r_torso, kinematics.p[:3], kinematics.p[3:]
         yield RobotPose(
             row.t_ns, _vector(torso), _vector(angles), _vector(com), q, modes, force,
             ORIGIN,
         )  # fmt: skip
-
-
-class NewestAt:
-    """Finds the newest message of a key at a time."""
-
-    def __init__(self, rows: list[Any]) -> None:
-        self._rows = rows
-        self._stamps = [row.t_ns for row in rows]
-
-    def at(self, t_ns: int) -> Any:
-        """Return the newest message at or before a time; there must be one."""
-        return self._rows[bisect.bisect_right(self._stamps, t_ns) - 1]
 
 
 def _thin(rows: list[Any], first_ns: int) -> Iterator[Any]:
