@@ -162,10 +162,14 @@ def _backs_ns(
     return list(found.values()) if enough else []
 
 
+def goes_to_hold(row: JointEvent) -> bool:
+    """Return True for a module that drops out: it tracked, and holds."""
+    return row.mode_before == Mode.TRACK and row.mode_after == Mode.HOLD
+
+
 def _is_excused(row: JointEvent, stall: Stall) -> bool:
     in_time = stall.begin_ns <= row.t_ns <= stall.end_ns + DROP_OUT_NS
-    into_hold = row.mode_before == Mode.TRACK and row.mode_after == Mode.HOLD
-    return in_time and into_hold and row.cause in (Cause.COMMAND_STALE, Cause.HOLD_ALL)
+    return in_time and goes_to_hold(row) and row.cause in (Cause.COMMAND_STALE, Cause.HOLD_ALL)
 
 
 def inside(rows: Iterable[Disturbance], times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -246,8 +250,7 @@ def drop_outs(
         (event.t_ns, module)
         for module in MODULES
         for event in log.messages(topics.JOINT_EVENT, module)
-        if event.mode_before == Mode.TRACK
-        and event.mode_after == Mode.HOLD
+        if goes_to_hold(event)
         and event.cause in (Cause.COMMAND_STALE, Cause.HOLD_ALL)
         and begin_ns <= event.t_ns < end_ns
         and not any(_is_excused(event, stall) for stall in excused)
