@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 import numpy as np
@@ -30,9 +30,11 @@ from shared.bus.messages import (
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import GRAVITY, RobotConfig
-from shared.joints import MODULE_INDEX, MODULES, N_LEG
+from shared.joints import MODULES, N_LEG
 from shared.robot.capture_point import capture_point
+from shared.robot.frames import ORIGIN
 from tools.fleet.fleet_status import module_status
+from tools.judge.reports import scene
 from tools.judge.stalls import STALL_SHOWN_NS, stalls_of
 
 Array = NDArray[np.float64]
@@ -110,7 +112,6 @@ STALE_NS: Final = NS_PER_S // 2
 """An older message is not shown: its sender is dead, stopped or cut off."""
 DIGITS: Final = 5
 """Behind the point: 0.01 mm."""
-_NOWHERE: Final = (0.0, 0.0, 0.0)
 
 
 class PlannerShown(msgspec.Struct, frozen=True):
@@ -194,52 +195,43 @@ class Newest:
 
     def clear(self) -> None:
         """Forget every message."""
-        self._states: list[JointState | None] = [None] * len(MODULES)
-        self._commands: list[JointCommand | None] = [None] * len(MODULES)
-        self._status: PlannerStatus | None = None
-        self._wrench: Wrench | None = None
-        self._truth: SimTruth | None = None
-        self._stall: RunEvent | None = None
+        self._rows: dict[tuple[str, str], Any] = {}
         self._first_ns: int | None = None
 
     def take(self, topic: Topic, module: str, message: Message) -> None:
         """Take a message; those that no frame shows are ignored."""
-        if topic is topics.JOINT_STATE and isinstance(message, JointState):
-            self._states[MODULE_INDEX[module]] = message
-        elif topic is topics.JOINT_COMMAND and isinstance(message, JointCommand):
-            self._commands[MODULE_INDEX[module]] = message
-        elif isinstance(message, PlannerStatus):
-            self._status = message
-        elif isinstance(message, Wrench):
-            self._wrench = message
-        elif isinstance(message, SimTruth):
-            self._truth = message
-        elif isinstance(message, RunEvent) and message.kind == RunEventKind.STALLED:
-            self._stall = message
+        if not isinstance(message, RunEvent) or message.kind == RunEventKind.STALLED:
+            self._rows[topic.name, module] = message
 
     @property
     def scenario_s(self) -> float:
         """Scenario time of the newest truth, s; negative: no scenario runs."""
-        return self._truth.scenario_s if self._truth is not None else -1.0
+        truth: SimTruth | None = self._rows.get((topics.SIM_TRUTH.name, ""))
+        return truth.scenario_s if truth is not None else -1.0
 
     def frame(self, now_ns: int) -> Frame | None:
         """Return what is known now; None until each module was heard once."""
-        states = [state for state in self._states if state is not None and state.t_ns > 0]
+        states: list[JointState] = [
+            row for row in self._of_modules(topics.JOINT_STATE) if row.t_ns > 0
+        ]
         if len(states) < len(MODULES):
             return None
         if self._first_ns is None:
             self._first_ns = now_ns
-        status, wrench, truth = (
-            row if row is not None and now_ns - row.t_ns < STALE_NS else None
-            for row in (self._status, self._wrench, self._truth)
-        )
+        status: PlannerStatus | None = self._fresh(topics.PLANNER_STATUS, now_ns)
+        wrench: Wrench | None = self._fresh(topics.WRENCH, now_ns)
+        truth: SimTruth | None = self._fresh(topics.SIM_TRUTH, now_ns)
         heard = [now_ns - state.t_ns < STALE_NS for state in states]
         q = tuple(angle for state in states for angle in state.q)
-        torso, angles, com = self._pose(truth, q)
-        commands = [row for row in self._commands if row is not None]
-        led = isinstance(status, PlannerStatus) and len(commands) == len(MODULES)
+        if truth is not None:
+            torso, angles, com = truth.torso, truth.angles, truth.com
+        else:
+            newest = self._rows.get((topics.PLANNER_STATUS.name, ""))
+            torso, angles, com = scene.pose_of_legs(self._kinematics, q, newest)
+        commands: list[JointCommand] = self._of_modules(topics.JOINT_COMMAND)
+        led = status is not None and len(commands) == len(MODULES)
         soles, estimated = self._soles_of(truth, states)
-        begun = isinstance(truth, SimTruth) and truth.scenario_s >= 0.0
+        begun = truth is not None and truth.scenario_s >= 0.0
         t_s = self.scenario_s if begun else (now_ns - self._first_ns) / NS_PER_S
         return Frame(
             t_s=t_s,
@@ -256,35 +248,41 @@ class Newest:
                 for state, here in zip(states, heard, strict=True)
             ),
             tau=_short(torque for state in states for torque in state.tau),
-            force=_vector(wrench.force)
-            if isinstance(wrench, Wrench) and wrench.valid
-            else _NOWHERE,
-            push=truth.push if isinstance(truth, SimTruth) else _NOWHERE,
-            is_true=isinstance(truth, SimTruth),
-            fallen=isinstance(truth, SimTruth) and truth.fallen,
-            capture=_capture_point(status) if isinstance(status, PlannerStatus) else (),
+            force=_vector(wrench.force) if wrench is not None and wrench.valid else ORIGIN,
+            push=truth.push if truth is not None else ORIGIN,
+            is_true=truth is not None,
+            fallen=truth is not None and truth.fallen,
+            capture=_capture_point(status) if status is not None else (),
             soles=soles,
             soles_estimated=estimated,
             ways_out=tuple(
                 module_status(state if here else None).way_out.replace("MODULE", name)
                 for state, here, name in zip(states, heard, MODULES, strict=True)
             ),
-            planner=_shown(status) if isinstance(status, PlannerStatus) else None,
+            planner=_shown(status) if status is not None else None,
             stall=self._stall_words(now_ns),
         )
 
+    def _of_modules(self, topic: Topic) -> list[Any]:
+        rows = (self._rows.get((topic.name, module)) for module in MODULES)
+        return [row for row in rows if row is not None]
+
+    def _fresh(self, topic: Topic, now_ns: int) -> Any | None:
+        row = self._rows.get((topic.name, ""))
+        return row if row is not None and now_ns - row.t_ns < STALE_NS else None
+
     def _stall_words(self, now_ns: int) -> str:
-        stall = self._stall
+        stall: RunEvent | None = self._rows.get((topics.RUN_EVENT.name, ""))
         if stall is None or not 0 <= now_ns - stall.t_ns < STALL_SHOWN_NS:
             return ""
         return "".join(found.words for found in stalls_of([stall]))
 
     def _soles_of(
-        self, truth: Message | None, states: list[JointState]
+        self, truth: SimTruth | None, states: list[JointState]
     ) -> tuple[tuple[SoleLoad, ...], bool]:
         """Return the soles' loads, and whether they are estimated."""
         # a world of before the soles were measured has zeros
-        if isinstance(truth, SimTruth) and any((*truth.foot_right_force, *truth.foot_left_force)):
+        if truth is not None and any((*truth.foot_right_force, *truth.foot_left_force)):
             loads: Sequence[SoleLoad] = (
                 SoleLoad(truth.foot_right_force, truth.foot_right_cop),
                 SoleLoad(truth.foot_left_force, truth.foot_left_cop),
@@ -293,18 +291,6 @@ class Newest:
         q = [angle for state in states for angle in state.q]
         tau = [torque for state in states for torque in state.tau]
         return _shown_soles(self._soles.of(q, tau) or ()), True
-
-    def _pose(
-        self, truth: Message | None, q: tuple[float, ...]
-    ) -> tuple[Vector3, Vector3, Vector3]:
-        if isinstance(truth, SimTruth):
-            return truth.torso, truth.angles, truth.com
-        known = self._kinematics
-        if self._status is not None:
-            known.stance[:] = self._status.stance
-        known.update(np.array(q))
-        torso, angles, com = (part.tolist() for part in (known.r_torso, known.p[3:], known.p[:3]))
-        return torso, angles, com
 
 
 def _shown(status: PlannerStatus) -> PlannerShown:

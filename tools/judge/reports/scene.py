@@ -17,7 +17,7 @@ import numpy as np
 
 from services.planner.law.kinematics import Kinematics
 from shared.bus import topics
-from shared.bus.messages import JointState, Mode, SimTruth, Vector3
+from shared.bus.messages import JointState, Mode, PlannerStatus, SimTruth, Vector3
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
@@ -164,14 +164,19 @@ def poses(log: RunLog, robot: RobotConfig) -> Iterator[RobotPose]:
         if kinematics is None:
             yield RobotPose(row.t_ns, row.torso, row.angles, row.com, q, modes, force, row.push)
             continue
-        if (status := statuses.at(row.t_ns)) is not None:
-            kinematics.stance[:] = status.stance
-        kinematics.update(np.array(q))
-        torso, com, angles = kinematics.r_torso, kinematics.p[:3], kinematics.p[3:]
-        yield RobotPose(
-            row.t_ns, _vector(torso), _vector(angles), _vector(com), q, modes, force,
-            ORIGIN,
-        )  # fmt: skip
+        known = pose_of_legs(kinematics, q, statuses.at(row.t_ns))
+        yield RobotPose(row.t_ns, *known, q, modes, force, ORIGIN)
+
+
+def pose_of_legs(
+    kinematics: Kinematics, q: Sequence[float], status: PlannerStatus | None
+) -> tuple[Vector3, Vector3, Vector3]:
+    """Return torso, angles and COM as the legs know them, with the planner's stance."""
+    if status is not None:
+        kinematics.stance[:] = status.stance
+    kinematics.update(np.array(q))
+    p, (x, y, z) = kinematics.p.tolist(), kinematics.r_torso.tolist()
+    return (x, y, z), (p[3], p[4], p[5]), (p[0], p[1], p[2])
 
 
 def _thin(rows: list[Any], first_ns: int) -> Iterator[Any]:
@@ -237,10 +242,6 @@ def _arrows(force: Vector3, colour: Colour, position: Vector3 = ORIGIN) -> tuple
     if size < FORCE_MIN_N:
         return ()
     return (Arrow(position, rotation_to(force), METRES_PER_NEWTON * size, 0.02, colour),)
-
-
-def _vector(values: Any) -> Vector3:
-    return float(values[0]), float(values[1]), float(values[2])
 
 
 def urdf_message(text: str) -> bytes:
