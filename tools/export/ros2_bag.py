@@ -26,7 +26,6 @@ from services.ros2_gateway.rmw import RosTopic
 from services.ros2_gateway.ros_types import RosTypes
 from shared.bus.messages import Message
 from shared.bus.topics import Topic
-from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.joints import MODULES
@@ -67,7 +66,7 @@ def write_bag(
     with writer:
         connections = {topic: _connection(writer, topic, types) for topic in gateway.sent_topics}
         description = gateway.description()
-        for log in parts_of(index, part):
+        for log in parts_of(index, part, done=done):
             for at_ns, topic, module, message in _in_order(log):
                 unix_ns = max(at_ns + log.offset_ns, TIME_FIRST_NS)
                 if not count:
@@ -77,7 +76,6 @@ def write_bag(
                 for outgoing in gateway.due(at_ns, unix_ns):
                     writer.write(connections[outgoing.topic], unix_ns, outgoing.payload)
                     count += 1
-            done((log.end_ns - log.began_ns()) / NS_PER_S)
     if not count:
         raise RunError(f"{index.path}: has no message for a bag in this part; {SEE_INFO}")
     return count

@@ -152,7 +152,7 @@ def write_tables(
     rows: dict[str, int] = {}
     readers = {key.topic: columns_of(key.topic.type) for key in keys}
     try:
-        for log in parts_of(index, part):
+        for log in parts_of(index, part, done=done):
             for key in keys:
                 held = list(stamped(log, *key))
                 if not held:
@@ -169,7 +169,6 @@ def write_tables(
                 }
                 open_files[name].add({TIME: times, **cells})
                 rows[name] = rows.get(name, 0) + len(held)
-            done((log.end_ns - log.began_ns()) / NS_PER_S)
     finally:
         for file in open_files.values():
             file.close()
@@ -199,7 +198,7 @@ def write_grid(
     zero, step_ns, count, heard = zero_ns(index), NS_PER_S / rate_hz, 0, False
     file = make(path, {TIME: float, **kinds})
     try:
-        for log in parts_of(index, part):
+        for log in parts_of(index, part, done=done):
             first = math.ceil((log.begin_ns - zero) / step_ns)
             last = math.ceil((log.end_ns - zero) / step_ns)
             grid = [zero + round(number * step_ns) for number in range(first, last)]
@@ -214,7 +213,6 @@ def write_grid(
             if grid:
                 file.add(cells)
             count += len(grid)
-            done((log.end_ns - log.began_ns()) / NS_PER_S)
     finally:
         file.close()
     if not heard:

@@ -37,7 +37,7 @@ def part_of(args: argparse.Namespace, index: RunIndex) -> RunPart:
         return RunPart()
     if not begin_s < end_s:
         raise RunError(f"--from {begin_s:g} --to {end_s:g}: the first is to be the smaller one")
-    offset_s = (zero_ns(index) - index.began_ns + index.offset_ns) / 1e9
+    offset_s = (zero_ns(index) - index.span_ns[0]) / 1e9
     first_s, last_s = -offset_s, index.length_s - offset_s
     if begin_s > last_s or end_s < first_s:
         raise RunError(
@@ -60,4 +60,4 @@ def zero_ns(index: RunIndex) -> int:
         except RunError:
             if not part.has_world:
                 break
-    return index.began_ns - index.offset_ns
+    return index.span_ns[0]

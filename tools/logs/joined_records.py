@@ -60,8 +60,8 @@ class HostRecord(NamedTuple):
 
     def overlap_ns(self, fleets: RunIndex) -> int:
         """Return how long both were recorded; below zero: how far they are apart."""
-        first_ns, last_ns = map(self.to_fleets_ns, _span_ns(self.run))
-        began_ns, ended_ns = _span_ns(fleets)
+        first_ns, last_ns = map(self.to_fleets_ns, self.run.span_ns)
+        began_ns, ended_ns = fleets.span_ns
         return min(last_ns, ended_ns) - max(first_ns, began_ns)
 
 
@@ -101,11 +101,6 @@ def host_record(fleets: RunIndex, index: RunIndex) -> HostRecord:
         apart_s = -found.overlap_ns(fleets) * _NS
         raise RunError(f"{index.path}: of another time than {fleets.path}, {apart_s:.0f} s apart")
     return found
-
-
-def _span_ns(index: RunIndex) -> tuple[int, int]:
-    """Return begin and end on the clock of the record's own host."""
-    return index.began_ns - index.offset_ns, index.ended_ns - index.offset_ns
 
 
 def join(
@@ -207,7 +202,7 @@ def _sent_ns(payloads: Sequence[bytes], count: int) -> list[tuple[int, int]] | N
 
 def _window_ns(fleets: RunIndex, log: RunLog) -> tuple[int, int]:
     """Return from when to when, fleet's clock, the joined run has the messages of a part."""
-    began_ns, ended_ns = _span_ns(fleets)
+    began_ns, ended_ns = fleets.span_ns
     return (
         began_ns - _MARGIN_NS if log.is_first else log.begin_ns,
         ended_ns + _MARGIN_NS if log.is_last else log.end_ns,
@@ -242,7 +237,7 @@ class _Rows:
 
 def _rows_around(record: HostRecord, window: tuple[int, int]) -> Iterator[Row]:
     """Yield the messages of a host's record in a window and a margin about it, fleet's clock."""
-    own_ns = _span_ns(record.run)[0]
+    own_ns = record.run.span_ns[0]
     begin_s, end_s = ((record.to_own_ns(t_ns) - own_ns) * _NS for t_ns in window)
     if end_s + LATE_S < 0.0 or begin_s - LATE_S > record.run.length_s:
         return

@@ -236,6 +236,11 @@ class RunIndex:
         """Log time of the last message."""
 
     @property
+    def span_ns(self) -> tuple[int, int]:
+        """Times of the first and the last message, monotonic clock of the recorder."""
+        return self.began_ns - self.offset_ns, self.ended_ns - self.offset_ns
+
+    @property
     def length_s(self) -> float:
         """Time from the first message to the last."""
         return (self.ended_ns - self.began_ns) / 1e9

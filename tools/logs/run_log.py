@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import bisect
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -107,11 +107,12 @@ class RunLog:
         self.path, self.files = index.path, index.files
         self.metadata, self.attachments = index.metadata, index.attachments
         self.robot, self.offset_ns = index.robot, index.offset_ns
-        self.begin_ns = self.began_ns() + _ns(part.begin_s)
-        self.end_ns = min(self.began_ns() + _ns(part.end_s), self._ended_ns() + 1)
+        began_ns, ended_ns = index.span_ns
+        self.begin_ns = began_ns + _ns(part.begin_s)
+        self.end_ns = min(began_ns + _ns(part.end_s), ended_ns + 1)
         """The part, monotonic clock: from `begin_ns`, before `end_ns`."""
         self.is_first = part.begin_s <= 0.0
-        self.is_last = self.end_ns > self._ended_ns()
+        self.is_last = self.end_ns > ended_ns
         self.is_whole = self.is_first and self.is_last
         self._clocks = None if as_sent else clocks_of(index)
         self._series: dict[str, Series] = {}
@@ -167,10 +168,7 @@ class RunLog:
 
     def began_ns(self) -> int:
         """Return when the run's first message reached the recorder, monotonic; 0 if none did."""
-        return self.index.began_ns - self.offset_ns
-
-    def _ended_ns(self) -> int:
-        return self.index.ended_ns - self.offset_ns
+        return self.index.span_ns[0]
 
     def received_ns(self, topic: Topic, module: str = "") -> list[int]:
         """Return when each of `messages(topic, module)` reached the recorder.
@@ -195,11 +193,12 @@ class RunLog:
 
     def gaps(self) -> dict[str, KeyCount]:
         """Return counts, gaps and restarts of every key with messages, from the file itself."""
-        found = {}
-        for key in self.keys():
-            found[key] = KeyCount(several=topics.several_may_write(key))
-            for seq in self._of(key).seq:
-                found[key].feed(seq)
+        found: dict[str, KeyCount] = {}
+        for key, series in self._series.items():
+            if series.seq:
+                found[key] = KeyCount(several=topics.several_may_write(key))
+                for seq in series.seq:
+                    found[key].feed(seq)
         return found
 
     def forget(self) -> None:
@@ -302,10 +301,12 @@ def parts_of(
     part_s: float = PART_S,
     margin_s: float = MARGIN_S,
     as_sent: bool = False,
+    done: Callable[[float], None] = lambda _s: None,
 ) -> Iterator[RunLog]:
     """Yield a run, or a part of it, in parts that follow each other: one in memory at a time.
 
     Each forgets its messages when the next is asked for; `margin_s` before and behind is read too.
+    `done` takes how much of the run is behind, s.
     """
     begin_s, end_s = max(part.begin_s, 0.0), min(part.end_s, index.length_s)
     count = max(1, math.ceil((end_s - begin_s) / part_s))
@@ -315,6 +316,7 @@ def parts_of(
         log = RunLog(index, RunPart(first_s, last_s), margin_s, as_sent=as_sent)
         yield log
         log.forget()
+        done((log.end_ns - log.began_ns()) / NS_PER_S)
 
 
 def robot_of(log: RunLog | RunIndex) -> RobotConfig:

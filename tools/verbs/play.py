@@ -65,10 +65,9 @@ def run(args: argparse.Namespace) -> int:
     with contextlib.ExitStack() as stack:
         stack.callback(_leave_no_directory, args.run_dir, made=not args.run_dir.exists())
         acting = [] if prefix else guard.those_of(guard.ACTED_ON, targets.values())
-        watch = (
-            stack.enter_context(guard.LiveRobotWatch(bus.robot, args.run_dir)) if acting else None
-        )
+        watch = guard.LiveRobotWatch(bus.robot, args.run_dir) if acting else None
         if watch is not None:
+            stack.callback(watch.close)
             targets = _permitted(targets, watch, console, force=args.force)
         executor = stack.enter_context(ThreadPoolExecutor(1, "read ahead"))
         schedule = schedule_of(recording, targets, part, executor, loop=args.loop)

@@ -131,15 +131,13 @@ def render_parts(
 ) -> str:
     """Return the page of a run, or of a part of it, with `part_s` of it in memory at a time."""
     zero = zero_ns(index)
-    began_ns = index.began_ns - index.offset_ns
-    offset_s = (began_ns - zero) / NS_PER_S
+    offset_s = (index.span_ns[0] - zero) / NS_PER_S
     begin_s, end_s = max(part.begin_s, 0.0), min(part.end_s, index.length_s)
     page = Page(TimeAxis(zero, Span(begin_s + offset_s, end_s + offset_s)))
     heard = False
-    for log in parts_of(index, part, part_s=part_s):
+    for log in parts_of(index, part, part_s=part_s, done=done):
         heard = heard or bool(log.keys())
         page.take(log)
-        done((log.end_ns - began_ns) / NS_PER_S)
     if not heard:
         raise RunError(f"{index.path}: has no message in this part; {SEE_INFO}")
     return page.html()

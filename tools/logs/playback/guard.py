@@ -6,8 +6,7 @@ import re
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 from shared.bus import same_host, topics
 from shared.bus.messages import JointState
@@ -61,16 +60,7 @@ class LiveRobotWatch:
             for module in MODULES
         }
 
-    def __enter__(self) -> Self:
-        """Return the watch itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
         """Leave the bus."""
         self._session.close()
 
