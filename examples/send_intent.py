@@ -14,7 +14,7 @@ from shared.bus.messages import OperatorIntent, PlannerStatus
 from shared.bus.session import open_session
 from shared.clock import now_ns
 from shared.config.files import load
-from shared.process import default_run_dir
+from shared.run_directory import default_run_dir
 from tools.fleet.supervise import SupervisedFleet
 
 FOR_S, ASSIST_N = 5.0, 40.0

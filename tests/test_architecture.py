@@ -58,7 +58,7 @@ VENDORS = {
     "rosbags": ["services/ros2_gateway/ros_types.py", "tools/export/ros2_bag.py"],
     "gymnasium": ["tools/lab/learning/environment.py"],
     "shtab": ["tools/verbs/completion.py"],
-    "pyarrow": ["tools/export/parquet.py"],
+    "pyarrow": ["tools/export/tables.py"],
     "mujoco": [
         "services/simulator/physics/world.py",
         "services/simulator/physics/body.py",
@@ -74,7 +74,7 @@ VENDORS = {
         "tools/lab/design/damping_picture.py",
         "tools/lab/studies/*/*picture.py",
     ],
-    "PIL": ["tools/judge/reports/canvas.py", "tools/judge/reports/moving_picture.py"],
+    "PIL": ["tools/judge/reports/moving_picture.py"],
     "casadi": [
         "services/planner/law/certificate.py",
         "services/planner/law/symbolic.py",
@@ -105,8 +105,7 @@ NEEDS_EXTRA = {
     "tools/view/server.py": "view",
     "tools/view/foxglove_server.py": "foxglove",
     "tools/export/ros2_bag.py": "ros2",
-    "tools/judge/reports/canvas.py": "plot",
-    "tools/judge/reports/moving_*.py": "plot",
+    "tools/judge/reports/moving_picture.py": "plot",
     "tools/lab/learning/environment.py": "learn",
 }
 """Modules that cannot be imported without an extra. Whoever imports one, by a function, has called

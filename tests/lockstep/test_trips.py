@@ -23,8 +23,8 @@ from shared.robot.trip_table import JOINT_TRIPS, untripped
 from tests.lockstep.runs import still, variant
 from tools.lab.studies.sweeps.trips_trial import PLANTS, unfiltered
 from tools.sim.lockstep import Lockstep, forget
-from tools.sim.virtual_time import Record
 from tools.sim.standing_start import begin_standing
+from tools.sim.virtual_time import Record
 
 RESTS_TWICE = changed(PlantConfig(), {"person.load_scale": 2.0})
 SHAKEN = [name for name in PLANTS if name != "rigid"]

@@ -25,7 +25,8 @@ from tools import cli
 from tools.fleet import procfs, supervise
 from tools.fleet import run_dir as run_dir_module
 from tools.fleet.run_dir import MARKER
-from tools.fleet.supervise import ServiceInfo, SupervisedFleet
+from tools.fleet.supervise import SupervisedFleet
+from tools.fleet.supervisor_client import ServiceInfo
 from tools.fleet.supervisor_process import BACKOFF_MAX_S, Service
 
 pytestmark = pytest.mark.system

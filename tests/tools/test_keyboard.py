@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tools.keyboard import Keyboard, understood
-from tools.logs.playback.press import PRESSES, Press
+from tools.logs.playback.player import PRESSES, Press
 
 TYPED = {b" ": Press.PAUSE, b"\x1b[C": Press.STEP, b"\x1bOA": Press.FASTER, b"q": Press.QUIT}
 

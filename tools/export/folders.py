@@ -15,15 +15,9 @@ OWN: Collection[str] = (".csv", ".parquet", ".mcap", ".yaml")
 
 @contextlib.contextmanager
 def whole_folder(out: Path, record: Path, *, force: bool) -> Iterator[Path]:
-    """Yield a path of the same name for what is to be in a folder; it is moved there at the end.
+    """Yield a path for what is to be in a folder; it is moved there whole at the end.
 
-    Args:
-        out: the folder.
-        record: the run that is exported.
-        force: replace an earlier export; else what is there is refused.
-
-    Raises:
-        RunError: it exists and is not to be replaced, or it cannot be written.
+    An earlier export is replaced with `force` only, anything else never (RunError).
     """
     out, source = out.resolve(), record.resolve()
     if source.is_relative_to(out):
@@ -45,11 +39,7 @@ def whole_folder(out: Path, record: Path, *, force: bool) -> Iterator[Path]:
 
 
 def _check_replaceable(out: Path, *, force: bool) -> None:
-    """Refuse to replace what is not an export's.
-
-    Raises:
-        RunError: it is something else, or `force` is not given.
-    """
+    """Refuse to replace what is not an export's."""
     if not force:
         raise RunError(f"{out}: exists already; remove it, give another name, or --force")
     if not out.is_dir() or out.is_symlink():

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable, Iterator
+from operator import itemgetter
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 from rosbags.interfaces import (
@@ -25,12 +26,11 @@ from services.ros2_gateway.rmw import RosTopic
 from services.ros2_gateway.ros_types import RosTypes
 from shared.bus.messages import Message
 from shared.bus.topics import Topic
-from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.joints import MODULES
 from shared.mcap_log.recover import clock_time
-from tools.export.stamps import stamped
+from tools.export.tables import stamped
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import SEE_INFO, RunLog, RunPart, parts_of
 
@@ -47,16 +47,7 @@ def write_bag(
 ) -> int:
     """Write a bag; return how many messages it has. Its times are the log's, ns since 1970.
 
-    Args:
-        index: of the run.
-        part: what of it to write.
-        robot: of the run.
-        folder: of the bag; must not exist.
-        rate_hz: of joint states, transforms and wrench.
-        done: is told how much of the run is written, s.
-
-    Raises:
-        RunError: the times are beyond those of ROS 2, or there is no message.
+    `rate_hz` is that of joint states, transforms and wrench; `done` takes the s that are written.
     """
     if not TIME_FIRST_NS <= index.began_ns <= index.ended_ns <= TIME_LAST_NS:
         raise RunError(
@@ -75,7 +66,7 @@ def write_bag(
     with writer:
         connections = {topic: _connection(writer, topic, types) for topic in gateway.sent_topics}
         description = gateway.description()
-        for log in parts_of(index, part):
+        for log in parts_of(index, part, done=done):
             for at_ns, topic, module, message in _in_order(log):
                 unix_ns = max(at_ns + log.offset_ns, TIME_FIRST_NS)
                 if not count:
@@ -85,7 +76,6 @@ def write_bag(
                 for outgoing in gateway.due(at_ns, unix_ns):
                     writer.write(connections[outgoing.topic], unix_ns, outgoing.payload)
                     count += 1
-            done((log.end_ns - log.began_ns()) / NS_PER_S)
     if not count:
         raise RunError(f"{index.path}: has no message for a bag in this part; {SEE_INFO}")
     return count
@@ -97,15 +87,11 @@ def _in_order(log: RunLog) -> Iterator[tuple[int, Topic, str, Message]]:
     streams = [
         sorted(
             ((at_ns, topic, module, message) for at_ns, message in stamped(log, topic, module)),
-            key=_time,
+            key=itemgetter(0),
         )
         for topic, module in keys
     ]
-    return heapq.merge(*streams, key=_time)
-
-
-def _time(row: tuple[int, Any, Any, Any]) -> int:
-    return row[0]
+    return heapq.merge(*streams, key=itemgetter(0))
 
 
 def _connection(writer: Writer, topic: RosTopic, types: RosTypes) -> Connection:

@@ -1,29 +1,39 @@
 """A run as tables, CSV or Parquet: each key with all of its messages, or all on one time grid.
 
 A column is a field, or an element of one: `tau_ff[1]`, as viewers of the log name it. In a table of
-one key, `time_s` is the sender's stamp on the report's axis (`tools.export.stamps`).
+one key, `time_s` is the sender's stamp on the report's axis (`stamped`).
 """
 
 from __future__ import annotations
 
-import bisect
 import csv
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from operator import itemgetter
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Protocol, get_args, get_origin
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, get_args, get_origin
 
 import msgspec
 
 from shared.bus import topics
+from shared.bus.topics import Topic
 from shared.clock import NS_PER_S
 from shared.exceptions import RunError
-from tools.export.stamps import stamped
+from shared.extras import late
 from tools.judge.run_parts import zero_ns
 from tools.logs.run_index import RunIndex
-from tools.logs.run_log import SEE_INFO, RunLog, RunPart, parts_of
+from tools.logs.run_log import SEE_INFO, NewestAt, RunLog, RunPart, parts_of
 from tools.topic_keys import TopicKey
 
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from pyarrow import parquet as pq
+else:
+    pa = late("pyarrow")
+    pq = late("pyarrow.parquet")
+
+_CLOCK_NS: Final = NS_PER_S
+"""A stamp that is further from its reception is of another clock."""
 TIME: Final = "time_s"
 GRID_NAME: Final = "run"
 """File of the table on a grid, without its suffix."""
@@ -66,7 +76,6 @@ class CsvFile:
     suffix = ".csv"
 
     def __init__(self, path: Path, kinds: Kinds) -> None:
-        """Begin it with its heading; the suffix is added to the path."""
         path = path.with_name(path.name + self.suffix)
         self._file = path.open("w", newline="", encoding="utf-8")
         self._writer = csv.writer(self._file)
@@ -79,6 +88,42 @@ class CsvFile:
     def close(self) -> None:
         """Finish it."""
         self._file.close()
+
+
+class ParquetFile:
+    """A Parquet file; each part of the run is a row group."""
+
+    suffix: Final = ".parquet"
+
+    def __init__(self, path: Path, kinds: Kinds) -> None:
+        types = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string()}
+        self._schema = pa.schema([(name, types[kind]) for name, kind in kinds.items()])
+        path = path.with_name(path.name + self.suffix)
+        self._writer: Any = pq.ParquetWriter(path, self._schema)
+
+    def add(self, columns: Columns) -> None:
+        """Append rows."""
+        self._writer.write_table(pa.table(dict(columns), schema=self._schema))
+
+    def close(self) -> None:
+        """Finish it."""
+        self._writer.close()
+
+
+def stamped(
+    log: RunLog, topic: Topic, module: str, *, margins: bool = False
+) -> Iterator[tuple[int, Any]]:
+    """Yield time, monotonic ns of the recorder's clock, and message of a key.
+
+    The time is the sender's stamp. Where that is more than a second off, because the sender is on
+    another host or had none yet, it is the reception, which is up to 20 ms late. `margins` are the
+    messages before and behind the part.
+    """
+    received = log.received_ns(topic, module)
+    for at_ns, message in zip(received, log.messages(topic, module), strict=True):
+        if margins or log.holds(at_ns):
+            alike = abs(at_ns - message.t_ns) <= _CLOCK_NS
+            yield (message.t_ns if alike else at_ns), message
 
 
 def columns_of(kind: type[msgspec.Struct]) -> dict[str, Column]:
@@ -100,20 +145,14 @@ def write_tables(
 ) -> dict[str, int]:
     """Write a file for each key that has messages; return the rows of each file.
 
-    Args:
-        index: of the run.
-        part: what of it to write.
-        keys: from `tools.topic_keys`.
-        folder: to write into.
-        make: begins a file at a path without suffix, with the types of its columns.
-        done: is told how much of the run is written, s.
+    `make` begins a file at a path without suffix; `done` takes the s that are written.
     """
     zero = zero_ns(index)
     open_files: dict[str, TableFile] = {}
     rows: dict[str, int] = {}
     readers = {key.topic: columns_of(key.topic.type) for key in keys}
     try:
-        for log in parts_of(index, part):
+        for log in parts_of(index, part, done=done):
             for key in keys:
                 held = list(stamped(log, *key))
                 if not held:
@@ -130,7 +169,6 @@ def write_tables(
                 }
                 open_files[name].add({TIME: times, **cells})
                 rows[name] = rows.get(name, 0) + len(held)
-            done((log.end_ns - log.began_ns()) / NS_PER_S)
     finally:
         for file in open_files.values():
             file.close()
@@ -149,18 +187,6 @@ def write_grid(
     """Write one table on a grid of time: at each time the newest message of each key.
 
     Topics of events, which have no rate, are left out. Returns the number of rows.
-
-    Args:
-        index: of the run.
-        part: what of it to write.
-        keys: from `tools.topic_keys`.
-        rate_hz: of the grid.
-        path: without suffix.
-        make: as for `write_tables`.
-        done: as for `write_tables`.
-
-    Raises:
-        RunError: no key has a rate, or none a message.
     """
     steady = [key for key in keys if key.topic.rate_hz]
     if not steady:
@@ -172,7 +198,7 @@ def write_grid(
     zero, step_ns, count, heard = zero_ns(index), NS_PER_S / rate_hz, 0, False
     file = make(path, {TIME: float, **kinds})
     try:
-        for log in parts_of(index, part):
+        for log in parts_of(index, part, done=done):
             first = math.ceil((log.begin_ns - zero) / step_ns)
             last = math.ceil((log.end_ns - zero) / step_ns)
             grid = [zero + round(number * step_ns) for number in range(first, last)]
@@ -187,7 +213,6 @@ def write_grid(
             if grid:
                 file.add(cells)
             count += len(grid)
-            done((log.end_ns - log.began_ns()) / NS_PER_S)
     finally:
         file.close()
     if not heard:
@@ -196,18 +221,14 @@ def write_grid(
 
 
 def _newest_at(log: RunLog, key: TopicKey, grid: Iterable[int]) -> list[Any | None]:
-    rows = sorted(stamped(log, *key, margins=True), key=_time)
-    times = [at_ns for at_ns, _ in rows]
+    rows = sorted(stamped(log, *key, margins=True), key=itemgetter(0))
+    newest = NewestAt(rows, [at_ns for at_ns, _ in rows])
     found: list[Any | None] = []
     for at_ns in grid:
-        number = bisect.bisect_right(times, at_ns) - 1
-        fresh = number >= 0 and at_ns - times[number] <= HELD_S * NS_PER_S
-        found.append(rows[number][1] if fresh else None)
+        row: Any = newest.at(at_ns)
+        fresh = row is not None and at_ns - row[0] <= HELD_S * NS_PER_S
+        found.append(row[1] if fresh else None)
     return found
-
-
-def _time(row: tuple[int, Any]) -> int:
-    return row[0]
 
 
 def _add_column(found: dict[str, Column], name: str, kind: Any, read: Callable[[Any], Any]) -> None:

@@ -13,8 +13,7 @@ from shared.exceptions import FleetError, RunError
 from tools.hosts.layout import RECORDS
 from tools.hosts.remote import Remote
 from tools.logs.joined_records import HostRecord, host_record, join
-from tools.logs.run_files import runs_in
-from tools.logs.run_index import RunIndex
+from tools.logs.run_index import RunIndex, runs_in
 
 _DATED: Final = re.compile(r"([0-9]{1,12}(?:\.[0-9]{1,12})?) (/.*)")
 """A time, s since 1970, and a folder."""

@@ -19,18 +19,9 @@ from tools.logs.run_log import PICTURE_MAX_S, RunLog, RunPart, parts_of
 def judge_run(
     out: Path, title: str, duration_s: float, figures: Mapping[str, Any] | None = None
 ) -> Summary:
-    """Judge a run; write `summary.json` and `run.png` beside it.
+    """Judge a run of a scenario of `duration_s`; write `summary.json` and `run.png` beside it.
 
-    The picture of a long run is that of its end.
-
-    Args:
-        out: folder of `run.mcap`.
-        title: of the picture.
-        duration_s: how long the scenario was to be, s.
-        figures: laid over those from the log.
-
-    Raises:
-        RunError: the log holds nothing to judge, or a file cannot be written.
+    The picture of a long run is that of its end. `figures` are laid over those from the log.
     """
     index = RunIndex(out / "run.mcap")
     last_s = max(0.0, index.length_s - PICTURE_MAX_S)
@@ -47,11 +38,7 @@ def judge_run(
 
 
 def summarise_parts(index: RunIndex, duration_s: float) -> Summary:
-    """Return the figures of a run that is read in parts.
-
-    Raises:
-        RunError: none of them can be judged; says why the first cannot.
-    """
+    """Return the figures of a run that is read in parts; RunError says why none can be judged."""
     found: list[Summary] = []
     counts: dict[str, KeyCount] = {}
     why: RunError | None = None

@@ -31,17 +31,13 @@ def add_part(parser: argparse.ArgumentParser, what: str = "of the part to read")
 
 
 def part_of(args: argparse.Namespace, index: RunIndex) -> RunPart:
-    """Return the part that a command line asks for.
-
-    Raises:
-        RunError: it is empty, or outside of the run.
-    """
+    """Return the part that a command line asks for."""
     begin_s, end_s = args.begin_s, args.end_s
     if math.isinf(begin_s) and math.isinf(end_s):
         return RunPart()
     if not begin_s < end_s:
         raise RunError(f"--from {begin_s:g} --to {end_s:g}: the first is to be the smaller one")
-    offset_s = (zero_ns(index) - index.began_ns + index.offset_ns) / 1e9
+    offset_s = (zero_ns(index) - index.span_ns[0]) / 1e9
     first_s, last_s = -offset_s, index.length_s - offset_s
     if begin_s > last_s or end_s < first_s:
         raise RunError(
@@ -52,11 +48,7 @@ def part_of(args: argparse.Namespace, index: RunIndex) -> RunPart:
 
 
 def read_asked(args: argparse.Namespace, index: RunIndex, *, as_sent: bool = False) -> RunLog:
-    """Read the part that a command line asks for, at once; `as_sent` as for `RunLog`.
-
-    Raises:
-        RunError: it is empty, outside of the run, or too long for that.
-    """
+    """Read the part that a command line asks for, at once; `as_sent` as for `RunLog`."""
     return read_part(index, part_of(args, index), as_sent=as_sent)
 
 
@@ -68,4 +60,4 @@ def zero_ns(index: RunIndex) -> int:
         except RunError:
             if not part.has_world:
                 break
-    return index.began_ns - index.offset_ns
+    return index.span_ns[0]

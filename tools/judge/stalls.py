@@ -8,8 +8,8 @@ there.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from typing import Any, Final, NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,12 +122,7 @@ def disturbances(log: RunLog, begin_ns: int, end_ns: int) -> list[Disturbance]:
 
     A drop-out is a stall's doing only if commands grew too old right after it, it was long enough,
     and not the joint services alone stood still: what makes all six wait may be our own fault.
-    After a kill or a fault none is: it may be that one's.
-
-    Args:
-        log: the run.
-        begin_ns: of the part, monotonic.
-        end_ns: of the part; what a stall made ends there at the latest.
+    After a kill or a fault none is: it may be that one's. What a stall made ends at `end_ns`.
     """
     events: list[RunEvent] = log.messages(topics.RUN_EVENT)
     stalls = [row for row in stalls_of(events) if row.begin_ns <= end_ns]
@@ -167,10 +162,14 @@ def _backs_ns(
     return list(found.values()) if enough else []
 
 
+def goes_to_hold(row: JointEvent) -> bool:
+    """Return True for a module that drops out: it tracked, and holds."""
+    return row.mode_before == Mode.TRACK and row.mode_after == Mode.HOLD
+
+
 def _is_excused(row: JointEvent, stall: Stall) -> bool:
     in_time = stall.begin_ns <= row.t_ns <= stall.end_ns + DROP_OUT_NS
-    into_hold = row.mode_before == Mode.TRACK and row.mode_after == Mode.HOLD
-    return in_time and into_hold and row.cause in (Cause.COMMAND_STALE, Cause.HOLD_ALL)
+    return in_time and goes_to_hold(row) and row.cause in (Cause.COMMAND_STALE, Cause.HOLD_ALL)
 
 
 def inside(rows: Iterable[Disturbance], times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -184,14 +183,7 @@ def inside(rows: Iterable[Disturbance], times_ns: NDArray[np.int64]) -> NDArray[
 def as_dicts(
     log: RunLog, rows: Sequence[Disturbance], truth: Sequence[SimTruth], zero_ns: int
 ) -> list[dict[str, Any]]:
-    """Return disturbances as plain values, with what the robot did meanwhile.
-
-    Args:
-        log: the run.
-        rows: in order.
-        truth: of the part that is judged.
-        zero_ns: of the times, which are s.
-    """
+    """Return disturbances as plain values, with what the robot did meanwhile."""
     times_ns = np.array([row.t_ns for row in truth])
     rows = [row for row in rows if row.begin_ns >= times_ns[0]]
     lost = _lost(log, rows)
@@ -252,31 +244,18 @@ def _lost(log: RunLog, rows: Sequence[Disturbance]) -> list[int]:
 def drop_outs(
     log: RunLog, rows: Sequence[Disturbance], zero_ns: int, begin_ns: int, end_ns: int
 ) -> list[str]:
-    """Return a line for each time that modules held for old commands, and no stall was the reason.
-
-    Args:
-        log: the run.
-        rows: what the stalls made of it.
-        zero_ns: of the times, which are s.
-        begin_ns: from here on.
-        end_ns: up to here.
-    """
+    """Return a line for each time that modules held for old commands without a stall."""
     excused = [row.stall for row in rows if row.held]
     found = sorted(
         (event.t_ns, module)
         for module in MODULES
         for event in log.messages(topics.JOINT_EVENT, module)
-        if event.mode_before == Mode.TRACK
-        and event.mode_after == Mode.HOLD
+        if goes_to_hold(event)
         and event.cause in (Cause.COMMAND_STALE, Cause.HOLD_ALL)
         and begin_ns <= event.t_ns < end_ns
         and not any(_is_excused(event, stall) for stall in excused)
     )
-    groups: list[list[tuple[int, str]]] = []
-    for row in found:
-        if not groups or row[0] - groups[-1][0][0] > TOGETHER_NS:
-            groups.append([])
-        groups[-1].append(row)
+    groups = together(found, lambda _: None, TOGETHER_NS)
     statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS) if groups else []
     sent_ns = np.array([row.t_ns for row in statuses], np.int64)
     lines = []
@@ -287,6 +266,22 @@ def drop_outs(
         at_s = (group[0][0] - zero_ns) / NS_PER_S
         lines.append(f"{at_s:.2f} s: {who} held without a stall; {known}")
     return lines
+
+
+Row = TypeVar("Row", bound=tuple[Any, ...])
+
+
+def together(rows: Iterable[Row], key: Callable[[Row], Any], within: float) -> list[list[Row]]:
+    """Group rows with equal keys at about the same time, which is the first field of a row."""
+    groups: list[list[Row]] = []
+    open_: dict[Any, list[Row]] = {}
+    for row in rows:
+        group = open_.get(key(row))
+        if group is None or row[0] - group[0][0] > within:
+            group = open_[key(row)] = []
+            groups.append(group)
+        group.append(row)
+    return groups
 
 
 def _planners_silence(sent_ns: NDArray[np.int64], at_ns: int) -> str:

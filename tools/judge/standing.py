@@ -1,11 +1,61 @@
-"""Definition of standing: one rule for `demo`, `sim`, `crashtest` and the sweeps."""
+"""What a run has to keep: limits of its figures, standing at its end, soundness all the way."""
 
 from __future__ import annotations
 
-from typing import Final
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, NamedTuple
 
-from shared.bus.messages import SimTruth
+import numpy as np
+from numpy.typing import NDArray
+
+from services.joint.trips import AT_LIMIT, SHAKE_ABOVE_HZ, SHAKE_S
+from shared.bus import topics
+from shared.bus.messages import JointState, Mode, SimTruth
+from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
+from shared.joints import MODULES
+from tools.logs.run_log import RunLog
+
+
+class VerdictLimit(NamedTuple):
+    """One row of the verdict table."""
+
+    key: str
+    limit: float
+    unit: str
+    what: str
+
+
+LIMITS: Final = (
+    VerdictLimit("alive_com_x_max_mm", 20.0, "mm", "COM x, led"),
+    VerdictLimit("alive_com_y_max_mm", 10.0, "mm", "COM y, led"),
+    VerdictLimit("alive_roll_max_rad", 0.02, "rad", "roll, led"),
+    VerdictLimit("alive_yaw_max_rad", 0.02, "rad", "yaw, led"),
+    VerdictLimit("alive_sole_tilt_max_rad", 0.02, "rad", "soles' tilt, led"),
+    VerdictLimit("torque_at_limit_ms", 50.0, "ms", "module's torque at its limit, longest"),
+    VerdictLimit("shaking_nm", 15.0, "N m", "torque above 8 Hz, root mean square"),
+    VerdictLimit("sinking_m_s", 0.8, "m/s", "torso's fastest way down"),
+    VerdictLimit("operator_peak_n", 40.0, "N", "operator's force, led"),
+    VerdictLimit("assist_error_n", 10.0, "N", "assist force against what was asked"),
+    VerdictLimit("hold_com_x_max_mm", 80.0, "mm", "COM x, held"),
+    VerdictLimit("hold_com_y_max_mm", 100.0, "mm", "COM y, held"),
+    VerdictLimit("handover_max_ms", 65.0, "ms", "kill to HOLD, slowest module"),
+    VerdictLimit("handover_torque_step_nm", 5.0, "N m", "torque step at hand-over"),
+    VerdictLimit("reengage_s", 1.5, "s", "restart to TRACK, slowest module"),
+    VerdictLimit("pd_cycles_late_pct", 0.5, "%", "PD cycles later than two periods"),
+    VerdictLimit("fleet_cpu_pct", 160.0, "%", "CPU of all processes, of 200"),
+    VerdictLimit("sequence_gaps", 0.0, "", "messages lost on the way to the log"),
+)
+"""Live targets. Only `stood` decides the exit code: to the end, standing then
+(`tools.judge.standing`), and soundly all the way (`SOUND`). `led`: all six modules track, before
+any kill; `held`: after a kill, or in HOLD by an impaired network. What a stall of the machine made
+of a run counts as neither (`tools.judge.stalls`)."""
+
+SOUND: Final = ("torque_at_limit_ms", "shaking_nm", "sinking_m_s")
+"""A run in which one of these is over its limit did not stand. The limit of sinking: a person who
+catches up with a robot that held leads it down at up to 0.73 m/s (`bad_network`)."""
+
 
 SOLE_TILT_MAX: Final = 0.05
 """rad; a sole tilted more than this does not lie down again by itself."""
@@ -16,12 +66,7 @@ PITCH: Final = (-0.5, 1.6)
 
 
 def why_not_standing(row: SimTruth, robot: RobotConfig) -> str:
-    """Return in words why the robot does not stand at a moment, or is about to fall; "": it stands.
-
-    Args:
-        row: the world at that moment.
-        robot: for the size of its feet.
-    """
+    """Return why the robot does not stand at a moment, or is about to fall; "": it stands."""
     if row.fallen:
         return "it is down"
     (x, y), geometry = row.over, robot.geometry
@@ -39,3 +84,89 @@ def why_not_standing(row: SimTruth, robot: RobotConfig) -> str:
 def is_tipping(row: SimTruth, robot: RobotConfig) -> bool:
     """Return True if the robot does not stand, or cannot recover."""
     return bool(why_not_standing(row, robot))
+
+
+Array = NDArray[np.float64]
+
+BREAK_S: Final = 0.05
+"""Longest gap between states; within a longer one nothing is known."""
+SINK_OVER_S: Final = 0.1
+"""A sole's touch or a blow is faster, and no sinking."""
+_HELD: Final = (Mode.HOLD, Mode.TRACK, Mode.DAMP)
+
+
+def soundness(log: RunLog, truth: Sequence[SimTruth], robot: RobotConfig) -> dict[str, Any]:
+    """Return the figures of a run from its first row on; None where the log has no data."""
+    start_ns = truth[0].t_ns
+    longest, shaking = [], []
+    for module in MODULES:
+        states: list[JointState] = [
+            row for row in log.messages(topics.JOINT_STATE, module)
+            if row.t_ns >= start_ns and row.mode in _HELD
+        ]  # fmt: skip
+        if len(states) < 2:
+            continue
+        t = np.array([row.t_ns for row in states])
+        tau = np.array([row.tau for row in states])
+        at_limit = np.abs(tau).sum(axis=1) >= AT_LIMIT * robot.joint.tau_module_max
+        longest.append(_longest_s(t, at_limit))
+        shaking.append(float(shaking_of(t, tau).max()))
+    return {
+        "torque_at_limit_ms": 1e3 * max(longest) if longest else None,
+        "shaking_nm": max(shaking) if shaking else None,
+        "sinking_m_s": _sinking(truth),
+    }
+
+
+def why_not_sound(figures: Mapping[str, Any]) -> str:
+    """Return the exceeded limits as text; "" if none is."""
+    rows = (row for row in LIMITS if row.key in SOUND)
+    over = [row for row in rows if (figures.get(row.key) or 0.0) > row.limit]
+    return "; ".join(
+        f"{row.what}: {figures[row.key]:.3g} {row.unit} (limit {row.limit:g})" for row in over
+    )
+
+
+def shaking_of(t_ns: NDArray[np.int64], tau: Array) -> Array:
+    """Return the root mean square above `SHAKE_ABOVE_HZ` (n, 2), N m, as `services.joint.trips`.
+
+    `tau` (n, 2), N m, is that of a module's axes at `t_ns` (n,).
+    """
+    slow, mean = tau[0].copy(), np.zeros(2)
+    found = np.zeros_like(tau)
+    dts = np.diff(t_ns, prepend=t_ns[0]) / NS_PER_S
+    for index, (dt, now) in enumerate(zip(dts, tau, strict=True)):
+        if dt > BREAK_S:
+            slow, mean = now.copy(), np.zeros(2)
+        slow += (1.0 - math.exp(-2.0 * math.pi * SHAKE_ABOVE_HZ * dt)) * (now - slow)
+        mean += (1.0 - math.exp(-dt / SHAKE_S)) * ((now - slow) ** 2 - mean)
+        found[index] = mean
+    return np.sqrt(found)
+
+
+def _longest_s(t_ns: NDArray[np.int64], true: NDArray[np.bool_]) -> float:
+    """Return the longest time without a break, s."""
+    longest_ns, since_ns, last_ns = 0, -1, 0
+    for at_ns, is_true in zip(t_ns.tolist(), true.tolist(), strict=True):
+        broken, last_ns = at_ns - last_ns > BREAK_S * NS_PER_S, at_ns
+        if broken or not is_true:
+            since_ns = -1
+        if not is_true:
+            continue
+        since_ns = at_ns if since_ns < 0 else since_ns
+        longest_ns = max(longest_ns, at_ns - since_ns)
+    return longest_ns / NS_PER_S
+
+
+def _sinking(truth: Sequence[SimTruth]) -> float | None:
+    """Return the fastest way down of the torso, m/s."""
+    if len(truth) < 2:
+        return None
+    t = np.array([row.t_ns for row in truth])
+    height = np.array([row.torso[2] for row in truth])
+    later = np.searchsorted(t, t + round(SINK_OVER_S * 1e3) * NS_PER_MS)
+    inside = later < len(t)
+    if not inside.any():
+        return None
+    fallen = height[inside] - height[later[inside]]
+    return max(0.0, float((fallen / ((t[later[inside]] - t[inside]) / NS_PER_S)).max()))

@@ -5,9 +5,10 @@ Everything is read from the MCAP file, so that a run can be judged again at any 
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import pairwise
+from itertools import compress, pairwise
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -25,11 +26,9 @@ from shared.bus.messages import (
     SimTruth,
 )
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE, ConfigError, RunError
 from shared.joints import MODULES
 from shared.mcap_log.sequence_stats import KeyCount
-from tools.judge.soundness import soundness, why_not_sound
 from tools.judge.stalls import (
     WORLD_STOPS,
     Disturbance,
@@ -37,20 +36,20 @@ from tools.judge.stalls import (
     as_dicts,
     disturbances,
     drop_outs,
+    goes_to_hold,
     inside,
     stalls_of,
 )
-from tools.judge.standing import why_not_standing
-from tools.judge.verdict_limits import LIMITS
+from tools.judge.standing import LIMITS, soundness, why_not_sound, why_not_standing
 from tools.logs.impairment_intervals import Impaired, impairments, touches
-from tools.logs.recorded_robot import robot_of
-from tools.logs.run_log import RunLog
+from tools.logs.run_log import RunLog, robot_of
 
 Array = NDArray[np.float64]
 Summary = dict[str, Any]
 
-KILLED, RESTARTED = RunEventKind.KILLED, RunEventKind.RESTARTED
-FAULTED = RunEventKind.FAULTED
+KILLED, RESTARTED, FAULTED = (
+    RunEventKind.KILLED, RunEventKind.RESTARTED, RunEventKind.FAULTED,
+)  # fmt: skip
 
 REAL_TIME_FACTOR_MIN: Final = 0.99
 LATE_MAX_S: Final = 0.05
@@ -72,11 +71,7 @@ class Course(NamedTuple):
 
 
 def course(log: RunLog) -> Course:
-    """Return a run's course.
-
-    Raises:
-        RunError: the log holds no simulated world, or nothing to judge.
-    """
+    """Return a run's course."""
     rows: list[SimTruth] = log.messages(topics.SIM_TRUTH)
     scenario = [row for row in rows if row.scenario_s >= 0.0]
     if scenario:
@@ -95,23 +90,17 @@ def course(log: RunLog) -> Course:
 
 
 def summarise(log: RunLog, duration_s: float) -> Summary:
-    """Return the figures of a run.
-
-    Args:
-        log: the run.
-        duration_s: how long the scenario was to be, s.
-
-    Raises:
-        RunError: the log holds no simulated world, or the scenario never began.
-    """
+    """Return the figures of a run."""
     t, truth, began, zero_ns = course(log)
     events: list[RunEvent] = log.messages(topics.RUN_EVENT)
-    kills = [row for row in events if row.kind == RunEventKind.KILLED]
+    kills = [row for row in events if row.kind == KILLED]
     kill_s = kills[0].scenario_s if kills else np.inf
     last = truth[-1]
     fallen = any(row.fallen for row in truth)
     reached = began and bool(t[-1] >= duration_s - 0.1)
-    robot = _robot_of(log)
+    robot = None
+    with contextlib.suppress(RunError, ConfigError):  # none in it, or one of another version
+        robot = robot_of(log)
     sound = soundness(log, truth, robot) if robot is not None else {}
     why_not = why_not_standing(last, robot) if robot is not None and reached else ""
     stands = reached and not fallen and not why_not
@@ -121,9 +110,7 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
         "why_not": why_not,
         "unsound": unsound,
         "began": began,
-        "fallen_at_s": next(
-            (float(s) for s, row in zip(t, truth, strict=True) if row.fallen), None
-        ),
+        "fallen_at_s": float(t[[row.fallen for row in truth]][0]) if fallen else None,
         "duration_s": float(t[-1]),
         "pace": _pace(log),
         "real_time_factor": last.real_time_factor,
@@ -151,22 +138,20 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
     force = np.array([abs(row.operator_force[2]) for row in truth])
     summary["operator_peak_n"] = _max(force[led])
     summary["hold_operator_peak_n"] = _max(force[held])
-    summary["assist_error_n"] = _assist_error(
-        [
-            row
-            for s, row, is_apart in zip(t, truth, apart, strict=True)
-            if s < kill_s and not is_apart
-        ]
-    )
+    judged = (t < kill_s) & ~apart
+    summary["assist_error_n"] = _assist_error(list(compress(truth, judged)))
     summary |= _handover(log, kills)
     summary["reengage_s"] = _reengage(log, events)
-    summary["hold_entries"] = _hold_entries(log, truth[0].t_ns)
+    entries = [len(_drop_outs(log, module, truth[0].t_ns)) for module in MODULES]
+    summary["hold_entries"] = max(entries)
     network = impairments(log.messages(topics.LINK_EVENT))
     summary |= _command_age(log, truth[0].t_ns, network)
     summary["links_impaired"] = len(network)
     summary["impairments"] = [row.as_dict(zero_ns) for row in network]
     summary["pd_cycles_late_pct"] = _late_share(log, truth[0].t_ns, disturbed)
-    summary["planner_tick_us"] = _tick(log, truth[0].t_ns)
+    statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
+    ticks_us = [row.tick_us for row in statuses if row.t_ns >= truth[0].t_ns]
+    summary["planner_tick_us"] = _middle_and_most(np.array(ticks_us))
     summary["stopped"] = sorted({row.subject for row in kills if row.detail == "STOP"})
     summary["messages_recorded"] = sum(log.count(key) for key in log.keys())  # noqa: SIM118 - not a dict
     summary["sequence_gaps"] = sum(count.missing for count in log.gaps().values())
@@ -240,10 +225,6 @@ def joined(parts: Sequence[Summary], counts: Iterable[KeyCount]) -> Summary:
 
     Extremes are those of the run. A percentile or a mean is that of the worst part, a median
     the median of the parts.
-
-    Args:
-        parts: at least one; the scenario of each is that of the whole run.
-        counts: of every key, over the whole run.
     """
     if len(parts) == 1:
         return parts[0]
@@ -277,22 +258,15 @@ def joined(parts: Sequence[Summary], counts: Iterable[KeyCount]) -> Summary:
     return summary
 
 
-def _robot_of(log: RunLog) -> RobotConfig | None:
-    """Return the robot of a log; None if the log has none, or one of another version."""
-    try:
-        return robot_of(log)
-    except (RunError, ConfigError):
-        return None
+POSES: Final = (
+    ("com_x_max_mm", 1e3, 0), ("com_y_max_mm", 1e3, 1), ("roll_max_rad", 1.0, 3),
+    ("pitch_max_rad", 1.0, 4), ("yaw_max_rad", 1.0, 5),
+)  # fmt: skip
+"""Figure, scale and column of a pose: COM over the soles and its height, m, roll, pitch, yaw."""
 
 
 def _extent(prefix: str, poses: Array) -> Summary:
-    names = ("com_x_max_mm", "com_y_max_mm", "", "roll_max_rad", "pitch_max_rad", "yaw_max_rad")
-    scales = (1e3, 1e3, 1.0, 1.0, 1.0, 1.0)
-    return {
-        prefix + name: _max(np.abs(poses[:, column]) * scale) if len(poses) else None
-        for column, (name, scale) in enumerate(zip(names, scales, strict=True))
-        if name
-    }
+    return {prefix + name: _max(np.abs(poses[:, n]) * scale) for name, scale, n in POSES}
 
 
 def _asked(log: RunLog, truth: Sequence[SimTruth]) -> Array:
@@ -328,28 +302,19 @@ def _assist_error(truth: Sequence[SimTruth]) -> float | None:
     return float(np.mean(errors)) if errors else None
 
 
-def _transitions(log: RunLog, module: str) -> list[JointEvent]:
-    events: list[JointEvent] = log.messages(topics.JOINT_EVENT, module)
-    return events
-
-
 def leading(log: RunLog, times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return, for each time, True if the run is judged by the limits of a leading planner.
 
     True until the first kill. While the network is impaired on purpose, only while all six modules
     track: HOLD is expected then. A module that drops out at any other time is judged.
-
-    Args:
-        log: the run.
-        times_ns: monotonic, as of messages.
     """
     events: list[RunEvent] = log.messages(topics.RUN_EVENT)
-    kills = [row.t_ns for row in events if row.kind == RunEventKind.KILLED]
+    kills = [row.t_ns for row in events if row.kind == KILLED]
     led = times_ns < (kills[0] if kills else np.iinfo(np.int64).max)
     if not log.count(topics.LINK_EVENT.key(log.robot)):
         return led
     for module in MODULES:
-        rows = _transitions(log, module)
+        rows: list[JointEvent] = log.messages(topics.JOINT_EVENT, module)
         at = np.searchsorted([row.t_ns for row in rows], times_ns, side="right") - 1
         modes = np.array([row.mode_after for row in rows] or [Mode.DISARMED])
         led &= modes[at] == Mode.TRACK
@@ -386,6 +351,12 @@ def _middle_and_most(values: Array) -> dict[str, float] | None:
     return {"median": float(median), "p99": float(p99)}
 
 
+def _drop_outs(log: RunLog, module: str, from_ns: int) -> list[JointEvent]:
+    """Return each time that a module went from TRACK to HOLD."""
+    events: list[JointEvent] = log.messages(topics.JOINT_EVENT, module)
+    return [row for row in events if row.t_ns >= from_ns and goes_to_hold(row)]
+
+
 def _handover(log: RunLog, kills: Sequence[RunEvent]) -> Summary:
     """Return the time from the first kill to HOLD, and the largest torque step into HOLD.
 
@@ -393,57 +364,32 @@ def _handover(log: RunLog, kills: Sequence[RunEvent]) -> Summary:
     """
     impaired = [row.t_ns for row in log.messages(topics.LINK_EVENT)]
     begins = [row.t_ns for row in kills[:1]] + impaired[:1]
-    from_ns = min(begins, default=0)
     times: dict[str, float | None] = dict.fromkeys(MODULES)
-    step = None
+    steps = []
     for module in MODULES if begins else ():
-        for event in _transitions(log, module):
-            into_hold = event.mode_before == Mode.TRACK and event.mode_after == Mode.HOLD
-            if not into_hold or event.t_ns < from_ns:
-                continue
-            step = max(step or 0.0, _step(event))
-            if kills and event.t_ns >= kills[0].t_ns and times[module] is None:
-                times[module] = (event.t_ns - kills[0].t_ns) / NS_PER_MS
+        entries = _drop_outs(log, module, min(begins))
+        steps += [abs(b - a) for row in entries
+                  for a, b in zip(row.tau_before, row.tau_after, strict=True)]  # fmt: skip
+        after = [row.t_ns for row in entries if kills and row.t_ns >= kills[0].t_ns]
+        if after:
+            times[module] = (after[0] - kills[0].t_ns) / NS_PER_MS
     known = [value for value in times.values() if value is not None]
     return {
         "handover_ms": times if kills else None,
         "handover_max_ms": max(known) if len(known) == len(MODULES) else None,
-        "handover_torque_step_nm": step,
+        "handover_torque_step_nm": max(steps, default=None),
     }
-
-
-def _step(event: JointEvent) -> float:
-    return max(abs(b - a) for a, b in zip(event.tau_before, event.tau_after, strict=True))
 
 
 def _reengage(log: RunLog, events: Sequence[RunEvent]) -> float | None:
     """Return the time from the first restart to the last module's TRACK, s."""
-    restarts = [row for row in events if row.kind == RunEventKind.RESTARTED]
-    if not restarts:
-        return None
-    slowest = 0.0
+    begin_ns = next((row.t_ns for row in events if row.kind == RESTARTED), math.inf)
+    tracks_ns = []
     for module in MODULES:
-        tracks = [
-            event.t_ns
-            for event in _transitions(log, module)
-            if event.mode_after == Mode.TRACK and event.t_ns > restarts[0].t_ns
-        ]
-        if not tracks:
-            return None
-        slowest = max(slowest, (tracks[0] - restarts[0].t_ns) / NS_PER_S)
-    return slowest
-
-
-def _hold_entries(log: RunLog, start_ns: int) -> int:
-    """Return how often the busiest module went from TRACK to HOLD since the start."""
-    return max(
-        sum(
-            event.mode_before == Mode.TRACK and event.mode_after == Mode.HOLD
-            for event in _transitions(log, module)
-            if event.t_ns >= start_ns
-        )
-        for module in MODULES
-    )
+        rows: list[JointEvent] = log.messages(topics.JOINT_EVENT, module)
+        back = [row.t_ns for row in rows if row.mode_after == Mode.TRACK and row.t_ns > begin_ns]
+        tracks_ns += back[:1]
+    return (max(tracks_ns) - begin_ns) / NS_PER_S if len(tracks_ns) == len(MODULES) else None
 
 
 def _late_share(log: RunLog, start_ns: int, disturbed: Sequence[Disturbance]) -> float | None:
@@ -462,11 +408,6 @@ def _late_share(log: RunLog, start_ns: int, disturbed: Sequence[Disturbance]) ->
                 late += after.late - before.late
                 cycles += after.cycle - before.cycle
     return 100.0 * late / cycles if cycles else None
-
-
-def _tick(log: RunLog, start_ns: int) -> dict[str, float] | None:
-    ticks = [row.tick_us for row in log.messages(topics.PLANNER_STATUS) if row.t_ns >= start_ns]
-    return _middle_and_most(np.array(ticks))
 
 
 def _pace(log: RunLog) -> float:

@@ -7,8 +7,8 @@ from typing import Final
 from rich.table import Table
 from rich.text import Text
 
+from tools.judge.standing import LIMITS, SOUND, VerdictLimit
 from tools.judge.verdict import Summary
-from tools.judge.verdict_limits import LIMITS, SOUND, VerdictLimit
 from tools.terminal import Console, marked
 
 OK: Final = "ok"
@@ -28,18 +28,12 @@ def show(summary: Summary, console: Console) -> None:
     table.add_column("measured", justify="right")
     table.add_column("limit", justify="right")
     table.add_column("")
-    for row in LIMITS:
-        value = summary.get(row.key)
-        if value is None:
-            continue
-        word = mark(row, summary)
+    figures = rows(summary)
+    for *cells, word in figures:
         colour = "green" if word == OK else "yellow" if word.startswith(OVER) else "default"
-        unit = f" {row.unit}" if row.unit else ""
-        table.add_row(
-            row.what, f"{digits(value)}{unit}", f"{row.limit:g}{unit}", Text(word, colour)
-        )
+        table.add_row(*cells, Text(word, colour))
     console.print(table)
-    if summary["stood"] and any(_is_over(row, summary) for row in LIMITS):
+    if summary["stood"] and any(word.startswith(OVER) for *_, word in figures):
         decide = ", ".join(row.what for row in LIMITS if row.key in SOUND)
         console.print(
             "A figure over its limit is reported and does not decide: standing to the end does, "
@@ -67,6 +61,17 @@ def show(summary: Summary, console: Console) -> None:
     console.print(_sentence(summary))
 
 
+def rows(summary: Summary) -> list[tuple[str, str, str, str]]:
+    """Return figure, measured, limit and mark of each figure that is known."""
+    found = []
+    for row in LIMITS:
+        if summary.get(row.key) is not None:
+            unit = f" {row.unit}" if row.unit else ""
+            measured = f"{digits(summary[row.key])}{unit}"
+            found.append((row.what, measured, f"{row.limit:g}{unit}", mark(row, summary)))
+    return found
+
+
 def mark(row: VerdictLimit, summary: Summary) -> str:
     """Return the verdict on a figure: `ok`, or `over` and perhaps why."""
     if summary[row.key] <= row.limit:
@@ -78,10 +83,6 @@ def mark(row: VerdictLimit, summary: Summary) -> str:
     if row.key in OF_THE_MACHINE:
         return f"{OVER}, a busy machine" if row.key != "sequence_gaps" else OVER
     return f"{OVER}, links impaired" if summary.get("links_impaired") else OVER
-
-
-def _is_over(row: VerdictLimit, summary: Summary) -> bool:
-    return summary.get(row.key) is not None and mark(row, summary).startswith(OVER)
 
 
 def stalls(summary: Summary) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bisect
 from typing import Final
 
 import msgspec
@@ -10,7 +9,7 @@ import msgspec
 from shared.bus import topics
 from shared.bus.messages import HandLead, SimTruth
 from shared.clock import NS_PER_S
-from tools.logs.run_log import RunLog
+from tools.logs.run_log import NewestAt, RunLog
 
 EARLY_NS: Final = 1000
 """Scenario time in lockstep is a sum of steps: a rounding error less than a message's, at times."""
@@ -27,23 +26,20 @@ def hand_path(log: RunLog) -> tuple[HandRow, ...]:
     """Return how the hand was led while the scenario ran, in order; empty if nobody led it.
 
     Where it was led last before the scenario began is its first row: there it stayed.
-
-    Raises:
-        RunError: a message of the record cannot be read.
     """
     led: list[HandLead] = log.messages(topics.OPERATOR_HAND)
     truths: list[SimTruth] = log.messages(topics.SIM_TRUTH) if led else []
     truths = [truth for truth in truths if truth.scenario_s >= 0.0]
     if not truths:
         return ()
-    stamps = [truth.t_ns for truth in truths]
-    begin_ns = stamps[0] - round(truths[0].scenario_s * NS_PER_S)
+    newest = NewestAt(truths)
+    begin_ns = truths[0].t_ns - round(truths[0].scenario_s * NS_PER_S)
     before = [hand for hand in led if hand.t_ns < begin_ns and hand.leads]
     rows = [HandRow(0.0, _without_push(before[-1]))] if before else []
     for hand in led:
         if hand.t_ns >= begin_ns:
             # by the newest truth: a simulator that is late leaves time out
-            truth = truths[max(0, bisect.bisect_right(stamps, hand.t_ns) - 1)]
+            truth = newest.at(hand.t_ns) or truths[0]
             after_ns = hand.t_ns - truth.t_ns - EARLY_NS
             rows.append(HandRow(max(0.0, truth.scenario_s + after_ns / NS_PER_S), hand))
     return tuple(rows)

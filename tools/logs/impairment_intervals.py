@@ -78,9 +78,6 @@ def impairments(events: Iterable[LinkEvent]) -> list[Impaired]:
 
     A network proxy that was killed records no end, and its successor counts from 1 again: a number
     that starts again ends the earlier impairment of that number.
-
-    Args:
-        events: from the log.
     """
     found: list[list[LinkEvent]] = []
     ends: list[list[LinkEvent]] = []
@@ -120,13 +117,7 @@ def _of(
 def touches(
     rows: Iterable[Impaired], module: str, times_ns: NDArray[np.int64]
 ) -> NDArray[np.bool_]:
-    """Return, for each time, whether a link between the planner and a module was impaired.
-
-    Args:
-        rows: all impairments.
-        module: the module.
-        times_ns: monotonic, as of messages.
-    """
+    """Return, for each time, whether a link between the planner and a module was impaired."""
     mask = np.zeros(len(times_ns), dtype=bool)
     for row in rows:
         if row.directions & {f"planner->{module}", f"{module}->planner"}:

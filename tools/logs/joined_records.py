@@ -60,16 +60,15 @@ class HostRecord(NamedTuple):
 
     def overlap_ns(self, fleets: RunIndex) -> int:
         """Return how long both were recorded; below zero: how far they are apart."""
-        first_ns, last_ns = map(self.to_fleets_ns, _span_ns(self.run))
-        began_ns, ended_ns = _span_ns(fleets)
+        first_ns, last_ns = map(self.to_fleets_ns, self.run.span_ns)
+        began_ns, ended_ns = fleets.span_ns
         return min(last_ns, ended_ns) - max(first_ns, began_ns)
 
 
 def host_record(fleets: RunIndex, index: RunIndex) -> HostRecord:
     """Return how a record joins the fleet's.
 
-    Raises:
-        RunError: it is no host's own, another robot's, of another time, or its clock is not known.
+    Refuses what is no host's own, another robot's, of another time, or of an unknown clock.
     """
     if fleets.metadata["run"].get("of"):
         raise RunError(f"{fleets.path}: is a host's own record; the fleet's comes first")
@@ -104,30 +103,15 @@ def host_record(fleets: RunIndex, index: RunIndex) -> HostRecord:
     return found
 
 
-def _span_ns(index: RunIndex) -> tuple[int, int]:
-    """Return begin and end on the clock of the record's own host."""
-    return index.began_ns - index.offset_ns, index.ended_ns - index.offset_ns
-
-
 def join(
     fleets: RunIndex,
     records: Sequence[HostRecord],
     out: Path,
     progress: Callable[[float], None] = lambda _done: None,
 ) -> dict[str, int]:
-    """Write the joined run into a folder.
+    """Write the joined run into a folder that holds no run; return what each key gained.
 
-    Args:
-        fleets: the fleet's record.
-        records: of single hosts.
-        out: folder that holds no run.
-        progress: takes the fraction that is done.
-
-    Returns:
-        How many messages each key gained.
-
-    Raises:
-        RunError: a file cannot be read or written; what was written so far is gone then.
+    `progress` takes the fraction that is done. What was written is gone after an error (RunError).
     """
     gained: dict[str, int] = {}
     metadata = {name: row for name, row in fleets.metadata.items() if name not in _OF_A_FILE}
@@ -182,10 +166,6 @@ def in_order(own: Sequence[Timed], new: Sequence[Timed]) -> list[tuple[int, byte
 
     A message that the fleet's recorder had keeps its time there, however late it came; one that it
     gains is put between its neighbours.
-
-    Args:
-        own: of the fleet's record, in its order.
-        new: of a host's record.
     """
     rows = [(t_ns, payload, False) for t_ns, payload in own]
     if not new:
@@ -208,10 +188,8 @@ def in_order(own: Sequence[Timed], new: Sequence[Timed]) -> list[tuple[int, byte
 def _sent_ns(payloads: Sequence[bytes], count: int) -> list[tuple[int, int]] | None:
     """Return each message's own time and number; None if they tell no order.
 
-    Args:
-        payloads: of one key.
-        count: how many of them, the first, were recorded in their order: in that their times go
-            back only if the sender's host started again, or has had no sample of its drive yet.
+    The first `count` were recorded in their order: in that their times go back only if the sender's
+    host started again, or has had no sample of its drive yet.
     """
     decode = msgspec.json.Decoder(MessageHead).decode
     try:
@@ -224,7 +202,7 @@ def _sent_ns(payloads: Sequence[bytes], count: int) -> list[tuple[int, int]] | N
 
 def _window_ns(fleets: RunIndex, log: RunLog) -> tuple[int, int]:
     """Return from when to when, fleet's clock, the joined run has the messages of a part."""
-    began_ns, ended_ns = _span_ns(fleets)
+    began_ns, ended_ns = fleets.span_ns
     return (
         began_ns - _MARGIN_NS if log.is_first else log.begin_ns,
         ended_ns + _MARGIN_NS if log.is_last else log.end_ns,
@@ -259,7 +237,7 @@ class _Rows:
 
 def _rows_around(record: HostRecord, window: tuple[int, int]) -> Iterator[Row]:
     """Yield the messages of a host's record in a window and a margin about it, fleet's clock."""
-    own_ns = _span_ns(record.run)[0]
+    own_ns = record.run.span_ns[0]
     begin_s, end_s = ((record.to_own_ns(t_ns) - own_ns) * _NS for t_ns in window)
     if end_s + LATE_S < 0.0 or begin_s - LATE_S > record.run.length_s:
         return

@@ -1,45 +1,231 @@
-"""What a run's files hold and where, without their messages.
+"""What a run's files hold and where, without their messages; which files belong to one run.
 
 A record of an hour has 2 GiB and, read whole, ten times that in memory. So its files are skimmed
-once, and `tools/logs/run_log.py` reads the parts that are needed.
+once, and `tools/logs/run_log.py` reads the parts that are needed. A split run is several files in
+one directory.
 """
 
 from __future__ import annotations
 
+import contextlib
+import re
 import tomllib
 from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
+from typing import Final
 
+from shared.config.robot_config import SERVICES
 from shared.exceptions import RunError
-from shared.mcap_log.reader import LogRecord, LostBytes
+from shared.mcap_log.files import SUFFIX
+from shared.mcap_log.reader import ChunkPlace, LogRecord, LostBytes, open_log
+from shared.mcap_log.records import Attachment, Channel, Metadata
 from shared.mcap_log.writer import SCHEMA_VERSION
 from shared.text_file import decoded
-from tools.logs.host_clocks import hosts_of
-from tools.logs.recorded_file import RecordedFile
-from tools.logs.run_files import MetadataByName, files_in
+
+THIS_HOST: Final = "this host"
+"""Name of the host of services whose endpoint is a socket in the file system."""
+_HOST: Final = re.compile(r"(?:tls|tcp)/(\[[^\]]+\]|[^:]+):")
+_OFFSET: Final = re.compile(r"-?[0-9]{1,20}")
+_EVER: Final = 1 << 64
+_CLOCK_MAX_NS: Final = 1 << 62
+"""More than any monotonic clock shows."""
+
+MetadataByName = dict[str, dict[str, str]]
+
+
+def head_of(path: Path) -> MetadataByName:
+    """Return the metadata at the start of a file, up to its first messages."""
+    found: MetadataByName = {}
+    with open_log(path) as reader:
+        for record in reader:
+            if record.rows:
+                break
+            if isinstance(record.value, Metadata):
+                found[record.value.name] = record.value.metadata
+    return found
+
+
+def files_of_run(path: Path, metadata: MetadataByName) -> list[Path]:
+    """Return the files of the run that one of them belongs to, in order; that one at least.
+
+    A recovered copy stands in for nothing: only if the original is gone it is taken.
+    """
+    run = metadata.get("split", {}).get("run")
+    if not run:
+        return [path]
+    numbers = {path: _number(metadata)}
+    for other in _names(path.parent):
+        if other.resolve() == path.resolve():
+            continue
+        with contextlib.suppress(RunError):
+            head = head_of(other)
+            number = _number(head)
+            if head.get("split", {}).get("run") == run and number not in numbers.values():
+                numbers[other] = number
+    return sorted(numbers, key=lambda file: numbers[file])
+
+
+def further_files(path: Path) -> list[Path]:
+    """Return the other files of the run that a file belongs to."""
+    own = path.resolve()
+    return [file for file in files_of_run(path, head_of(path)) if file.resolve() != own]
+
+
+def files_in(directory: Path) -> list[Path]:
+    """Return the files of the one run in a directory, in order."""
+    runs = runs_in(directory)
+    if len(runs) > 1:
+        first = ", ".join(run[0].name for run in runs)
+        raise RunError(f"{directory}: holds {len(runs)} runs ({first}); give the files of one")
+    return runs[0]
+
+
+def runs_in(directory: Path) -> list[list[Path]]:
+    """Return the files of each run in a directory: a recorder that restarts begins one."""
+    names = _names(directory)
+    plain = [path for path in names if "." not in path.stem]  # not recovered or executed again
+    runs: list[list[Path]] = []
+    unreadable: RunError | None = None
+    for path in plain or names:
+        if any(path in run for run in runs):
+            continue
+        try:
+            runs.append(files_of_run(path, head_of(path)))
+        except RunError as error:
+            unreadable = error
+    if not runs:
+        raise unreadable or RunError(f"{directory}: holds no {SUFFIX} file; give a run's directory")
+    return runs
+
+
+def _names(directory: Path) -> list[Path]:
+    return sorted(directory.glob(f"*{SUFFIX}"), key=lambda path: (len(path.name), path.name))
+
+
+def _number(metadata: MetadataByName) -> int:
+    text = metadata.get("split", {}).get("number", "")
+    return int(text) if text.isdecimal() and text.isascii() and len(text) < 10 else 0
+
+
+class RecordedFile:
+    """A file, skimmed."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.metadata: MetadataByName = {}
+        """Metadata records by name: `run`, `clock`, `packages`, at the end `counts`."""
+        self.attachments: dict[str, bytes] = {}
+        self.keys: dict[int, str] = {}
+        """Full key of each channel."""
+        self.chunks: list[ChunkPlace] = []
+        self.damage: list[LostBytes] = []
+        """Places that could not be read, as far as they have been read."""
+        with open_log(path) as reader:
+            for found in reader.skim():
+                if isinstance(found, ChunkPlace):
+                    self.chunks.append(found)
+                else:
+                    self._learn(found)
+            self.finished = reader.finished
+            """The recorder wrote the end of the file."""
+            self.cut = reader.cut
+            """What follows the last whole record of a file that was cut off."""
+            self.damage += reader.damage
+
+    def required(self, record: str, field: str) -> str:
+        """Return a field of a metadata record."""
+        value = self.metadata.get(record, {}).get(field)
+        if value is None:
+            raise RunError(
+                f"{self.path}: no metadata {record}.{field}; an MCAP file written by "
+                "services.recorder, not cut off before its first message, is right"
+            )
+        return value
+
+    @property
+    def offset_ns(self) -> int:
+        """Wall clock in ns since 1970 = `t_ns` of a message + this."""
+        text = self.required("clock", "offset_ns")
+        if not _OFFSET.fullmatch(text):
+            raise RunError(f"{self.path}: clock.offset_ns is {text[:40]!r}; an integer is right")
+        offset_ns = int(text)
+        if max(abs(t - offset_ns) for t in self.span_ns or (offset_ns,)) > _CLOCK_MAX_NS:
+            raise RunError(f"{self.path}: its times and clock.offset_ns do not fit each other")
+        return offset_ns
+
+    @property
+    def span_ns(self) -> tuple[int, int] | None:
+        """Log times of the first and the last message; None without any."""
+        if not self.chunks:
+            return None
+        return min(c.first_ns for c in self.chunks), max(c.last_ns for c in self.chunks)
+
+    def keys_with_messages(self) -> list[str]:
+        """Return the keys that have a message, in the order of their channels."""
+        known = {n for chunk in self.chunks if chunk.channels is not None for n in chunk.channels}
+        if any(chunk.channels is None for chunk in self.chunks):
+            known |= {row.channel_id for record in self.records(0, _EVER) for row in record.rows}
+        return [self.keys[number] for number in sorted(known) if number in self.keys]
+
+    def records(
+        self, begin_ns: int, end_ns: int, keys: frozenset[str] | None = None
+    ) -> Iterator[LogRecord]:
+        """Yield chunks that may hold messages of a log time (end exclusive) and of some keys."""
+        wanted = self._among(begin_ns, end_ns, keys)
+        if not wanted:
+            return
+        with open_log(self.path) as reader:
+            for place in wanted:
+                try:
+                    record = reader.read_at(place.start)
+                except RunError as error:
+                    raise RunError(f"{self.path}: {error}") from None
+                if record is not None:
+                    self._learn(record)
+                    yield record
+            self.damage += [loss for loss in reader.damage if loss not in self.damage]
+
+    def _among(self, begin_ns: int, end_ns: int, keys: frozenset[str] | None) -> list[ChunkPlace]:
+        """Return the chunks to read; the first is always among them: it has the channels again."""
+        others = {n for n, key in self.keys.items() if keys is not None and key not in keys}
+        return [
+            chunk
+            for number, chunk in enumerate(self.chunks)
+            if number == 0
+            or (
+                chunk.last_ns >= begin_ns
+                and chunk.first_ns < end_ns
+                and not (chunk.channels is not None and chunk.channels <= others)
+            )
+        ]
+
+    def _learn(self, record: LogRecord) -> None:
+        for value in record.values():
+            match value:
+                case Metadata(name=name, metadata=entries):
+                    self.metadata[name] = entries
+                case Attachment(name=name, data=data):
+                    self.attachments[name] = data
+                case Channel(id=number, topic=topic):
+                    self.keys[number] = topic
 
 
 class RunIndex:
     """A run's files: what is said about it, and the places of its messages."""
 
     def __init__(self, path: Path, files: Sequence[Path] = ()) -> None:
-        """Skim a file, or the files of the run in a directory.
-
-        Args:
-            path: of it.
-            files: of the run, where a directory holds several runs.
-
-        Raises:
-            RunError: a file is missing, empty, no MCAP file or no run; or the directory holds
-                no run, or several.
-        """
         self.path = path
         self.files = list(files) or (files_in(path) if path.is_dir() else [path])
         """The files of the run, in order: several if it was split."""
         self._files = [RecordedFile(file) for file in self.files]
         first = self._files[0]
-        self._check_version(first.required("run", "schema_version"))
+        version = first.required("run", "schema_version")
+        if version != SCHEMA_VERSION:
+            raise RunError(
+                f"{path}: the log has schema version {version}, and this code reads "
+                f"{SCHEMA_VERSION}: read it with the checkout that wrote it"
+            )
         self.robot = first.required("run", "robot")
         self.offset_ns = first.offset_ns
         """wall clock in ns since 1970 = `t_ns` of a message + `offset_ns`."""
@@ -48,6 +234,11 @@ class RunIndex:
         """Log time of the first message."""
         self.ended_ns = max((end for _, end in spans), default=self.offset_ns)
         """Log time of the last message."""
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """Times of the first and the last message, monotonic clock of the recorder."""
+        return self.began_ns - self.offset_ns, self.ended_ns - self.offset_ns
 
     @property
     def length_s(self) -> float:
@@ -69,10 +260,14 @@ class RunIndex:
         """Host of each service, by the attached robot file; nothing if that says none."""
         text = self.attachments.get("robot.toml", b"")
         try:
-            endpoints = tomllib.loads(decoded(text)).get("bus", {}).get("endpoints", {})
+            endpoints = tomllib.loads(decoded(text)).get("bus", {}).get("endpoints", {}).items()
         except (tomllib.TOMLDecodeError, UnicodeError, AttributeError, RecursionError):
             return {}
-        return hosts_of(endpoints) if isinstance(endpoints, dict) else {}
+        return {
+            service: found[1].strip("[]") if (found := _HOST.match(endpoint)) else THIS_HOST
+            for service, endpoint in endpoints
+            if service in SERVICES and isinstance(endpoint, str)
+        }
 
     @property
     def complete(self) -> bool:
@@ -92,23 +287,7 @@ class RunIndex:
     def records(
         self, begin_ns: int, end_ns: int, keys: frozenset[str] | None = None
     ) -> Iterator[tuple[LogRecord, dict[int, str]]]:
-        """Yield the chunks that may hold messages of a time and of some keys.
-
-        Args:
-            begin_ns: log time, inclusive.
-            end_ns: log time, exclusive.
-            keys: full keys; None: all.
-
-        Yields:
-            A chunk, and the full keys of the channels in it.
-        """
+        """Yield those chunks of all files, each with the full keys of its channels."""
         for file in self._files:
             for record in file.records(begin_ns, end_ns, keys):
                 yield record, file.keys
-
-    def _check_version(self, version: str) -> None:
-        if version != SCHEMA_VERSION:
-            raise RunError(
-                f"{self.path}: the log has schema version {version}, and this code reads "
-                f"{SCHEMA_VERSION}: read it with the checkout that wrote it"
-            )

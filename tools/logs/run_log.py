@@ -10,8 +10,9 @@ So what may be long is read by `parts_of`, one after the other.
 
 from __future__ import annotations
 
+import bisect
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -19,13 +20,17 @@ from typing import Any, Final, NamedTuple
 
 import msgspec
 
+from services.planner.controller_file import ATTACHED
 from shared.bus import topics
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_S
+from shared.config import files as config_file
+from shared.config.gain_table import GainSchedule
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.mcap_log.sequence_stats import KeyCount
-from tools.logs.host_clocks import HostClocks
-from tools.logs.run_clocks import find_clocks
+from shared.text_file import decoded
+from tools.logs.host_clocks import HostClocks, find_clocks
 from tools.logs.run_index import RunIndex
 
 PART_S: Final = 30.0
@@ -66,6 +71,19 @@ class Series:
         self.decoded: list[Any] | None = None
 
 
+class NewestAt:
+    """Finds the newest of rows, which are in the order of their stamps, at a time."""
+
+    def __init__(self, rows: Sequence[Any], stamps: Sequence[int] | None = None) -> None:
+        self._rows = rows
+        self._stamps = [row.t_ns for row in rows] if stamps is None else stamps
+
+    def at(self, t_ns: int) -> Any | None:
+        """Return the newest row at or before a time; None before the first."""
+        index = bisect.bisect_right(self._stamps, t_ns) - 1
+        return self._rows[index] if index >= 0 else None
+
+
 class RunLog:
     """The messages of a run, or of a part of it, in memory.
 
@@ -85,26 +103,16 @@ class RunLog:
         *,
         as_sent: bool = False,
     ) -> None:
-        """Read the messages; `read_run` is the name to use.
-
-        Args:
-            index: of the run.
-            part: what of it to read.
-            margin_s: how much before and behind it is read as well.
-            as_sent: leave all times as they were sent.
-
-        Raises:
-            RunError: a file has gone, or is no log any more.
-        """
         self.index = index
         self.path, self.files = index.path, index.files
         self.metadata, self.attachments = index.metadata, index.attachments
         self.robot, self.offset_ns = index.robot, index.offset_ns
-        self.begin_ns = self.began_ns() + _ns(part.begin_s)
-        self.end_ns = min(self.began_ns() + _ns(part.end_s), self._ended_ns() + 1)
+        began_ns, ended_ns = index.span_ns
+        self.begin_ns = began_ns + _ns(part.begin_s)
+        self.end_ns = min(began_ns + _ns(part.end_s), ended_ns + 1)
         """The part, monotonic clock: from `begin_ns`, before `end_ns`."""
         self.is_first = part.begin_s <= 0.0
-        self.is_last = self.end_ns > self._ended_ns()
+        self.is_last = self.end_ns > ended_ns
         self.is_whole = self.is_first and self.is_last
         self._clocks = None if as_sent else clocks_of(index)
         self._series: dict[str, Series] = {}
@@ -132,13 +140,7 @@ class RunLog:
     def messages(self, topic: Topic, module: str = "") -> list[Any]:
         """Return the messages of a topic as `topic.type`, in the order of the file.
 
-        Args:
-            topic: a row of `shared.bus.topics`.
-            module: for a topic with one key for each module.
-
-        Raises:
-            RunError: a message is not of that type: another version wrote the file;
-                or a module is needed and missing, or the other way round.
+        Raises RunError if another version wrote them, or the module does not fit the topic.
         """
         key = self._key(topic, module)
         series = self._of(key)
@@ -155,6 +157,10 @@ class RunLog:
             series.decoded = self._aligned(decoded, topic, module, series.received_ns)
         return series.decoded
 
+    def newest(self, topic: Topic, module: str = "") -> NewestAt:
+        """Return what finds the newest of `messages(topic, module)` at a time."""
+        return NewestAt(self.messages(topic, module))
+
     def raw(self, key: str) -> list[tuple[int, bytes, int]]:
         """Return (monotonic reception, payload, number) of every message of a key."""
         series = self._of(key)
@@ -162,10 +168,7 @@ class RunLog:
 
     def began_ns(self) -> int:
         """Return when the run's first message reached the recorder, monotonic; 0 if none did."""
-        return self.index.began_ns - self.offset_ns
-
-    def _ended_ns(self) -> int:
-        return self.index.ended_ns - self.offset_ns
+        return self.index.span_ns[0]
 
     def received_ns(self, topic: Topic, module: str = "") -> list[int]:
         """Return when each of `messages(topic, module)` reached the recorder.
@@ -190,11 +193,12 @@ class RunLog:
 
     def gaps(self) -> dict[str, KeyCount]:
         """Return counts, gaps and restarts of every key with messages, from the file itself."""
-        found = {}
-        for key in self.keys():
-            found[key] = KeyCount(several=topics.several_may_write(key))
-            for seq in self._of(key).seq:
-                found[key].feed(seq)
+        found: dict[str, KeyCount] = {}
+        for key, series in self._series.items():
+            if series.seq:
+                found[key] = KeyCount(several=topics.several_may_write(key))
+                for seq in series.seq:
+                    found[key].feed(seq)
         return found
 
     def forget(self) -> None:
@@ -241,14 +245,7 @@ class RunLog:
         *,
         others: bool = True,
     ) -> None:
-        """Sort the messages of a time by key.
-
-        Args:
-            first_ns: monotonic clock, inclusive.
-            last_ns: the same, exclusive.
-            keys: full keys.
-            others: take the messages of all other keys; else of these.
-        """
+        """Sort the messages of a time by key."""
         offset_ns = self.offset_ns
         first_ns, last_ns = first_ns + offset_ns, last_ns + offset_ns
         for record, keys_by_channel in self.index.records(
@@ -270,39 +267,21 @@ class RunLog:
 
 @lru_cache(maxsize=8)
 def clocks_of(index: RunIndex) -> HostClocks | None:
-    """Compare the clocks of a run's hosts; None if all its services ran on one.
-
-    Raises:
-        RunError: a message cannot be read.
-    """
+    """Compare the clocks of a run's hosts; None if all its services ran on one."""
     return find_clocks(index, lambda *part: RunLog(index, RunPart(*part), as_sent=True))
 
 
 def read_run(path: Path, *, as_sent: bool = False) -> RunLog:
-    """Read a run, finished or killed.
+    """Read a run, finished or killed: a file, or all files of the run in a directory.
 
-    Args:
-        path: a file; or a directory: all files of the run in it.
-        as_sent: leave all times as they were sent, see `RunLog`.
-
-    Raises:
-        RunError: a file is missing, empty, no MCAP file or no run; or the directory holds no
-            run, or several; or the run is longer than is read at once.
+    Raises RunError if a file is missing, empty or no run, the directory holds none or several, or
+    the run is longer than is read at once. `as_sent` leaves all times as they were sent.
     """
     return read_part(RunIndex(path), WHOLE, as_sent=as_sent)
 
 
 def read_part(index: RunIndex, part: RunPart, *, as_sent: bool = False) -> RunLog:
-    """Read a part of a run at once.
-
-    Args:
-        index: of the run.
-        part: what of it to read.
-        as_sent: leave all times as they were sent, see `RunLog`.
-
-    Raises:
-        RunError: the part is empty, or longer than is read at once.
-    """
+    """Read a part of a run at once."""
     length_s = index.length_s
     if part.begin_s > length_s:
         raise RunError(f"{index.path}: --from {part.begin_s:g}: the run is {length_s:.1f} s long")
@@ -322,17 +301,12 @@ def parts_of(
     part_s: float = PART_S,
     margin_s: float = MARGIN_S,
     as_sent: bool = False,
+    done: Callable[[float], None] = lambda _s: None,
 ) -> Iterator[RunLog]:
     """Yield a run, or a part of it, in parts that follow each other: one in memory at a time.
 
-    Each forgets its messages when the next is asked for.
-
-    Args:
-        index: of the run.
-        part: what of it to read.
-        part_s: length of each part.
-        margin_s: how much before and behind each is read as well.
-        as_sent: leave all times as they were sent, see `RunLog`.
+    Each forgets its messages when the next is asked for; `margin_s` before and behind is read too.
+    `done` takes how much of the run is behind, s.
     """
     begin_s, end_s = max(part.begin_s, 0.0), min(part.end_s, index.length_s)
     count = max(1, math.ceil((end_s - begin_s) / part_s))
@@ -342,6 +316,45 @@ def parts_of(
         log = RunLog(index, RunPart(first_s, last_s), margin_s, as_sent=as_sent)
         yield log
         log.forget()
+        done((log.end_ns - log.began_ns()) / NS_PER_S)
+
+
+def robot_of(log: RunLog | RunIndex) -> RobotConfig:
+    """Return the robot that a log was made with."""
+    raw = text_of(log, "robot.toml")
+    robot = config_file.parse(raw, f"{log.path}: robot.toml")
+    schedule = log.attachments.get("robot.gains.json")
+    if schedule is None:
+        return robot
+    try:
+        table = msgspec.json.decode(decoded(schedule), type=GainSchedule)
+    except (msgspec.DecodeError, UnicodeError) as error:
+        raise RunError(f"{log.path}: robot.gains.json in it is no gain schedule: {error}") from None
+    return msgspec.structs.replace(robot, gain_schedule=table)
+
+
+def text_of(log: RunLog | RunIndex, name: str) -> str:
+    """Return a text file that is in a log."""
+    try:
+        return decoded(log.attachments[name])
+    except KeyError:
+        raise RunError(f"{log.path}: holds no {name}; a run of this project has one") from None
+    except UnicodeError as error:
+        raise RunError(f"{log.path}: {name} in it {error}") from None
+
+
+def has_own_controller(log: RunLog | RunIndex) -> bool:
+    """Return True if a controller of somebody's own led in the law's place."""
+    return ATTACHED in log.attachments
+
+
+def refuse_own_controller(log: RunLog | RunIndex) -> None:
+    """Refuse a log whose planner was led by a controller of somebody's own."""
+    if has_own_controller(log):
+        raise RunError(
+            f"{log.path}: a controller of somebody's own led ({ATTACHED} in it), and this computes "
+            "the shipped law; `xrl resim --controller FILE` runs it again"
+        )
 
 
 def _ns(seconds: float) -> int:

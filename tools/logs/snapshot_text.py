@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bisect
 from collections.abc import Sequence
 
 from shared.bus import topics
@@ -15,12 +14,7 @@ from tools.logs.run_log import RunLog
 
 def states_at(log: RunLog, at_ns: int) -> list[JointState | None]:
     """Return each module's newest state at a monotonic time; None before its first."""
-    found: list[JointState | None] = []
-    for module in MODULES:
-        states: list[JointState] = log.messages(topics.JOINT_STATE, module)
-        index = bisect.bisect_right([state.t_ns for state in states], at_ns) - 1
-        found.append(states[index] if index >= 0 else None)
-    return found
+    return [log.newest(topics.JOINT_STATE, module).at(at_ns) for module in MODULES]
 
 
 def describe_modules(states: Sequence[JointState | None]) -> str:

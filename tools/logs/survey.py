@@ -16,7 +16,7 @@ from shared.mcap_log.reader import ChunkPlace, LogReader, LogRecord, LostBytes, 
 from shared.mcap_log.records import Attachment, Channel, Header, McapRecord, Metadata, Schema
 from shared.mcap_log.sequence_stats import KeyCount
 from shared.mcap_log.writer import COUNTS, PROFILE
-from tools.logs.run_files import MetadataByName
+from tools.logs.run_index import MetadataByName
 
 _NEVER: Final = -1
 
@@ -95,15 +95,9 @@ class Survey:
         return max((f.last_ns for f in self.files if f.messages), default=_NEVER)
 
     def add(self, path: Path, *, by_index: bool = False) -> FileFacts:
-        """Read a file.
+        """Read a file. `by_index` takes what the recorder of a finished file of ours counted.
 
-        Args:
-            path: the file.
-            by_index: of a finished file of ours take what its recorder counted, to within a
-                chunk, and do not look for damage; its messages are not read.
-
-        Raises:
-            RunError: it is missing, empty, or no MCAP file.
+        That is true to within a chunk, and finds no damage.
         """
         for take in (_Reading.skim, _Reading.read) if by_index else (_Reading.read,):
             with open_log(path) as reader:
@@ -226,11 +220,6 @@ def _counted(
     """Return what the recorder counted, by key; None if it does not fit the file any more.
 
     Another program may have left out messages, and copied the recorder's counts.
-
-    Args:
-        records: of the file.
-        names: of its channels.
-        total: messages, as the file's statistics say.
     """
     texts = next((m.metadata for m in records if isinstance(m, Metadata) and m.name == COUNTS), {})
     try:

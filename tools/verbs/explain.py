@@ -40,9 +40,8 @@ from tools.judge.run_parts import zero_ns
 from tools.lab.design.push_limit import PushLimits
 from tools.lab.design.torque_breakdown import TorqueBreakdown, torque_breakdown
 from tools.logs import snapshot_text
-from tools.logs.recorded_robot import refuse_own_controller, robot_of
 from tools.logs.run_index import RunIndex
-from tools.logs.run_log import RunLog, RunPart
+from tools.logs.run_log import RunLog, RunPart, refuse_own_controller, robot_of
 from tools.number_arguments import finite, finite_numbers
 from tools.terminal import Console, marked
 from tools.verb_table import RUN_HELP, Subparsers, add_config, add_verb

@@ -17,13 +17,18 @@ from shared.mcap_log.files import SUFFIX
 from shared.mcap_log.log_copy import write_extended
 from shared.places import FILES
 from tools.export.folders import whole_folder
-from tools.export.parquet import ParquetFile
-from tools.export.tables import FOR_REEXECUTION, GRID_NAME, CsvFile, write_grid, write_tables
+from tools.export.tables import (
+    FOR_REEXECUTION,
+    GRID_NAME,
+    CsvFile,
+    ParquetFile,
+    write_grid,
+    write_tables,
+)
 from tools.judge.reports import scene
 from tools.judge.run_parts import add_part, part_of
-from tools.logs.recorded_robot import robot_of
 from tools.logs.run_index import RunIndex
-from tools.logs.run_log import SEE_INFO, RunLog, RunPart, parts_of, read_part
+from tools.logs.run_log import SEE_INFO, RunLog, RunPart, parts_of, read_part, robot_of
 from tools.number_arguments import rate
 from tools.output import progress_along, write_atomically
 from tools.terminal import Console, marked

@@ -35,8 +35,7 @@ from tools.bringup.module_motion import exit_if_interrupted
 from tools.bringup.motion_runner import Interrupts
 from tools.fleet.supervise import SupervisedFleet
 from tools.live import experiment
-from tools.logs.recorded_robot import robot_of
-from tools.logs.run_log import RunLog, read_run
+from tools.logs.run_log import RunLog, read_run, robot_of
 from tools.number_arguments import finite
 from tools.output import make_folder
 from tools.terminal import Console

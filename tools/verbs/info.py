@@ -20,10 +20,8 @@ from shared.mcap_log.writer import SCHEMA_VERSION
 from tools.guarded_streams import printable
 from tools.judge.run_parts import zero_ns
 from tools.logs.host_clocks import HostClocks
-from tools.logs.host_clocks import describe as describe_clocks
 from tools.logs.impairment_intervals import impairments
-from tools.logs.run_files import files_in, files_of_run
-from tools.logs.run_index import RunIndex
+from tools.logs.run_index import RunIndex, files_in, files_of_run
 from tools.logs.run_log import NOTHING, RunLog, clocks_of
 from tools.logs.survey import FileFacts, Survey, TopicFacts
 from tools.terminal import Console, marked
@@ -239,7 +237,7 @@ def _clocks(file: FileFacts) -> list[str]:
         clocks = _clocks_of(file)
     except XrlError as error:
         return [str(error)]
-    return [] if clocks is None else describe_clocks(clocks)
+    return [] if clocks is None else clocks.describe()
 
 
 def _clocks_as_json(file: FileFacts) -> dict[str, Any]:

@@ -24,12 +24,9 @@ from tools.cli import INTERRUPTED
 from tools.fleet.supervise import SupervisedFleet
 from tools.keyboard import Keyboard
 from tools.logs.playback import arguments, guard, reading, selection
-from tools.logs.playback.display import Display, introduce, summary, where
-from tools.logs.playback.player import Player
-from tools.logs.playback.press import PRESSES, Press
+from tools.logs.playback.player import PRESSES, Display, Player, Press, introduce, summary, where
 from tools.logs.playback.reading import Recording
-from tools.logs.playback.schedule import Entry, Playhead, Schedule, Window, window
-from tools.logs.playback.stream import EntryStream
+from tools.logs.playback.schedule import Entry, EntryStream, Playhead, Schedule, Window, window
 from tools.terminal import Console
 from tools.verb_table import Subparsers, add_verb
 
@@ -68,10 +65,9 @@ def run(args: argparse.Namespace) -> int:
     with contextlib.ExitStack() as stack:
         stack.callback(_leave_no_directory, args.run_dir, made=not args.run_dir.exists())
         acting = [] if prefix else guard.those_of(guard.ACTED_ON, targets.values())
-        watch = (
-            stack.enter_context(guard.LiveRobotWatch(bus.robot, args.run_dir)) if acting else None
-        )
+        watch = guard.LiveRobotWatch(bus.robot, args.run_dir) if acting else None
         if watch is not None:
+            stack.callback(watch.close)
             targets = _permitted(targets, watch, console, force=args.force)
         executor = stack.enter_context(ThreadPoolExecutor(1, "read ahead"))
         schedule = schedule_of(recording, targets, part, executor, loop=args.loop)

@@ -9,7 +9,7 @@ from shared.exceptions import RunError
 from shared.mcap_log import recover
 from shared.mcap_log.files import in_use, recovered_name
 from tools.guarded_streams import printable
-from tools.logs.run_files import MetadataByName, head_of
+from tools.logs.run_index import MetadataByName, head_of
 from tools.terminal import Console, marked
 from tools.verb_table import Subparsers, add_verb
 

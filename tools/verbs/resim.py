@@ -21,7 +21,6 @@ from shared.mcap_log import provenance
 from tools.judge.run_parts import add_part, part_of
 from tools.lab.studies.sweeps.pool import cores, results
 from tools.live import experiment
-from tools.logs.recorded_robot import has_own_controller, robot_of
 from tools.logs.reexecution import rewritten
 from tools.logs.reexecution.compare import size
 from tools.logs.reexecution.execution import Execution
@@ -30,7 +29,7 @@ from tools.logs.reexecution.outcome import ReexecutionResult
 from tools.logs.reexecution.params import with_params
 from tools.logs.reexecution.ranges import RangeTask, execute_range, merged, ranges_of
 from tools.logs.run_index import RunIndex
-from tools.logs.run_log import RunLog, parts_of, read_part
+from tools.logs.run_log import RunLog, has_own_controller, parts_of, read_part, robot_of
 from tools.number_arguments import count, finite
 from tools.terminal import Console, marked
 from tools.verb_table import RUN_HELP, Subparsers, add_verb

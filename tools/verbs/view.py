@@ -17,18 +17,16 @@ from shared.process import StopFlag
 from tools.fleet.supervise import SupervisedFleet
 from tools.judge.run_parts import add_part, read_asked
 from tools.live.experiment import load_robot
-from tools.logs.recorded_robot import robot_of
 from tools.logs.run_index import RunIndex
+from tools.logs.run_log import robot_of
 from tools.output import progress_along, write_atomically
 from tools.terminal import Console, marked
 from tools.verb_table import RUN_HELP, Subparsers, add_config, add_run_dir, add_verb
 from tools.view.live import LiveSource
 from tools.view.lockstep import LockstepSource
-from tools.view.record import RecordSource
+from tools.view.record import RecordSource, single_file
 from tools.view.serving import add_port, serve
-from tools.view.settings import FOXGLOVE_PORT, HOST, PORT
-from tools.view.single_file import single_file
-from tools.view.source import Source
+from tools.view.source import FOXGLOVE_PORT, HOST, PORT, Source
 
 
 def add_parser(subparsers: Subparsers) -> None:

@@ -24,9 +24,8 @@ from tools.lab.studies.sweeps.pool import cores, results
 from tools.lab.studies.sweeps.study import bar
 from tools.live.experiment import PLANT_FILE
 from tools.logs.hand_path import hand_path
-from tools.logs.recorded_robot import refuse_own_controller, robot_of, text_of
 from tools.logs.run_index import RunIndex
-from tools.logs.run_log import RunLog
+from tools.logs.run_log import RunLog, refuse_own_controller, robot_of, text_of
 from tools.number_arguments import count, finite
 from tools.terminal import Console, marked
 from tools.verb_table import RUN_HELP, Subparsers, add_verb

@@ -16,8 +16,7 @@ from tools.judge.reports import foxglove as encoding
 from tools.judge.reports import scene
 from tools.judge.reports.scene import RobotPose
 from tools.view.frame import Frame
-from tools.view.settings import FOXGLOVE_PORT, FRAMES_S, HOST
-from tools.view.source import Source
+from tools.view.source import FOXGLOVE_PORT, FRAMES_S, HOST, Source
 
 LINKS_EVERY: Final = 30
 """Frames between two messages of the robot's bodies, which do not change."""
@@ -27,11 +26,6 @@ class FoxgloveServer:
     """Serves one source; subscribed to it only while somebody looks."""
 
     def __init__(self, source: Source, port: int = FOXGLOVE_PORT) -> None:
-        """Listen on this computer.
-
-        Raises:
-            FleetError: the port is in use.
-        """
         self._source = source
         self._context = foxglove.Context()
         self._listener = _Lookers()
@@ -65,14 +59,7 @@ class FoxgloveServer:
         return int(self._server.port)
 
     def serve(self, is_over: Callable[[], bool]) -> None:
-        """Send frames until it is over.
-
-        Args:
-            is_over: returns True to end.
-
-        Raises:
-            XrlError: the source cannot be opened, or has ended.
-        """
+        """Send frames until it is over."""
         number, connected = 0, False
         try:
             while not is_over():

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
-from services.planner.law.kinematics import Kinematics
+from services.planner.law.kinematics import DETERMINANT_MIN, Kinematics
+from services.planner.law.model import LegGeometry, leg_geometry
 from services.simulator.physics.posture import SoleLoad
 from shared.bus import topics
 from shared.bus.messages import (
@@ -26,12 +29,81 @@ from shared.bus.messages import (
 )
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config.robot_config import RobotConfig
-from shared.joints import MODULE_INDEX, MODULES
-from shared.robot.frames import capture_point
+from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.joints import MODULES, N_LEG
+from shared.robot.frames import ORIGIN, capture_point
 from tools.fleet.fleet_status import module_status
+from tools.judge.reports import scene
 from tools.judge.stalls import STALL_SHOWN_NS, stalls_of
-from tools.view.sole_estimate import SoleEstimate
+
+Array = NDArray[np.float64]
+
+LEAST_N: Final = 20.0
+"""A sole that bears less has no centre of pressure worth showing."""
+
+
+class SoleEstimate:
+    """Both soles, with the feet where the robot file has them."""
+
+    def __init__(self, config: RobotConfig) -> None:
+        self._legs = leg_geometry(config)
+        self._foot_height = config.geometry.foot_height
+        self._leg_weight = 2.0 * config.mass.module * GRAVITY  # knee and ankle
+
+    def of(self, q: Sequence[float], tau: Sequence[float]) -> tuple[SoleLoad, SoleLoad] | None:
+        """Return the loads of the right and the left sole; None where a leg is too straight."""
+        found = []
+        for index, leg in enumerate(self._legs):
+            part = slice(index * N_LEG, (index + 1) * N_LEG)
+            load = self._of_leg(leg, np.array(q[part]), np.array(tau[part]))
+            if load is None:
+                return None
+            found.append(load)
+        return found[0], found[1]
+
+    def _of_leg(self, leg: LegGeometry, q: Array, tau: Array) -> SoleLoad | None:
+        J, r_torso = jacobian(leg, q)
+        if abs(np.linalg.det(J)) < DETERMINANT_MIN:
+            return None
+        wrench = np.linalg.solve(J.T, tau)
+        force, moment = wrench[:3], wrench[3:]
+        moment = moment + np.cross(r_torso - leg.r_foot, force)  # about the ankle
+        f_x, f_y, f_z = force.tolist()
+        f_z += self._leg_weight
+        if f_z < LEAST_N:
+            return SoleLoad((f_x, f_y, f_z), (0.0, 0.0))
+        x = leg.r_foot[0] + (-moment[1] - self._foot_height * f_x) / f_z
+        y = leg.r_foot[1] + (moment[0] - self._foot_height * f_y) / f_z
+        return SoleLoad((f_x, f_y, f_z), (float(x), float(y)))
+
+
+def jacobian(leg: LegGeometry, q: Array) -> tuple[Array, Array]:
+    """Return the torso's velocity per joint rate (6, 6), linear above angular, and its origin (3,).
+
+    By the product of exponentials, from the foot up; m, rad, world.
+    """
+    R, t = np.eye(3), np.zeros(3)
+    axes, points = [], []
+    for axis, point, angle in zip(leg.axes, leg.points, q.tolist(), strict=True):
+        axes.append(R @ axis)
+        points.append(R @ point + t)
+        turn = _turn(axis, angle)
+        t = R @ (point - turn @ point) + t
+        R = R @ turn
+    r_torso = R @ leg.r_torso + t
+    columns = [
+        np.concatenate((np.cross(axis, r_torso - point), axis))
+        for axis, point in zip(axes, points, strict=True)
+    ]
+    return np.array(columns).T, r_torso
+
+
+def _turn(axis: Array, angle: float) -> Array:
+    """Return the rotation matrix about a unit axis (Rodrigues)."""
+    x, y, z = axis.tolist()
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(np.eye(3) + math.sin(angle) * K + (1.0 - math.cos(angle)) * (K @ K))
+
 
 SHOWN: Final = (topics.PLANNER_STATUS, topics.WRENCH, topics.SIM_TRUTH, topics.RUN_EVENT)
 SHOWN_OF_MODULES: Final = (topics.JOINT_STATE, topics.JOINT_COMMAND)
@@ -39,7 +111,6 @@ STALE_NS: Final = NS_PER_S // 2
 """An older message is not shown: its sender is dead, stopped or cut off."""
 DIGITS: Final = 5
 """Behind the point: 0.01 mm."""
-_NOWHERE: Final = (0.0, 0.0, 0.0)
 
 
 class PlannerShown(msgspec.Struct, frozen=True):
@@ -123,56 +194,43 @@ class Newest:
 
     def clear(self) -> None:
         """Forget every message."""
-        self._states: list[JointState | None] = [None] * len(MODULES)
-        self._commands: list[JointCommand | None] = [None] * len(MODULES)
-        self._status: PlannerStatus | None = None
-        self._wrench: Wrench | None = None
-        self._truth: SimTruth | None = None
-        self._stall: RunEvent | None = None
+        self._rows: dict[tuple[str, str], Any] = {}
         self._first_ns: int | None = None
 
     def take(self, topic: Topic, module: str, message: Message) -> None:
         """Take a message; those that no frame shows are ignored."""
-        if topic is topics.JOINT_STATE and isinstance(message, JointState):
-            self._states[MODULE_INDEX[module]] = message
-        elif topic is topics.JOINT_COMMAND and isinstance(message, JointCommand):
-            self._commands[MODULE_INDEX[module]] = message
-        elif isinstance(message, PlannerStatus):
-            self._status = message
-        elif isinstance(message, Wrench):
-            self._wrench = message
-        elif isinstance(message, SimTruth):
-            self._truth = message
-        elif isinstance(message, RunEvent) and message.kind == RunEventKind.STALLED:
-            self._stall = message
+        if not isinstance(message, RunEvent) or message.kind == RunEventKind.STALLED:
+            self._rows[topic.name, module] = message
 
     @property
     def scenario_s(self) -> float:
         """Scenario time of the newest truth, s; negative: no scenario runs."""
-        return self._truth.scenario_s if self._truth is not None else -1.0
+        truth: SimTruth | None = self._rows.get((topics.SIM_TRUTH.name, ""))
+        return truth.scenario_s if truth is not None else -1.0
 
     def frame(self, now_ns: int) -> Frame | None:
-        """Return what is known now; None until each module was heard once.
-
-        Args:
-            now_ns: on the clock of the messages.
-        """
-        states = [state for state in self._states if state is not None and state.t_ns > 0]
+        """Return what is known now; None until each module was heard once."""
+        states: list[JointState] = [
+            row for row in self._of_modules(topics.JOINT_STATE) if row.t_ns > 0
+        ]
         if len(states) < len(MODULES):
             return None
         if self._first_ns is None:
             self._first_ns = now_ns
-        status, wrench, truth = (
-            row if row is not None and now_ns - row.t_ns < STALE_NS else None
-            for row in (self._status, self._wrench, self._truth)
-        )
+        status: PlannerStatus | None = self._fresh(topics.PLANNER_STATUS, now_ns)
+        wrench: Wrench | None = self._fresh(topics.WRENCH, now_ns)
+        truth: SimTruth | None = self._fresh(topics.SIM_TRUTH, now_ns)
         heard = [now_ns - state.t_ns < STALE_NS for state in states]
         q = tuple(angle for state in states for angle in state.q)
-        torso, angles, com = self._pose(truth, q)
-        commands = [row for row in self._commands if row is not None]
-        led = isinstance(status, PlannerStatus) and len(commands) == len(MODULES)
+        if truth is not None:
+            torso, angles, com = truth.torso, truth.angles, truth.com
+        else:
+            newest = self._rows.get((topics.PLANNER_STATUS.name, ""))
+            torso, angles, com = scene.pose_of_legs(self._kinematics, q, newest)
+        commands: list[JointCommand] = self._of_modules(topics.JOINT_COMMAND)
+        led = status is not None and len(commands) == len(MODULES)
         soles, estimated = self._soles_of(truth, states)
-        begun = isinstance(truth, SimTruth) and truth.scenario_s >= 0.0
+        begun = truth is not None and truth.scenario_s >= 0.0
         t_s = self.scenario_s if begun else (now_ns - self._first_ns) / NS_PER_S
         return Frame(
             t_s=t_s,
@@ -189,35 +247,41 @@ class Newest:
                 for state, here in zip(states, heard, strict=True)
             ),
             tau=_short(torque for state in states for torque in state.tau),
-            force=_vector(wrench.force)
-            if isinstance(wrench, Wrench) and wrench.valid
-            else _NOWHERE,
-            push=truth.push if isinstance(truth, SimTruth) else _NOWHERE,
-            is_true=isinstance(truth, SimTruth),
-            fallen=isinstance(truth, SimTruth) and truth.fallen,
-            capture=_capture_point(status) if isinstance(status, PlannerStatus) else (),
+            force=_vector(wrench.force) if wrench is not None and wrench.valid else ORIGIN,
+            push=truth.push if truth is not None else ORIGIN,
+            is_true=truth is not None,
+            fallen=truth is not None and truth.fallen,
+            capture=_capture_point(status) if status is not None else (),
             soles=soles,
             soles_estimated=estimated,
             ways_out=tuple(
                 module_status(state if here else None).way_out.replace("MODULE", name)
                 for state, here, name in zip(states, heard, MODULES, strict=True)
             ),
-            planner=_shown(status) if isinstance(status, PlannerStatus) else None,
+            planner=_shown(status) if status is not None else None,
             stall=self._stall_words(now_ns),
         )
 
+    def _of_modules(self, topic: Topic) -> list[Any]:
+        rows = (self._rows.get((topic.name, module)) for module in MODULES)
+        return [row for row in rows if row is not None]
+
+    def _fresh(self, topic: Topic, now_ns: int) -> Any | None:
+        row = self._rows.get((topic.name, ""))
+        return row if row is not None and now_ns - row.t_ns < STALE_NS else None
+
     def _stall_words(self, now_ns: int) -> str:
-        stall = self._stall
+        stall: RunEvent | None = self._rows.get((topics.RUN_EVENT.name, ""))
         if stall is None or not 0 <= now_ns - stall.t_ns < STALL_SHOWN_NS:
             return ""
         return "".join(found.words for found in stalls_of([stall]))
 
     def _soles_of(
-        self, truth: Message | None, states: list[JointState]
+        self, truth: SimTruth | None, states: list[JointState]
     ) -> tuple[tuple[SoleLoad, ...], bool]:
         """Return the soles' loads, and whether they are estimated."""
         # a world of before the soles were measured has zeros
-        if isinstance(truth, SimTruth) and any((*truth.foot_right_force, *truth.foot_left_force)):
+        if truth is not None and any((*truth.foot_right_force, *truth.foot_left_force)):
             loads: Sequence[SoleLoad] = (
                 SoleLoad(truth.foot_right_force, truth.foot_right_cop),
                 SoleLoad(truth.foot_left_force, truth.foot_left_cop),
@@ -226,18 +290,6 @@ class Newest:
         q = [angle for state in states for angle in state.q]
         tau = [torque for state in states for torque in state.tau]
         return _shown_soles(self._soles.of(q, tau) or ()), True
-
-    def _pose(
-        self, truth: Message | None, q: tuple[float, ...]
-    ) -> tuple[Vector3, Vector3, Vector3]:
-        if isinstance(truth, SimTruth):
-            return truth.torso, truth.angles, truth.com
-        known = self._kinematics
-        if self._status is not None:
-            known.stance[:] = self._status.stance
-        known.update(np.array(q))
-        torso, angles, com = (part.tolist() for part in (known.r_torso, known.p[3:], known.p[:3]))
-        return torso, angles, com
 
 
 def _shown(status: PlannerStatus) -> PlannerShown:

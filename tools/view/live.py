@@ -1,22 +1,144 @@
-"""Frames of a live fleet; subscribed only while somebody looks, and acted on only when allowed."""
+"""Frames of a live fleet, and what a page may do to it.
+
+It is subscribed only while somebody looks, and acted on only when allowed.
+"""
 
 from __future__ import annotations
 
+import signal
 import threading
+from collections.abc import Callable
 from typing import Any, Final
 
 import msgspec
 
-from shared.bus.session import Latest, Session, open_session
+from shared.bus import topics
+from shared.bus.credentials import require_operator
+from shared.bus.messages import HandLead, RunEvent, RunEventKind
+from shared.bus.session import Latest, Publisher, Session, open_session
 from shared.bus.topics import Topic
 from shared.clock import now_ns
 from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Inject
+from shared.exceptions import FleetError, XrlError
 from shared.joints import MODULES
+from tools.fleet.emergency_stop import BusStop, request_here
 from tools.fleet.fleet_status import impairments
+from tools.fleet.proxy_client import ProxyClient
 from tools.fleet.supervise import SupervisedFleet
 from tools.view.frame import SHOWN, SHOWN_OF_MODULES, Frame, Newest, ShownProcess
-from tools.view.live_orders import LiveOrders
-from tools.view.source import Order, Source
+from tools.view.source import CUT_S, CUTS, HandOrders, Order, Source
+
+
+class LiveOrders:
+    """Carries out a page's orders.
+
+    Attributes:
+        services: that can be killed, frozen and started; the planner first.
+        orders: that this fleet takes: `hand` and `push` only with a simulator.
+    """
+
+    def __init__(
+        self, robot: RobotConfig, fleet: SupervisedFleet, scenario_s: Callable[[], float]
+    ) -> None:
+        require_operator(robot, "view")
+        self._robot, self._fleet, self._scenario_s = robot, fleet, scenario_s
+        self.services = tuple(sorted(fleet.manifest.services, key=lambda name: name != "planner"))
+        self._carriers: dict[str, Callable[[Order], None]] = {
+            "estop": self._estop,
+            "kill": self._kill,
+            "freeze": self._freeze,
+            "start": self._start,
+        }
+        if "network_proxy" in self.services:
+            self._carriers["cut"] = self._cut
+        if "simulator" in self.services:
+            self._carriers |= {"hand": self._lead, "push": self._lead}
+        self.orders = tuple(self._carriers)
+        self._hand = HandOrders()
+        self._publisher: Publisher[HandLead] | None = None
+        self._events: Publisher[RunEvent] | None = None
+        self._stop: BusStop | None = None
+        self._led = self._told = 0
+
+    def begin(self, session: Session) -> None:
+        """Take the session that is open while somebody looks."""
+        self._hand = HandOrders()
+        self._publisher = session.publisher(topics.OPERATOR_HAND, HandLead)
+        self._events = session.publisher(topics.RUN_EVENT, RunEvent)
+        self._stop = BusStop(self._robot, session, self._fleet.run.path)
+
+    def end(self) -> None:
+        """The session is about to be closed."""
+        self._publisher = self._events = self._stop = None
+
+    def carry_out(self, order: Order) -> str:
+        """Do it, and return why not, or nothing; may block for some seconds."""
+        carrier = self._carriers.get(order.order)
+        if carrier is None:
+            return f"{order.order!r} is no order here; one of {', '.join(self.orders)}"
+        try:
+            carrier(order)
+        except (XrlError, OSError) as error:  # a process may end while it is signalled
+            return str(error)
+        return ""
+
+    def _lead(self, order: Order) -> None:
+        publisher = self._publisher
+        if publisher is None:
+            raise FleetError("the hand is not linked yet")
+        self._led += 1
+        asked = self._hand.message(order)
+        publisher.put(msgspec.structs.replace(asked, t_ns=now_ns(), seq=self._led))
+
+    def _estop(self, _order: Order) -> None:
+        """Stop all, first by shared memory."""
+        request_here(self._fleet.run.path)
+        stop = self._stop
+        if stop is None:
+            raise FleetError("by shared memory only: the bus is not linked")
+        going = stop.stop()
+        if going:
+            raise FleetError(f"not stopped: {', '.join(going)}; cut the power")
+
+    def _kill(self, order: Order) -> None:
+        if order.service in MODULES:
+            self._fleet.forget(order.service)  # a person asked for its next process
+        self._fleet.kill(order.service, signal.SIGKILL)
+        self._tell(RunEventKind.KILLED, order.service, "KILL")
+
+    def _freeze(self, order: Order) -> None:
+        self._fleet.kill(order.service, signal.SIGSTOP)
+        self._tell(RunEventKind.KILLED, order.service, "STOP")
+
+    def _start(self, order: Order) -> None:
+        self._fleet.start_service(order.service)
+        self._tell(RunEventKind.RESTARTED, order.service, "")
+
+    def _tell(self, kind: RunEventKind, subject: str, detail: str) -> None:
+        """Have it in the log."""
+        events = self._events
+        if events is not None:
+            self._told += 1
+            event = RunEvent(
+                t_ns=now_ns(),
+                seq=self._told,
+                kind=int(kind),
+                subject=subject,
+                detail=detail,
+                scenario_s=self._scenario_s(),
+            )
+            events.put(event)
+
+    def _cut(self, order: Order) -> None:
+        """Cut links for a while."""
+        links = CUTS.get(order.service)
+        if links is None:
+            raise FleetError(f"{order.service!r}: one of {', '.join(CUTS)}")
+        proxy = ProxyClient(self._fleet.run.path)
+        for link in links:
+            proxy.begin(Inject(link=link, at=0.0, duration=CUT_S, partition=True))
+
 
 LOOK_S: Final = 1.0
 """The supervisor is asked so often how its processes do."""
@@ -28,16 +150,6 @@ class LiveSource(Source):
     kind = "live"
 
     def __init__(self, robot: RobotConfig, fleet: SupervisedFleet, *, act: bool = False) -> None:
-        """Take a fleet that is up.
-
-        Args:
-            robot: its robot file.
-            fleet: the fleet.
-            act: a page may do something to it.
-
-        Raises:
-            BusError, FleetError: this host has no key that may act.
-        """
         super().__init__(robot)
         self.title = f"live, {fleet.run.path}"
         self._fleet = fleet
@@ -54,11 +166,7 @@ class LiveSource(Source):
         self._looker: threading.Thread | None = None
 
     def connect(self) -> None:
-        """Subscribe.
-
-        Raises:
-            BusError: the bus cannot be opened.
-        """
+        """Subscribe."""
         if self._session is not None:
             return
         session = self._session = open_session(self.robot, "view", self._fleet.run.path)

@@ -18,8 +18,7 @@ from shared.joints import MODULES
 from tools.sim.lockstep import Lockstep
 from tools.sim.standing_start import begin_standing
 from tools.view.frame import Frame, Newest
-from tools.view.hand import HandOrders
-from tools.view.source import CUT_S, CUTS, Order, Source
+from tools.view.source import CUT_S, CUTS, HandOrders, Order, Source
 
 _FOREVER_S: Final = 1e9
 _STEP_S: Final = 0.01
@@ -57,11 +56,7 @@ class LockstepSource(Source):
         self._thread.join()
 
     def frame(self, t_s: float) -> Frame | None:  # noqa: ARG002 - it has no other time
-        """Return the newest frame; None until it stands.
-
-        Raises:
-            RunError: the robot's thread has ended.
-        """
+        """Return the newest frame; None until it stands."""
         if self._failed:
             raise RunError(self._failed)
         with self._lock:

@@ -1,36 +1,27 @@
-"""Frames of a record: any moment of it, in any order."""
+"""Frames of a record: any moment of it, in any order; and the page with a whole record in it."""
 
 from __future__ import annotations
 
-import bisect
-from typing import Any
+import base64
+import gzip
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
 
 import msgspec
 
 from shared.bus import topics
-from shared.bus.messages import Message, RunEventKind
-from shared.bus.topics import Topic
+from shared.bus.messages import RunEventKind
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
+from shared.exceptions import RunError
 from shared.joints import MODULES
 from tools.judge.reports.run_data import RunData
 from tools.judge.reports.timeline import timeline_events
-from tools.logs.run_log import RunLog
+from tools.logs.run_log import NewestAt, RunLog
 from tools.view.frame import SHOWN, SHOWN_OF_MODULES, Frame, Newest
-from tools.view.source import Mark, Model, Source
-
-
-class _Key:
-    """The messages of one key, found by time."""
-
-    def __init__(self, topic: Topic, module: str, rows: list[Any]) -> None:
-        self.topic, self.module = topic, module
-        self._rows = rows
-        self._stamps = [row.t_ns for row in rows]
-
-    def at(self, t_ns: int) -> Message | None:
-        index = bisect.bisect_right(self._stamps, t_ns) - 1
-        return self._rows[index] if index >= 0 else None
+from tools.view.source import FRAMES_S, PAGE, UPLOT, Mark, Model, Source
 
 
 class RecordSource(Source):
@@ -39,21 +30,16 @@ class RecordSource(Source):
     kind = "record"
 
     def __init__(self, log: RunLog, robot: RobotConfig) -> None:
-        """Take a record; reads all of it that a frame shows.
-
-        Raises:
-            RunError: a message of the record cannot be read.
-        """
         super().__init__(robot)
         self.title = str(log.path)
         self._data = RunData(log)
         self._newest = Newest(robot)
         wanted = [(topic, "") for topic in SHOWN if topic is not topics.RUN_EVENT]
         wanted += [(topic, module) for topic in SHOWN_OF_MODULES for module in MODULES]
-        self._keys = [_Key(topic, m, log.messages(topic, m)) for topic, m in wanted]
+        self._keys = [(topic, module, log.newest(topic, module)) for topic, module in wanted]
         stalls = [row for row in log.messages(topics.RUN_EVENT) if row.kind == RunEventKind.STALLED]
         stalls.sort(key=lambda row: row.t_ns)  # each tells when it ended, and is told later
-        self._keys.append(_Key(topics.RUN_EVENT, "", stalls))
+        self._keys.append((topics.RUN_EVENT, "", NewestAt(stalls)))
         self._marks = tuple(
             Mark(event.t, event.kind, event.text) for event in timeline_events(self._data)
         )
@@ -70,9 +56,64 @@ class RecordSource(Source):
         t_ns = self._data.zero_ns + round(t_s * NS_PER_S)
         newest = self._newest
         newest.clear()
-        for key in self._keys:
-            message = key.at(t_ns)
+        for topic, module, messages in self._keys:
+            message = messages.at(t_ns)
             if message is not None:
-                newest.take(key.topic, key.module, message)
+                newest.take(topic, module, message)
         found = newest.frame(t_ns)
         return None if found is None else msgspec.structs.replace(found, t_s=t_s)
+
+
+_MODULES: Final = (
+    "vendor/three/three.module.min.js", "recorded.js", "plots.js", "scene.js", "main.js",
+)  # fmt: skip
+"""Each after those that it imports."""
+_LOADER: Final = """
+const urls = {};
+for (const node of document.querySelectorAll("script[data-module]")) {
+  const text = node.textContent.replace(/from "(\\.[^"]+)"/g, (_, name) => `from "${urls[name]}"`);
+  urls[node.dataset.module] = URL.createObjectURL(new Blob([text], { type: "text/javascript" }));
+}
+import(urls["./main.js"]);
+"""
+
+
+def single_file(source: RecordSource, done: Callable[[float], None] = lambda _s: None) -> bytes:
+    """Return the page with a whole record in it."""
+    model = source.model()
+    count = round((model.end_s - model.begin_s) * FRAMES_S) + 1
+    frames = []
+    for number in range(count):
+        frames.append(source.frame(min(model.end_s, model.begin_s + number / FRAMES_S)))
+        done(number / FRAMES_S)
+    if not any(frames):
+        raise RunError(f"{source.title}: no moment at which all six modules were heard")
+    model = msgspec.structs.replace(model, title=Path(model.title).name)  # no path of this machine
+    run = {"model": model, "frames": frames, "every_s": 1.0 / FRAMES_S}
+    packed = base64.b64encode(gzip.compress(msgspec.json.encode(run), mtime=0)).decode()
+    page = (PAGE / "index.html").read_text(encoding="utf-8")
+    page = re.sub(r'<link rel="stylesheet" href="([^"]+)">', _style, page)
+    page = re.sub(r'<script src="([^"]+)"></script>', _script, page)
+    modules = "".join(_module(name) for name in _MODULES)
+    own = (
+        f'<script type="text/plain" id="run">{packed}</script>\n{modules}<script>{_LOADER}</script>'
+    )
+    return page.replace('<script type="module" src="main.js"></script>', own).encode()
+
+
+def _content(name: str) -> str:
+    """Return one of the page's files; a script's text must not end the script around it."""
+    file = PAGE / name if not name.startswith("vendor/uplot/") else UPLOT / name.rpartition("/")[2]
+    return file.read_text(encoding="utf-8").replace("</script", "<\\/script")
+
+
+def _style(found: re.Match[str]) -> str:
+    return f"<style>{_content(found[1])}</style>"
+
+
+def _script(found: re.Match[str]) -> str:
+    return f"<script>{_content(found[1])}</script>"
+
+
+def _module(name: str) -> str:
+    return f'<script type="text/plain" data-module="./{name}">{_content(name)}</script>\n'

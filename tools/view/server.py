@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import secrets
 from collections.abc import AsyncIterator, Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -17,10 +18,10 @@ import msgspec
 from aiohttp import WSMsgType, web
 
 from shared.exceptions import FleetError, XrlError
-from tools.view.cursor import TimelineCursor
-from tools.view.settings import FRAMES_S, HOST, PAGE, PORT, UPLOT
-from tools.view.source import Order, Source
+from tools.view.source import FRAMES_S, HOST, PAGE, PORT, UPLOT, Order, Source
 
+RATES: Final = (0.05, 20.0)
+"""Of a record's cursor."""
 MESSAGE_MAX: Final = 4096
 """Largest message of a page, bytes."""
 CLIENTS_MAX: Final = 8
@@ -53,17 +54,51 @@ class Control(msgspec.Struct, frozen=True):
     rate: float | None = None
 
 
+class TimelineCursor:
+    """A place on a timeline that moves with a clock."""
+
+    def __init__(self, begin_s: float, end_s: float) -> None:
+        self._begin_s, self._end_s = begin_s, end_s
+        self._place_s = max(begin_s, min(0.0, end_s))
+        self._since_s: float | None = None
+        self._rate = 1.0
+
+    @property
+    def playing(self) -> bool:
+        """True while it moves."""
+        return self._since_s is not None
+
+    def at(self, now_s: float) -> float:
+        """Return the place; at the end it stops."""
+        if self._since_s is None:
+            return self._place_s
+        place = self._place_s + (now_s - self._since_s) * self._rate
+        if place >= self._end_s:
+            self._place_s, self._since_s = self._end_s, None
+            return self._end_s
+        return place
+
+    def control(
+        self, now_s: float, play: bool | None, seek_s: float | None, rate: float | None
+    ) -> None:
+        """Change what is not None; play at the end begins again, a rate stays within `RATES`."""
+        place, moving = self.at(now_s), self.playing
+        if seek_s is not None and math.isfinite(seek_s):
+            place = min(max(seek_s, self._begin_s), self._end_s)
+        if rate is not None and math.isfinite(rate):
+            self._rate = min(max(rate, RATES[0]), RATES[1])
+        if play is not None:
+            moving = play
+            if play and place >= self._end_s:
+                place = self._begin_s
+        self._place_s = place
+        self._since_s = now_s if moving and self._end_s > self._begin_s else None
+
+
 class ViewServer:
     """Serves one source to some pages."""
 
     def __init__(self, source: Source, port: int = PORT, token: str = "") -> None:
-        """Make a server; `running` starts it.
-
-        Args:
-            source: of the frames.
-            port: 0 for a free one.
-            token: of the address; made up if empty.
-        """
         self._source = source
         self._port = port
         self._token = token or secrets.token_urlsafe(16)
@@ -82,11 +117,7 @@ class ViewServer:
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """Serve meanwhile.
-
-        Raises:
-            FleetError: the port is in use.
-        """
+        """Serve meanwhile."""
         app = web.Application(middlewares=[self._guard], client_max_size=MESSAGE_MAX)
         app.router.add_get("/{token}/ws", self._socket)
         app.router.add_get("/{token}/{file:.*}", self._file)

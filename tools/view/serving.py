@@ -1,4 +1,7 @@
-"""Serves a source until Ctrl-C, in this process or in one of its own."""
+"""Serves a page from a process: until Ctrl-C, or beside a fleet for as long as that is up.
+
+`python -m tools.view.serving PID WORDS` is `xrl WORDS`, which ends when process PID does.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +19,10 @@ from shared.config.endpoints import PORT_MAX
 from shared.exceptions import FleetError
 from shared.extras import require
 from shared.run_directory import private_files
+from tools.fleet.parent_death import die_with_parent
 from tools.number_arguments import whole
 from tools.terminal import Console
-from tools.view.settings import HOST, PORT
-from tools.view.source import Source
+from tools.view.source import HOST, PORT, Source
 
 _END_S = 5.0
 
@@ -36,12 +39,7 @@ def _port(text: str) -> int:
 
 
 def serve(source: Source, port: int) -> None:
-    """Serve until Ctrl-C or SIGTERM, and print the address.
-
-    Raises:
-        FleetError: the port is in use.
-        MissingPackageError: there is no aiohttp.
-    """
+    """Serve until Ctrl-C or SIGTERM, and print the address."""
     asyncio.run(_serve(source, port))
 
 
@@ -61,15 +59,8 @@ async def _serve(source: Source, port: int) -> None:
 
 @contextlib.contextmanager
 def served_beside(run_dir: Path, port: int) -> Iterator[str]:
-    """Serve a fleet that is up from a process of its own, in which a page may act; end it after.
-
-    Yields:
-        The address.
-
-    Raises:
-        FleetError: it does not begin.
-    """
-    command = [sys.executable, "-m", "tools.view.leashed", str(os.getpid())]
+    """Serve a fleet that is up from a process of its own, in which a page may act; end it after."""
+    command = [sys.executable, "-m", "tools.view.serving", str(os.getpid())]
     command += ["view", "--act", "--run-dir", str(run_dir), "--port", str(port)]
     log = run_dir / "logs" / "view.log"
     with private_files(), log.open("wb") as said:
@@ -95,3 +86,16 @@ def served_beside(run_dir: Path, port: int) -> Iterator[str]:
         except subprocess.TimeoutExpired:
             process.kill()
             process.communicate()
+
+
+def main() -> int:
+    """Run it."""
+    from tools import cli  # noqa: PLC0415 - which loads this module for its verb
+
+    parent, *words = sys.argv[1:]
+    die_with_parent(int(parent), signal.SIGTERM)
+    return cli.main(words)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -2,23 +2,35 @@
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Final
 
 import msgspec
 
-from shared.bus.messages import Mode
+from services.simulator.physics.led_hand import PUSH_EXPIRES_S
+from shared.bus.messages import HandLead, Mode
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
+from shared.robot.frames import ORIGIN
 from tools.judge.reports import scene
 from tools.judge.reports.scene import RobotPose
 from tools.view.frame import Frame
 
-_STILL: Final = RobotPose(
-    0, (0.0,) * 3, (0.0,) * 3, (0.0,) * 3, (0.0,) * 12, (-1,) * 6, (0.0,) * 3, (0.0,) * 3
-)
+HOST: Final = "127.0.0.1"
+PORT: Final = 8417
+FOXGLOVE_PORT: Final = 8765
+"""That Foxglove offers."""
+FRAMES_S: Final = 30.0
+PAGE: Final = Path(__file__).parent / "page"
+UPLOT: Final = Path(__file__).parents[1] / "judge" / "reports" / "vendor" / "uplot"
 
+_STILL: Final = RobotPose(
+    t_ns=0, torso=ORIGIN, angles=ORIGIN, com=ORIGIN, q=(0.0,) * 12, modes=(-1,) * len(MODULES),
+    force=ORIGIN, push=ORIGIN,
+)  # fmt: skip
 
 CUTS: Final[Mapping[str, tuple[str, ...]]] = {
     "left leg": ("planner->left", "left->planner"),
@@ -130,12 +142,40 @@ class Source(ABC):
 
     @abstractmethod
     def frame(self, t_s: float) -> Frame | None:
-        """Return the newest frame, or of a record that at a time of its timeline; None: not yet.
-
-        Raises:
-            XrlError: there will be no more.
-        """
+        """Return the newest frame, or of a record that at a time of its timeline; None: not yet."""
 
     def carry_out(self, order: Order) -> str:
         """Do what a person asks for; return why not, or nothing. May block."""
         return f"{order.order} is not possible here"
+
+
+SOURCE = "xrl view"
+
+
+class HandOrders:
+    """Puts orders to lead and orders to push together: each message has both."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._led: tuple[float, float] | None = None
+        self._force = (0.0, 0.0, 0.0)
+        self._pushed_s = -PUSH_EXPIRES_S
+
+    def message(self, order: Order) -> HandLead:
+        """Return the message of a `hand` or `push` order; its stamp is for the sender."""
+        now_s = self._clock()
+        if order.order == "push":
+            self._force, self._pushed_s = order.force, now_s
+        else:
+            self._led = (order.height, order.pitch)
+        lasts = now_s - self._pushed_s < PUSH_EXPIRES_S
+        height, pitch = self._led or (0.0, 0.0)
+        return HandLead(
+            t_ns=0,
+            seq=0,
+            leads=self._led is not None,
+            height=height,
+            pitch=pitch,
+            push=self._force if lasts else (0.0, 0.0, 0.0),
+            source=SOURCE,
+        )

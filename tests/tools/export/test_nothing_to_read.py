@@ -8,7 +8,8 @@ import pytest
 
 from tools import cli
 from tools.logs.reexecution import rewritten
-from tools.logs.run_log import NOTHING, RunIndex, RunLog
+from tools.logs.run_index import RunIndex
+from tools.logs.run_log import NOTHING, RunLog
 
 WRITERS = (
     "report --open no -o OUT",

@@ -6,7 +6,6 @@ import re
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -46,7 +45,7 @@ from tools.judge.stalls import (
     drop_outs,
     stalls_of,
 )
-from tools.judge.verdict_limits import LIMITS
+from tools.judge.standing import LIMITS
 from tools.live.live_stalls import (
     A_THREAD,
     MERGE_NS,
@@ -469,10 +468,3 @@ def test_messages_lost_in_a_stall_name_it_and_stalls_without_effect_share_a_line
     assert re.search(r"messages lost on the way .* in a stall", words)
     assert "6.58 s: x\n2 more stalls were without consequence: 34 ms at most\n" in words
     assert "does not decide" not in words
-
-
-def test_a_run_in_virtual_time_has_no_stalls_and_says_nothing_of_them(tmp_path: Path) -> None:
-    assert cli.main(["sim", "--duration", "1", "--out", str(tmp_path)]) == 0
-    summary = verdict.summarise(read_run(tmp_path / "run.mcap"), 1.0)
-    assert (summary["stalls"], summary["across_stalls"], summary["drop_outs"]) == ([], [], [])
-    assert verdict_table.stalls(summary) == []

@@ -17,9 +17,15 @@ from shared.config.scenarios import Push
 from tests.lockstep.runs import still
 from tools import cli
 from tools.judge import verdict, verdict_table
-from tools.judge.soundness import _longest_s, shaking_of, why_not_sound
-from tools.judge.standing import why_not_standing
-from tools.judge.verdict_limits import LIMITS, SOUND
+from tools.judge.standing import (
+    LIMITS,
+    SOUND,
+    _longest_s,
+    shaking_of,
+    why_not_sound,
+    why_not_standing,
+)
+from tools.judge.verdict import Summary
 from tools.logs.run_log import read_run
 from tools.terminal import Console
 
@@ -75,14 +81,25 @@ def test_a_run_is_judged_by_how_it_stands_at_its_end(
     assert "DOES NOT STAND" in capsys.readouterr().out
 
 
-def test_a_sound_run_has_figures_within_their_limits(tmp_path: Path) -> None:
-    assert cli.main(["sim", "--duration", "4", "--out", str(tmp_path)]) == 0
-    summary = verdict.summarise(read_run(tmp_path / "run.mcap"), 4.0)
-    assert summary["torque_at_limit_ms"] == 0.0
-    assert 0.05 < summary["shaking_nm"] < 5.0
-    assert 0.05 < summary["sinking_m_s"] < 0.3, "it is led down"
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Summary:
+    """The summary of a run to which nothing happens."""
+    out = tmp_path_factory.mktemp("sound")
+    assert cli.main(["sim", "--duration", "4", "--out", str(out)]) == 0
+    return verdict.summarise(read_run(out / "run.mcap"), 4.0)
+
+
+def test_a_run_in_virtual_time_has_no_stalls_and_says_nothing_of_them(sound: Summary) -> None:
+    assert (sound["stalls"], sound["across_stalls"], sound["drop_outs"]) == ([], [], [])
+    assert verdict_table.stalls(sound) == []
+
+
+def test_a_sound_run_has_figures_within_their_limits(sound: Summary) -> None:
+    assert sound["torque_at_limit_ms"] == 0.0
+    assert 0.05 < sound["shaking_nm"] < 5.0
+    assert 0.05 < sound["sinking_m_s"] < 0.3, "it is led down"
     console = Console(width=120, record=True)
-    verdict_table.show(summary, console)
+    verdict_table.show(sound, console)
     text = console.export_text()
     assert all(word in text for word in ("torque above 8 Hz", "at its limit", "fastest way down"))
 

@@ -16,8 +16,8 @@ from shared.links import DIRECTIONS, directions_of
 from shared.network.impairment_schedule import ImpairmentSchedule
 from tests.shared.mcap_log.runs import sample
 from tools.judge import verdict_table
+from tools.judge.standing import LIMITS
 from tools.judge.verdict import Summary
-from tools.judge.verdict_limits import LIMITS
 from tools.live.live_view import LiveView, active, waiting
 from tools.live.scenario_runner import LiveSnapshot
 from tools.logs.impairment_intervals import impairments, touches

@@ -19,7 +19,7 @@ from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES, side_of
 from shared.mcap_log.writer import SCHEMA_VERSION, RunWriter
 from tests.conftest import ROBOT_FILE
-from tests.shared.mcap_log.runs import sample
+from tests.shared.mcap_log.runs import Queue, sample
 from tools.sim.lockstep import Lockstep
 from tools.sim.standing_start import NOTHING_HAPPENS
 from tools.sim.virtual_time import HostClock
@@ -68,17 +68,7 @@ def write_record(
     lost: Callable[[Sent], bool] = lambda _one: False,
     clock: HostClock | None = None,
 ) -> Path:
-    """Write what a host's recorder gets, by its own clock.
-
-    Args:
-        folder: an empty one.
-        robot: whose services they are.
-        sent: all messages.
-        host: of the recorder.
-        of: it is the host's own, of these services.
-        lost: what does not arrive.
-        clock: of that host; None: as in `CLOCKS`.
-    """
+    """Write what a host's recorder gets by its clock, None: as in `CLOCKS`; `of` its services."""
     clock = clock or CLOCKS[host]
     dice = random.Random(5)
     newest: dict[str, int] = {}
@@ -90,12 +80,6 @@ def write_record(
             newest[key] = max(newest.get(key, 0), clock.read(at_ns) + dice.randrange(NS_PER_MS))
             rows.append((key, payload, newest[key]))
     rows.sort(key=lambda row: row[2])
-    waiting = iter(rows)
-
-    class Source:
-        def take(self) -> tuple[str, bytes, int] | None:
-            return next(waiting, None)
-
     about = {"schema_version": SCHEMA_VERSION, "robot": robot.name, "of": ",".join(of)}
     with RunWriter(
         folder,
@@ -108,7 +92,7 @@ def write_record(
         },
         chunk_kib=256,
     ) as writer:
-        writer.take_from(Source(), len(rows))
+        writer.take_from(Queue(rows), len(rows))
     return writer.path
 
 

@@ -21,8 +21,7 @@ from shared.robot.robot_model import stand_pose
 from tools import cli
 from tools.judge.run_parts import zero_ns
 from tools.lab.design.torque_breakdown import torque_breakdown
-from tools.logs.recorded_robot import robot_of
-from tools.logs.run_log import RunLog, read_run
+from tools.logs.run_log import RunLog, read_run, robot_of
 from tools.verbs import explain
 
 

@@ -8,7 +8,7 @@ import contextlib
 import itertools
 import shutil
 import tempfile
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,8 +19,10 @@ BROWSER: Final = next((found for name in NAMES if (found := shutil.which(name)))
 FLAGS: Final = (
     "--headless", "--no-sandbox", "--disable-quic", "--no-first-run",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
-    "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--remote-debugging-port=0",
+    "--remote-debugging-port=0",
 )  # fmt: skip
+WEBGL: Final = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+FLAT: Final = ("--disable-gpu",)
 START_S: Final = 30.0
 
 
@@ -63,7 +65,9 @@ class Page:
         await self.call("Page.navigate", url=address)
 
     async def value(self, expression: str) -> Any:
-        result = await self.call("Runtime.evaluate", expression=expression, returnByValue=True)
+        result = await self.call(
+            "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
+        )
         return None if "exceptionDetails" in result else result["result"].get("value")
 
     async def until(
@@ -98,12 +102,12 @@ class Page:
 
 
 @contextlib.asynccontextmanager
-async def browser() -> AsyncIterator[Page]:
-    """Start a browser with one empty page."""
+async def browser(graphics: Sequence[str] = WEBGL) -> AsyncIterator[Page]:
+    """Start a browser with one empty page, without a display."""
     assert BROWSER is not None
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         process = await asyncio.create_subprocess_exec(
-            BROWSER, *FLAGS, f"--user-data-dir={folder}", "about:blank",
+            BROWSER, *FLAGS, *graphics, f"--user-data-dir={folder}", "about:blank",
             stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.DEVNULL,
         )  # fmt: skip
         try:

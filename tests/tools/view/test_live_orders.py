@@ -15,8 +15,7 @@ from shared.exceptions import FleetError
 from tests.certified import certified, install_all
 from tools.fleet import process_table
 from tools.verbs import view
-from tools.view.live import LiveSource
-from tools.view.live_orders import LiveOrders
+from tools.view.live import LiveOrders, LiveSource
 from tools.view.source import Order
 
 REAL = ("planner", "knee_left", "recorder")

@@ -10,21 +10,14 @@ import pytest
 from shared.bus import topics
 from shared.bus.messages import JointState, SimTruth
 from shared.joints import MODULES
-from tests.tools.judge.reports.runs import make, rewritten
+from tests.tools.judge.reports.runs import rewritten
 from tests.tools.logs.split_runs import recorded_in_parts
 from tools.judge.stalls import MACHINE, Stall
-from tools.logs.recorded_robot import robot_of
-from tools.logs.run_log import RunLog, read_run
+from tools.logs.run_log import RunLog, read_run, robot_of
 from tools.view.record import RecordSource
 from tools.view.source import Order
 
 LOG = Path(__file__).parents[1] / "logs" / "reexecution" / "golden" / "stand-v6c.mcap"
-
-
-@pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> RunLog:
-    """Return four seconds in virtual time: a planner killed and started, a push, a fault."""
-    return read_run(make(tmp_path_factory.mktemp("run")).path)
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +105,7 @@ def test_without_a_simulated_world_the_pose_is_what_the_legs_know(log: RunLog) -
     """The planner's own kinematics: within a centimetre of the truth."""
     with_truth = RecordSource(log, robot_of(log))
     without = RecordSource(log, robot_of(log))
-    without._keys = [key for key in without._keys if key.topic is not topics.SIM_TRUTH]
+    without._keys = [row for row in without._keys if row[0] is not topics.SIM_TRUTH]
     t_s = with_truth.model().end_s - 0.2
     known, true = without.frame(t_s), with_truth.frame(t_s)
     assert known is not None

@@ -13,7 +13,7 @@ from shared.robot.robot_model import stand_pose
 from tests.lockstep.runs import still
 from tools.sim.lockstep import Lockstep
 from tools.sim.standing_start import begin_standing
-from tools.view.sole_estimate import SoleEstimate, jacobian
+from tools.view.frame import SoleEstimate, jacobian
 
 
 def standing(robot: RobotConfig, height: float) -> tuple[SimTruth, list[float], list[float]]:

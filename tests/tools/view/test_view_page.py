@@ -16,8 +16,7 @@ from tests.tools.view.browser import BROWSER, Page, browser
 from tests.tools.view.test_record_source import LOG
 from tools import cli
 from tools.live.experiment import load_robot
-from tools.logs.recorded_robot import robot_of
-from tools.logs.run_log import read_run
+from tools.logs.run_log import read_run, robot_of
 from tools.view.lockstep import LockstepSource
 from tools.view.record import RecordSource
 from tools.view.server import ViewServer

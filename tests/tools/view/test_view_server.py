@@ -3,20 +3,30 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
+import inspect
+import math
 import socket
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import Awaitable, Callable
 from typing import Any
 
 import aiohttp
 import msgspec
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError
 from tools.view.frame import Frame
-from tools.view.server import CLIENTS_MAX, MESSAGE_MAX, ORDERS_MAX, ViewServer
+from tools.view.server import (
+    CLIENTS_MAX,
+    MESSAGE_MAX,
+    ORDERS_MAX,
+    RATES,
+    TimelineCursor,
+    ViewServer,
+)
 from tools.view.source import Model, Order, Source
 
 TOKEN = "known-to-this-test"  # noqa: S105 - of a server that ends with its test
@@ -66,13 +76,37 @@ class Recorded(Source):
         return "" if order.order == "push" else "not here"
 
 
+def origin_of(server: ViewServer) -> str:
+    return "/".join(server.address.split("/")[:3])
+
+
+async def silent_page(server: ViewServer) -> asyncio.StreamWriter:
+    """Open a WebSocket that reads nothing."""
+    origin = origin_of(server)
+    host = origin.removeprefix("http://")
+    _, writer = await asyncio.open_connection(*host.split(":"), limit=1)
+    writer.write(
+        f"GET /{TOKEN}/ws HTTP/1.1\r\nHost: {host}\r\nOrigin: {origin}\r\n"
+        "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n".encode()
+    )
+    await writer.drain()
+    return writer
+
+
+async def until(holds: Callable[[], bool]) -> None:
+    async with asyncio.timeout(20.0):
+        while not holds():
+            await asyncio.sleep(0.01)
+
+
 class Bench:
     def __init__(self, source: Recorded, server: ViewServer, http: aiohttp.ClientSession) -> None:
         self.source, self.server, self.http = source, server, http
 
     @property
     def origin(self) -> str:
-        return "/".join(self.server.address.split("/")[:3])
+        return origin_of(self.server)
 
     async def page(self) -> aiohttp.ClientWebSocketResponse:
         address = self.server.address + "ws"
@@ -94,49 +128,46 @@ async def message_with(
                 return value
 
 
-def with_server(
-    robot: RobotConfig, work: Callable[[Bench], Awaitable[None]], port: int = 0
-) -> Recorded:
-    source = Recorded(robot)
+def served(test: Callable[..., Awaitable[None]]) -> Callable[..., None]:
+    """Make a test of a coroutine that takes a bench: a page's server, and who asks it."""
 
-    @contextlib.asynccontextmanager
-    async def bench() -> AsyncIterator[Bench]:
-        server = ViewServer(source, port, TOKEN)
-        async with server.running(), aiohttp.ClientSession() as http:
-            yield Bench(source, server, http)
+    def run(robot: RobotConfig, **given: Any) -> None:
+        async def main() -> None:
+            source = Recorded(robot)
+            server = ViewServer(source, 0, TOKEN)
+            async with server.running(), aiohttp.ClientSession() as http:
+                await test(Bench(source, server, http), **given)
 
-    async def main() -> None:
-        async with bench() as found:
-            await work(found)
+        asyncio.run(main())
 
-    asyncio.run(main())
-    return source
+    _, *more = inspect.signature(test).parameters.values()
+    robot = inspect.Parameter("robot", inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    run.__signature__ = inspect.Signature([robot, *more])  # type: ignore[attr-defined]
+    return run
 
 
-def test_the_page_and_all_it_loads_are_served_here_and_nothing_from_elsewhere(
-    robot: RobotConfig,
+@served
+async def test_the_page_and_all_it_loads_are_served_here_and_nothing_from_elsewhere(
+    bench: Bench,
 ) -> None:
-    async def work(bench: Bench) -> None:
-        loaded = [
-            "", "main.js", "scene.js", "plots.js", "style.css",
-            "vendor/three/three.module.min.js", "vendor/uplot/uPlot.iife.min.js",
-            "vendor/uplot/uPlot.min.css",
-        ]  # fmt: skip
-        size = 0
-        for path in loaded:
-            async with bench.http.get(bench.server.address + path) as answer:
-                assert answer.status == 200, path
-                assert "default-src 'none'" in answer.headers["Content-Security-Policy"]
-                text = await answer.text()
-                size += len(text)
-                if "vendor" not in path:
-                    assert "http://" not in text
-                    assert "https://" not in text
-        assert size < 700_000
-        assert await bench.status("no-such-file") == 404
-        assert await bench.status("..%2f..%2fserver.py") == 404
-
-    with_server(robot, work)
+    loaded = [
+        "", "main.js", "scene.js", "plots.js", "style.css",
+        "vendor/three/three.module.min.js", "vendor/uplot/uPlot.iife.min.js",
+        "vendor/uplot/uPlot.min.css",
+    ]  # fmt: skip
+    size = 0
+    for path in loaded:
+        async with bench.http.get(bench.server.address + path) as answer:
+            assert answer.status == 200, path
+            assert "default-src 'none'" in answer.headers["Content-Security-Policy"]
+            text = await answer.text()
+            size += len(text)
+            if "vendor" not in path:
+                assert "http://" not in text
+                assert "https://" not in text
+    assert size < 700_000
+    assert await bench.status("no-such-file") == 404
+    assert await bench.status("..%2f..%2fserver.py") == 404
 
 
 @pytest.mark.parametrize(
@@ -150,66 +181,58 @@ def test_the_page_and_all_it_loads_are_served_here_and_nothing_from_elsewhere(
         ({"Origin": "https://127.0.0.1"}, 403),
     ],
 )
-def test_another_host_or_origin_is_refused(
-    robot: RobotConfig, headers: dict[str, str], status: int
+@served
+async def test_another_host_or_origin_is_refused(
+    bench: Bench, headers: dict[str, str], status: int
 ) -> None:
-    async def work(bench: Bench) -> None:
-        assert await bench.status(**headers) == status
-        address = bench.server.address + "ws"
-        if status != 200:
-            with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
-                await bench.http.ws_connect(address, headers={"Origin": bench.origin} | headers)
-            assert refused.value.status == 403
-
-    assert with_server(robot, work).connected == []
-
-
-def test_without_the_token_or_an_origin_there_is_nothing(robot: RobotConfig) -> None:
-    async def work(bench: Bench) -> None:
-        for token in ("", "x", TOKEN[:-1], TOKEN + "x", "%00"):
-            async with bench.http.get(f"{bench.origin}/{token}/") as answer:
-                assert answer.status in (403, 404), token
-                assert TOKEN not in await answer.text()
+    assert await bench.status(**headers) == status
+    address = bench.server.address + "ws"
+    if status != 200:
         with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
-            await bench.http.ws_connect(bench.server.address + "ws")
+            await bench.http.ws_connect(address, headers={"Origin": bench.origin} | headers)
         assert refused.value.status == 403
-
-    assert with_server(robot, work).connected == []
-
-
-def test_a_source_listens_only_while_a_page_is_open(robot: RobotConfig) -> None:
-    async def work(bench: Bench) -> None:
-        assert bench.source.connected == []
-        one, two = await bench.page(), await bench.page()
-        for page in (one, two):
-            assert (await message_with(page, "model"))["robot"] == "xrl"
-            await message_with(page, "frame")
-        await one.close()
-        await two.send_json({"seek_s": 2.0})
-        await message_with(two, "frame", lambda frame: frame["t_s"] == 2.0)
-        assert False not in bench.source.connected
-        await two.close()
-        async with asyncio.timeout(10.0):
-            while bench.source.connected[-1]:
-                await asyncio.sleep(0.01)
-
-    with_server(robot, work)
+    assert bench.source.connected == []
 
 
-def test_each_page_has_a_place_in_the_record_of_its_own(robot: RobotConfig) -> None:
-    async def work(bench: Bench) -> None:
-        one, two = await bench.page(), await bench.page()
-        await one.send_json({"seek_s": 7.5})
-        await message_with(one, "frame", lambda frame: frame["t_s"] == 7.5)
-        assert (await message_with(two, "frame"))["t_s"] == 0.0
-        await two.send_json({"play": True, "rate": 20.0})
-        await message_with(two, "frame", lambda frame: frame["t_s"] == 10.0)
-        await one.send_json({"seek_s": -99.0})
-        await message_with(one, "frame", lambda frame: frame["t_s"] == 0.0)
-        await one.close()
-        await two.close()
+@served
+async def test_without_the_token_or_an_origin_there_is_nothing(bench: Bench) -> None:
+    for token in ("", "x", TOKEN[:-1], TOKEN + "x", "%00"):
+        async with bench.http.get(f"{bench.origin}/{token}/") as answer:
+            assert answer.status in (403, 404), token
+            assert TOKEN not in await answer.text()
+    with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+        await bench.http.ws_connect(bench.server.address + "ws")
+    assert refused.value.status == 403
+    assert bench.source.connected == []
 
-    with_server(robot, work)
+
+@served
+async def test_a_source_listens_only_while_a_page_is_open(bench: Bench) -> None:
+    assert bench.source.connected == []
+    one, two = await bench.page(), await bench.page()
+    for page in (one, two):
+        assert (await message_with(page, "model"))["robot"] == "xrl"
+        await message_with(page, "frame")
+    await one.close()
+    await two.send_json({"seek_s": 2.0})
+    await message_with(two, "frame", lambda frame: frame["t_s"] == 2.0)
+    assert False not in bench.source.connected
+    await two.close()
+    await until(lambda: not bench.source.connected[-1])
+
+
+@served
+async def test_each_page_has_a_place_in_the_record_of_its_own(bench: Bench) -> None:
+    one, two = await bench.page(), await bench.page()
+    await one.send_json({"seek_s": 7.5})
+    await message_with(one, "frame", lambda frame: frame["t_s"] == 7.5)
+    assert (await message_with(two, "frame"))["t_s"] == 0.0
+    await two.send_json({"play": True, "rate": 20.0})
+    await message_with(two, "frame", lambda frame: frame["t_s"] == 10.0)
+    await one.send_json({"seek_s": -99.0})
+    await message_with(one, "frame", lambda frame: frame["t_s"] == 0.0)
+    await one.close()
+    await two.close()
 
 
 @pytest.mark.parametrize(
@@ -218,113 +241,93 @@ def test_each_page_has_a_place_in_the_record_of_its_own(robot: RobotConfig) -> N
      '{"order": "push", "force": [1, 2]}', '{"order": "push", "force": [1, 2, "x"]}',
      '{"order": "push", "force": null}'],
 )  # fmt: skip
-def test_what_is_not_understood_is_told_and_the_page_stays_open(
-    robot: RobotConfig, text: str
+@served
+async def test_what_is_not_understood_is_told_and_the_page_stays_open(
+    bench: Bench, text: str
 ) -> None:
-    async def work(bench: Bench) -> None:
-        page = await bench.page()
-        await page.send_str(text)
-        assert "not understood" in await message_with(page, "error")
-        await page.send_json({"seek_s": 1.0})
-        await message_with(page, "frame", lambda frame: frame["t_s"] == 1.0)
+    page = await bench.page()
+    await page.send_str(text)
+    assert "not understood" in await message_with(page, "error")
+    await page.send_json({"seek_s": 1.0})
+    await message_with(page, "frame", lambda frame: frame["t_s"] == 1.0)
+    await page.close()
+    assert bench.source.orders_taken == []
+
+
+@served
+async def test_orders_go_to_the_source_and_its_refusal_to_the_page(bench: Bench) -> None:
+    page = await bench.page()
+    await page.send_json({"order": "push", "force": [1.0, 2.0, 3.0]})
+    await page.send_json({"order": "dance"})
+    assert await message_with(page, "error") == "not here"
+    await page.close()
+    assert bench.source.orders_taken[0] == Order(order="push", force=(1.0, 2.0, 3.0))
+
+
+@served
+async def test_an_emergency_stop_waits_for_no_other_order(bench: Bench) -> None:
+    page = await bench.page()
+    await page.send_json({"order": "cut", "service": "slow"})
+    await page.send_json({"order": "estop"})
+    await until(lambda: len(bench.source.orders_taken) == 2)
+    await page.close()
+    assert [order.order for order in bench.source.orders_taken] == ["estop", "cut"]
+
+
+@served
+async def test_of_too_many_orders_some_are_left_out_and_that_is_said(bench: Bench) -> None:
+    page = await bench.page()
+    await page.send_json({"order": "cut", "service": "slow"})
+    for _ in range(ORDERS_MAX + 2):
+        await page.send_json({"order": "push"})
+    assert "too many orders" in await message_with(page, "error")
+    await page.close()
+    await until(lambda: not bench.source.connected[-1])
+    assert len(bench.source.orders_taken) <= ORDERS_MAX + 2
+
+
+@served
+async def test_a_message_that_is_too_long_ends_the_page_and_no_other(bench: Bench) -> None:
+    one, two = await bench.page(), await bench.page()
+    await one.send_str("x" * (MESSAGE_MAX + 1))
+    async with asyncio.timeout(20.0):
+        while (await one.receive()).type is not aiohttp.WSMsgType.CLOSE:
+            pass
+    await two.send_json({"seek_s": 2.0})
+    await message_with(two, "frame", lambda frame: frame["t_s"] == 2.0)
+    await two.close()
+
+
+@served
+async def test_so_many_pages_and_no_more(bench: Bench) -> None:
+    pages = [await bench.page() for _ in range(CLIENTS_MAX)]
+    with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+        await bench.page()
+    assert refused.value.status == 503
+    for page in pages:
         await page.close()
 
-    assert with_server(robot, work).orders_taken == []
 
-
-def test_orders_go_to_the_source_and_its_refusal_to_the_page(robot: RobotConfig) -> None:
-    async def work(bench: Bench) -> None:
-        page = await bench.page()
-        await page.send_json({"order": "push", "force": [1.0, 2.0, 3.0]})
-        await page.send_json({"order": "dance"})
-        assert await message_with(page, "error") == "not here"
-        await page.close()
-
-    source = with_server(robot, work)
-    assert source.orders_taken[0] == Order(order="push", force=(1.0, 2.0, 3.0))
-
-
-def test_an_emergency_stop_waits_for_no_other_order(robot: RobotConfig) -> None:
-    async def work(bench: Bench) -> None:
-        page = await bench.page()
-        await page.send_json({"order": "cut", "service": "slow"})
-        await page.send_json({"order": "estop"})
-        async with asyncio.timeout(20.0):
-            while len(bench.source.orders_taken) < 2:
-                await asyncio.sleep(0.01)
-        await page.close()
-
-    taken = with_server(robot, work).orders_taken
-    assert [order.order for order in taken] == ["estop", "cut"]
-
-
-def test_of_too_many_orders_some_are_left_out_and_that_is_said(robot: RobotConfig) -> None:
-    async def work(bench: Bench) -> None:
-        page = await bench.page()
-        await page.send_json({"order": "cut", "service": "slow"})
-        for _ in range(ORDERS_MAX + 2):
-            await page.send_json({"order": "push"})
-        assert "too many orders" in await message_with(page, "error")
-        await page.close()
-
-    assert len(with_server(robot, work).orders_taken) <= ORDERS_MAX + 2
-
-
-def test_a_message_that_is_too_long_ends_the_page_and_no_other(robot: RobotConfig) -> None:
-    async def work(bench: Bench) -> None:
-        one, two = await bench.page(), await bench.page()
-        await one.send_str("x" * (MESSAGE_MAX + 1))
-        async with asyncio.timeout(20.0):
-            while (await one.receive()).type is not aiohttp.WSMsgType.CLOSE:
-                pass
-        await two.send_json({"seek_s": 2.0})
-        await message_with(two, "frame", lambda frame: frame["t_s"] == 2.0)
-        await two.close()
-
-    with_server(robot, work)
-
-
-def test_so_many_pages_and_no_more(robot: RobotConfig) -> None:
-    async def work(bench: Bench) -> None:
-        pages = [await bench.page() for _ in range(CLIENTS_MAX)]
-        with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
-            await bench.page()
-        assert refused.value.status == 503
-        for page in pages:
-            await page.close()
-
-    with_server(robot, work)
-
-
-def test_a_page_that_does_not_drain_holds_up_no_other(robot: RobotConfig) -> None:
-    async def work(bench: Bench) -> None:
-        port = int(bench.origin.rpartition(":")[2])
-        reader, writer = await asyncio.open_connection("127.0.0.1", port, limit=1)
-        writer.write(
-            f"GET /{TOKEN}/ws HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nOrigin: {bench.origin}\r\n"
-            "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
-            "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n".encode()
-        )
-        await writer.drain()
-        page = await bench.page()
-        await page.send_json({"play": True, "rate": 5.0})
-        await message_with(page, "frame", lambda frame: frame["t_s"] == 10.0)
-        await page.close()
-        writer.close()
-        assert reader is not None
-
-    with_server(robot, work)
+@served
+async def test_a_page_that_does_not_drain_holds_up_no_other(bench: Bench) -> None:
+    writer = await silent_page(bench.server)
+    page = await bench.page()
+    await page.send_json({"play": True, "rate": 5.0})
+    await message_with(page, "frame", lambda frame: frame["t_s"] == 10.0)
+    await page.close()
+    writer.close()
 
 
 def test_a_port_in_use_is_told(robot: RobotConfig) -> None:
-    async def work(_bench: Bench) -> None:
-        raise AssertionError("it is in use")
+    async def main(port: int) -> None:
+        async with ViewServer(Recorded(robot), port, TOKEN).running():
+            raise AssertionError("it is in use")
 
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
         with pytest.raises(FleetError, match="give another --port"):
-            with_server(robot, work, other.getsockname()[1])
+            asyncio.run(main(other.getsockname()[1]))
 
 
 class Wordy(Recorded):
@@ -339,19 +342,54 @@ def test_a_page_that_reads_nothing_does_not_hold_up_the_end(robot: RobotConfig) 
         server = ViewServer(Wordy(robot), 0, TOKEN)
         running = server.running()
         await running.__aenter__()
-        origin = "/".join(server.address.split("/")[:3])
-        host = origin.removeprefix("http://")
-        _, writer = await asyncio.open_connection(*host.split(":"), limit=1)
-        writer.write(
-            f"GET /{TOKEN}/ws HTTP/1.1\r\nHost: {host}\r\nOrigin: {origin}\r\n"
-            "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
-            "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n".encode()
-        )
+        writer = await silent_page(server)
+        await until(lambda: any(page.prepared for page in server._sockets))
         async with asyncio.timeout(20.0):
-            while not any(page.prepared for page in server._sockets):
-                await asyncio.sleep(0.01)
             await asyncio.sleep(0.5)  # a frame is on its way
             await running.__aexit__(None, None, None)
         writer.close()
 
     asyncio.run(main())
+
+
+NUMBERS = st.none() | st.floats(allow_nan=True, allow_infinity=True)
+CONTROLS = st.tuples(st.floats(0.0, 10.0), st.none() | st.booleans(), NUMBERS, NUMBERS)
+
+
+@given(st.lists(CONTROLS))
+def test_whatever_a_page_asks_for_it_stays_within_the_record(
+    asked: list[tuple[float, bool | None, float | None, float | None]],
+) -> None:
+    cursor, now_s = TimelineCursor(-3.0, 20.0), 0.0
+    for waits_s, play, seek_s, rate in asked:
+        now_s += waits_s
+        cursor.control(now_s, play, seek_s, rate)
+        place = cursor.at(now_s)
+        assert math.isfinite(place)
+        assert -3.0 <= place <= 20.0
+
+
+def test_it_begins_where_the_scenario_does_and_waits() -> None:
+    cursor = TimelineCursor(-3.0, 20.0)
+    assert (cursor.at(5.0), cursor.playing) == (0.0, False)
+
+
+def test_it_plays_at_its_rate_stops_at_the_end_and_begins_anew() -> None:
+    cursor = TimelineCursor(0.0, 10.0)
+    cursor.control(100.0, True, None, 2.0)
+    assert cursor.at(101.5) == 3.0
+    cursor.control(101.5, None, None, 0.5)
+    assert cursor.at(103.5) == 4.0, "a new rate makes no jump"
+    assert cursor.at(1000.0) == 10.0
+    assert not cursor.playing
+    cursor.control(1000.0, True, None, None)
+    assert cursor.at(1001.0) == 0.5
+
+
+def test_rates_have_limits_and_a_record_without_length_never_plays() -> None:
+    cursor = TimelineCursor(0.0, 100.0)
+    cursor.control(0.0, True, None, 1e9)
+    assert cursor.at(1.0) == RATES[1]
+    nothing = TimelineCursor(0.0, 0.0)
+    nothing.control(0.0, True, None, None)
+    assert not nothing.playing

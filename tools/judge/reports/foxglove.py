@@ -8,7 +8,7 @@ quaternions (x, y, z, w), colours are (r, g, b, a) from 0 to 1.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
 
 from shared.bus.messages import Vector3
 from shared.clock import NS_PER_S
@@ -94,6 +94,14 @@ def scene(ns: int, entities: Iterable[Entity]) -> bytes:
 
 
 def _entity(timestamp: well_known.Timestamp, row: Entity) -> well_known.SceneEntity:
+    def solids(shape: str, kind: Any, **scales: float) -> list[Any]:
+        return [
+            kind(pose=_pose(one.position), size=_vector(one.size), color=_colour(one.colour),
+                 **scales)
+            for one in row.solids
+            if one.shape == shape
+        ]  # fmt: skip
+
     return well_known.SceneEntity(
         timestamp=timestamp,
         frame_id=row.frame,
@@ -101,31 +109,9 @@ def _entity(timestamp: well_known.Timestamp, row: Entity) -> well_known.SceneEnt
         lifetime=well_known.Duration(0),  # no end
         frame_locked=True,
         arrows=[_arrow(arrow) for arrow in row.arrows],
-        cubes=[
-            well_known.CubePrimitive(
-                pose=_pose(solid.position), size=_vector(solid.size), color=_colour(solid.colour)
-            )
-            for solid in row.solids
-            if solid.shape == "cube"
-        ],
-        spheres=[
-            well_known.SpherePrimitive(
-                pose=_pose(solid.position), size=_vector(solid.size), color=_colour(solid.colour)
-            )
-            for solid in row.solids
-            if solid.shape == "sphere"
-        ],
-        cylinders=[
-            well_known.CylinderPrimitive(
-                pose=_pose(solid.position),
-                size=_vector(solid.size),
-                bottom_scale=1.0,
-                top_scale=1.0,
-                color=_colour(solid.colour),
-            )
-            for solid in row.solids
-            if solid.shape == "cylinder"
-        ],
+        cubes=solids("cube", well_known.CubePrimitive),
+        spheres=solids("sphere", well_known.SpherePrimitive),
+        cylinders=solids("cylinder", well_known.CylinderPrimitive, bottom_scale=1.0, top_scale=1.0),
     )
 
 

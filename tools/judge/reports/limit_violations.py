@@ -6,8 +6,8 @@ The search for the cause of a fall begins at the earliest violation.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from typing import Final, NamedTuple
+from collections.abc import Iterator
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +19,9 @@ from tools.judge import stalls
 from tools.judge.reports.page_model import TimelineEvent
 from tools.judge.reports.run_data import RunData
 from tools.judge.reports.signals import Array
+from tools.judge.stalls import together
+from tools.judge.standing import LIMITS
 from tools.judge.verdict import leading
-from tools.judge.verdict_limits import LIMITS
 
 TOGETHER_S: Final = 0.1
 """Equal violations of several modules or joints within this time share one row."""
@@ -43,6 +44,10 @@ WORLD: Final = (
 )
 """(name, field of `SimTruth`, index in the field, scale, key of the verdict's limit while the
 planner leads, key while it does not lead); an empty key: no limit."""
+
+
+Beyond: TypeAlias = tuple[str, str, Array, NDArray[np.bool_], Array | None]
+"""A limit, a figure, its times, where it is beyond; its values if the limit is a lower one."""
 
 
 class Violation(NamedTuple):
@@ -78,16 +83,39 @@ class LimitViolations:
 
     def take(self, run: RunData) -> None:
         """Take a run, or the next part of it."""
-        for find in (_world, _torques, _stops, _margins):
-            for new in find(run):
-                old = self._found.get((new.what, new.name))
-                self._found[new.what, new.name] = new if old is None else old.joined(new)
+        for look in (_world, *((_torques, _stops, _margins) if run.robot is not None else ())):
+            for what, name, t, passed, values in look(run):
+                beyond = passed & run.inside(t)
+                new = first_violation(what, name, t, beyond)
+                if new is None:
+                    continue
+                if values is not None:
+                    new = new._replace(least=float(values[beyond].min()))
+                old = self._found.get((what, name))
+                self._found[what, name] = new if old is None else old.joined(new)
 
     def events(self) -> Iterator[TimelineEvent]:
-        """Yield the first violation of each limit, in no order."""
-        found = [one for one in self._found.values() if one.duration_s >= _duration_min_s(one)]
-        for group in _together(found):
-            yield _event(group)
+        """Yield the first violation of each limit; modules and joints that pass it together."""
+        found = [
+            one
+            for one in self._found.values()
+            if one.duration_s >= TORQUE_DURATION_MIN_S or not one.what.startswith(TORQUE)
+        ]
+        rows = [(one.t, one) for one in sorted(found, key=lambda one: (one.what, one.t))]
+        for group in together(rows, _shared, TOGETHER_S):
+            t, first = group[0]
+            names = ", ".join(one.name for _, one in group)
+            longest = max(one.duration_s for _, one in group)
+            least = min(one.least for _, one in group)
+            down = f", down to {least:.3g}" if math.isfinite(least) else ""
+            text = f"{names}: {first.what}{down}, for the first time; {longest:.2f} s in total"
+            yield TimelineEvent(t, "limit", text)
+
+
+def _shared(row: tuple[float, Violation]) -> tuple[str, str]:
+    """Return what violations that share a row have in common."""
+    _, one = row
+    return one.what, "" if one.name in (*MODULES, *JOINTS) else one.name
 
 
 def limit_violations(run: RunData) -> list[TimelineEvent]:
@@ -100,11 +128,7 @@ def limit_violations(run: RunData) -> list[TimelineEvent]:
 def first_violation(what: str, name: str, t: Array, beyond: NDArray[np.bool_]) -> Violation | None:
     """Return the first time beyond a limit and the total duration; None if there is none.
 
-    Args:
-        what: the limit.
-        name: the figure, module or joint.
-        t: times, s, not falling.
-        beyond: True where the limit is exceeded; one for each time.
+    The times `t`, s, do not fall; `beyond` is True where the limit is exceeded.
     """
     if not beyond.any():
         return None
@@ -114,15 +138,14 @@ def first_violation(what: str, name: str, t: Array, beyond: NDArray[np.bool_]) -
     return Violation(what, name, float(t[int(np.argmax(beyond))]), duration)
 
 
-def _world(run: RunData) -> Iterator[Violation]:
-    """Yield violations of the verdict's limits, over the time that the verdict judges."""
+def _world(run: RunData) -> Iterator[Beyond]:
+    """Yield the figures of the world, over the time that the verdict judges."""
     if run.course is None:
         return
     t = run.course.t + run.at(run.course.zero_ns)
     times_ns = np.array([row.t_ns for row in run.course.rows])
     leads = leading(run.log, times_ns)
     stalled = stalls.inside(stalls.disturbances(run.log, times_ns[0], times_ns[-1]), times_ns)
-    inside = run.inside(t) & ~stalled
     for name, field, index, scale, leading_key, other_key in WORLD:
         rows = np.array([getattr(row, field) for row in run.course.rows], dtype=np.float64)
         values = np.abs(rows if rows.ndim == 1 else rows[:, index]) * scale
@@ -130,92 +153,44 @@ def _world(run: RunData) -> Iterator[Violation]:
             (leading_key, leads, "while the planner leads"),
             (other_key, ~leads, "while the planner does not lead"),
         ):
-            if not key:
-                continue
-            most, unit = ALLOWED[key]
-            what = f"over {most:g} {unit}, the limit {condition}"
-            found = first_violation(what, name, t, (values > most) & mask & inside)
-            if found is not None:
-                yield found
+            if key:
+                most, unit = ALLOWED[key]
+                what = f"over {most:g} {unit}, the limit {condition}"
+                yield what, name, t, (values > most) & mask & ~stalled, None
 
 
-def _torques(run: RunData) -> Iterator[Violation]:
-    if run.robot is None:
-        return
+def _torques(run: RunData) -> Iterator[Beyond]:
+    assert run.robot is not None  # noqa: S101 - looked at with a robot only
     most = run.robot.joint.tau_module_max
     for module in MODULES:
-        (tau,) = run.columns(topics.JOINT_STATE, module, "tau")
-        if not len(tau):
-            continue
+        tau = run.wide(topics.JOINT_STATE, "tau", 2, module)
         t = run.times(topics.JOINT_STATE, module)
         at_limit = np.abs(tau).sum(axis=1) >= AT_LIMIT * most
-        what = f"{TORQUE} of {most:g} N m"
-        found = first_violation(what, module, t, at_limit & run.inside(t))
-        if found is not None:
-            yield found
+        yield f"{TORQUE} of {most:g} N m", module, t, at_limit, None
 
 
-def _stops(run: RunData) -> Iterator[Violation]:
-    if run.robot is None:
-        return
-    limits = run.robot.joint_limits()
-    armed_s = run.armed_s()
+def _stops(run: RunData) -> Iterator[Beyond]:
+    assert run.robot is not None  # noqa: S101 - looked at with a robot only
+    limits, armed_s = run.robot.joint_limits(), run.armed_s()
     for number, joint in enumerate(JOINTS):
         module = MODULES[number // 2]
-        (q,) = run.columns(topics.JOINT_STATE, module, "q")
-        if not len(q):
-            continue
-        low, high = limits[number]
-        angle = q[:, number % 2]
         t = run.times(topics.JOINT_STATE, module)
-        outside = (angle < low) | (angle > high)
-        found = first_violation(
-            "beyond a soft stop", joint, t, outside & (t >= armed_s) & run.inside(t)
-        )
-        if found is not None:
-            yield found
+        angle = run.wide(topics.JOINT_STATE, "q", 2, module)[:, number % 2]
+        low, high = limits[number]
+        outside = ((angle < low) | (angle > high)) & (t >= armed_s)
+        yield "beyond a soft stop", joint, t, outside, None
 
 
-def _margins(run: RunData) -> Iterator[Violation]:
-    if run.robot is None:
-        return
+def _margins(run: RunData) -> Iterator[Beyond]:
+    assert run.robot is not None  # noqa: S101 - looked at with a robot only
     certificate = run.robot.certificate
     mode, service, onboard = run.columns(
         topics.PLANNER_STATUS, "", "mode", "margin", "margin_onboard"
     )
+    has_margin = ~np.isin(mode, (PlannerMode.WAITING, PlannerMode.MISPLACED))
     t = run.times(topics.PLANNER_STATUS)
-    has_margin = ~np.isin(mode, (PlannerMode.WAITING, PlannerMode.MISPLACED)) & run.inside(t)
     for name, values, least in (
         ("margin of the joint services alone", service, certificate.margin_min),
         ("margin of the drives alone", onboard, certificate.onboard_margin_min),
     ):
-        below = (values < least) & has_margin
-        found = first_violation(f"under {least:g}", name, t, below)
-        if found is not None:
-            yield found._replace(least=float(values[below].min()))
-
-
-def _duration_min_s(found: Violation) -> float:
-    return TORQUE_DURATION_MIN_S if found.what.startswith(TORQUE) else 0.0
-
-
-def _together(found: Sequence[Violation]) -> list[list[Violation]]:
-    """Group violations of the modules or joints that began at about the same time."""
-    groups: list[list[Violation]] = []
-    for one in sorted(found, key=lambda violation: (violation.what, violation.t)):
-        before = groups[-1] if groups else []
-        many = one.name in (*MODULES, *JOINTS)
-        if many and before and before[0].what == one.what and one.t - before[0].t <= TOGETHER_S:
-            before.append(one)
-        else:
-            groups.append([one])
-    return groups
-
-
-def _event(group: Sequence[Violation]) -> TimelineEvent:
-    names = ", ".join(one.name for one in group)
-    longest = max(one.duration_s for one in group)
-    least = min(one.least for one in group)
-    down = f", down to {least:.3g}" if math.isfinite(least) else ""
-    text = f"{names}: {group[0].what}{down}, for the first time; {longest:.2f} s in total"
-    return TimelineEvent(group[0].t, "limit", text)
+        yield f"under {least:g}", name, t, (values < least) & has_margin, values

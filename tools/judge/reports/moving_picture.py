@@ -1,4 +1,7 @@
-"""The moving picture of a run: the robot from the side and from the front, as an animated GIF."""
+"""The moving picture of a run: the robot from the side and from the front, as an animated GIF.
+
+Beside it curves may grow: the paper's Fig. 7 as an animation.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageColor, ImageDraw
+from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from shared.atomic_file import atomic_file
 from shared.bus import topics
@@ -19,10 +22,53 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.joints import MODULES, SIDES
 from tools.judge.reports import scene
-from tools.judge.reports.canvas import SCALE, Canvas, Point
-from tools.judge.reports.moving_curves import WIDTH, Curves
 from tools.judge.reports.scene import RobotPose
 from tools.logs.run_log import RunLog
+
+Point = tuple[float, float]
+SCALE: Final = 2
+"""Drawn larger and reduced, so that lines are smooth."""
+
+
+class Canvas:
+    """Drawing in pixels of the picture, on an image that is larger."""
+
+    def __init__(self, draw: ImageDraw.ImageDraw) -> None:
+        self._draw = draw
+
+    def line(self, points: Sequence[Point], colour: str, width: float) -> None:
+        """Draw a line through points."""
+        self._draw.line(_scaled(points), fill=colour, width=round(width * SCALE), joint="curve")
+
+    def polygon(self, points: Sequence[Point], colour: str) -> None:
+        """Fill a polygon."""
+        self._draw.polygon(_scaled(points), fill=colour)
+
+    def disc(self, at: Point, radius: float, colour: str) -> None:
+        """Fill a disc."""
+        (x, y), r = at, radius
+        self._draw.ellipse(_scaled([(x - r, y - r), (x + r, y + r)]), fill=colour)
+
+    def arrow(self, at: Point, by: Point, colour: str) -> None:
+        """Draw an arrow from a point by a vector; none that is shorter than a pixel."""
+        length = float(np.hypot(*by))
+        if length < 1.0:
+            return
+        x, y = at[0] + by[0], at[1] + by[1]
+        ux, uy = by[0] / length, by[1] / length
+        self.line([at, (x, y)], colour, 4.0)
+        tip = [(x + 9 * ux, y + 9 * uy), (x - 7 * uy, y + 7 * ux), (x + 7 * uy, y - 7 * ux)]
+        self.polygon(tip, colour)
+
+    def text(self, at: Point, text: str, colour: str, size: int) -> None:
+        """Write a text whose upper left corner is at a point."""
+        font = ImageFont.load_default(size * SCALE)
+        self._draw.text((at[0] * SCALE, at[1] * SCALE), text, fill=colour, font=font)
+
+
+def _scaled(points: Sequence[Point]) -> list[Point]:
+    return [(x * SCALE, y * SCALE) for x, y in points]
+
 
 Array = NDArray[np.float64]
 
@@ -65,15 +111,7 @@ def write_gif(
 ) -> int:
     """Draw a run, from its scenario's begin, and return the number of frames.
 
-    Args:
-        log: the run; with the simulated world's truth, or as the legs know the torso.
-        robot: its robot.
-        path: the GIF; replaced if it exists.
-        progress: takes the share that is drawn, 0 .. 1.
-        with_curves: beside it COM, height and hand as they come.
-
-    Raises:
-        RunError: the log lacks states, or the file cannot be written.
+    The pose is the simulated world's, or as the legs know the torso. `progress` takes 0 .. 1.
     """
     began = _began_ns(log)
     chosen = list(_thinned([pose for pose in scene.poses(log, robot) if pose.t_ns >= began]))
@@ -178,11 +216,7 @@ def _thinned(poses: Sequence[RobotPose]) -> Iterator[RobotPose]:
 
 
 def _draw_frame(
-    canvas: Canvas,
-    robot: RobotConfig,
-    pose: RobotPose,
-    seconds: float,
-    captions: Sequence[Caption],
+    canvas: Canvas, robot: RobotConfig, pose: RobotPose, seconds: float, captions: Sequence[Caption]
 ) -> None:
     frames = world_frames(robot, pose)
     canvas.line([(20.0, GROUND_Y), (SIZE[0] - 20.0, GROUND_Y)], INK, 1.5)
@@ -241,3 +275,86 @@ def _draw_robot(
         canvas.arrow(harness, (0.0, -PX_PER_N * pose.force[2]), HAND_INK)
     if pose.push[axis]:
         canvas.arrow(at(np.array(pose.torso)), (sign * PX_PER_N * pose.push[axis], 0.0), PUSH_INK)
+
+
+WIDTH: Final = 440
+"""By which the picture is wider, px."""
+TOP, HEIGHT, GAP = 66.0, 84.0, 22.0
+LEFT, RIGHT = 64.0, 16.0
+
+
+class CurvePanel(NamedTuple):
+    """One panel: what it shows, and its lines' inks."""
+
+    title: str
+    values: Callable[[RobotPose], tuple[float, ...]]
+    names: tuple[str, ...]
+    least: float
+    """Smallest span of its axis."""
+
+
+PANELS: Final = (
+    CurvePanel("COM, mm", lambda pose: (1e3 * pose.com[0], 1e3 * pose.com[1]), ("x", "y"), 20.0),
+    CurvePanel("height, m", lambda pose: (pose.torso[2],), ("torso",), 0.1),
+    CurvePanel("hand, N", lambda pose: (-pose.force[2],), ("robot on hand",), 20.0),
+)
+
+
+class Curves:
+    """All panels of a run."""
+
+    def __init__(
+        self, poses: Sequence[RobotPose], began_ns: int, left: float, inks: Sequence[str], ink: str
+    ) -> None:
+        self._t = [(pose.t_ns - began_ns) / NS_PER_S for pose in poses]
+        self._left, self._inks, self._ink = left + LEFT, inks, ink
+        self._columns = [list(zip(*map(panel.values, poses), strict=True)) for panel in PANELS]
+        self._ranges = [
+            _range(columns, p.least) for columns, p in zip(self._columns, PANELS, strict=True)
+        ]
+
+    def draw(self, canvas: Canvas, number: int) -> None:
+        """Draw all curves up to a frame."""
+        for index, panel in enumerate(PANELS):
+            top = TOP + index * (HEIGHT + GAP)
+            low, high = self._ranges[index]
+            for value in (low, high):
+                y = self._y(value, index)
+                canvas.line([(self._left, y), (self._left + self._width, y)], self._ink, 0.5)
+                canvas.text((self._left - 46.0, y - 7.0), f"{value:.3g}", self._ink, 11)
+            canvas.text((self._left, top - 17.0), panel.title, self._ink, 12)
+            for line, name in enumerate(panel.names):
+                canvas.text(
+                    (self._left + 90.0 + 60.0 * line, top - 17.0), name, self._inks[line], 12
+                )
+                values = self._columns[index][line][: number + 1]
+                points = [
+                    (self._x(t), self._y(value, index))
+                    for t, value in zip(self._t, values, strict=False)
+                ]
+                if len(points) > 1:
+                    canvas.line(points, self._inks[line], 1.6)
+        x, bottom = self._x(self._t[number]), TOP + len(PANELS) * (HEIGHT + GAP) - GAP
+        canvas.line([(x, TOP), (x, bottom)], self._ink, 0.5)
+        canvas.text((x - 12.0, bottom + 4.0), f"{self._t[number]:.1f} s", self._ink, 11)
+
+    @property
+    def _width(self) -> float:
+        return WIDTH - LEFT - RIGHT
+
+    def _x(self, t: float) -> float:
+        begin, end = self._t[0], self._t[-1]
+        return self._left + self._width * (t - begin) / max(1e-9, end - begin)
+
+    def _y(self, value: float, index: int) -> float:
+        low, high = self._ranges[index]
+        top = TOP + index * (HEIGHT + GAP)
+        return top + HEIGHT * (high - value) / (high - low)
+
+
+def _range(columns: Sequence[Sequence[float]], least: float) -> tuple[float, float]:
+    """Return a panel's limits: its values and a margin, at least so far apart."""
+    low = min(min(column) for column in columns)
+    high = max(max(column) for column in columns)
+    more = max(0.05 * (high - low), 0.5 * (least - (high - low)))
+    return low - more, high + more

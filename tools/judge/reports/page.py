@@ -12,7 +12,7 @@ from typing import Final
 from shared.clock import NS_PER_S
 from shared.exceptions import RunError
 from tools.judge import verdict_table
-from tools.judge.reports import network, panels, summary, times, torques
+from tools.judge.reports import panels, summary, times, torques
 from tools.judge.reports.page_model import PageModel, PageWindow, TimelineEvent
 from tools.judge.reports.run_data import RunData, TimeAxis
 from tools.judge.reports.signals import Span
@@ -30,6 +30,11 @@ SCRIPTS: Final = tuple(
     HERE / f"{name}.js" for name in ("signals", "format", "overlay", "panel", "view", "page")
 )
 
+PANELS: Final = (
+    panels.body, panels.hand, panels.feet, panels.states, panels.network, times.ages,
+    panels.certificate, torques.joints, panels.harness, times.times,
+)  # fmt: skip
+"""What makes the panels, in the order of the page."""
 BEFORE_FALL_S: Final = 3.0
 """A click on a fall shows this time before it."""
 
@@ -56,11 +61,6 @@ class Page:
     """The page of a run, whose parts are taken one after the other."""
 
     def __init__(self, axis: TimeAxis | None = None) -> None:
-        """Begin a page.
-
-        Args:
-            axis: its time axis; None, for a run that is taken at once: that of the run.
-        """
         self._axis = axis
         self._model: PageModel | None = None
         self._about: RunData | None = None
@@ -71,11 +71,7 @@ class Page:
         self._losses = summary.MessageLosses()
 
     def take(self, log: RunLog) -> None:
-        """Take a run, or the next part of it.
-
-        Raises:
-            RunError: a message has another version.
-        """
+        """Take a run, or the next part of it."""
         run = RunData(log, self._axis, self._armed_s)
         armed_s = run.armed_s()
         self._armed_s = armed_s if math.isfinite(armed_s) else None
@@ -86,7 +82,9 @@ class Page:
         self._model = self._model or PageModel(run.span)
         span = None if log.is_whole else run.span
         self._model.window = PageWindow(run.begin_s, run.end_s, span)
-        add_panels(run, self._model)
+        for make in PANELS:
+            for panel in make(run):
+                self._model.add(panel)
         self._timeline.take(run)
         self._judge.take(run)
         self._losses.take(run)
@@ -98,6 +96,7 @@ class Page:
         assert model is not None  # noqa: S101
         log = run.log
         events = self._timeline.events(run.span)
+        plots, left_out = model.as_data(events)
         verdict = self._judge.verdict(
             log, self._losses.counts.values(), whole=self._has_first and self._has_last
         )
@@ -107,21 +106,17 @@ class Page:
             _head(run, verdict, name),
             _tools(run, fell_s),
             f'<div class="work">{_timeline(events)}<main id="panels"></main></div>',
-            _left_out(model),
+            _left_out(left_out),
             _message_losses(run, self._losses.rows(log.robot)),
             _inputs(run),
         )
-        data = json.dumps(model.as_data(events), separators=(",", ":"), allow_nan=False)
+        data = json.dumps(plots, separators=(",", ":"), allow_nan=False)
         prefix = "" if verdict.good is None else f"{verdict.sentence}: "
         return _document(f"{prefix}{name}, {log.robot}", "\n".join(parts), data)
 
 
 def render(log: RunLog) -> str:
-    """Return the page of a run that is in memory.
-
-    Raises:
-        RunError: a message has another version.
-    """
+    """Return the page of a run that is in memory."""
     page = Page()
     page.take(log)
     return page.html()
@@ -134,42 +129,18 @@ def render_parts(
     part_s: float = PART_S,
     done: Callable[[float], None] = lambda _: None,
 ) -> str:
-    """Return the page of a run, or of a part of it, with little of it in memory at a time.
-
-    Args:
-        index: of the run.
-        part: what of it to show.
-        part_s: length of what is read at a time, s.
-        done: takes the time of the run that is done, s.
-
-    Raises:
-        RunError: a message has another version, or there is none.
-    """
+    """Return the page of a run, or of a part of it, with `part_s` of it in memory at a time."""
     zero = zero_ns(index)
-    began_ns = index.began_ns - index.offset_ns
-    offset_s = (began_ns - zero) / NS_PER_S
+    offset_s = (index.span_ns[0] - zero) / NS_PER_S
     begin_s, end_s = max(part.begin_s, 0.0), min(part.end_s, index.length_s)
     page = Page(TimeAxis(zero, Span(begin_s + offset_s, end_s + offset_s)))
     heard = False
-    for log in parts_of(index, part, part_s=part_s):
+    for log in parts_of(index, part, part_s=part_s, done=done):
         heard = heard or bool(log.keys())
         page.take(log)
-        done((log.end_ns - began_ns) / NS_PER_S)
     if not heard:
         raise RunError(f"{index.path}: has no message in this part; {SEE_INFO}")
     return page.html()
-
-
-def add_panels(run: RunData, model: PageModel) -> None:
-    """Add all panels of a run, in the order of the page."""
-    panels.add_body(run, model)
-    panels.add_states(run, model)
-    network.add_network(run, model)
-    times.add_ages(run, model)
-    panels.add_certificate(run, model)
-    torques.add_joints(run, model)
-    panels.add_harness(run, model)
-    times.add_times(run, model)
 
 
 def _document(title: str, body: str, data: str) -> str:
@@ -251,10 +222,10 @@ def _tools(run: RunData, fell_s: float | None) -> str:
     )
 
 
-def _left_out(model: PageModel) -> str:
-    if not model.left_out:
+def _left_out(panels_without_data: Sequence[tuple[str, str]]) -> str:
+    if not panels_without_data:
         return ""
-    rows = "".join(f"<li>{escape(title)}: {escape(why)}</li>" for title, why in model.left_out)
+    rows = "".join(f"<li>{escape(title)}: {escape(why)}</li>" for title, why in panels_without_data)
     return f'<section id="left-out"><h2>Panels without data</h2><ul>{rows}</ul></section>'
 
 
@@ -279,15 +250,13 @@ def _before(row: TimelineEvent) -> str:
 
 
 def _message_losses(run: RunData, rows: Sequence[TopicLoss]) -> str:
-    missing = sum(row.lost for row in rows)
-    cells = [
-        (
-            row.name, str(row.messages), f"{row.rate_hz:.1f}" if row.rate_hz is not None else "",
-            f"{row.nominal_hz:g}" if row.nominal_hz else "", str(row.lost), str(row.gaps),
-            str(row.restarts),
-        )
-        for row in rows
-    ]  # fmt: skip
+    missing = sum(row.counted.missing for row in rows)
+    cells = []
+    for name, rate_hz, nominal_hz, count in rows:
+        rate = f"{rate_hz:.1f}" if rate_hz is not None else ""
+        nominal = f"{nominal_hz:g}" if nominal_hz else ""
+        counts = map(str, (count.missing, count.gaps, count.restarts))
+        cells.append((name, str(count.count), rate, nominal, *counts))
     title = f"Messages: {missing} lost on the way to the log" if missing else "Messages: none lost"
     names = ("topic", "messages", "Hz", "nominal Hz", "lost", "gaps", "restarts")
     damage = "".join(f"<li>{escape(line)}</li>" for line in summary.damage(run))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from enum import IntEnum
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 
 from shared.bus.messages import name_of
@@ -43,6 +44,56 @@ class BarRow(NamedTuple):
     codes: Array
 
 
+class Lines(NamedTuple):
+    """A set of lines, with the levels to compare them with."""
+
+    lines: Sequence[Line]
+    limits: Sequence[LevelLine] = ()
+
+
+class Panel(msgspec.Struct, frozen=True):
+    """What a run, or a part of it, has for a panel; of a long run a panel goes on part by part."""
+
+    title: str
+    unit: str = ""
+    note: str = ""
+    """An explanation for readers who do not know the panel."""
+    if_empty: str = ""
+    """Why it is left out, where the log has no data for it."""
+
+
+class Plot(Panel, frozen=True, kw_only=True):
+    """Lines over one value axis; those without data are left out."""
+
+    lines: Sequence[Line]
+    limits: Sequence[LevelLine] = ()
+    reach: float | None = None
+    """Upper end of the value axis; lines may go beyond it."""
+    needs_count: bool = False
+    """A panel whose lines are all zero is left out too."""
+
+
+class Choice(Panel, frozen=True, kw_only=True):
+    """One of several sets of lines at a time; panels of one group show the same."""
+
+    group: str
+    choices: Mapping[str, Lines]
+    initial: str
+    """Set that is shown first."""
+    weight: float = 0.0
+    """Of several parts of a run, that of the greatest says what is shown first."""
+
+
+class Bars(Panel, frozen=True, kw_only=True):
+    """Coloured bars, in rows from top to bottom; rows without data are left out."""
+
+    rows: Sequence[BarRow]
+    names: type[IntEnum]
+    """Of the codes."""
+    colours: Mapping[int, str]
+    """Name of the colour of each code."""
+
+
 class TimelineEvent(NamedTuple):
     """One row of the timeline."""
 
@@ -53,74 +104,6 @@ class TimelineEvent(NamedTuple):
     text: str
     mark: str = ""
     """Label of the mark in the plots; empty: no mark."""
-
-
-class _Trace:
-    """One line over all parts of a run."""
-
-    def __init__(self, line: Line) -> None:
-        self.line = line
-        self._t: list[Array] = []
-        self._values: list[Array] = []
-        self._count = 0.0
-
-    def add(self, t: Array, values: Array) -> None:
-        """Add what a part of the run has of it."""
-        if not len(t):
-            return
-        if self.line.counts_up:
-            values = values + self._count
-            self._count = float(values[-1])
-        self._t.append(t)
-        self._values.append(values)
-
-    def signal(self, span: Span) -> dict[str, Any] | None:
-        """Return it as the page stores it; None if it has no finite value."""
-        if not self._t:
-            return None
-        return encode_signal(np.concatenate(self._t), np.concatenate(self._values), span)
-
-    def is_zero(self) -> bool:
-        return not any(values.any() for values in self._values)
-
-
-class _Lines:
-    """Lines of a panel or of one choice, in the order in which they came first."""
-
-    def __init__(self) -> None:
-        self.traces: dict[str, _Trace] = {}
-        self.limits: Sequence[LevelLine] = ()
-
-    def add(self, lines: Sequence[Line], limits: Sequence[LevelLine], window: PageWindow) -> None:
-        """Add the lines of a part of the run."""
-        self.limits = limits
-        for line in lines:
-            values = line.values
-            if line.counts_up:  # what it counted before the part is in the part before
-                values = values - (values[line.t < window.begin_s][-1:].sum())
-            trace = self.traces.setdefault(line.label, _Trace(line))
-            trace.add(*window.of(line.t, values))
-
-    def is_zero(self) -> bool:
-        """Return True if no line ever leaves zero."""
-        return all(trace.is_zero() for trace in self.traces.values())
-
-
-class _Panel:
-    """A panel of lines, of one of several sets of lines, or of bars."""
-
-    def __init__(self, kind: str, title: str, unit: str, note: str, if_empty: str) -> None:
-        self.kind, self.title, self.unit = kind, title, unit
-        self.note, self.if_empty = note, if_empty
-        self.lines = _Lines()
-        self.reach: float | None = None
-        self.needs_count = False
-        self.group = ""
-        self.choices: dict[str, _Lines] = {}
-        self.initial, self.weight = "", -np.inf
-        self.bars: dict[str, list[list[float]]] = {}
-        self.names: type[IntEnum] = IntEnum
-        self.colours: Mapping[int, str] = {}
 
 
 class PageWindow(NamedTuple):
@@ -139,142 +122,126 @@ class PageWindow(NamedTuple):
         return (t, values) if self.span is None else thinned(t, values, self.span)
 
 
-class PageModel:
-    """Panels of a page, in the order in which they are added.
+class _Trace:
+    """One line over all parts of a run."""
 
-    A long run is added part by part: a panel or line that is there already goes on.
-    """
+    def __init__(self, line: Line) -> None:
+        self.line = line
+        self.parts: list[tuple[Array, Array]] = []
+        self._count = 0.0
+
+    def add(self, line: Line, window: PageWindow) -> None:
+        """Add what a part of the run has of it."""
+        values = line.values
+        if line.counts_up:  # what it counted before the part is in the part before
+            values = values - (values[line.t < window.begin_s][-1:].sum())
+        t, values = window.of(line.t, values)
+        if not len(t):
+            return
+        if line.counts_up:
+            values = values + self._count
+            self._count = float(values[-1])
+        self.parts.append((t, values))
+
+
+class _Gathered:
+    """A panel over all parts of a run."""
+
+    def __init__(self, panel: Panel) -> None:
+        self.panel = panel
+        """Of the newest part."""
+        self._traces: dict[str, dict[str, _Trace]] = {}
+        """By choice and label; the only choice of a plot is ""."""
+        self._limits: dict[str, Sequence[LevelLine]] = {}
+        self._bars: dict[str, list[list[float]]] = {}
+        self._initial, self._weight = "", -np.inf
+
+    def add(self, panel: Panel, window: PageWindow, span: Span) -> None:
+        """Add what a part of the run has of it."""
+        self.panel = panel
+        choices: Mapping[str, Lines] = {}
+        if isinstance(panel, Plot):
+            choices = {"": Lines(panel.lines, panel.limits)}
+        elif isinstance(panel, Choice):
+            choices = panel.choices
+            if panel.weight > self._weight:
+                self._initial, self._weight = panel.initial, panel.weight
+        elif isinstance(panel, Bars):
+            begin_s = max(span.begin, window.begin_s)
+            for row in panel.rows:
+                inside = (row.t >= begin_s) & (row.t <= span.end) & (row.t < window.end_s)
+                spans = segments(row.t[inside], np.asarray(row.codes[inside], dtype=np.int64))
+                _go_on(self._bars.setdefault(row.label, []), spans)
+        for name, (lines, limits) in choices.items():
+            self._limits[name] = limits
+            traces = self._traces.setdefault(name, {})
+            for line in lines:
+                traces.setdefault(line.label, _Trace(line)).add(line, window)
+
+    def as_data(self, signals: _Signals) -> dict[str, Any] | None:
+        """Return it as the page stores it; None if it has no data."""
+        panel = self.panel
+        head = {"title": panel.title, "note": panel.note}
+        if isinstance(panel, Bars):
+            rows = [
+                {"label": label, "spans": spans} for label, spans in self._bars.items() if spans
+            ]
+            used = sorted({int(span[2]) for spans in self._bars.values() for span in spans})
+            codes = {
+                str(code): [name_of(panel.names, code), panel.colours.get(code, "idle")]
+                for code in used
+            }
+            return {"kind": "bars", **head, "rows": rows, "codes": codes} if rows else None
+        if isinstance(panel, Plot) and panel.needs_count and self._is_zero():
+            return None
+        choices = [
+            {"label": name, "lines": lines, "limits": [row._asdict() for row in self._limits[name]]}
+            for name, traces in self._traces.items()
+            if (lines := signals.lines(traces.values()))
+        ]
+        if not choices:
+            return None
+        plot = {"kind": "plot", **head, "unit": panel.unit}
+        if isinstance(panel, Choice):
+            labels = [choice["label"] for choice in choices]
+            index = labels.index(self._initial) if self._initial in labels else 0
+            return plot | {"group": panel.group, "choices": choices, "initial": index}
+        del choices[0]["label"]
+        return plot | choices[0] | {"reach": panel.reach if isinstance(panel, Plot) else None}
+
+    def _is_zero(self) -> bool:
+        """Return True if no line ever leaves zero."""
+        traces = self._traces[""].values()
+        return not any(values.any() for trace in traces for _, values in trace.parts)
+
+
+class PageModel:
+    """Panels of a page, in the order in which they are added first; a long run part by part."""
 
     def __init__(self, span: Span) -> None:
         self.span = span
         self.window = PageWindow()
         """What of the data added is taken."""
-        self._panels: dict[str, _Panel] = {}
-        self._encoded_panels: tuple[list[tuple[_Panel, dict[str, Any] | None]], _Signals] | None = (
-            None
-        )
+        self._panels: dict[str, _Gathered] = {}
 
-    def plot(
-        self,
-        title: str,
-        unit: str,
-        lines: Sequence[Line],
-        *,
-        limits: Sequence[LevelLine] = (),
-        reach: float | None = None,
-        note: str = "",
-        if_empty: str = "",
-        needs_count: bool = False,
-    ) -> None:
-        """Add a panel of lines; a panel without data is left out.
+    def add(self, panel: Panel) -> None:
+        """Add a panel, or what the next part of the run has of it."""
+        self._panels.setdefault(panel.title, _Gathered(panel)).add(panel, self.window, self.span)
 
-        Args:
-            title: title of the panel.
-            unit: unit of the value axis.
-            lines: lines; those without data are left out.
-            limits: levels.
-            reach: upper end of the value axis; lines may go beyond it.
-            note: an explanation for readers who do not know the panel.
-            if_empty: reason to state if the panel has no data.
-            needs_count: a panel whose lines are all zero is left out too.
-        """
-        panel = self._panel("plot", title, unit, note, if_empty)
-        panel.reach, panel.needs_count = reach, needs_count
-        panel.lines.add(lines, limits, self.window)
-
-    def choice(
-        self,
-        title: str,
-        unit: str,
-        group: str,
-        choices: Mapping[str, tuple[Sequence[Line], Sequence[LevelLine]]],
-        *,
-        initial: str,
-        weight: float = 0.0,
-        note: str = "",
-        if_empty: str = "",
-    ) -> None:
-        """Add a panel that shows one of several sets of lines at a time.
-
-        Args:
-            title: title of the panel.
-            unit: unit of the value axis.
-            group: panels of one group show the same choice.
-            choices: lines and levels by name.
-            initial: name of the set that is shown first.
-            weight: of several parts of a run, that of the greatest weight says what is first.
-            note: an explanation for readers who do not know the panel.
-            if_empty: reason to state if the panel has no data.
-        """
-        panel = self._panel("choice", title, unit, note, if_empty)
-        panel.group = group
-        if weight > panel.weight:
-            panel.initial, panel.weight = initial, weight
-        for label, (lines, limits) in choices.items():
-            panel.choices.setdefault(label, _Lines()).add(lines, limits, self.window)
-
-    def bars(
-        self,
-        title: str,
-        rows: Sequence[BarRow],
-        names: type[IntEnum],
-        colours: Mapping[int, str],
-        *,
-        if_empty: str = "",
-    ) -> None:
-        """Add a panel of coloured bars; rows without data are left out.
-
-        Args:
-            title: title of the panel.
-            rows: rows from top to bottom.
-            names: names of the codes.
-            colours: name of the colour of each code.
-            if_empty: reason to state if the panel has no data.
-        """
-        panel = self._panel("bars", title, "", "", if_empty)
-        panel.names, panel.colours = names, colours
-        for row in rows:
-            begin_s = max(self.span.begin, self.window.begin_s)
-            inside = (row.t >= begin_s) & (row.t <= self.span.end) & (row.t < self.window.end_s)
-            spans = segments(row.t[inside], np.asarray(row.codes[inside], dtype=np.int64))
-            _go_on(panel.bars.setdefault(row.label, []), spans)
-
-    def leave_out(self, title: str, why: str) -> None:
-        """Note that the log has no data for a panel."""
-        self._panel("plot", title, "", "", why)
-
-    def as_data(self, events: Sequence[TimelineEvent]) -> dict[str, Any]:
-        """Return the data of the page's plots."""
-        panels, signals = self._encoded()
-        return {
+    def as_data(
+        self, events: Sequence[TimelineEvent]
+    ) -> tuple[dict[str, Any], list[tuple[str, str]]]:
+        """Return the data of the page's plots; title and reason of each panel without data."""
+        signals = _Signals(self.span)
+        found = [(row.panel, row.as_data(signals)) for row in self._panels.values()]
+        data = {
             "span": [self.span.begin, self.span.end],
             "grid": self.span.grid,
             "signals": signals.rows,
-            "panels": [data for _, data in panels if data is not None],
+            "panels": [data for _, data in found if data is not None],
             "marks": [[row.t, row.kind, row.mark] for row in events if row.mark],
         }
-
-    @property
-    def left_out(self) -> list[tuple[str, str]]:
-        """(title, reason) of each panel for which the log has no data."""
-        panels, _ = self._encoded()
-        return [(panel.title, panel.if_empty) for panel, data in panels if data is None]
-
-    def _panel(self, kind: str, title: str, unit: str, note: str, if_empty: str) -> _Panel:
-        self._encoded_panels = None
-        found = self._panels.get(title)
-        if found is None:
-            found = self._panels[title] = _Panel(kind, title, unit, note, if_empty)
-        elif unit:  # a part before it may have had nothing to show
-            found.unit, found.note, found.if_empty = unit, note, if_empty
-        return found
-
-    def _encoded(self) -> tuple[list[tuple[_Panel, dict[str, Any] | None]], _Signals]:
-        if self._encoded_panels is None:
-            signals = _Signals(self.span)
-            panels = [(panel, _data(panel, signals)) for panel in self._panels.values()]
-            self._encoded_panels = panels, signals
-        return self._encoded_panels
+        return data, [(panel.title, panel.if_empty) for panel, data in found if data is None]
 
 
 class _Signals:
@@ -285,21 +252,19 @@ class _Signals:
         self._span = span
         self._indices: dict[tuple[Any, ...], int] = {}
 
-    def lines(self, lines: _Lines) -> list[dict[str, Any]]:
-        """Return lines as the page stores them; those without data are left out."""
+    def lines(self, traces: Iterable[_Trace]) -> list[dict[str, Any]]:
+        """Return lines as the page stores them; those without a finite value are left out."""
         found = []
-        for trace in lines.traces.values():
-            signal, line = trace.signal(self._span), trace.line
+        for trace in traces:
+            if not trace.parts:
+                continue
+            t, values = map(np.concatenate, zip(*trace.parts, strict=True))
+            signal, line = encode_signal(t, values, self._span), trace.line
             if signal is not None:
-                found.append(
-                    {
-                        "label": line.label,
-                        "signal": self._index(signal),
-                        "colour": line.colour,
-                        "hidden": line.hidden,
-                        "dashed": line.dashed,
-                    }
-                )
+                found.append({
+                    "label": line.label, "signal": self._index(signal), "colour": line.colour,
+                    "hidden": line.hidden, "dashed": line.dashed,
+                })  # fmt: skip
         return found
 
     def _index(self, signal: dict[str, Any]) -> int:
@@ -309,40 +274,9 @@ class _Signals:
         return index
 
 
-def _data(panel: _Panel, signals: _Signals) -> dict[str, Any] | None:
-    """Return a panel as the page stores it; None if it has no data."""
-    head = {"title": panel.title, "note": panel.note}
-    if panel.kind == "bars":
-        rows = [{"label": label, "spans": spans} for label, spans in panel.bars.items() if spans]
-        used = sorted({int(span[2]) for spans in panel.bars.values() for span in spans})
-        names, colours = panel.names, panel.colours
-        codes = {str(code): [name_of(names, code), colours.get(code, "idle")] for code in used}
-        return {"kind": "bars", **head, "rows": rows, "codes": codes} if rows else None
-    plot = {"kind": "plot", **head, "unit": panel.unit}
-    if panel.kind == "choice":
-        choices = [
-            {"label": label, "lines": found, "limits": _levels(lines.limits)}
-            for label, lines in panel.choices.items()
-            if (found := signals.lines(lines))
-        ]
-        labels = [choice["label"] for choice in choices]
-        index = labels.index(panel.initial) if panel.initial in labels else 0
-        more = {"group": panel.group, "choices": choices, "initial": index}
-        return plot | more if choices else None
-    if panel.needs_count and panel.lines.is_zero():
-        return None
-    found = signals.lines(panel.lines)
-    more = {"lines": found, "limits": _levels(panel.lines.limits), "reach": panel.reach}
-    return plot | more if found else None
-
-
 def _go_on(spans: list[list[float]], more: list[list[float]]) -> None:
     """Add intervals behind others; one that goes on is not divided."""
     if spans and more and spans[-1][2] == more[0][2] and more[0][0] - spans[-1][1] <= GAP_S:
         spans[-1][1] = more[0][1]
         more = more[1:]
     spans += more
-
-
-def _levels(limits: Sequence[LevelLine]) -> list[dict[str, Any]]:
-    return [limit._asdict() for limit in limits]

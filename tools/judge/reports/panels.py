@@ -1,46 +1,46 @@
-"""Panels of the body, the operator's hand, the feet, the states, the harness, the certificate."""
+"""Panels of the body, the hand, the feet, the states, the network, the harness, the certificate."""
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
 from enum import IntEnum
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shared.bus import topics
 from shared.bus.messages import DriveStatus, Mode, PlannerMode, SplitSource
+from shared.bus.topics import Topic
+from shared.bus.traces import LinkEvent
+from shared.clock import NS_PER_S
 from shared.joints import MODULES
-from tools.judge.reports.page_model import BarRow, LevelLine, Line, PageModel
+from shared.links import GROUPS
+from tools.judge.reports.page_model import BarRow, Bars, LevelLine, Line, Panel, Plot
 from tools.judge.reports.run_data import RunData
-from tools.judge.reports.signals import Array
-from tools.judge.verdict_limits import LIMITS
+from tools.judge.reports.signals import GAP_S, Array
+from tools.judge.standing import LIMITS
 
 NO_WORLD: Final = "no sim/truth in this log"
 NO_PLANNER: Final = "no planner/status in this log"
 NO_HARNESS: Final = "no harness/wrench in this log"
 NO_STATES: Final = "no joint/*/state in this log"
+NO_IMPAIRMENTS: Final = "no impairment in this log"
+XYZ: Final = ("x", "y", "z")
+ANGLES: Final = ("roll", "pitch", "yaw")
 
 ALLOWED: Final = {row.key: row.limit for row in LIMITS}
 """Limits of the verdict; the panels show those that hold while the planner leads."""
 
-MODE_COLOURS: Final[dict[int, str]] = {
-    Mode.DISARMED: "idle", Mode.HOLD: "warn", Mode.TRACK: "good",
-    Mode.DAMP: "odd", Mode.FAULT: "bad",
-}  # fmt: skip
-DRIVE_COLOURS: Final[dict[int, str]] = {
-    DriveStatus.LOST: "bad", DriveStatus.IDLE: "idle", DriveStatus.ARMED: "good",
-    DriveStatus.ERROR: "odd", DriveStatus.UNZEROED: "warn", DriveStatus.HOLDING: "good",
-}  # fmt: skip
-PLANNER_COLOURS: Final[dict[int, str]] = {
-    PlannerMode.WAITING: "idle", PlannerMode.ALIGNING: "warn", PlannerMode.LEADING: "good",
-    PlannerMode.OVERLOADED: "odd", PlannerMode.UNCERTIFIED: "bad",
-    PlannerMode.MISPLACED: "bad", PlannerMode.TRIPPED: "bad",
-    PlannerMode.MISLOADED: "bad", PlannerMode.YIELDING: "odd",
-}  # fmt: skip
-SPLIT_COLOURS: Final[dict[int, str]] = {
-    SplitSource.DIAGONAL: "idle", SplitSource.SCHEDULE: "good", SplitSource.STIFFENED: "warn",
-    SplitSource.UNCERTIFIED: "bad", SplitSource.CONTROLLER: "good",
-}  # fmt: skip
+
+class ImpairedLink(IntEnum):
+    """State of one direction of a link."""
+
+    CLEAR = 0
+    IMPAIRED = 1
+    """Delayed, or lossy."""
+    CUT = 2
 
 
 class WrenchQuality(IntEnum):
@@ -51,16 +51,66 @@ class WrenchQuality(IntEnum):
     SATURATED = 2
 
 
-WRENCH_COLOURS: Final[dict[int, str]] = {
-    WrenchQuality.VALID: "good", WrenchQuality.NOT_VALID: "warn", WrenchQuality.SATURATED: "bad",
+COLOURS: Final[Mapping[type[IntEnum], Mapping[int, str]]] = {
+    Mode: {
+        Mode.DISARMED: "idle", Mode.HOLD: "warn", Mode.TRACK: "good", Mode.DAMP: "odd",
+        Mode.FAULT: "bad",
+    },
+    DriveStatus: {
+        DriveStatus.LOST: "bad", DriveStatus.IDLE: "idle", DriveStatus.ARMED: "good",
+        DriveStatus.ERROR: "odd", DriveStatus.UNZEROED: "warn", DriveStatus.HOLDING: "good",
+    },
+    PlannerMode: {
+        PlannerMode.WAITING: "idle", PlannerMode.ALIGNING: "warn", PlannerMode.LEADING: "good",
+        PlannerMode.OVERLOADED: "odd", PlannerMode.UNCERTIFIED: "bad",
+        PlannerMode.MISPLACED: "bad", PlannerMode.TRIPPED: "bad", PlannerMode.MISLOADED: "bad",
+        PlannerMode.YIELDING: "odd",
+    },
+    SplitSource: {
+        SplitSource.DIAGONAL: "idle", SplitSource.SCHEDULE: "good", SplitSource.STIFFENED: "warn",
+        SplitSource.UNCERTIFIED: "bad", SplitSource.CONTROLLER: "good",
+    },
+    WrenchQuality: {
+        WrenchQuality.VALID: "good", WrenchQuality.NOT_VALID: "warn",
+        WrenchQuality.SATURATED: "bad",
+    },
+    ImpairedLink: {
+        ImpairedLink.CLEAR: "good", ImpairedLink.IMPAIRED: "warn", ImpairedLink.CUT: "bad",
+    },
 }  # fmt: skip
 
 
-def add_body(run: RunData, model: PageModel) -> None:
-    """Add COM, height and torso angles (the paper's Fig. 7), the operator's force and the feet."""
-    com, torso, angles = _truth(run, "com", "torso", "angles")
-    p, p_ref = _planner(run)
+class StateBars(NamedTuple):
+    """A panel of bars that shows one field of a topic."""
+
+    title: str
+    label: str
+    """Of its row; empty: a row for each module."""
+    topic: Topic
+    field: str
+    names: type[IntEnum]
+    if_empty: str
+
+
+STATES: Final = (
+    StateBars("Modes of the six services", "", topics.JOINT_STATE, "mode", Mode, NO_STATES),
+    StateBars("Drives", "", topics.JOINT_STATE, "drive", DriveStatus, NO_STATES),
+    StateBars("Planner", "planner", topics.PLANNER_STATUS, "mode", PlannerMode, NO_PLANNER),
+    StateBars(
+        "Source of the local gains", "gains", topics.PLANNER_STATUS, "split", SplitSource,
+        NO_PLANNER,
+    ),
+)  # fmt: skip
+
+History = tuple[tuple[float, ImpairedLink], ...]
+
+
+def body(run: RunData) -> Iterator[Panel]:
+    """Yield COM, height and torso angles (the paper's Fig. 7)."""
+    com, torso, angles = (run.wide(topics.SIM_TRUTH, n, 3) for n in ("com", "torso", "angles"))
     t, t_p = run.times(topics.SIM_TRUTH), run.times(topics.PLANNER_STATUS)
+    p, p_ref = (run.wide(topics.PLANNER_STATUS, name, 6) for name in ("p", "p_ref"))
+    p[_waits(run)] = p_ref[_waits(run)] = np.nan
     simulated = bool(len(t))
 
     def both(label: str, truth: Array, estimate: Array, colour: int) -> list[Line]:
@@ -70,38 +120,34 @@ def add_body(run: RunData, model: PageModel) -> None:
         return [*lines, Line(name, t_p, estimate, colour, hidden=simulated, dashed=simulated)]
 
     neither = f"{NO_WORLD}, and {NO_PLANNER}"
-    model.plot(
-        "COM", "mm",
-        [*both("x", com[:, 0] * 1e3, p[:, 0] * 1e3, 0),
-         *both("y", com[:, 1] * 1e3, p[:, 1] * 1e3, 1)],
+    yield Plot(
+        "COM", "mm", "World axes: x forward, y left; 0 is midway between the ankles.", neither,
+        lines=[*both("x", com[:, 0] * 1e3, p[:, 0] * 1e3, 0),
+               *both("y", com[:, 1] * 1e3, p[:, 1] * 1e3, 1)],
         limits=[*_leading_limits("alive_com_x_max_mm", "x, planner leading"),
                 *_leading_limits("alive_com_y_max_mm", "y, planner leading")],
-        note="World axes: x forward, y left; 0 is midway between the ankles.",
-        if_empty=neither,
     )  # fmt: skip
-    model.plot(
-        "Height", "m",
-        [Line("torso", t, torso[:, 2], 0), *both("COM", com[:, 2], p[:, 2], 1),
-         Line("COM reference", t_p, p_ref[:, 2], 2, hidden=True, dashed=True)],
-        note="Above the ankles.", if_empty=neither,
+    yield Plot(
+        "Height", "m", "Above the ankles.", neither,
+        lines=[Line("torso", t, torso[:, 2], 0), *both("COM", com[:, 2], p[:, 2], 1),
+               Line("COM reference", t_p, p_ref[:, 2], 2, hidden=True, dashed=True)],
     )  # fmt: skip
-    model.plot(
-        "Torso angles", "rad",
-        [*(line for number, name in enumerate(("roll", "pitch", "yaw"))
-           for line in both(name, angles[:, number], p[:, 3 + number], number)),
-         Line("pitch reference", t_p, p_ref[:, 4], 4, hidden=True, dashed=True)],
+    yield Plot(
+        "Torso angles", "rad", "", neither,
+        lines=[*(line for number, name in enumerate(ANGLES)
+                 for line in both(name, angles[:, number], p[:, 3 + number], number)),
+               Line("pitch reference", t_p, p_ref[:, 4], 4, hidden=True, dashed=True)],
         limits=_leading_limits("alive_roll_max_rad", "roll and yaw, planner leading"),
-        if_empty=neither,
     )  # fmt: skip
-    _add_hand(run, model)
-    _add_feet(run, model)
 
 
-def _add_hand(run: RunData, model: PageModel) -> None:
-    hand, load, carried, push = _truth(run, "operator_force", "load_n", "harness_force_z", "push")
+def hand(run: RunData) -> Iterator[Panel]:
+    """Yield the operator's force, with what is carried and pushed."""
+    force, push = (run.wide(topics.SIM_TRUTH, name, 3) for name in ("operator_force", "push"))
+    load, carried = run.columns(topics.SIM_TRUTH, "", "load_n", "harness_force_z")
     t, t_p = run.times(topics.SIM_TRUTH), run.times(topics.PLANNER_STATUS)
     requested, assist = run.columns(topics.PLANNER_STATUS, "", "assist_requested_n", "assist_n")
-    lines = [Line("hand, z", t, hand[:, 2], 0)]
+    lines = [Line("hand, z", t, force[:, 2], 0)]
     if load.any():
         lines += [Line("weight on the harness", t, load, 1), Line("carried", t, carried, 2)]
     if requested.any() or assist.any():
@@ -111,48 +157,157 @@ def _add_hand(run: RunData, model: PageModel) -> None:
         ]
     lines += [
         Line(f"push, {axis}", t, push[:, number], 3 + number, hidden=True)
-        for number, axis in enumerate("xyz")
+        for number, axis in enumerate(XYZ)
         if push[:, number].any()
     ]
-    model.plot(
-        "Operator's force", "N", lines if len(t) else [],
+    yield Plot(
+        "Operator's force", "N", "World axes, on the torso.", NO_WORLD,
+        lines=lines if len(t) else [],
         limits=_leading_limits("operator_peak_n", "hand, planner leading"),
-        note="World axes, on the torso.", if_empty=NO_WORLD,
     )  # fmt: skip
 
 
-def _add_feet(run: RunData, model: PageModel) -> None:
-    """Add tilt and slip of the feet, and how far the legs' estimates of the torso differ."""
-    right, left, slip = _truth(run, "foot_right_tilt", "foot_left_tilt", "feet_slip")
+def feet(run: RunData) -> Iterator[Panel]:
+    """Yield tilt and slip of the feet, and how far the legs' estimates of the torso differ."""
+    right, left, slip = run.columns(
+        topics.SIM_TRUTH, "", "foot_right_tilt", "foot_left_tilt", "feet_slip"
+    )
     t, t_p = run.times(topics.SIM_TRUTH), run.times(topics.PLANNER_STATUS)
-    model.plot(
-        "Tilt of the soles", "rad", [Line("right", t, right, 0), Line("left", t, left, 1)],
+    yield Plot(
+        "Tilt of the soles", "rad",
+        "Angle between sole and floor: a tilted foot stands on an edge.", NO_WORLD,
+        lines=[Line("right", t, right, 0), Line("left", t, left, 1)],
         limits=_leading_limits("alive_sole_tilt_max_rad", "planner leading")[:1],
-        note="Angle between sole and floor: a tilted foot stands on an edge.",
-        if_empty=NO_WORLD,
     )  # fmt: skip
-    model.plot(
-        "Slip of the feet", "mm", [Line("larger of both ankles", t, slip * 1e3, 0)],
-        note="Distance of the ankle from its position at the start.", if_empty=NO_WORLD,
+    yield Plot(
+        "Slip of the feet", "mm", "Distance of the ankle from its position at the start.", NO_WORLD,
+        lines=[Line("larger of both ankles", t, slip * 1e3, 0)],
     )  # fmt: skip
-    mode, closure = run.columns(topics.PLANNER_STATUS, "", "mode", "closure")
-    closure = _wide(closure, 6)
-    closure[(mode == PlannerMode.WAITING) | (t_p < run.armed_s())] = np.nan
+    closure = run.wide(topics.PLANNER_STATUS, "closure", 6)
+    closure[_waits(run) | (t_p < run.armed_s())] = np.nan
+    closure[:, :3] *= 1e3
     note = (
         "Left leg's estimate of the torso pose minus the right leg's: grows when a foot slips or "
         "tips."
     )
-    model.plot(
-        "Difference between the legs, position", "mm",
-        [Line(axis, t_p, closure[:, number] * 1e3, number) for number, axis in enumerate("xyz")],
-        note=note, if_empty=NO_PLANNER,
-    )  # fmt: skip
-    model.plot(
-        "Difference between the legs, angle", "rad",
-        [Line(axis, t_p, closure[:, 3 + number], number)
-         for number, axis in enumerate(("roll", "pitch", "yaw"))],
+    for what, unit, names, values, words in (
+        ("position", "mm", XYZ, closure[:, :3], note),
+        ("angle", "rad", ANGLES, closure[:, 3:], ""),
+    ):
+        title = f"Difference between the legs, {what}"
+        yield Plot(title, unit, words, NO_PLANNER, lines=_components(names, t_p, values))
+
+
+def states(run: RunData) -> Iterator[Panel]:
+    """Yield the state bars: services, drives, planner, gains, harness."""
+    for title, label, topic, field, names, if_empty in STATES:
+        rows = [
+            BarRow(label or module, run.times(topic, module), *run.columns(topic, module, field))
+            for module in (("",) if label else MODULES)
+        ]
+        yield Bars(title, if_empty=if_empty, rows=rows, names=names, colours=COLOURS[names])
+    valid, saturated = run.columns(topics.WRENCH, "", "valid", "saturated")
+    quality = np.where(saturated > 0.0, WrenchQuality.SATURATED, np.where(valid > 0.0, 0.0, 1.0))
+    yield Bars(
+        "Harness sensor",
+        if_empty=NO_HARNESS,
+        rows=[BarRow("harness", run.times(topics.WRENCH), quality)],
+        names=WrenchQuality,
+        colours=COLOURS[WrenchQuality],
+    )
+
+
+def network(run: RunData) -> Iterator[Panel]:
+    """Yield the impaired directions; directions with equal histories share a row."""
+    names_by_history: dict[History, list[str]] = defaultdict(list)
+    events: list[LinkEvent] = run.log.messages(topics.LINK_EVENT)
+    for name, history in histories(events, run.zero_ns).items():
+        names_by_history[history].append(name)
+    rows = []
+    for history, names in names_by_history.items():
+        # samples that are close enough to form one bar
+        changes = np.array([t for t, _ in history])
+        codes = np.array([ImpairedLink.CLEAR, *(code for _, code in history)])
+        t = np.union1d(np.arange(*run.span, GAP_S / 2), changes)
+        codes = codes[np.searchsorted(changes, t, side="right")]
+        rows += [BarRow(label, t, codes) for label in _labels(names)]
+    yield Bars(
+        "Injected network impairments",
+        if_empty=NO_IMPAIRMENTS,
+        rows=rows,
+        names=ImpairedLink,
+        colours=COLOURS[ImpairedLink],
+    )
+
+
+def histories(events: Iterable[LinkEvent], zero_ns: int) -> dict[str, History]:
+    """Return (time in s, state from then on) of each direction that was ever impaired.
+
+    A partition outweighs all other impairments (`shared.config.impairment.Direction`).
+    """
+    found: dict[str, list[tuple[float, ImpairedLink]]] = defaultdict(list)
+    active: dict[str, dict[int, bool]] = defaultdict(dict)
+    for event in events:
+        cuts = active[event.link]
+        if event.active:
+            cuts[event.number] = event.partition
+        else:
+            cuts.pop(event.number, None)
+        state = ImpairedLink.IMPAIRED if cuts else ImpairedLink.CLEAR
+        state = ImpairedLink.CUT if any(cuts.values()) else state
+        found[event.link].append(((event.t_ns - zero_ns) / NS_PER_S, state))
+    return {name: tuple(history) for name, history in found.items()}
+
+
+def _labels(names: Iterable[str]) -> list[str]:
+    """Return short labels: the largest groups that the directions cover, then the rest."""
+    left, found = set(names), []
+    for group, members in sorted(GROUPS.items(), key=lambda item: -len(item[1])):
+        if set(members) <= left:
+            found.append(group)
+            left -= set(members)
+    return [_short(name) for name in (*found, *sorted(left))]
+
+
+def _short(name: str) -> str:
+    sender, arrow, receiver = name.partition("->")
+    if not arrow:
+        return name
+    return f"to {receiver}" if sender == "planner" else f"from {sender}"
+
+
+def harness(run: RunData) -> Iterator[Panel]:
+    """Yield the measured wrench of the operator on the torso."""
+    t = run.times(topics.WRENCH)
+    note = "Wrench of the operator on the torso, at the harness point, torso axes."
+    for name, unit in (("force", "N"), ("moment", "N m")):
+        lines = _components(XYZ, t, run.wide(topics.WRENCH, name, 3))
+        yield Plot(f"Harness {name}", unit, note, NO_HARNESS, lines=lines)
+
+
+def certificate(run: RunData) -> Iterator[Panel]:
+    """Yield the stability margins of the active gains and the least allowed margins."""
+    t = run.times(topics.PLANNER_STATUS)
+    service, onboard = run.columns(topics.PLANNER_STATUS, "", "margin", "margin_onboard")
+    service[_waits(run)] = onboard[_waits(run)] = np.nan
+    limits = [LevelLine(0.0, "unstable")]
+    if run.robot is not None:
+        least = run.robot.certificate
+        limits += [
+            LevelLine(least.margin_min, "least, services"),
+            LevelLine(least.onboard_margin_min, "least, drives"),
+        ]
+    yield Plot(
+        "Certificate margin",
+        note="Stability without the planner: 1 is the required stiffness, at 0 the robot falls.",
         if_empty=NO_PLANNER,
-    )  # fmt: skip
+        lines=[Line("joint services alone", t, service, 0), Line("drives alone", t, onboard, 1)],
+        limits=limits,
+    )
+
+
+def _components(names: Iterable[str], t: Array, values: Array) -> list[Line]:
+    return [Line(name, t, values[:, number], number) for number, name in enumerate(names)]
 
 
 def _leading_limits(key: str, label: str) -> list[LevelLine]:
@@ -161,84 +316,7 @@ def _leading_limits(key: str, label: str) -> list[LevelLine]:
     return [LevelLine(most, label, shown=False), LevelLine(-most, label, shown=False)]
 
 
-def add_states(run: RunData, model: PageModel) -> None:
-    """Add the state bars: services, drives, planner, gains, harness."""
-    modes, drives = [], []
-    for module in MODULES:
-        t = run.times(topics.JOINT_STATE, module)
-        mode, drive = run.columns(topics.JOINT_STATE, module, "mode", "drive")
-        modes.append(BarRow(module, t, mode))
-        drives.append(BarRow(module, t, drive))
-    model.bars("Modes of the six services", modes, Mode, MODE_COLOURS, if_empty=NO_STATES)
-    model.bars("Drives", drives, DriveStatus, DRIVE_COLOURS, if_empty=NO_STATES)
-    t = run.times(topics.PLANNER_STATUS)
-    mode, split = run.columns(topics.PLANNER_STATUS, "", "mode", "split")
-    model.bars(
-        "Planner", [BarRow("planner", t, mode)], PlannerMode, PLANNER_COLOURS, if_empty=NO_PLANNER
-    )
-    model.bars(
-        "Source of the local gains", [BarRow("gains", t, split)], SplitSource, SPLIT_COLOURS,
-        if_empty=NO_PLANNER,
-    )  # fmt: skip
-    valid, saturated = run.columns(topics.WRENCH, "", "valid", "saturated")
-    quality = np.where(saturated > 0.0, WrenchQuality.SATURATED, np.where(valid > 0.0, 0.0, 1.0))
-    row = BarRow("harness", run.times(topics.WRENCH), quality)
-    model.bars("Harness sensor", [row], WrenchQuality, WRENCH_COLOURS, if_empty=NO_HARNESS)
-
-
-def add_harness(run: RunData, model: PageModel) -> None:
-    """Add the measured wrench of the operator on the torso."""
-    t = run.times(topics.WRENCH)
-    force, moment = run.columns(topics.WRENCH, "", "force", "moment")
-    force, moment = _wide(force, 3), _wide(moment, 3)
-    for title, unit, values in (("force", "N", force), ("moment", "N m", moment)):
-        lines = [Line(axis, t, values[:, number], number) for number, axis in enumerate("xyz")]
-        note = "Wrench of the operator on the torso, at the harness point, torso axes."
-        model.plot(f"Harness {title}", unit, lines, note=note, if_empty=NO_HARNESS)
-
-
-def add_certificate(run: RunData, model: PageModel) -> None:
-    """Add the stability margins of the active gains and the least allowed margins."""
-    t = run.times(topics.PLANNER_STATUS)
-    mode, service, onboard = run.columns(
-        topics.PLANNER_STATUS, "", "mode", "margin", "margin_onboard"
-    )
-    for values in (service, onboard):
-        values[mode == PlannerMode.WAITING] = np.nan
-    limits = [LevelLine(0.0, "unstable")]
-    if run.robot is not None:
-        certificate = run.robot.certificate
-        limits += [
-            LevelLine(certificate.margin_min, "least, services"),
-            LevelLine(certificate.onboard_margin_min, "least, drives"),
-        ]
-    model.plot(
-        "Certificate margin", "",
-        [Line("joint services alone", t, service, 0), Line("drives alone", t, onboard, 1)],
-        limits=limits,
-        note="Stability without the planner: 1 is the required stiffness, at 0 the robot falls.",
-        if_empty=NO_PLANNER,
-    )  # fmt: skip
-
-
-def _truth(run: RunData, *names: str) -> list[Array]:
-    widths = {"com": 3, "torso": 3, "angles": 3, "operator_force": 3, "push": 3}
-    found = run.columns(topics.SIM_TRUTH, "", *names)
-    return [
-        _wide(values, widths[name]) if name in widths else values
-        for name, values in zip(names, found, strict=True)
-    ]
-
-
-def _planner(run: RunData) -> tuple[Array, Array]:
-    """Return the planner's p and p_ref; NaN while it waits."""
-    mode, p, p_ref = run.columns(topics.PLANNER_STATUS, "", "mode", "p", "p_ref")
-    p, p_ref = _wide(p, 6), _wide(p_ref, 6)
-    for values in (p, p_ref):
-        values[mode == PlannerMode.WAITING] = np.nan
-    return p, p_ref
-
-
-def _wide(values: Array, columns: int) -> Array:
-    """Return an array of `columns` columns, even without messages."""
-    return values if values.ndim == 2 else np.zeros((0, columns))
+def _waits(run: RunData) -> NDArray[np.bool_]:
+    """Return where the planner waits: its estimates and margins are not known then."""
+    (mode,) = run.columns(topics.PLANNER_STATUS, "", "mode")
+    return np.asarray(mode == PlannerMode.WAITING)

@@ -18,8 +18,7 @@ from shared.joints import MODULES
 from tools.judge import verdict
 from tools.judge.reports.signals import Array, Span, message_times
 from tools.judge.verdict import Course
-from tools.logs.recorded_robot import robot_of
-from tools.logs.run_log import RunLog
+from tools.logs.run_log import RunLog, robot_of
 
 
 class TimeAxis(NamedTuple):
@@ -37,13 +36,6 @@ class RunData:
     def __init__(
         self, log: RunLog, axis: TimeAxis | None = None, armed_before_s: float | None = None
     ) -> None:
-        """Take a log.
-
-        Args:
-            log: a run; or a part of one, read with a margin.
-            axis: of the page; None: that of the log alone.
-            armed_before_s: when all six drives were armed first, in a part before this one.
-        """
         self.armed_before_s = armed_before_s
         self.log = log
         self.course: Course | None = None
@@ -119,6 +111,11 @@ class RunData:
             np.array([getattr(message, name) for message in messages], dtype=np.float64)
             for name in names
         ]
+
+    def wide(self, topic: Topic, name: str, width: int, module: str = "") -> Array:
+        """Return a field of some numbers (n, width), even without messages."""
+        (values,) = self.columns(topic, module, name)
+        return values.reshape(-1, width)
 
     def armed_s(self) -> float:
         """Return when all six drives were armed for the first time, s; if never, the begin.

@@ -1,36 +1,31 @@
 """3-D scene of the robot: a frame for each module, a body for each link, COM and forces.
 
 The frames are those of `shared.robot.frames`, and `com` with the axes of the world. The links are
-those of `shared.robot.robot_model`.
+those of `shared.robot.robot_model`. Rerun draws bodies from URDF alone, in a ROS 2 message; all its
+joints are floating: the transforms give the poses of the frames.
 """
 
 from __future__ import annotations
 
-import bisect
 import math
-from collections.abc import Iterable, Iterator
+import struct
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Final, NamedTuple
+from xml.etree import ElementTree as ET
 
 import numpy as np
 
 from services.planner.law.kinematics import Kinematics
 from shared.bus import topics
-from shared.bus.messages import JointState, Mode, PlannerStatus, SimTruth, Vector3, Wrench
+from shared.bus.messages import JointState, Mode, PlannerStatus, SimTruth, Vector3
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.joints import MODULES, SIDES
 from shared.mcap_log.log_copy import NewChannel, NewMessage
-from shared.robot.frames import (
-    ORIGIN,
-    UPRIGHT,
-    FramePose,
-    Quaternion,
-    body_frames,
-    torso_rotation,
-)
+from shared.robot.frames import ORIGIN, UPRIGHT, FramePose, Quaternion, body_frames, torso_rotation
 from shared.robot.robot_model import MODULE_RADIUS
-from tools.judge.reports import foxglove, urdf
+from tools.judge.reports import foxglove
 from tools.judge.reports.foxglove import Arrow, Colour, Entity, Solid
 from tools.logs.run_log import RunLog
 
@@ -48,6 +43,12 @@ COM: Final[Colour] = (0.05, 0.37, 0.65, 1.0)
 HAND: Final[Colour] = (0.77, 0.31, 0.11, 1.0)
 PUSH: Final[Colour] = (0.55, 0.20, 0.60, 1.0)
 UNKNOWN: Final[Colour] = (0.4, 0.4, 0.4, 1.0)
+URDF_SCHEMA_NAME: Final = "std_msgs/msg/String"
+URDF_SCHEMA: Final = b"string data\n"
+URDF_SCHEMA_ENCODING: Final = "ros2msg"
+URDF_ENCODING: Final = "cdr"
+"""Encoding of the message."""
+_LITTLE_ENDIAN: Final = b"\x00\x01\x00\x00"
 NO_MODE: Final = -1
 MODES: Final[dict[int, Colour]] = {
     Mode.DISARMED: (0.70, 0.74, 0.77, 1.0),
@@ -98,25 +99,17 @@ def channels(robot: str) -> list[NewChannel]:
     ]
     model = NewChannel(
         f"xrl/{robot}/robot_description",  # the name that Rerun expects
-        urdf.SCHEMA_NAME,
-        urdf.SCHEMA_ENCODING,
-        urdf.SCHEMA,
-        urdf.ENCODING,
+        URDF_SCHEMA_NAME,
+        URDF_SCHEMA_ENCODING,
+        URDF_SCHEMA,
+        URDF_ENCODING,
         {"why": "bodies of the robot as URDF, once"},
     )
     return [*found, model]
 
 
 def messages(logs: Iterable[RunLog], robot: RobotConfig) -> Iterator[NewMessage]:
-    """Yield the messages of a run's scene in the order of time.
-
-    Args:
-        logs: the run, or its parts one after the other.
-        robot: of the run.
-
-    Raises:
-        RunError: the log does not hold the states of all six modules.
-    """
+    """Yield the messages of a run's scene in the order of time."""
     links_ns: int | None = None
     missing: RunError | None = None
     for log in logs:
@@ -124,7 +117,7 @@ def messages(logs: Iterable[RunLog], robot: RobotConfig) -> Iterator[NewMessage]
             for pose in poses(log, robot):
                 ns = pose.t_ns + log.offset_ns
                 if links_ns is None:
-                    yield NewMessage(MODEL, ns, urdf.message(model(log.robot, robot, pose)))
+                    yield NewMessage(MODEL, ns, urdf_message(model(log.robot, robot, pose)))
                 yield NewMessage(FRAMES, ns, foxglove.transforms(ns, frames(robot, pose)))
                 if links_ns is None or ns - links_ns >= LINKS_PERIOD_S * NS_PER_S:
                     links_ns = ns
@@ -139,7 +132,7 @@ def messages(logs: Iterable[RunLog], robot: RobotConfig) -> Iterator[NewMessage]
 def model(name: str, robot: RobotConfig, pose: RobotPose) -> str:
     """Return all bodies of a robot as URDF; the modules have the colour of no mode."""
     still = pose._replace(modes=(NO_MODE,) * len(MODULES))
-    return urdf.urdf(name, frames(robot, pose), [*links(robot), *state(still)])
+    return urdf(name, frames(robot, pose), [*links(robot), *state(still)])
 
 
 def poses(log: RunLog, robot: RobotConfig) -> Iterator[RobotPose]:
@@ -147,20 +140,14 @@ def poses(log: RunLog, robot: RobotConfig) -> Iterator[RobotPose]:
 
     The pose of the torso comes from the simulated world. In a log without one it comes from the
     legs' kinematics, with the planner's stance.
-
-    Raises:
-        RunError: the log does not hold the states of all six modules.
     """
     states: list[list[JointState]] = [log.messages(topics.JOINT_STATE, name) for name in MODULES]
     if not all(states):
         missing = ", ".join(name for name, rows in zip(MODULES, states, strict=True) if not rows)
         raise RunError(f"{log.path}: no states of {missing}; a scene needs the states of all six")
     truth: list[SimTruth] = log.messages(topics.SIM_TRUTH)
-    wrenches: list[Wrench] = log.messages(topics.WRENCH)
-    newest = [NewestAt(rows) for rows in states]
-    wrench = NewestAt(wrenches)
-    statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
-    status = NewestAt(statuses)
+    newest = [log.newest(topics.JOINT_STATE, name) for name in MODULES]
+    wrenches, statuses = log.newest(topics.WRENCH), log.newest(topics.PLANNER_STATUS)
     kinematics = None if truth else Kinematics(robot)
     # a service without a sample from its drive yet publishes a stamp of 0
     first_ns = max(next((row.t_ns for row in rows if row.t_ns > 0), 0) for rows in states)
@@ -169,34 +156,27 @@ def poses(log: RunLog, robot: RobotConfig) -> Iterator[RobotPose]:
     for row in _thin(truth or states[0], first_ns):
         if row.t_ns >= log.end_ns and not log.is_last:
             break
-        states_now = [one.at(row.t_ns) for one in newest]
+        states_now: list[Any] = [one.at(row.t_ns) for one in newest]
         q = tuple(angle for state_now in states_now for angle in state_now.q)
-        sensed = wrench.at(row.t_ns) if wrenches and wrenches[0].t_ns <= row.t_ns else None
+        sensed = wrenches.at(row.t_ns)
         force = sensed.force if sensed is not None and sensed.valid else (0.0, 0.0, 0.0)
         modes = tuple(state_now.mode for state_now in states_now)
         if kinematics is None:
             yield RobotPose(row.t_ns, row.torso, row.angles, row.com, q, modes, force, row.push)
             continue
-        if statuses and statuses[0].t_ns <= row.t_ns:
-            kinematics.stance[:] = status.at(row.t_ns).stance
-        kinematics.update(np.array(q))
-        torso, com, angles = kinematics.r_torso, kinematics.p[:3], kinematics.p[3:]
-        yield RobotPose(
-            row.t_ns, _vector(torso), _vector(angles), _vector(com), q, modes, force,
-            ORIGIN,
-        )  # fmt: skip
+        known = pose_of_legs(kinematics, q, statuses.at(row.t_ns))
+        yield RobotPose(row.t_ns, *known, q, modes, force, ORIGIN)
 
 
-class NewestAt:
-    """Finds the newest message of a key at a time."""
-
-    def __init__(self, rows: list[Any]) -> None:
-        self._rows = rows
-        self._stamps = [row.t_ns for row in rows]
-
-    def at(self, t_ns: int) -> Any:
-        """Return the newest message at or before a time; there must be one."""
-        return self._rows[bisect.bisect_right(self._stamps, t_ns) - 1]
+def pose_of_legs(
+    kinematics: Kinematics, q: Sequence[float], status: PlannerStatus | None
+) -> tuple[Vector3, Vector3, Vector3]:
+    """Return torso, angles and COM as the legs know them, with the planner's stance."""
+    if status is not None:
+        kinematics.stance[:] = status.stance
+    kinematics.update(np.array(q))
+    p, (x, y, z) = kinematics.p.tolist(), kinematics.r_torso.tolist()
+    return (x, y, z), (p[3], p[4], p[5]), (p[0], p[1], p[2])
 
 
 def _thin(rows: list[Any], first_ns: int) -> Iterator[Any]:
@@ -264,5 +244,42 @@ def _arrows(force: Vector3, colour: Colour, position: Vector3 = ORIGIN) -> tuple
     return (Arrow(position, rotation_to(force), METRES_PER_NEWTON * size, 0.02, colour),)
 
 
-def _vector(values: Any) -> Vector3:
-    return float(values[0]), float(values[1]), float(values[2])
+def urdf_message(text: str) -> bytes:
+    """Return a `std_msgs/msg/String` in CDR."""
+    data = text.encode() + b"\0"
+    return _LITTLE_ENDIAN + struct.pack("<I", len(data)) + data
+
+
+def urdf(robot: str, frames: Sequence[FramePose], entities: Iterable[Entity]) -> str:
+    """Return the model: a link for each frame and its parents, a visual for each solid."""
+    root = ET.Element("robot", name=robot)
+    names = dict.fromkeys(name for row in frames for name in (row.parent, row.child))
+    links = {name: ET.SubElement(root, "link", name=name) for name in names}
+    for entity in entities:
+        for solid in entity.solids:
+            _add_visual(links[entity.frame], entity.name, solid)
+    for row in frames:
+        joint = ET.SubElement(root, "joint", name=f"to_{row.child}", type="floating")
+        ET.SubElement(joint, "parent", link=row.parent)
+        ET.SubElement(joint, "child", link=row.child)
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode")
+
+
+def _add_visual(link: ET.Element, name: str, solid: Solid) -> None:
+    visual = ET.SubElement(link, "visual", name=name)
+    ET.SubElement(visual, "origin", xyz=_listed(solid.position))
+    geometry = ET.SubElement(visual, "geometry")
+    x, _, z = solid.size
+    if solid.shape == "cube":
+        ET.SubElement(geometry, "box", size=_listed(solid.size))
+    elif solid.shape == "cylinder":
+        ET.SubElement(geometry, "cylinder", radius=str(x / 2), length=str(z))
+    else:
+        ET.SubElement(geometry, "sphere", radius=str(x / 2))
+    material = ET.SubElement(visual, "material", name=name)
+    ET.SubElement(material, "color", rgba=_listed(solid.colour))
+
+
+def _listed(values: Iterable[float]) -> str:
+    return " ".join(map(str, values))

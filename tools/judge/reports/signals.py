@@ -60,12 +60,6 @@ def message_times(
     equal stamps are placed after the first by their delay of reception, but before the next
     stamp. Messages received at the same time (all, in virtual time) are spread until the next
     stamp, at half the usual rate or faster.
-
-    Args:
-        stamps_ns: stamps of the messages, in the order of reception.
-        zero_ns: stamp of time 0.
-        received_ns: time of reception of each message, possibly by another clock; None: the
-            stamps are the times of reception.
     """
     stamps = np.maximum.accumulate(np.array(stamps_ns, dtype=np.int64))
     t = (stamps - zero_ns) / NS_PER_S
@@ -91,10 +85,7 @@ def message_times(
 def encode_signal(t: Array, values: Array, span: Span) -> dict[str, Any] | None:
     """Return a signal as the page stores it, or None if it has no finite value.
 
-    Args:
-        t: times, s, not falling.
-        values: one value for each time; NaN where there is none.
-        span: time that the page shows.
+    The times `t`, s, do not fall; a value is NaN where there is none.
     """
     usable = np.isfinite(values) & (t >= span.begin) & (t <= span.end)
     t, values = t[usable], values[usable]
@@ -130,13 +121,7 @@ def encode_signal(t: Array, values: Array, span: Span) -> dict[str, Any] | None:
 
 
 def thinned(t: Array, values: Array, span: Span) -> tuple[Array, Array]:
-    """Return the samples of each bin that `encode_signal` needs: its extremes, first and last.
-
-    Args:
-        t: times, s, not falling.
-        values: one value for each time; NaN where there is none.
-        span: time that the page shows.
-    """
+    """Return the samples of each bin that `encode_signal` needs: its extremes, first and last."""
     usable = np.isfinite(values)
     t, values = t[usable], values[usable]
     if not len(t):

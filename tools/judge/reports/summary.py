@@ -18,7 +18,6 @@ from shared.text_file import decoded
 from tools.judge import verdict, verdict_table
 from tools.judge.reports.run_data import RunData
 from tools.judge.verdict import Summary
-from tools.judge.verdict_limits import LIMITS
 from tools.logs.run_log import RunLog
 from tools.terminal import Console
 
@@ -28,6 +27,9 @@ REAL_TIME_ONLY: Final = ("pd_cycles_late_pct", "planner_tick_us")
 MACHINE: Final = {
     "python": "Python", "platform": "platform", "cpu_model": "CPU", "cpu_count": "CPUs",
 }  # fmt: skip
+
+
+INCOMPLETE: Final = "incomplete: the recorder did not close the file"
 
 
 class RunVerdict(NamedTuple):
@@ -46,13 +48,10 @@ class TopicLoss(NamedTuple):
     """Recorded and lost messages of one topic."""
 
     name: str
-    messages: int
     rate_hz: float | None
     """Mean rate from the first to the last message."""
     nominal_hz: float
-    lost: int
-    gaps: int
-    restarts: int
+    counted: KeyCount
 
 
 class Judge:
@@ -68,40 +67,38 @@ class Judge:
             self._why_not = self._why_not or run.without_course
             return
         try:
-            self._summaries.append(verdict.summarise(run.log, _duration_s(run)))
+            planned = _scenario_of(run).get("duration")
+            last_s = float(run.course.t[-1])
+            duration_s = float(planned) if isinstance(planned, int | float) else last_s
+            self._summaries.append(verdict.summarise(run.log, duration_s))
         except XrlError as error:
             self._why_not = str(error)
 
     def verdict(self, log: RunLog, counts: Iterable[KeyCount], *, whole: bool = True) -> RunVerdict:
-        """Return the verdict.
-
-        Args:
-            log: the run, or any part of it.
-            counts: of every key, over the run.
-            whole: all of the run was taken; False gives the figures alone.
-        """
+        """Return the verdict; a part of a run (`whole` is False) has figures alone."""
         if not self._summaries:
             return RunVerdict(f"No verdict: {self._why_not}", None, [])
         summary = verdict.joined(self._summaries, counts)
         if log.metadata["run"].get("lockstep"):
             summary |= dict.fromkeys(REAL_TIME_ONLY) | {"in_real_time": True}
         if not whole:
-            return RunVerdict("A part of a run, and its figures: no verdict", None, _rows(summary))
+            return RunVerdict(
+                "A part of a run, and its figures: no verdict", None, verdict_table.rows(summary)
+            )
         lines = _verdict_lines(summary)
         cautions = verdict_table.stalls(summary)
         cautions += [] if summary["in_real_time"] else [lines[-2]]
         caution = " ".join(f"{line.rstrip('.')}." for line in cautions)
-        return RunVerdict(lines[-1], bool(summary["stood"]), _rows(summary), caution)
+        return RunVerdict(lines[-1], bool(summary["stood"]), verdict_table.rows(summary), caution)
 
 
-def _duration_s(run: RunData) -> float:
-    """Return the planned duration of the scenario; without one, the duration of the run."""
+def _scenario_of(run: RunData) -> dict[str, Any]:
+    """Return the scenario of a run; nothing if the log has none that can be read."""
     raw = run.log.attachments.get("scenario.toml", b"")
     try:
-        return float(tomllib.loads(decoded(raw))["duration"])
-    except (ValueError, KeyError, TypeError, RecursionError):  # not TOML, or without it
-        assert run.course is not None  # noqa: S101 - called with a course only
-        return float(run.course.t[-1])
+        return tomllib.loads(decoded(raw))
+    except (ValueError, RecursionError):
+        return {}
 
 
 def _verdict_lines(summary: Summary) -> list[str]:
@@ -112,34 +109,20 @@ def _verdict_lines(summary: Summary) -> list[str]:
     return [line.strip() for line in text.getvalue().strip().splitlines()]
 
 
-def _rows(summary: Summary) -> list[tuple[str, str, str, str]]:
-    rows = []
-    for limit in LIMITS:
-        value = summary.get(limit.key)
-        if value is None:
-            continue
-        unit = f" {limit.unit}" if limit.unit else ""
-        measured = f"{verdict_table.digits(value)}{unit}"
-        mark = verdict_table.mark(limit, summary)
-        rows.append((limit.what, measured, f"{limit.limit:g}{unit}", mark))
-    return rows
-
-
 def head(run: RunData) -> list[tuple[str, str]]:
     """Return (name, value) of the facts that a reader needs first."""
     log, about = run.log, run.log.metadata["run"]
     begin, end = run.span
+    scenario = (about.get("scenario", ""), str(_scenario_of(run).get("about", "")))
+    changed = " with changes" if about.get("git_dirty") == "true" else ""
     rows = [
-        ("scenario", _scenario(run)),
+        ("scenario", ": ".join(filter(None, scenario))),
         ("started", _date(about.get("started", ""))),
         ("virtual time", about.get("lockstep", "")),
         ("length", f"{end - begin:.1f} s"),
         ("file", log.path.name),
-        (
-            "recording",
-            "complete" if log.complete else "incomplete: the recorder did not close the file",
-        ),
-        ("git commit", _commit(about)),
+        ("recording", "complete" if log.complete else INCOMPLETE),
+        ("git commit", about.get("git_commit", "") + changed),
         ("robot", log.robot),
         ("xrl", log.metadata.get("packages", {}).get("xrl", "")),
         ("log version", about.get("schema_version", "")),
@@ -164,21 +147,6 @@ def _date(started: str) -> str:
         return f"{datetime.fromisoformat(started):%Y-%m-%d %H:%M:%S %Z}".strip()
     except ValueError:
         return started
-
-
-def _scenario(run: RunData) -> str:
-    name = run.log.metadata["run"].get("scenario", "")
-    raw = run.log.attachments.get("scenario.toml", b"")
-    try:
-        about = str(tomllib.loads(decoded(raw)).get("about", ""))
-    except (ValueError, RecursionError):
-        about = ""
-    return ": ".join(part for part in (name, about) if part)
-
-
-def _commit(about: dict[str, str]) -> str:
-    commit = about.get("git_commit", "")
-    return f"{commit} with changes" if about.get("git_dirty") == "true" else commit
 
 
 class MessageLosses:
@@ -208,11 +176,7 @@ class MessageLosses:
             nominal_hz = known[key].rate_hz if key in known else 0.0
             rate = (count.count - 1) / span_s if nominal_hz > 0.0 and span_s > 0.0 else None
             name = key.removeprefix(f"xrl/{robot}/")
-            rows.append(
-                TopicLoss(
-                    name, count.count, rate, nominal_hz, count.missing, count.gaps, count.restarts
-                )
-            )
+            rows.append(TopicLoss(name, rate, nominal_hz, count))
         return rows
 
 
@@ -226,16 +190,10 @@ def damage(run: RunData) -> list[str]:
 
 def files(run: RunData) -> list[tuple[str, str]]:
     """Return (name, text) of the input files of the run, from its log."""
-    found = []
-    for name, raw in sorted(run.log.attachments.items(), key=lambda row: _order(row[0])):
-        if name.endswith((".toml", ".json")):
-            found.append((name, raw.decode(errors="replace")))
-    return found
-
-
-def _order(name: str) -> tuple[bool, str]:
-    """Sort files written by people before computed ones."""
-    return not name.endswith(".toml"), name
+    texts = {name: raw.decode(errors="replace") for name, raw in run.log.attachments.items()}
+    written = sorted(name for name in texts if name.endswith(".toml"))  # by people, so first
+    computed = sorted(name for name in texts if name.endswith(".json"))
+    return [(name, texts[name]) for name in (*written, *computed)]
 
 
 def packages(run: RunData) -> list[tuple[str, str]]:

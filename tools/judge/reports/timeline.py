@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any, Final, TypeVar
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, Final
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from tools.judge.reports.limit_violations import LimitViolations
 from tools.judge.reports.page_model import TimelineEvent
 from tools.judge.reports.run_data import RunData, module_of
 from tools.judge.reports.signals import GAP_S, Span, message_times
-from tools.judge.stalls import stalls_of
+from tools.judge.stalls import stalls_of, together
 from tools.logs.impairment_intervals import impairments
 
 TOGETHER_S: Final = 0.1
@@ -42,17 +42,6 @@ BACKOFF_MIN_S: Final = 0.5
 END_S: Final = 0.1
 """An impairment that ends this close to the end of the log has no mark for its end."""
 
-Row = TypeVar("Row", bound=tuple[Any, ...])
-
-KINDS: Final = {
-    RunEventKind.KILLED: "kill",
-    RunEventKind.RESTARTED: "restart",
-    RunEventKind.PUSHED: "push",
-    RunEventKind.FAULTED: "fault",
-    RunEventKind.STALLED: "stall",
-    RunEventKind.STARTED: "note",
-    RunEventKind.FINISHED: "note",
-}
 _NORMAL_MODES: Final = (PlannerMode.WAITING, PlannerMode.ALIGNING, PlannerMode.LEADING)
 
 
@@ -106,19 +95,8 @@ def _first_unmarked(found: Sequence[TimelineEvent]) -> list[TimelineEvent]:
 
 
 def _run_events(run: RunData) -> Iterator[TimelineEvent]:
-    events: list[RunEvent] = run.log.messages(topics.RUN_EVENT)
-    for event in events:
-        kind = KINDS.get(_member(RunEventKind, event.kind), "note")
-        text = _describe_run_event(event)
-        mark = ""
-        if kind != "note":
-            mark = f"{event.subject} {event.detail}".strip() if kind != "restart" else ""
-            mark = mark or f"{event.subject} back"
-        if kind == "push":
-            mark = f"push {event.detail.partition(' for ')[0]}"
-        if kind == "stall":
-            mark = "stall"
-        yield TimelineEvent(run.at(event.t_ns), kind, text, mark)
+    for event in run.log.messages(topics.RUN_EVENT):
+        yield TimelineEvent(run.at(event.t_ns), *_told(event))
     last = None
     for stop in run.log.messages(topics.ESTOP):
         t = run.at(stop.t_ns)
@@ -141,18 +119,28 @@ def _network(run: RunData) -> Iterator[TimelineEvent]:
         yield TimelineEvent(end_s, "network" if mark else "note", text, mark)
 
 
-def _describe_run_event(event: RunEvent) -> str:
-    texts = {
-        RunEventKind.STARTED: f"{event.subject} starts",
-        RunEventKind.KILLED: f"{event.subject} gets SIG{event.detail}",
-        RunEventKind.RESTARTED: f"{event.subject} restarts",
-        RunEventKind.PUSHED: f"push {event.detail}",
-        RunEventKind.FINISHED: f"{event.subject} ends {event.detail}".strip(),
-        RunEventKind.FAULTED: f"{event.subject}: fault {event.detail} begins",
-        RunEventKind.STALLED: "".join(stall.words for stall in stalls_of([event])),
-    }
-    other = f"{event.subject} {name_of(RunEventKind, event.kind)} {event.detail}"
-    return texts.get(_member(RunEventKind, event.kind)) or other.strip()
+def _told(event: RunEvent) -> tuple[str, str, str]:
+    """Return kind, text and mark of a run's event."""
+    who, detail = event.subject, event.detail
+    named = f"{who} {detail}".strip()
+    match event.kind:
+        case RunEventKind.STARTED:
+            return "note", f"{who} starts", ""
+        case RunEventKind.FINISHED:
+            return "note", f"{who} ends {detail}".strip(), ""
+        case RunEventKind.KILLED:
+            return "kill", f"{who} gets SIG{detail}", named
+        case RunEventKind.RESTARTED:
+            return "restart", f"{who} restarts", f"{who} back"
+        case RunEventKind.PUSHED:
+            return "push", f"push {detail}", f"push {detail.partition(' for ')[0]}"
+        case RunEventKind.FAULTED:
+            return "fault", f"{who}: fault {detail} begins", named
+        case RunEventKind.STALLED if stalls := stalls_of([event]):
+            return "stall", stalls[0].words, "stall"
+    kind = "stall" if event.kind == RunEventKind.STALLED else "note"
+    text = f"{who} {name_of(RunEventKind, event.kind)} {detail}".strip()
+    return kind, text, "stall" if kind == "stall" else ""
 
 
 def _mode_changes(run: RunData) -> Iterator[TimelineEvent]:
@@ -161,33 +149,17 @@ def _mode_changes(run: RunData) -> Iterator[TimelineEvent]:
         for module in MODULES
         for event in run.log.messages(topics.JOINT_EVENT, module)
     )
-    for group in _together(
-        changes, lambda row: (row[2].mode_before, row[2].mode_after, row[2].cause)
+    for group in together(
+        changes, lambda row: (row[2].mode_before, row[2].mode_after, row[2].cause), TOGETHER_S
     ):
         t, _, first = group[0]
-        yield TimelineEvent(t, _severity(first), _describe_mode_change(group))
-
-
-def _together(changes: Sequence[Row], key: Callable[[Row], Any]) -> list[list[Row]]:
-    """Group rows with equal keys at about the same time. The first field of a row is its time."""
-    groups: list[list[Row]] = []
-    open_: dict[Any, list[Row]] = {}
-    for row in changes:
-        group = open_.get(key(row))
-        if group is None or row[0] - group[0][0] > TOGETHER_S:
-            group = open_[key(row)] = []
-            groups.append(group)
-        group.append(row)
-    return groups
+        bad = first.mode_after in (Mode.FAULT, Mode.DAMP)
+        yield TimelineEvent(t, "bad" if bad else "note", _describe_mode_change(group))
 
 
 def _modules(found: Iterable[str]) -> str:
     modules = sorted(set(found), key=MODULES.index)
     return "all six" if len(modules) == len(MODULES) else ", ".join(modules)
-
-
-def _severity(event: JointEvent) -> str:
-    return "bad" if event.mode_after in (Mode.FAULT, Mode.DAMP) else "note"
 
 
 def _describe_mode_change(group: Sequence[tuple[float, str, JointEvent]]) -> str:
@@ -241,7 +213,7 @@ def _drives(run: RunData, successive: Successive) -> Iterator[TimelineEvent]:
             for index in _changes([(state.drive, state.drive_error) for _, state in rows])
         ]
     changes.sort(key=lambda row: row[0])
-    for group in _together(changes, _describe_drive_change):
+    for group in together(changes, _describe_drive_change, TOGETHER_S):
         t_s, _, before, after = group[0]
         worse = after.drive != DriveStatus.ARMED and before.drive == DriveStatus.ARMED
         bad = worse or after.drive == DriveStatus.ERROR or after.drive_error != 0
@@ -323,7 +295,7 @@ class Silences:
 
     def events(self) -> Iterator[TimelineEvent]:
         """Yield the gaps; those that begin together in one row."""
-        for group in _together(sorted(self._found), lambda _: None):
+        for group in together(sorted(self._found), lambda _: None, TOGETHER_S):
             names = ", ".join(_merged([name for _, name, _ in group]))
             longest = max(length for *_, length in group)
             most = "up to " if len(group) > 1 else ""
@@ -343,7 +315,3 @@ def _merged(names: Sequence[str]) -> list[str]:
 
 def _changes(values: Sequence[Any]) -> list[int]:
     return [index for index in range(1, len(values)) if values[index] != values[index - 1]]
-
-
-def _member(enumeration: Any, code: int) -> Any:
-    return next((member for member in enumeration if member == code), None)

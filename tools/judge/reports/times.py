@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
@@ -10,7 +11,8 @@ from shared.bus import topics
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS
 from shared.joints import MODULES
-from tools.judge.reports.page_model import LevelLine, Line, PageModel
+from tools.judge.reports.page_model import LevelLine, Line, Panel, Plot
+from tools.judge.reports.panels import NO_PLANNER, NO_STATES
 from tools.judge.reports.run_data import RunData, module_of
 from tools.judge.reports.signals import Array, message_times
 
@@ -19,7 +21,6 @@ AGE_REACH: Final = 4.0
 """Upper end of an age axis, as a multiple of the largest usable age. In HOLD ages reach seconds,
 which would flatten all others."""
 NO_REAL_TIME: Final = "no real time in this log"
-NO_PLANNER: Final = "no planner/status in this log"
 LATE_NOTE: Final = (
     "Cycles more than two periods after the previous one, since all six drives were armed."
 )
@@ -29,108 +30,92 @@ REFUSED_NOTE: Final = (
 )
 
 
-def add_ages(run: RunData, model: PageModel) -> None:
-    """Add the ages of commands and states, to be compared with the network impairments."""
-    _add_command_ages(run, model)
-    _add_state_ages(run, model)
-
-
-def add_times(run: RunData, model: PageModel) -> None:
-    """Add rates, late cycles, refused commands and the planner's tick."""
-    _add_rates(run, model)
-    _add_cycles(run, model)
-    _add_tick(run, model)
-
-
-def _add_command_ages(run: RunData, model: PageModel) -> None:
+def ages(run: RunData) -> Iterator[Panel]:
+    """Yield the ages of commands and states, to be compared with the network impairments."""
     lines = []
     for number, module in enumerate(MODULES):
         (age,) = run.columns(topics.JOINT_STATE, module, "age_ns")
-        age[age < 0.0] = np.nan
-        lines.append(Line(module, run.times(topics.JOINT_STATE, module), age / NS_PER_MS, number))
-    limits, reach = [], None
+        lines.append(_age(module, run.times(topics.JOINT_STATE, module), age, number))
     note = "Age of the command in use, by each joint service's own clock."
-    if run.robot is not None:
-        most_ms = run.robot.joint_service.max_command_age_ms
-        limits, reach = [LevelLine(most_ms, "HOLD")], AGE_REACH * most_ms
-        note += f" The axis ends at {reach:g} ms."
-    model.plot(
-        "Command age", "ms", lines, limits=limits, reach=reach, note=note,
-        if_empty="no service ever used a command",
-    )  # fmt: skip
+    most_ms = run.robot.joint_service.max_command_age_ms if run.robot is not None else None
+    yield _age_plot("Command age", note, "no service ever used a command", lines, most_ms, "HOLD")
 
-
-def _add_state_ages(run: RunData, model: PageModel) -> None:
-    """Add the ages of the planner's inputs when it used them."""
-    (ages,) = run.columns(topics.PLANNER_STATUS, "", "state_age_ns")
+    (state,) = run.columns(topics.PLANNER_STATUS, "", "state_age_ns")
     (sample,) = run.columns(topics.WRENCH, "", "age_ns")
-    if not ages.any() and not (sample > 0.0).any():
-        model.leave_out("Age of the planner's inputs", NO_REAL_TIME)
-        return
-    t = run.times(topics.PLANNER_STATUS)
-    ages[ages < 0.0] = np.nan
-    sample[sample < 0.0] = np.nan
-    lines = [
-        Line(f"state, {module}", t, ages[:, number] / NS_PER_MS, number)
-        for number, module in enumerate(MODULES)
-        if len(ages)
-    ]
-    wrench_t = run.times(topics.WRENCH)
-    lines.append(Line("harness sensor sample", wrench_t, sample / NS_PER_MS, 6, hidden=True))
-    limits, reach = [], None
+    real = state.any() or (sample > 0.0).any()
+    lines = []
+    if real:
+        t = run.times(topics.PLANNER_STATUS)
+        lines = [
+            _age(f"state, {module}", t, state[:, number], number)
+            for number, module in enumerate(MODULES)
+            if len(state)
+        ]
+        sampled = _age("harness sensor sample", run.times(topics.WRENCH), sample, 6)
+        lines.append(sampled._replace(hidden=True))
     note = (
         "Time since each module's newest state arrived, by the planner's clock. The delay before "
         "the arrival is not included."
     )
-    if run.robot is not None:
-        most_ms = run.robot.planner.state_stale_ms
-        limits, reach = [LevelLine(most_ms, "planner waits")], AGE_REACH * most_ms
-        note += f" The axis ends at {reach:g} ms."
-    model.plot(
-        "Age of the planner's inputs", "ms", lines, limits=limits, reach=reach, note=note,
-        if_empty=NO_PLANNER,
-    )  # fmt: skip
+    most_ms = run.robot.planner.state_stale_ms if run.robot is not None else None
+    why = NO_PLANNER if real else NO_REAL_TIME
+    yield _age_plot("Age of the planner's inputs", note, why, lines, most_ms, "planner waits")
 
 
-def _add_rates(run: RunData, model: PageModel) -> None:
+def _age(label: str, t: Array, age_ns: Array, colour: int) -> Line:
+    """Return the line of an age; a negative one stands for none."""
+    return Line(label, t, np.where(age_ns < 0.0, np.nan, age_ns) / NS_PER_MS, colour)
+
+
+def _age_plot(
+    title: str, note: str, if_empty: str, lines: list[Line], most_ms: float | None, then: str
+) -> Panel:
+    """Return a panel of ages; beyond `most_ms` something happens."""
+    if most_ms is None:
+        return Plot(title, "ms", note, if_empty, lines=lines)
+    reach = AGE_REACH * most_ms
+    note += f" The axis ends at {reach:g} ms."
+    limits = [LevelLine(most_ms, then)]
+    return Plot(title, "ms", note, if_empty, lines=lines, limits=limits, reach=reach)
+
+
+def times(run: RunData) -> Iterator[Panel]:
+    """Yield rates, late cycles, refused commands and the planner's tick."""
     lines = []
     for number, topic in enumerate(row for row in topics.TOPICS if row.rate_hz >= 10.0):
-        t, rate = _rate(run, topic)
-        name = topic.name.replace("/*/", "/") if topic.per_module else topic.name
-        label = f"{name}, slowest module" if topic.per_module else name
-        lines.append(Line(label, t, rate, number, hidden=topic is topics.JOINT_TRACE))
-    model.plot(
-        "Messages recorded", "Hz", lines,
-        note=f"Mean over {RATE_WINDOW_S:g} s, by the recorder's clock.",
-        if_empty="no messages",
-    )  # fmt: skip
+        name = topic.name.replace("/*/", "/") + ", slowest module" * topic.per_module
+        hidden = topic is topics.JOINT_TRACE
+        lines.append(Line(name, *_rate(run, topic), number, hidden=hidden))
+    note = f"Mean over {RATE_WINDOW_S:g} s, by the recorder's clock."
+    yield Plot("Messages recorded", "Hz", note, "no messages", lines=lines)
+    yield from _cycles(run)
+    (tick,) = run.columns(topics.PLANNER_STATUS, "", "tick_us")
+    note = "Time from reading the inputs to publishing the last command."
+    lines = [Line("tick", run.times(topics.PLANNER_STATUS), tick, 0)] if tick.any() else []
+    yield Plot("Planner tick", "\u00b5s", note, NO_REAL_TIME, lines=lines)
 
 
-def _add_cycles(run: RunData, model: PageModel) -> None:
-    """Add the rates of the control loops, their late cycles and the commands they refused."""
+def _cycles(run: RunData) -> Iterator[Panel]:
+    """Yield the rates of the control loops, their late cycles and the commands they refused."""
     armed_s = run.armed_s()
     rates: list[Line] = []
-    late: list[Line] = []
-    refused: list[Line] = []
+    counted: dict[str, list[Line]] = {"late": [], "refused": []}
     for number, module in enumerate(MODULES):
         t = run.times(topics.JOINT_STATE, module)
         if len(t) < 2:
             continue
-        cycles, *counts = run.columns(topics.JOINT_STATE, module, "cycle", "late", "refused")
+        cycles, *counts = run.columns(topics.JOINT_STATE, module, "cycle", *counted)
         rates.append(Line(module, *_cycle_rate(t, cycles), number))
-        for lines, count in zip((late, refused), counts, strict=True):
+        for lines, count in zip(counted.values(), counts, strict=True):
             after = t >= armed_s
             lines.append(Line(module, t[after], _increase(count[after]), number, counts_up=True))
-    model.plot(
-        "Control cycles of each service", "Hz", rates,
-        note=f"Mean over {RATE_WINDOW_S:g} s, by each service's clock.",
-        if_empty="no joint/*/state in this log",
-    )  # fmt: skip
-    for title, lines, note, none in (
-        ("Late control cycles", late, LATE_NOTE, "no cycle was late"),
-        ("Refused commands", refused, REFUSED_NOTE, "no command was refused"),
+    note = f"Mean over {RATE_WINDOW_S:g} s, by each service's clock."
+    yield Plot("Control cycles of each service", "Hz", note, NO_STATES, lines=rates)
+    for name, title, note, none in (
+        ("late", "Late control cycles", LATE_NOTE, "no cycle was late"),
+        ("refused", "Refused commands", REFUSED_NOTE, "no command was refused"),
     ):
-        model.plot(title, "count", lines, note=note, if_empty=none, needs_count=True)
+        yield Plot(title, "count", note, none, lines=counted[name], needs_count=True)
 
 
 def _cycle_rate(t: Array, cycles: Array) -> tuple[Array, Array]:
@@ -147,18 +132,6 @@ def _increase(count: Array) -> Array:
     """Return the growth of a counter since its first value; a restart resets the counter to 0."""
     steps = np.diff(count, prepend=count[:1])
     return np.asarray(np.cumsum(np.where(steps >= 0.0, steps, count)))
-
-
-def _add_tick(run: RunData, model: PageModel) -> None:
-    t = run.times(topics.PLANNER_STATUS)
-    (tick,) = run.columns(topics.PLANNER_STATUS, "", "tick_us")
-    if not tick.any():
-        model.leave_out("Planner tick", NO_REAL_TIME)
-        return
-    model.plot(
-        "Planner tick", "\u00b5s", [Line("tick", t, tick, 0)],
-        note="Time from reading the inputs to publishing the last command.",
-    )  # fmt: skip
 
 
 def _rate(run: RunData, topic: Topic) -> tuple[Array, Array]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Final, TypeAlias
+from collections.abc import Iterable, Iterator
+from typing import Final
 
 import msgspec
 import numpy as np
@@ -13,14 +14,15 @@ from shared.bus.messages import JointCommand, JointState, Mode
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.joints import AXES, MODULES
-from tools.judge.reports.page_model import LevelLine, Line, PageModel
+from tools.judge.reports.page_model import Choice, LevelLine, Line, Lines, Panel, Plot
+from tools.judge.reports.panels import NO_STATES
 from tools.judge.reports.run_data import RunData
 from tools.judge.reports.signals import Array
 
-Sets: TypeAlias = dict[str, tuple[list[Line], list[LevelLine]]]
-"""Lines and levels by joint."""
-
-NO_STATES: Final = "no joint/*/state in this log"
+ORIGINS_NOTE: Final = (
+    "The origins belong to the command in use, while the service is in TRACK. In HOLD the "
+    "service repeats a frozen command, and the log holds only the total."
+)
 
 
 class TorqueTerms(msgspec.Struct):
@@ -36,14 +38,13 @@ class TorqueTerms(msgspec.Struct):
     and the part of a step that remains after a service stopped for a while."""
 
 
-def add_joints(run: RunData, model: PageModel) -> None:
-    """Add the panels of the joints."""
+def joints(run: RunData) -> Iterator[Panel]:
+    """Yield the panels of the joints."""
     robot = run.robot
-    most = robot.joint.tau_module_max if robot is not None else None
     sums: list[Line] = []
-    torques: Sets = {}
-    angles: Sets = {}
-    rates: Sets = {}
+    torques: dict[str, Lines] = {}
+    angles: dict[str, Lines] = {}
+    rates: dict[str, Lines] = {}
     peaks: dict[str, float] = {}
     for number, module in enumerate(MODULES):
         t = run.times(topics.JOINT_STATE, module)
@@ -52,41 +53,44 @@ def add_joints(run: RunData, model: PageModel) -> None:
         tau, q, v = run.columns(topics.JOINT_STATE, module, "tau", "q", "v")
         sums.append(Line(module, t, np.abs(tau).sum(axis=1), number))
         found = torque_terms(run, robot, module) if robot is not None else None
-        t_ref, q_ref, v_ref = _references(run, module)
+        t_ref = run.times(topics.JOINT_COMMAND, module)
+        q_ref, v_ref = (run.wide(topics.JOINT_COMMAND, n, 2, module) for n in ("q_ref", "v_ref"))
         for axis, name in enumerate(AXES):
             joint = f"{module}_{name}"
             peaks[joint] = float(np.abs(tau[:, axis]).max())
-            torques[joint] = (_torques(t, tau, found, axis), _torque_limits(most))
-            angles[joint] = (
+            most = (
+                [] if robot is None else [robot.joint.tau_module_max, -robot.joint.tau_module_max]
+            )
+            torques[joint] = Lines(_torques(t, tau, found, axis), _levels("limit", most))
+            stops = [] if robot is None else robot.joint_limits()[2 * number + axis]
+            angles[joint] = Lines(
                 [Line("q", t, q[:, axis], 0), Line("q_ref", t_ref, q_ref[:, axis], 1)],
-                _stops(run, module, axis),
+                _levels("soft stop", stops),
             )
-            rates[joint] = (
-                [Line("v", t, v[:, axis], 0), Line("v_ref", t_ref, v_ref[:, axis], 1)],
-                [],
+            rates[joint] = Lines(
+                [Line("v", t, v[:, axis], 0), Line("v_ref", t_ref, v_ref[:, axis], 1)]
             )
-    model.plot(
-        "Torque of each module against its limit", "N m", sums,
-        limits=[LevelLine(most, "limit")] if most is not None else [],
-        note="|tau_phi| + |tau_theta|: both motors of a module act along one axis.",
-        if_empty=NO_STATES,
+    yield Plot(
+        "Torque of each module against its limit", "N m",
+        "|tau_phi| + |tau_theta|: both motors of a module act along one axis.", NO_STATES,
+        lines=sums,
+        limits=[] if robot is None else [LevelLine(robot.joint.tau_module_max, "limit")],
     )  # fmt: skip
-    note = (
-        "The origins belong to the command in use, while the service is in TRACK. In HOLD the "
-        "service repeats a frozen command, and the log holds only the total."
-    )
-    if robot is None:
-        note = f"Origins unknown: {run.without_robot}."
+    note = f"Origins unknown: {run.without_robot}." if robot is None else ORIGINS_NOTE
     hardest = max(peaks, key=lambda joint: peaks[joint], default="")
     for title, unit, choices, words in (
         ("Torque of one joint, by origin", "N m", torques, note),
         ("Angle of one joint", "rad", angles, ""),
         ("Rate of one joint", "rad/s", rates, ""),
     ):
-        model.choice(
-            title, unit, "joint", choices, initial=hardest, weight=peaks.get(hardest, 0.0),
-            note=words, if_empty=NO_STATES,
+        yield Choice(
+            title, unit, words, NO_STATES, group="joint", choices=choices, initial=hardest,
+            weight=peaks.get(hardest, 0.0),
         )  # fmt: skip
+
+
+def _levels(label: str, values: Iterable[float]) -> list[LevelLine]:
+    return [LevelLine(value, label, shown=False) for value in values]
 
 
 def torque_terms(run: RunData, robot: RobotConfig, module: str) -> TorqueTerms:
@@ -134,24 +138,3 @@ def _torques(t: Array, tau: Array, found: TorqueTerms | None, axis: int) -> list
         ]
     sibling = f"total of {AXES[1 - axis]}"
     return [*lines, Line(sibling, t, tau[:, 1 - axis], 4, hidden=True, dashed=True)]
-
-
-def _torque_limits(most: float | None) -> list[LevelLine]:
-    if most is None:
-        return []
-    return [LevelLine(most, "limit", shown=False), LevelLine(-most, "limit", shown=False)]
-
-
-def _references(run: RunData, module: str) -> tuple[Array, Array, Array]:
-    t = run.times(topics.JOINT_COMMAND, module)
-    q_ref, v_ref = run.columns(topics.JOINT_COMMAND, module, "q_ref", "v_ref")
-    if q_ref.ndim != 2:
-        q_ref = v_ref = np.zeros((0, 2))
-    return t, q_ref, v_ref
-
-
-def _stops(run: RunData, module: str, axis: int) -> list[LevelLine]:
-    if run.robot is None:
-        return []
-    low, high = run.robot.joint_limits()[2 * MODULES.index(module) + axis]
-    return [LevelLine(low, "soft stop", shown=False), LevelLine(high, "soft stop", shown=False)]

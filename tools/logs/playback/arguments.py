@@ -148,11 +148,7 @@ def _add_when(parser: argparse.ArgumentParser) -> None:
 
 
 def check(args: argparse.Namespace) -> None:
-    """Refuse numbers that cannot be meant.
-
-    Raises:
-        RunError: naming the first.
-    """
+    """Refuse numbers that cannot be meant."""
     for name, value, least, most in (
         ("--rate", args.rate, RATE_MIN, RATE_MAX),
         ("--start-offset", args.start_offset, 0.0, math.inf),

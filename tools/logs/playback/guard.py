@@ -6,8 +6,7 @@ import re
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 from shared.bus import security, topics
 from shared.bus.messages import JointState
@@ -61,16 +60,7 @@ class LiveRobotWatch:
             for module in MODULES
         }
 
-    def __enter__(self) -> Self:
-        """Return the watch itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
         """Leave the bus."""
         self._session.close()
 
@@ -105,15 +95,9 @@ class LiveRobotWatch:
 
 
 def allowed(targets: Mapping[str, str], live: str, *, force: bool) -> dict[str, str]:
-    """Return the keys that may be published.
+    """Return the keys that may be published beside what `LiveRobotWatch.look` found.
 
-    Args:
-        targets: key on the bus of each key of the log.
-        live: from `LiveRobotWatch.look`.
-        force: also topics that a live robot acts on, but for those that move it.
-
-    Raises:
-        FleetError: a key is refused, or none is left.
+    `force` adds topics that a live robot acts on, but for those that move it (else FleetError).
     """
     refused = set(those_of(IN_THE_LOOP if force else ACTED_ON, targets.values()))
     if not live or not refused:

@@ -10,8 +10,7 @@ from typing import Final
 from shared.clock import NS_PER_S
 from shared.exceptions import RunError
 from tools.logs.playback.schedule import Entry
-from tools.logs.recorded_file import RecordedFile
-from tools.logs.run_files import files_in
+from tools.logs.run_index import RecordedFile, files_in
 
 ROBOT_FILE: Final = "robot.toml"
 
@@ -24,7 +23,6 @@ class Recording:
     """Some files of one robot, as one log."""
 
     def __init__(self, files: Sequence[RecordedFile]) -> None:
-        """Take files that belong together, in any order; at least one with messages."""
         self._files = sorted(files, key=lambda file: file.span_ns or (0, 0))
         self.robot = files[0].required("run", "robot")
         text = next(
@@ -51,10 +49,8 @@ class Recording:
     ) -> list[Entry]:
         """Return messages sorted by time; what came at the same moment stays as in the file.
 
-        Args:
-            begin_ns: recorder's clock, inclusive.
-            end_ns: the same, exclusive.
-            keys: `Entry.key` counts in these, and other messages are left out; None: `self.keys`.
+        Times are of the recorder's clock, the first inclusive. `Entry.key` counts in `keys`; if
+        that is None, in `self.keys`.
         """
         numbers = {key: number for number, key in enumerate(self.keys if keys is None else keys)}
         found = [row for file in self._files for row in _entries(file, begin_ns, end_ns, numbers)]
@@ -77,14 +73,7 @@ def _entries(
 
 
 def read(paths: Sequence[Path]) -> Recording:
-    """Look through files of one run, or of runs of one robot on one clock.
-
-    Args:
-        paths: files, in any order.
-
-    Raises:
-        RunError: a file is no run, two do not belong together, or none holds a message.
-    """
+    """Look through files of one run, or of runs of one robot on one clock."""
     files: list[RecordedFile] = []
     seen: dict[tuple[str, str], Path] = {}
     for path in paths:
@@ -105,11 +94,7 @@ def read(paths: Sequence[Path]) -> Recording:
 
 
 def files_named(given: Iterable[Path]) -> list[Path]:
-    """Return the files meant: for a directory those of the run in it.
-
-    Raises:
-        RunError: a directory holds no run, or several.
-    """
+    """Return the files meant: for a directory those of the run in it."""
     found: list[Path] = []
     for path in given:
         found += files_in(path) if path.is_dir() else [path]

@@ -1,17 +1,19 @@
-"""Schedules messages for playback. Pure: times in, messages out.
+"""Which message is played when. Pure: times in, messages out.
 
 Two times: the clock's (monotonic, ns) and the position in the log (ns since the start of the played
 part; it keeps counting when playback loops). A `Playhead` maps one to the other by a line that
 changes only at a pause, a step or a change of rate, so no error adds up. A `Schedule` gives the
-position of each message.
+position of each message, and an `EntryStream` the messages, block by block: a long log fits too.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple, Protocol
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, Future
+from typing import Final, NamedTuple, Protocol, TypeAlias
 
-from shared.clock import NS_PER_MS
+from shared.clock import NS_PER_MS, NS_PER_S
 
 PASS_MIN_NS: Final = 100 * NS_PER_MS
 """Shortest pass of a loop: a log of one message is not played without a pause."""
@@ -42,12 +44,6 @@ def window(began_ns: int, ended_ns: int, offset_ns: int, duration_ns: int | None
 
     Parts that follow one another hold every message once. An end beyond the log's is the
     log's.
-
-    Args:
-        began_ns: of its first message.
-        ended_ns: of its last.
-        offset_ns: not negative.
-        duration_ns: None: to the end.
     """
     start_ns = began_ns + offset_ns
     end_ns = ended_ns + 1
@@ -60,13 +56,6 @@ class Playhead:
     """The position in the log as a function of the clock."""
 
     def __init__(self, now_ns: int, rate: float, *, paused: bool = False) -> None:
-        """Begin at position 0.
-
-        Args:
-            now_ns: clock.
-            rate: recorded seconds for each second.
-            paused: stand still until `resume`.
-        """
         self.rate = rate
         self.paused = paused
         self._since_ns, self._from_ns = now_ns, 0
@@ -123,13 +112,6 @@ class Schedule:
     """The messages of a window in order, once or for ever."""
 
     def __init__(self, source: EntrySource, part: Window, *, loop: bool) -> None:
-        """Take messages in the order of playback.
-
-        Args:
-            source: those of the window.
-            part: the window.
-            loop: restart at its end.
-        """
         self._source = source
         self._start_ns = part.start_ns
         self.length_ns = max(0, part.end_ns - part.start_ns)
@@ -164,3 +146,53 @@ class Schedule:
         if self._loop:
             position_ns %= self._period_ns
         return min(position_ns, self.length_ns)
+
+
+BLOCK_NS: Final = 60 * NS_PER_S
+"""Length of a block: some 160 MB of messages."""
+
+Read: TypeAlias = Callable[[int, int], Sequence[Entry]]
+"""Returns the messages from a time, inclusive, to another, exclusive; sorted."""
+
+
+class EntryStream:
+    """The messages of a window; while one block is given, the next is read."""
+
+    def __init__(
+        self, read: Read, part: Window, executor: Executor | None = None, block_ns: int = BLOCK_NS
+    ) -> None:
+        self._read, self._part, self._block_ns = read, part, block_ns
+        self._executor = executor
+        self.rewind()
+
+    def rewind(self) -> None:
+        """Begin again."""
+        self._entries: Sequence[Entry] = ()
+        self._next = 0
+        self._from_ns = self._part.start_ns
+        self._coming: Future[Sequence[Entry]] | None = None
+
+    def peek(self) -> Entry | None:
+        """Return the next message, which stays the next; None behind the last."""
+        while self._next >= len(self._entries):
+            if self._from_ns >= self._part.end_ns:
+                return None
+            self._entries, self._next = self._block(), 0
+        return self._entries[self._next]
+
+    def pop(self) -> Entry:
+        """Return the next message, which `peek` has returned."""
+        self._next += 1
+        return self._entries[self._next - 1]
+
+    def _block(self) -> Sequence[Entry]:
+        """Return the next block, and have the one behind it read."""
+        coming, self._coming = self._coming, None
+        entries = self._read(*self._bounds()) if coming is None else coming.result()
+        self._from_ns += self._block_ns
+        if self._executor is not None and self._from_ns < self._part.end_ns:
+            self._coming = self._executor.submit(self._read, *self._bounds())
+        return entries
+
+    def _bounds(self) -> tuple[int, int]:
+        return self._from_ns, min(self._from_ns + self._block_ns, self._part.end_ns)

@@ -32,16 +32,7 @@ def short(key: str) -> str:
 def choose(
     present: Sequence[str], wanted: Iterable[str], unwanted: Iterable[str]
 ) -> tuple[str, ...]:
-    """Return the keys to play, in the order given.
-
-    Args:
-        present: full keys of the log.
-        wanted: names or globs; none for all.
-        unwanted: names or globs.
-
-    Raises:
-        RunError: a name is no topic, or nothing is left.
-    """
+    """Return the keys to play, in the order given; `wanted` none: all."""
     wanted, unwanted = tuple(wanted), tuple(unwanted)
     for flag, names in (("--topics", wanted), ("--exclude", unwanted)):
         for name in names:
@@ -59,11 +50,7 @@ def choose(
 
 
 def check_prefix(prefix: str) -> str:
-    """Return a prefix of keys, without slashes at its ends.
-
-    Raises:
-        RunError: it is malformed, or would make live keys.
-    """
+    """Return a prefix of keys without slashes at its ends; refuse one that makes live keys."""
     stripped = prefix.strip("/")
     sections = stripped.split("/") if stripped else []
     if not all(_SECTION.fullmatch(section) for section in sections):
@@ -80,16 +67,9 @@ def check_prefix(prefix: str) -> str:
 def targets(
     chosen: Sequence[str], prefix: str, remaps: Iterable[str], robot: str
 ) -> dict[str, str]:
-    """Return the key onto which each key is played.
+    """Return the key onto which each key is played; `prefix` empty: the live key.
 
-    Args:
-        chosen: full keys of the log.
-        prefix: from `check_prefix`; empty: the live keys.
-        remaps: as `harness/wrench=harness/before` or `joint/*/state=was/*/state`.
-        robot: of the log.
-
-    Raises:
-        RunError: a remap cannot be understood or fits nothing, or two keys become one.
+    Remaps are as `harness/wrench=harness/before` or `joint/*/state=was/*/state`.
     """
     names = {key: short(key) for key in chosen}
     done: dict[str, str] = {}

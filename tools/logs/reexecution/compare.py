@@ -58,7 +58,6 @@ class Comparison:
     """
 
     def __init__(self, tolerance: float = 0.0) -> None:
-        """Take how much numbers may differ; 0: not in one bit."""
         self._tolerance = tolerance
         self.compared = 0
         self.differing = 0
@@ -66,14 +65,7 @@ class Comparison:
         self.largest: dict[tuple[str, str], Difference] = {}
 
     def take(self, key: str, tick: int, recorded: Message, recomputed: Message) -> bool:
-        """Compare two messages; return True if they agree.
-
-        Args:
-            key: their topic below `xrl/<robot>/`.
-            tick: the cycle or tick that they come from.
-            recorded: as the log has it.
-            recomputed: as it came out now.
-        """
+        """Compare two messages; return True if they agree."""
         self.compared += 1
         if _encode(recorded) == _encode(recomputed):
             return True

@@ -15,18 +15,12 @@ class BySeq(Generic[M]):
     """Finds a sender's message by its number; a restarted sender counts from the start again."""
 
     def __init__(self, messages: Iterable[M]) -> None:
-        """Take the messages of one key, in the order of the log."""
         self._rows: dict[int, list[M]] = {}
         for message in messages:
             self._rows.setdefault(message.seq, []).append(message)
 
     def at(self, seq: int, by_ns: int) -> M | None:
-        """Return the newest message of this number that was made by a time; None if none was.
-
-        Args:
-            seq: the number.
-            by_ns: monotonic clock of the host that sender and service share.
-        """
+        """Return the newest message of this number that was made by a time; None if none was."""
         rows = self._rows.get(seq)
         if not rows:
             return None

@@ -12,11 +12,7 @@ M = TypeVar("M")
 
 
 def memory_of(text: str, kind: type[M]) -> M:
-    """Return a recorded memory.
-
-    Raises:
-        RunError: it is that of another version, or made up.
-    """
+    """Return a recorded memory."""
     try:
         return msgspec.json.decode(text, type=kind)
     except (msgspec.DecodeError, RecursionError) as error:

@@ -24,15 +24,8 @@ _GAIN: Final = re.compile(r"gains\.([kb])_p_(\w+)")
 def with_params(robot: RobotConfig, texts: Sequence[str], file: str) -> RobotConfig:
     """Return a robot with keys of its file changed; its gain schedule stays as it was.
 
-    Args:
-        robot: as recorded.
-        texts: NAME=VALUE each; NAME is a dotted key as in the robot file, with an index or a
-            direction for one value of a row: law.K_p.x=2000, law.lead_easing=0.2,
-            joint_service.blend_ms=100. gains.k_p_x is law.K_p.x.
-        file: for errors.
-
-    Raises:
-        ConfigError: a key is unknown, or its value is not as it should be.
+    A text is NAME=VALUE: NAME is a dotted key as in the robot file, with an index or a direction
+    for one value of a row: law.K_p.x=2000, joint_service.blend_ms=100. gains.k_p_x is law.K_p.x.
     """
     table = msgspec.json.decode(msgspec.json.encode(robot))  # with lists, which can be changed
     del table["gain_schedule"]

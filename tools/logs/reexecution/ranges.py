@@ -13,11 +13,10 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from tools.logs.recorded_robot import robot_of
 from tools.logs.reexecution.execution import Execution
 from tools.logs.reexecution.outcome import ReexecutionResult
 from tools.logs.run_index import RunIndex
-from tools.logs.run_log import MARGIN_S, NOTHING, RunLog, RunPart, parts_of
+from tools.logs.run_log import MARGIN_S, NOTHING, RunLog, RunPart, parts_of, robot_of
 
 RANGE_S: Final = 60.0
 """Length of a range; shorter ones spend more on their lead-in and on starting."""
@@ -43,16 +42,7 @@ def ranges_of(
     range_s: float = RANGE_S,
     workers: int = 1,
 ) -> list[RangeTask]:
-    """Return a part of a run in ranges, in their order.
-
-    Args:
-        index: of the run.
-        part: what of it to execute.
-        services: their names.
-        tolerance: largest accepted difference of numbers.
-        range_s: the longest that one may be.
-        workers: that share them: each is to have as many.
-    """
+    """Return a part of a run in ranges, in their order."""
     begin_s, end_s = max(part.begin_s, 0.0), min(part.end_s, index.length_s)
     count = math.ceil((end_s - begin_s) / range_s)
     count = workers * math.ceil(count / workers) if count > 1 else 1
@@ -62,11 +52,7 @@ def ranges_of(
 
 
 def execute_range(task: RangeTask) -> list[ReexecutionResult]:
-    """Execute one range; return a result for each service, in the order of their names.
-
-    Raises:
-        RunError: the log cannot be read, or does not say what robot it is of.
-    """
+    """Execute one range; return a result for each service, in the order of their names."""
     index = _index_of(task.run)
     robot = robot_of(RunLog(index, NOTHING, as_sent=True))
     executions = [Execution(robot, name, task.tolerance) for name in task.services]

@@ -24,17 +24,7 @@ _SEQUENCE_MASK: Final = 0xFFFFFFFF
 def write(
     log: RunLog, path: Path, replaced: Mapping[str, Collection[Message]], note: Mapping[str, str]
 ) -> int:
-    """Write a run with replaced messages; return the number of messages.
-
-    Args:
-        log: the recorded run; all else is copied, metadata and attachments too.
-        path: of the new file, which must not exist.
-        replaced: by full key, the new messages.
-        note: metadata `resim`: the changes.
-
-    Raises:
-        RunError: the file exists, or cannot be written.
-    """
+    """Write a run with replaced messages; return the number of messages."""
     rows: list[tuple[int, str, bytes, int, int]] = []
     encode = msgspec.json.Encoder().encode
     for key in log.keys():  # noqa: SIM118 - a log is no mapping

@@ -28,125 +28,77 @@ class Known(msgspec.Struct, forbid_unknown_fields=True, rename="camel"):
     """Base class: an unknown key is an error."""
 
 
-class Titled(Known):
-    foxglove_panel_title: str
-    lichtblick_panel_title: str
+def known(name: str, may: dict[str, Any] | None = None, /, **must: Any) -> Any:
+    """Return the type of an object that has all keys of `must`, perhaps those of `may`."""
+    fields = [*must.items(), *((key, kind | UnsetType, UNSET) for key, kind in (may or {}).items())]
+    return msgspec.defstruct(name, fields, bases=(Known,), kw_only=True)
 
 
-class PlotPath(Known):
-    value: str
-    """A message path, or a number: a line across the plot."""
-    enabled: bool
-    timestamp_method: TimestampMethod
-    color: str | UnsetType = UNSET
-    label: str | UnsetType = UNSET
-    show_line: bool | UnsetType = UNSET
-    line_size: float | UnsetType = UNSET
+def panel(name: str, may: dict[str, Any] | None = None, /, **must: Any) -> Any:
+    """Return the type of a panel with a title, as both viewers have it."""
+    return known(name, may, foxglove_panel_title=str, lichtblick_panel_title=str, **must)
 
 
-class Plot(Titled, kw_only=True):
-    paths: list[PlotPath]
-    show_legend: bool
-    legend_display: Literal["floating", "top", "left", "none"]
-    show_plot_values_in_legend: bool
-    show_x_axis_labels: bool
-    show_y_axis_labels: bool
-    is_synced: bool
-    x_axis_val: Literal["timestamp", "index", "custom", "currentCustom"]
-    sidebar_dimension: float
-    min_x_value: float | UnsetType = UNSET
-    max_x_value: float | UnsetType = UNSET
-    min_y_value: float | str | UnsetType = UNSET
-    max_y_value: float | str | UnsetType = UNSET
-    following_view_width: float | UnsetType = UNSET
-
-
-class StateTransitionPath(Known):
-    value: str
-    timestamp_method: TimestampMethod
-    color: str | UnsetType = UNSET
-    label: str | UnsetType = UNSET
-    enabled: bool | UnsetType = UNSET
-
-
-class StateTransitions(Titled):
-    paths: list[StateTransitionPath]
-    is_synced: bool
-
-
-class RawMessages(Titled):
-    diff_enabled: bool
-    diff_method: Literal["custom", "previous message"]
-    diff_topic_path: str
-    show_full_message_for_diff: bool
-    topic_path: str
-    expansion: Literal["all", "none"] | dict[str, str] | UnsetType = UNSET
-
-
-class CameraState(Known):
-    distance: float
-    perspective: bool
-    phi: float
-    target: Vector
-    target_offset: Vector
-    target_orientation: tuple[float, float, float, float]
-    theta_offset: float
-    fovy: float
-    near: float
-    far: float
-
-
-class SceneTransforms(Known):
-    editable: bool | UnsetType = UNSET
-    show_label: bool | UnsetType = UNSET
-    label_size: float | UnsetType = UNSET
-    axis_scale: float | UnsetType = UNSET
-    line_width: float | UnsetType = UNSET
-    line_color: str | UnsetType = UNSET
-    enable_preloading: bool | UnsetType = UNSET
-
-
-class Scene(Known):
-    enable_stats: bool | UnsetType = UNSET
-    background_color: str | UnsetType = UNSET
-    label_scale_factor: float | UnsetType = UNSET
-    ignore_collada_up_axis: bool | UnsetType = UNSET
-    transforms: SceneTransforms | UnsetType = UNSET
-    sync_camera: bool | UnsetType = UNSET
-    topics_visible: bool | UnsetType = UNSET
-
-
-class TopicSettings(Known):
-    visible: bool
-    frame_locked: bool | UnsetType = UNSET
-    show_outlines: bool | UnsetType = UNSET
-    color: str | UnsetType = UNSET
-
-
-class GridLayer(Known):
-    visible: bool
-    frame_locked: bool
-    label: str
-    instance_id: str
-    layer_id: Literal["foxglove.Grid"]
-    frame_id: str
-    size: float
-    divisions: int
-    line_width: float
-    color: str
-    position: Vector
-    rotation: Vector
-    order: int | UnsetType = UNSET
-
-
-class ThreeDee(Titled):
-    camera_state: CameraState
-    follow_mode: Literal["follow-pose", "follow-position", "follow-none"]
-    follow_tf: str
-    scene: Scene
-    transforms: dict[str, TopicSettings]
-    topics: dict[str, TopicSettings]
-    layers: dict[str, GridLayer]
+PlotPath = known(
+    "PlotPath",
+    {"color": str, "label": str, "show_line": bool, "line_size": float},
+    value=str, enabled=bool, timestamp_method=TimestampMethod,
+)  # fmt: skip
+"""Its value: a message path, or a number: a line across the plot."""
+Plot = panel(
+    "Plot",
+    {"min_x_value": float, "max_x_value": float, "min_y_value": float | str,
+     "max_y_value": float | str, "following_view_width": float},
+    paths=list[PlotPath], show_legend=bool,
+    legend_display=Literal["floating", "top", "left", "none"], show_plot_values_in_legend=bool,
+    show_x_axis_labels=bool, show_y_axis_labels=bool, is_synced=bool,
+    x_axis_val=Literal["timestamp", "index", "custom", "currentCustom"], sidebar_dimension=float,
+)  # fmt: skip
+StateTransitionPath = known(
+    "StateTransitionPath",
+    {"color": str, "label": str, "enabled": bool},
+    value=str, timestamp_method=TimestampMethod,
+)  # fmt: skip
+StateTransitions = panel("StateTransitions", paths=list[StateTransitionPath], is_synced=bool)
+RawMessages = panel(
+    "RawMessages",
+    {"expansion": Literal["all", "none"] | dict[str, str]},
+    diff_enabled=bool, diff_method=Literal["custom", "previous message"], diff_topic_path=str,
+    show_full_message_for_diff=bool, topic_path=str,
+)  # fmt: skip
+CameraState = known(
+    "CameraState",
+    distance=float, perspective=bool, phi=float, target=Vector, target_offset=Vector,
+    target_orientation=tuple[float, float, float, float], theta_offset=float, fovy=float,
+    near=float, far=float,
+)  # fmt: skip
+SceneTransforms = known(
+    "SceneTransforms",
+    {"editable": bool, "show_label": bool, "label_size": float, "axis_scale": float,
+     "line_width": float, "line_color": str, "enable_preloading": bool},
+)  # fmt: skip
+Scene = known(
+    "Scene",
+    {"enable_stats": bool, "background_color": str, "label_scale_factor": float,
+     "ignore_collada_up_axis": bool, "transforms": SceneTransforms, "sync_camera": bool,
+     "topics_visible": bool},
+)  # fmt: skip
+TopicSettings = known(
+    "TopicSettings", {"frame_locked": bool, "show_outlines": bool, "color": str}, visible=bool
+)
+GridLayer = known(
+    "GridLayer",
+    {"order": int},
+    visible=bool, frame_locked=bool, label=str, instance_id=str,
+    layer_id=Literal["foxglove.Grid"], frame_id=str, size=float, divisions=int, line_width=float,
+    color=str, position=Vector, rotation=Vector,
+)  # fmt: skip
+ThreeDee = panel(
+    "ThreeDee",
+    camera_state=CameraState, follow_mode=Literal["follow-pose", "follow-position", "follow-none"],
+    follow_tf=str, scene=Scene, transforms=dict[str, TopicSettings],
+    topics=dict[str, TopicSettings], layers=dict[str, GridLayer],
+)  # fmt: skip
 
 
 class Split(Known):
@@ -156,35 +108,17 @@ class Split(Known):
     split_percentage: float
 
 
-class OneTab(Known):
-    title: str
-    layout: Split | str
+OneTab = known("OneTab", title=str, layout=Split | str)
+Tab = known("Tab", active_tab_idx=int, tabs=list[OneTab])
+Layout = known(
+    "Layout",
+    config_by_id=dict[str, dict[str, Any]], layout=Split | str, global_variables=dict[str, Any],
+    user_nodes=dict[str, Any], playback_config=known("PlaybackConfig", speed=float),
+)  # fmt: skip
+"""Layout file; the start of a panel's id names the type of its configuration."""
 
-
-class Tab(Known):
-    active_tab_idx: int
-    tabs: list[OneTab]
-
-
-class PlaybackConfig(Known):
-    speed: float
-
-
-class Layout(Known):
-    """Layout file; the start of a panel's id names the type of its configuration."""
-
-    config_by_id: dict[str, dict[str, Any]]
-    layout: Split | str
-    global_variables: dict[str, Any]
-    user_nodes: dict[str, Any]
-    playback_config: PlaybackConfig
-
-
-PANELS: Final[dict[str, type[Known]]] = {
-    "3D": ThreeDee,
-    "Plot": Plot,
-    "StateTransitions": StateTransitions,
-    "RawMessages": RawMessages,
-    "Tab": Tab,
-}
+PANELS: Final[dict[str, Any]] = {
+    "3D": ThreeDee, "Plot": Plot, "StateTransitions": StateTransitions,
+    "RawMessages": RawMessages, "Tab": Tab,
+}  # fmt: skip
 """Panel types that this layout uses."""

@@ -1,20 +1,27 @@
-"""Logs for the tests of the report: one run in virtual time, and changed copies of it."""
+"""Logs for the tests of the report: one run in virtual time, changed copies of it, and its page."""
 
 from __future__ import annotations
 
+import base64
 import contextlib
+import fnmatch
 import io
+import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from shared.bus import topics
 from shared.clock import NS_PER_S
 from shared.mcap_log.writer import RunWriter
 from tests.shared.mcap_log.runs import Queue
 from tools import cli
+from tools.judge.reports.run_data import RunData
 from tools.logs.run_log import RunLog, read_run
 
 SIM = (
@@ -82,6 +89,29 @@ def rewritten(
     return read_run(run.path)
 
 
+def changed(
+    log: RunLog,
+    directory: Path,
+    name: str,
+    change: Callable[[float, dict[str, Any]], object],
+    **more: Any,
+) -> RunLog:
+    """Write a copy of a log in which the messages of some keys, by pattern, are changed in place.
+
+    `change` takes the scenario time of a message, s, and the message.
+    """
+    zero_ns = RunData(log).zero_ns
+
+    def payload(key: str, body: bytes) -> bytes:
+        if not fnmatch.fnmatch(key, name):
+            return body
+        message = msgspec.json.decode(body)
+        change((message["t_ns"] - zero_ns) / NS_PER_S, message)
+        return msgspec.json.encode(message)
+
+    return rewritten(log, directory, payload=payload, **more)
+
+
 def _moved(
     row: tuple[int, str, bytes], known: Mapping[str, topics.Topic], number: int, length_ns: int
 ) -> tuple[str, bytes, int]:
@@ -94,3 +124,33 @@ def _moved(
     if hasattr(message, "scenario_s"):
         changes["scenario_s"] = message.scenario_s + by / NS_PER_S
     return key, msgspec.json.encode(msgspec.structs.replace(message, **changes)), t_ns + by
+
+
+Array = NDArray[np.float64]
+
+
+def data_of(page: str) -> dict[str, Any]:
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.S)
+    assert found is not None
+    return json.loads(found[1])
+
+
+def panel(data: dict[str, Any], title: str) -> dict[str, Any]:
+    return next(panel for panel in data["panels"] if panel["title"] == title)
+
+
+def decode_signal(signal: dict[str, Any], grid: dict[str, float]) -> tuple[Array, Array]:
+    """Return times and values as the page's script decodes them; NaN where the line breaks."""
+    codes = np.frombuffer(base64.b64decode(signal["d"]), "<i2").astype(np.int64)
+    assert signal["first"] + len(codes) <= grid["count"]
+    t = grid["begin"] + (signal["first"] + np.arange(len(codes)) + 0.5) * grid["step"]
+    values = signal["lo"] + (codes + 32766) * signal["step"]
+    values[codes == -32767] = np.nan
+    present = codes != -32768
+    return t[present], values[present]
+
+
+def line(data: dict[str, Any], title: str, label: str) -> tuple[Array, Array]:
+    lines = panel(data, title)["lines"]
+    index = next(line for line in lines if line["label"] == label)["signal"]
+    return decode_signal(data["signals"][index], data["grid"])

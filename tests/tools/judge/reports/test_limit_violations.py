@@ -28,16 +28,7 @@ def changed(
     log: RunLog, directory: Path, name: str, change: Callable[[float, dict[str, Any]], object]
 ) -> list[TimelineEvent]:
     """Return the violations in a log after a change of one key's messages."""
-    zero_ns = RunData(log).zero_ns
-
-    def payload(key: str, body: bytes) -> bytes:
-        if key != name:
-            return body
-        message = msgspec.json.decode(body)
-        change((message["t_ns"] - zero_ns) / 1e9, message)
-        return msgspec.json.encode(message)
-
-    return list(limit_violations(RunData(runs.rewritten(log, directory, payload=payload))))
+    return list(limit_violations(RunData(runs.changed(log, directory, name, change))))
 
 
 def test_a_run_within_its_limits_has_no_violation(log: RunLog) -> None:

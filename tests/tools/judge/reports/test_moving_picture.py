@@ -15,8 +15,15 @@ from shared.robot.robot_model import ankle_positions
 from tests.tools.judge.reports.runs import Made
 from tools import cli
 from tools.judge.reports import scene
-from tools.judge.reports.moving_curves import RIGHT, WIDTH
-from tools.judge.reports.moving_picture import FRAMES_S, HAND_INK, MODE_INK, SIZE, world_frames
+from tools.judge.reports.moving_picture import (
+    FRAMES_S,
+    HAND_INK,
+    MODE_INK,
+    RIGHT,
+    SIZE,
+    WIDTH,
+    world_frames,
+)
 from tools.logs.run_log import RunLog
 
 

@@ -1,17 +1,18 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import re
 from pathlib import Path
+from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 
 from shared.bus import topics
-from shared.bus.messages import JointState, Mode, RunEvent
+from shared.bus.messages import JointState, Mode
 from shared.joints import JOINTS, MODULES
-from tests.tools.judge.reports import pages, runs
+from tests.tools.judge.reports import runs
 from tests.tools.judge.reports.runs import Made
 from tools.judge.reports import page as page_module
 from tools.judge.reports.page import render
@@ -48,34 +49,34 @@ ORIGINS = {
 
 
 def test_every_panel_has_its_data(page: str, log: RunLog) -> None:
-    data = pages.data_of(page)
+    data = runs.data_of(page)
     for title, labels in PLOTS.items():
         for label in labels:
-            _, values = pages.line(data, title, label)
+            _, values = runs.line(data, title, label)
             assert len(values) > 12, (title, label)
     for title in BARS:
-        assert all(row["spans"] for row in pages.panel(data, title)["rows"])
+        assert all(row["spans"] for row in runs.panel(data, title)["rows"])
     for title, least in (
         ("Torque of one joint, by origin", ORIGINS),
         ("Angle of one joint", {"q", "q_ref"}),
         ("Rate of one joint", {"v", "v_ref"}),
     ):
-        choices = pages.panel(data, title)["choices"]
+        choices = runs.panel(data, title)["choices"]
         assert [choice["label"] for choice in choices] == list(JOINTS)
         for choice in choices:
             assert least <= {line["label"] for line in choice["lines"]}
 
 
 def test_the_plots_show_the_values_of_the_log(page: str, log: RunLog) -> None:
-    data = pages.data_of(page)
+    data = runs.data_of(page)
     zero_ns = RunData(log).zero_ns
     truth = log.messages(topics.SIM_TRUTH)
     t = (np.array([row.t_ns for row in truth]) - zero_ns) / 1e9
     x_mm = 1e3 * np.array([row.com[0] for row in truth])
-    where, seen = pages.line(data, "COM", "x")
+    where, seen = runs.line(data, "COM", "x")
     assert (x_mm.min(), x_mm.max()) == pytest.approx((seen.min(), seen.max()), abs=1e-3)
     assert np.abs(np.interp(where, t, x_mm) - seen).max() < 0.5
-    spans = pages.panel(data, "Modes of the six services")["rows"][0]["spans"]
+    spans = runs.panel(data, "Modes of the six services")["rows"][0]["spans"]
     states = log.messages(topics.JOINT_STATE, MODULES[0])
     for state in states[::25]:
         at = (state.t_ns - zero_ns) / 1e9
@@ -100,12 +101,10 @@ def test_the_verdict_is_the_sentence_that_the_command_printed(made: Made, page: 
 
 
 def test_a_fall_has_the_verdict_of_the_commands(log: RunLog, tmp_path: Path) -> None:
-    def fell(name: str, payload: bytes) -> bytes:
-        return (
-            payload.replace(b'"fallen":false', b'"fallen":true') if name == "sim/truth" else payload
-        )
+    def fell(_t: float, truth: dict[str, Any]) -> None:
+        truth["fallen"] = True
 
-    page = render(runs.rewritten(log, tmp_path, payload=fell))
+    page = render(runs.changed(log, tmp_path, "sim/truth", fell))
     assert re.search(r'<p class="verdict bad" id="verdict">FELL at \d', page)
 
 
@@ -116,7 +115,7 @@ def test_a_minute_of_the_fleet_is_at_most_5_mb(log: RunLog, tmp_path: Path) -> N
     page = render(minute)
     assert len(page.encode()) <= 5e6
     peak = max(abs(row.com[0]) for row in log.messages(topics.SIM_TRUTH)) * 1e3
-    _, seen = pages.line(pages.data_of(page), "COM", "x")
+    _, seen = runs.line(runs.data_of(page), "COM", "x")
     assert np.nanmax(np.abs(seen)) == pytest.approx(peak, abs=1e-3)
 
 
@@ -129,11 +128,11 @@ def test_the_page_of_a_real_robot_lists_what_is_missing(log: RunLog, tmp_path: P
         about={"robot": log.robot, "schema_version": log.metadata["run"]["schema_version"]},
     )
     page = render(real)
-    data = pages.data_of(page)
+    data = runs.data_of(page)
     assert data["span"][0] == pytest.approx(0.0, abs=1e-6)
     assert "No verdict: " in page
     assert "<li>Operator&#x27;s force: no sim/truth in this log</li>" in page
-    assert len(pages.line(data, "COM", "x")[0]) > 50, (
+    assert len(runs.line(data, "COM", "x")[0]) > 50, (
         "the planner's estimate replaces the simulated value"
     )
     assert "Tilt of the soles" not in [panel["title"] for panel in data["panels"]]
@@ -143,8 +142,8 @@ def test_a_log_with_an_unreadable_robot_file_has_a_page_without_origins(
     log: RunLog, tmp_path: Path
 ) -> None:
     foreign = runs.rewritten(log, tmp_path, attachments={"robot.toml": b'name = "old"\n'})
-    data = pages.data_of(render(foreign))
-    choice = pages.panel(data, "Torque of one joint, by origin")
+    data = runs.data_of(render(foreign))
+    choice = runs.panel(data, "Torque of one joint, by origin")
     assert "Origins unknown: " in choice["note"]
     assert str(tmp_path) not in choice["note"]
     assert {line["label"] for line in choice["choices"][0]["lines"]} == {
@@ -163,29 +162,24 @@ def test_a_truncated_log_has_a_page_that_is_marked_so(
     page = render(read_run(path))
     assert "incomplete: the recorder did not close the file" in page
     assert re.search(r"lost: the last \d+ bytes, cut off", page)
-    assert len(pages.line(pages.data_of(page), "Command age", MODULES[0])[0]) > 10
+    assert len(runs.line(runs.data_of(page), "Command age", MODULES[0])[0]) > 10
 
 
 def test_a_log_without_messages_has_a_page(log: RunLog, tmp_path: Path) -> None:
     page = render(runs.rewritten(log, tmp_path, keep=lambda name: name == "run/event"))
-    data = pages.data_of(page)
+    data = runs.data_of(page)
     assert data["panels"] == [] or all(panel["kind"] == "plot" for panel in data["panels"])
     assert "No verdict: " in page
 
 
 def test_text_from_a_log_is_never_code_in_the_page(log: RunLog, tmp_path: Path) -> None:
-    def hostile(name: str, payload: bytes) -> bytes:
-        if name != "run/event":
-            return payload
-        event = msgspec.json.decode(payload, type=RunEvent)
-        return msgspec.json.encode(
-            msgspec.structs.replace(event, subject="</script><script>alert(1)//")
-        )
+    def hostile(_t: float, event: dict[str, Any]) -> None:
+        event["subject"] = "</script><script>alert(1)//"
 
-    page = render(runs.rewritten(log, tmp_path, payload=hostile))
+    page = render(runs.changed(log, tmp_path, "run/event", hostile))
     assert "<script>alert" not in page
     assert page.count("</script>") == 3
-    assert any("<script>alert" in mark[2] for mark in pages.data_of(page)["marks"])
+    assert any("<script>alert" in mark[2] for mark in runs.data_of(page)["marks"])
 
 
 def test_the_origins_of_a_torque_add_up_to_it(log: RunLog) -> None:
@@ -233,7 +227,7 @@ def test_a_silent_drive_does_not_make_its_service_silent(log: RunLog, page: str)
     states = log.messages(topics.JOINT_STATE, "hip_left")
     repeated = [state for state in states if state.mode == Mode.FAULT]
     assert len({state.t_ns for state in repeated}) < len(repeated)
-    row = pages.panel(pages.data_of(page), "Modes of the six services")["rows"][-1]
+    row = runs.panel(runs.data_of(page), "Modes of the six services")["rows"][-1]
     fault = sum(b - a for a, b, code in row["spans"] if code == Mode.FAULT)
     assert fault == pytest.approx(4.0 - 3.2, abs=0.15)
 
@@ -241,17 +235,14 @@ def test_a_silent_drive_does_not_make_its_service_silent(log: RunLog, page: str)
 def test_a_state_before_the_first_sample_is_placed_at_its_reception(
     log: RunLog, tmp_path: Path
 ) -> None:
-    count = 0
+    seen = itertools.count()
 
-    def unset(name: str, payload: bytes) -> bytes:
-        nonlocal count
-        count += name == "joint/knee_left/state"
-        if name != "joint/knee_left/state" or count > 25:
-            return payload
-        return msgspec.json.encode(msgspec.json.decode(payload) | {"t_ns": 0, "mode": 0})
+    def unset(_t: float, state: dict[str, Any]) -> None:
+        if next(seen) < 25:
+            state |= {"t_ns": 0, "mode": 0}
 
-    data = pages.data_of(render(runs.rewritten(log, tmp_path, payload=unset)))
-    row = pages.panel(data, "Modes of the six services")["rows"][MODULES.index("knee_left")]
+    data = runs.data_of(render(runs.changed(log, tmp_path, "joint/knee_left/state", unset)))
+    row = runs.panel(data, "Modes of the six services")["rows"][MODULES.index("knee_left")]
     begin, end, mode = row["spans"][0]
     assert mode == Mode.DISARMED
     assert data["span"][0] <= begin < end
@@ -260,17 +251,13 @@ def test_a_state_before_the_first_sample_is_placed_at_its_reception(
 
 def test_lost_messages_are_counted_by_topic(log: RunLog, tmp_path: Path, page: str) -> None:
     assert "Messages: none lost" in page
-    seen = 0
+    seen = itertools.count()
 
-    def dropped(name: str, payload: bytes) -> bytes:
-        nonlocal seen
-        seen += name == "harness/wrench"
-        if name == "harness/wrench" and seen > 100:
-            wrench = msgspec.json.decode(payload)
-            return msgspec.json.encode(wrench | {"seq": wrench["seq"] + 3})
-        return payload
+    def dropped(_t: float, wrench: dict[str, Any]) -> None:
+        if next(seen) >= 100:
+            wrench["seq"] += 3
 
-    page = render(runs.rewritten(log, tmp_path, payload=dropped))
+    page = render(runs.changed(log, tmp_path, "harness/wrench", dropped))
     assert "Messages: 3 lost on the way to the log" in page
     assert re.search(r"harness/wrench</td>(<td[^>]*>[^<]*</td>){3}<td[^>]*>3</td>", page)
 

@@ -5,29 +5,28 @@ from __future__ import annotations
 import re
 from functools import partial
 from pathlib import Path
+from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 
 from shared.bus import topics
-from shared.bus.messages import DriveStatus, JointState
+from shared.bus.messages import DriveStatus
 from shared.clock import NS_PER_S
 from shared.exceptions import RunError
-from tests.tools.judge.reports import pages, runs
+from tests.tools.judge.reports import runs
 from tests.tools.judge.reports.runs import Made
 from tools import cli
 from tools.judge import verdict
 from tools.judge.judgement import summarise_parts
 from tools.judge.reports import scene
 from tools.judge.reports.page import render, render_parts
-from tools.judge.reports.page_model import Line, PageModel, PageWindow
+from tools.judge.reports.page_model import Line, PageModel, PageWindow, Plot
 from tools.judge.reports.run_data import RunData
 from tools.judge.reports.signals import Span
 from tools.judge.run_parts import zero_ns
-from tools.logs.recorded_robot import robot_of
 from tools.logs.run_index import RunIndex
-from tools.logs.run_log import RunLog, RunPart, parts_of, read_part
+from tools.logs.run_log import RunLog, RunPart, parts_of, read_part, robot_of
 
 PART_S = 0.9
 
@@ -64,13 +63,13 @@ def test_the_messages_counted_are_those_of_the_whole(page: str, in_parts: str) -
 
 
 def test_panels_and_lines_are_those_of_the_whole(page: str, in_parts: str) -> None:
-    whole, parts = pages.data_of(page), pages.data_of(in_parts)
+    whole, parts = runs.data_of(page), runs.data_of(in_parts)
     assert [panel["title"] for panel in parts["panels"]] == [
         panel["title"] for panel in whole["panels"]
     ]
     for title, label in (("COM", "x"), ("Height", "torso"), ("Command age", "knee_left")):
         (t, values), (t_all, values_all) = (
-            pages.line(data, title, label) for data in (parts, whole)
+            runs.line(data, title, label) for data in (parts, whole)
         )
         # at a scale of hours a bin's extremes are shown; every one of them is kept
         assert np.nanmin(values) == pytest.approx(np.nanmin(values_all), abs=1e-3)
@@ -80,7 +79,7 @@ def test_panels_and_lines_are_those_of_the_whole(page: str, in_parts: str) -> No
 
 def test_the_bars_are_those_of_the_whole(page: str, in_parts: str) -> None:
     title = "Modes of the six services"
-    whole, parts = (pages.panel(pages.data_of(one), title) for one in (page, in_parts))
+    whole, parts = (runs.panel(runs.data_of(one), title) for one in (page, in_parts))
     for row, row_all in zip(parts["rows"], whole["rows"], strict=True):
         assert [span[2] for span in row["spans"]] == [span[2] for span in row_all["spans"]]
         edges, edges_all = (np.array([span[:2] for span in r["spans"]]) for r in (row, row_all))
@@ -129,9 +128,9 @@ def test_a_part_of_a_run_has_the_time_of_the_whole_and_all_events(
     words = ["--from", "1", "--to", "2", "-o", str(out), "--open", "no"]
     assert cli.main(["report", str(made.path), *words]) == 0
     assert 'id="verdict">A part of a run, and its figures: no verdict<' in out.read_text()
-    data = pages.data_of(out.read_text())
+    data = runs.data_of(out.read_text())
     assert data["span"] == pytest.approx([1.0, 2.0], abs=1e-6)
-    t, values = pages.line(data, "COM", "x")
+    t, values = runs.line(data, "COM", "x")
     assert t[0] >= 1.0
     assert t[-1] <= 2.001
     assert np.isfinite(values).any()
@@ -179,12 +178,13 @@ def test_time_zero_is_that_of_the_scenario(log: RunLog) -> None:
 
 def test_a_panel_without_data_in_the_first_part_has_its_unit_and_note_from_a_later_one() -> None:
     model = PageModel(Span(0.0, 2.0))
-    model.leave_out("Age", "nothing yet")
-    assert model.left_out == [("Age", "nothing yet")]
+    model.add(Plot("Age", if_empty="nothing yet", lines=[]))
+    assert model.as_data([])[1] == [("Age", "nothing yet")]
     line = Line("x", np.array([1.2, 1.4]), np.array([0.0, 3.0]), 0)
-    model.plot("Age", "ms", [line], note="how old", if_empty="none")
-    assert model.left_out == []
-    (panel,) = model.as_data([])["panels"]
+    model.add(Plot("Age", "ms", "how old", "none", lines=[line]))
+    data, left_out = model.as_data([])
+    assert left_out == []
+    (panel,) = data["panels"]
     assert (panel["unit"], panel["note"]) == ("ms", "how old")
 
 
@@ -198,9 +198,9 @@ def test_a_counter_goes_on_from_where_the_part_before_it_ended() -> None:
     for window, t, values in parts:
         model.window = window
         line = Line("late", np.array(t), np.array(values), 0, counts_up=True)
-        model.plot("Late", "count", [line], needs_count=True)
-    data = model.as_data([])
-    _, seen = pages.line(data, "Late", "late")
+        model.add(Plot("Late", "count", lines=[line], needs_count=True))
+    data, _ = model.as_data([])
+    _, seen = runs.line(data, "Late", "late")
     assert seen[-1] == pytest.approx(9.0, abs=1e-3), "3 in the first part, 6 in the second"
     assert (np.diff(seen) >= 0.0).all()
 
@@ -208,17 +208,11 @@ def test_a_counter_goes_on_from_where_the_part_before_it_ended() -> None:
 def test_before_the_drives_are_armed_no_soft_stop_is_passed(log: RunLog, tmp_path: Path) -> None:
     """A robot that hangs unarmed has its joints anywhere."""
 
-    def hanging(name: str, payload: bytes) -> bytes:
-        if not name.endswith("/state") or "joint" not in name:
-            return payload
-        state = msgspec.json.decode(payload, type=JointState)
-        if state.t_ns > armed_ns:
-            return payload
-        beyond = msgspec.structs.replace(state, q=(9.0, 9.0), drive=int(DriveStatus.IDLE))
-        return msgspec.json.encode(beyond)
+    def hanging(t: float, state: dict[str, Any]) -> None:
+        if t <= -1.0:
+            state |= {"q": (9.0, 9.0), "drive": int(DriveStatus.IDLE)}
 
-    armed_ns = RunData(log).zero_ns - NS_PER_S
-    hung = runs.rewritten(log, tmp_path, payload=hanging)
+    hung = runs.changed(log, tmp_path, "joint/*/state", hanging)
     for page in (render(hung), render_parts(hung.index, part_s=PART_S)):
         assert "beyond a soft stop" not in page
 

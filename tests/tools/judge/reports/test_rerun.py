@@ -17,9 +17,7 @@ import pytest
 from mcap.reader import make_reader
 
 from shared.config.robot_config import RobotConfig
-from tests.tools.judge.reports.runs import Made
-from tools import cli
-from tools.judge.reports import scene, urdf
+from tools.judge.reports import scene
 from tools.judge.reports.foxglove import Entity, Solid
 from tools.judge.reports.scene import RobotPose
 from tools.logs.run_log import RunLog
@@ -29,13 +27,6 @@ SIZES: dict[str, Callable[[pin.GeometryObject], list[float]]] = {
     "cylinder": lambda body: [2 * body.geometry.radius] * 2 + [2 * body.geometry.halfLength],
     "sphere": lambda body: [2 * body.geometry.radius] * 3,
 }
-
-
-@pytest.fixture(scope="module")
-def shown(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("rerun") / "shown.mcap"
-    assert cli.main(["export", str(made.path), "--scene", "-o", str(out)]) == 0
-    return out
 
 
 @pytest.fixture(scope="module")
@@ -104,5 +95,5 @@ def test_the_bodies_of_the_model_are_those_of_the_scene(
 def test_names_with_xml_characters_are_kept(robot: RobotConfig, first: RobotPose) -> None:
     name = 'a<b>&"c'
     solid = Solid("sphere", (0.1, 0.1, 0.1), (1.0, 0.0, 0.0, 1.0))
-    text = urdf.urdf(name, scene.frames(robot, first), [Entity("torso", name, (solid,))])
+    text = scene.urdf(name, scene.frames(robot, first), [Entity("torso", name, (solid,))])
     assert pin.buildModelFromXML(text).name == name

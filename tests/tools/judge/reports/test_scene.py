@@ -40,13 +40,6 @@ BODIES = {"hip": "thigh", "knee": "shin", "ankle": "foot"}
 
 
 @pytest.fixture(scope="module")
-def shown(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("shown") / "shown.mcap"
-    assert cli.main(["export", str(made.path), "--scene", "-o", str(out)]) == 0
-    return out
-
-
-@pytest.fixture(scope="module")
 def poses(log: RunLog, robot: RobotConfig) -> list[RobotPose]:
     return list(scene.poses(log, robot))
 

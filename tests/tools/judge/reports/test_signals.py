@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.tools.judge.reports.pages import decode_signal
+from tests.tools.judge.reports.runs import decode_signal
 from tools.judge.reports.signals import BINS, Span, encode_signal, message_times, segments
 
 VALUES = st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=300)

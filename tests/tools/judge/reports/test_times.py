@@ -8,14 +8,20 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from shared.bus import topics
 from shared.bus.messages import DriveStatus, PlannerMode, Trip
 from shared.bus.traces import LinkEvent
+from shared.clock import NS_PER_S
+from shared.config.impairment import Direction, Impairment
 from shared.joints import MODULES
-from tests.tools.judge.reports import pages, runs
-from tools.judge.reports.network import ImpairedLink
+from shared.links import DIRECTIONS, WRENCHES
+from shared.network.impairment_schedule import ImpairmentSchedule
+from tests.tools.judge.reports import runs
 from tools.judge.reports.page import render
+from tools.judge.reports.panels import ImpairedLink, histories
 from tools.judge.reports.run_data import RunData
 from tools.judge.reports.timeline import timeline_events
 from tools.logs.run_log import RunLog
@@ -23,30 +29,24 @@ from tools.logs.run_log import RunLog
 
 def test_the_rate_of_control_cycles_is_that_of_the_service(page: str) -> None:
     for module in MODULES:
-        _, rate = pages.line(pages.data_of(page), "Control cycles of each service", module)
+        _, rate = runs.line(runs.data_of(page), "Control cycles of each service", module)
         assert np.abs(rate - 500.0).max() < 10.0
 
 
 def test_late_cycles_are_counted_from_arming_and_across_a_restart(
     log: RunLog, tmp_path: Path
 ) -> None:
-    run = RunData(log)
-    begin_ns = run.zero_ns + round(run.armed_s() * 1e9)
+    armed_s = RunData(log).armed_s()
 
-    def late(name: str, body: bytes) -> bytes:
+    def late(t: float, state: dict[str, Any]) -> None:
         """40 late cycles at the start, then one in 0.1 s; a restart at 2 s resets the count."""
-        if name != "joint/hip_right/state":
-            return body
-        state = msgspec.json.decode(body)
-        t = (state["t_ns"] - run.zero_ns) / 1e9
-        since = (state["t_ns"] - begin_ns) / 1e9
-        state["late"] = 40 + int(10.0 * max(0.0, since)) if t < 2.0 else int(10.0 * (t - 2.0))
-        return msgspec.json.encode(state)
+        since = max(0.0, t - armed_s)
+        state["late"] = 40 + int(10.0 * since) if t < 2.0 else int(10.0 * (t - 2.0))
 
-    page = render(runs.rewritten(log, tmp_path, payload=late))
-    _, counted = pages.line(pages.data_of(page), "Late control cycles", "hip_right")
+    page = render(runs.changed(log, tmp_path, "joint/hip_right/state", late))
+    _, counted = runs.line(runs.data_of(page), "Late control cycles", "hip_right")
     assert counted[0] == 0.0
-    assert counted[-1] == pytest.approx(10.0 * (4.0 - run.armed_s()), abs=3.0)
+    assert counted[-1] == pytest.approx(10.0 * (4.0 - armed_s), abs=3.0)
     assert (np.diff(counted[np.isfinite(counted)]) >= 0.0).all()
 
 
@@ -61,11 +61,11 @@ def test_panels_of_real_time_are_left_out_in_virtual_time(page: str) -> None:
 def test_a_machine_too_slow_for_real_time_is_named_with_the_verdict(
     log: RunLog, tmp_path: Path
 ) -> None:
-    def slow(name: str, body: bytes) -> bytes:
-        return body.replace(b'"late_s":0.0', b'"late_s":1.5') if name == "sim/truth" else body
+    def slow(_t: float, truth: dict[str, Any]) -> None:
+        truth["late_s"] = 1.5
 
     about = {key: value for key, value in log.metadata["run"].items() if key != "lockstep"}
-    page = render(runs.rewritten(log, tmp_path, payload=slow, about=about))
+    page = render(runs.changed(log, tmp_path, "sim/truth", slow, about=about))
     caution = page.partition('<p class="caution">')[2].partition("</p>")[0]
     assert "too slow for real time" in caution
     assert "1.50 s" in caution
@@ -75,20 +75,18 @@ def test_a_machine_too_slow_for_real_time_is_named_with_the_verdict(
 def test_drives_that_start_together_share_one_row_and_are_no_alarm(
     log: RunLog, tmp_path: Path
 ) -> None:
-    run = RunData(log)
-
-    def coming_up(name: str, body: bytes) -> bytes:
-        if not name.endswith("/state") or not name.startswith("joint/"):
-            return body
-        state = msgspec.json.decode(body)
-        t = (state["t_ns"] - run.zero_ns) / 1e9
+    def coming_up(t: float, state: dict[str, Any]) -> None:
         if t < -2.0:
             state["drive"] = int(DriveStatus.LOST if t < -2.1 else DriveStatus.IDLE)
-        if 3.0 <= t < 3.1 and name == "joint/knee_left/state":
-            state["drive"] = int(DriveStatus.IDLE)
-        return msgspec.json.encode(state)
 
-    rows = timeline_events(RunData(runs.rewritten(log, tmp_path, payload=coming_up)))
+    def idle(t: float, state: dict[str, Any]) -> None:
+        if 3.0 <= t < 3.1:
+            state["drive"] = int(DriveStatus.IDLE)
+
+    idling = runs.changed(log, tmp_path / "idle", "joint/knee_left/state", idle)
+    rows = timeline_events(
+        RunData(runs.changed(idling, tmp_path / "up", "joint/*/state", coming_up))
+    )
     kinds = {row.text: row.kind for row in rows if "drive" in row.text}
     assert kinds["all six: drive LOST to IDLE"] == "note"
     assert kinds["all six: drive IDLE to ARMED"] == "note"
@@ -113,17 +111,15 @@ def test_network_impairments_have_a_panel_marks_and_rows(log: RunLog, tmp_path: 
                 t_ns = run.zero_ns + round(t * 1e9)
                 event = impairment(number, f"planner->{module}", t_ns, begins=begins, cut=cut)
                 more.append((t_ns, topics.LINK_EVENT.name, msgspec.json.encode(event)))
-    data, rows = panel_and_rows(runs.rewritten(log, tmp_path, more=more))
-    (row,) = pages.panel(data, "Injected network impairments")["rows"]
+    impaired = runs.rewritten(log, tmp_path, more=more)
+    data = runs.data_of(render(impaired))
+    rows = [row.text for row in timeline_events(RunData(impaired))]
+    (row,) = runs.panel(data, "Injected network impairments")["rows"]
     assert row["label"] == "to left"
     starts, _, codes = zip(*row["spans"][1:], strict=True)
     assert starts == pytest.approx((0.5, 1.0, 1.5, 2.0), abs=1e-3)
-    assert codes == (
-        ImpairedLink.IMPAIRED,
-        ImpairedLink.CUT,
-        ImpairedLink.IMPAIRED,
-        ImpairedLink.CLEAR,
-    )
+    link = ImpairedLink
+    assert codes == (link.IMPAIRED, link.CUT, link.IMPAIRED, link.CLEAR)
     assert [mark[2] for mark in data["marks"] if mark[1] == "network"] == [
         "planner->left delay=5", "planner->left partition", "planner->left ends",
         "planner->left ends",
@@ -134,7 +130,7 @@ def test_network_impairments_have_a_panel_marks_and_rows(log: RunLog, tmp_path: 
 def test_the_ages_follow_the_panel_of_network_impairments(log: RunLog, tmp_path: Path) -> None:
     t_ns = RunData(log).zero_ns + 10**9
     event = msgspec.json.encode(impairment(1, "planner->knee_left", t_ns, begins=True, cut=True))
-    data = pages.data_of(
+    data = runs.data_of(
         render(runs.rewritten(log, tmp_path, more=[(t_ns, topics.LINK_EVENT.name, event)]))
     )
     titles = [panel["title"] for panel in data["panels"]]
@@ -143,53 +139,53 @@ def test_the_ages_follow_the_panel_of_network_impairments(log: RunLog, tmp_path:
 
 
 def test_ages_of_seconds_do_not_flatten_ages_of_milliseconds(log: RunLog, tmp_path: Path) -> None:
-    def cut_off(name: str, body: bytes) -> bytes:
-        if name != "planner/status":
-            return body
-        status = msgspec.json.decode(body)
+    def cut_off(_t: float, status: dict[str, Any]) -> None:
         status["state_age_ns"] = [3_000_000_000] * 6
-        return msgspec.json.encode(status)
 
-    page = render(runs.rewritten(log, tmp_path, payload=cut_off))
-    panel = pages.panel(pages.data_of(page), "Age of the planner's inputs")
+    page = render(runs.changed(log, tmp_path, "planner/status", cut_off))
+    panel = runs.panel(runs.data_of(page), "Age of the planner's inputs")
     assert panel["reach"] == pytest.approx(200.0)
     assert "The delay before the arrival is not included" in panel["note"]
 
 
 def test_the_back_off_of_the_planner_is_in_the_timeline(log: RunLog, tmp_path: Path) -> None:
-    zero_ns = RunData(log).zero_ns
+    def waits(t: float, status: dict[str, Any]) -> None:
+        status["wait_s"] = 3.5 - t if 2.5 <= t < 3.5 else 0.0
 
-    def waits(name: str, body: bytes) -> bytes:
-        if name != "planner/status":
-            return body
-        status = msgspec.json.decode(body)
-        t_s = (status["t_ns"] - zero_ns) / 1e9
-        status["wait_s"] = 3.5 - t_s if 2.5 <= t_s < 3.5 else 0.0
-        return msgspec.json.encode(status)
-
-    found = timeline_events(RunData(runs.rewritten(log, tmp_path, payload=waits)))
+    found = timeline_events(RunData(runs.changed(log, tmp_path, "planner/status", waits)))
     (row,) = [row for row in found if "backs off" in row.text]
     assert row.t == pytest.approx(2.5, abs=0.01)
     assert row.text.startswith("planner: backs off for 1.0 s or more")
 
 
 def test_a_trip_of_the_planner_is_named_in_the_timeline(log: RunLog, tmp_path: Path) -> None:
-    zero_ns = RunData(log).zero_ns
+    def tripped(t: float, status: dict[str, Any]) -> None:
+        if t >= 2.5:
+            status |= {"mode": int(PlannerMode.TRIPPED), "trip": int(Trip.SAGGING)}
 
-    def tripped(name: str, body: bytes) -> bytes:
-        status = msgspec.json.decode(body)
-        if name != "planner/status" or (status["t_ns"] - zero_ns) / 1e9 < 2.5:
-            return body
-        changed = {"mode": int(PlannerMode.TRIPPED), "trip": int(Trip.SAGGING)}
-        return msgspec.json.encode(status | changed)
-
-    found = timeline_events(RunData(runs.rewritten(log, tmp_path, payload=tripped)))
+    found = timeline_events(RunData(runs.changed(log, tmp_path, "planner/status", tripped)))
     assert any(row.text.startswith("planner: LEADING to TRIPPED, SAGGING") for row in found)
-
-
-def panel_and_rows(log: RunLog) -> tuple[dict[str, Any], list[str]]:
-    return pages.data_of(render(log)), [row.text for row in timeline_events(RunData(log))]
 
 
 def test_a_log_without_impairments_is_described_so(page: str) -> None:
     assert "<li>Injected network impairments: no impairment in this log" in page
+
+
+@given(st.lists(st.tuples(st.booleans(), st.integers(1, 6), st.integers(1, 9)), max_size=8))
+def test_the_state_is_cut_exactly_when_no_message_passes(
+    requested: list[tuple[bool, int, int]],
+) -> None:
+    directions = {name: Direction(name, 0) for name in DIRECTIONS}
+    events: list[LinkEvent] = []
+    impairments = ImpairmentSchedule(directions, events.append)
+    for cut, begin_s, duration_s in requested:
+        what = Impairment(delay_ms=0.0 if cut else 5.0, partition=cut)
+        impairments.plan(WRENCHES, what, float(begin_s), float(begin_s + duration_s))
+    for s in range(20):
+        impairments.advance(float(s), s * NS_PER_S)
+        rows = histories(events, 0).get(WRENCHES, ())
+        shown = rows[-1][1] if rows else ImpairedLink.CLEAR
+        now_ns = s * NS_PER_S
+        passed = directions[WRENCHES].passes(now_ns, 0)
+        assert (shown is ImpairedLink.CUT) is (passed == ())
+        assert (shown is ImpairedLink.CLEAR) is (passed == (now_ns,))

@@ -11,10 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shared.clock import NS_PER_MS, NS_PER_S
-from tests.tools.logs.playback.schedules import schedule_of
-from tools.logs.playback.display import summary
-from tools.logs.playback.player import BURST, STEP_NS, ClockMessage, Player
-from tools.logs.playback.press import Press
+from tests.tools.logs.playback.test_schedule import schedule_of
+from tools.logs.playback.player import BURST, STEP_NS, ClockMessage, Player, Press, summary
 from tools.logs.playback.schedule import Entry, Playhead, window
 
 BEGAN = 4_000_000_000_000

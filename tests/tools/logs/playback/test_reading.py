@@ -13,7 +13,7 @@ from tests.shared.mcap_log import runs
 from tests.shared.mcap_log.runs import STATE_KEY, Queue, item, killed_file, write, writer
 from tools.logs.playback import reading
 from tools.logs.playback.reading import files_named, read
-from tools.logs.run_files import further_files
+from tools.logs.run_index import further_files
 
 WRENCH_KEY = topics.WRENCH.key(runs.ROBOT)
 
@@ -113,28 +113,6 @@ def test_an_unfinished_file_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
     recording = read([killed.path])
     assert len(recording.entries()) == 60
     assert recording.unfinished == [killed.path]
-    content = killed.path.read_bytes()
-    cut = tmp_path / "cut.mcap"
-    for size in range(killed.flushed[0][0], len(content), 97):
-        cut.write_bytes(content[:size])
-        least = killed.at_least(size)
-        try:
-            entries = read([cut]).entries()
-        except RunError:
-            assert least == 0
-        else:
-            assert len(entries) >= least
-            assert [e.payload for e in entries] == [item(n)[1] for n in range(len(entries))]
-
-
-@pytest.mark.parametrize("content", [b"", b"nonsense", b"\x89MCAP0\r\n", b"\x89MCAP0\r\n" * 9])
-def test_what_is_no_run_is_refused_in_a_line(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "a.mcap"
-    path.write_bytes(content)
-    with pytest.raises(RunError) as caught:
-        read([path])
-    assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_run_without_a_message_is_refused(tmp_path: Path) -> None:

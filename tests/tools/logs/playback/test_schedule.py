@@ -2,21 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from hypothesis import given
 from hypothesis import strategies as st
 
 from shared.clock import NS_PER_MS, NS_PER_S
-from tests.tools.logs.playback.schedules import schedule_of
 from tools.logs.playback.schedule import (
     PASS_MIN_NS,
     RATE_MAX,
     RATE_MIN,
     Entry,
+    EntryStream,
     Playhead,
     Schedule,
     Window,
     window,
 )
+
+
+def schedule_of(rows: Sequence[Entry], part: Window, *, loop: bool) -> Schedule:
+    """Return a schedule that reads its messages in blocks of a second."""
+    stream = EntryStream(
+        lambda begin_ns, end_ns: [row for row in rows if begin_ns <= row.time_ns < end_ns],
+        part,
+        block_ns=NS_PER_S,
+    )
+    return Schedule(stream, part, loop=loop)
+
 
 BEGAN = 7_000_000_000_000
 TIMES = st.lists(st.integers(0, 5 * NS_PER_S), min_size=1, max_size=40).map(sorted)

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from shared.config.robot_config import RobotConfig
-from tools.logs.recorded_robot import robot_of
 from tools.logs.reexecution.execution import Execution
 from tools.logs.reexecution.outcome import ReexecutionResult
-from tools.logs.run_log import RunLog
+from tools.logs.run_log import RunLog, robot_of
 
 
 def executed(

@@ -19,8 +19,7 @@ from shared.exceptions import RunError
 from shared.joints import MODULES
 from tests.tools.logs.reexecution.executions import executed
 from tests.tools.logs.reexecution.make_golden import TRACED
-from tools.logs.recorded_robot import robot_of
-from tools.logs.run_log import RunLog, read_run
+from tools.logs.run_log import RunLog, read_run, robot_of
 
 GOLDEN = sorted((Path(__file__).parent / "golden").glob("*.mcap"))
 NEWEST = GOLDEN[-1]

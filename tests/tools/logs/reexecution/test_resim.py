@@ -14,7 +14,7 @@ from shared.bus import topics
 from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Fault, Kill, Restart
-from shared.exceptions import FAULT_EXIT_CODE
+from shared.exceptions import FAULT_EXIT_CODE, RunError
 from shared.joints import MODULES
 from shared.mcap_log import provenance
 from tests.imu.robots import with_imu
@@ -22,6 +22,7 @@ from tests.lockstep.runs import still
 from tests.shared.mcap_log.runs import state
 from tests.tools.exit_codes import exit_code
 from tests.tools.logs.reexecution.executions import executed
+from tests.tools.logs.split_runs import recorded_in_parts
 from tools import cli
 from tools.logs.reexecution.outcome import ReexecutionResult
 from tools.logs.reexecution.params import with_params
@@ -247,3 +248,52 @@ def test_a_run_reports_how_many_of_its_cycles_were_traced(log: RunLog, module: s
 def _is_last(states: list[Any], state: Any) -> bool:
     index = states.index(state)
     return index + 1 == len(states) or states[index + 1].cycle < state.cycle
+
+
+# ---- the same run, split while it was recorded
+
+
+@pytest.fixture(scope="module")
+def directory(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return recorded_in_parts(read_run(recorded), tmp_path_factory.mktemp("split"))
+
+
+def test_the_directory_of_a_split_run_is_the_run(log: RunLog, directory: Path) -> None:
+    whole, log = log, read_run(directory)
+    assert [path.name for path in log.files] == ["run.mcap", "run_1.mcap", "run_2.mcap"]
+    assert (log.complete, log.damage, log.attachments) == (True, [], whole.attachments)
+    assert {key: log.raw(key) for key in log.keys()} == {  # noqa: SIM118
+        key: whole.raw(key)
+        for key in whole.keys()  # noqa: SIM118
+    }
+    assert log.began_ns() == whole.began_ns()
+
+
+@pytest.mark.parametrize("name", ["planner", "hip_left"])
+def test_a_split_run_is_executed_again_across_its_files(directory: Path, name: str) -> None:
+    outcome = executed(read_run(directory), name)
+    assert outcome.comparison.first is None
+    assert (outcome.lost_inputs, outcome.starts) == (0, 2 if name == "planner" else 1)
+    assert outcome.skipped <= 4
+
+
+def test_one_file_of_a_split_run_stands_for_itself(directory: Path) -> None:
+    outcome = executed(read_run(directory / "run_1.mcap"), "ankle_left")
+    assert outcome.comparison.first is None
+    assert outcome.ticks > 0
+
+
+def test_a_new_file_with_a_parameter_goes_beside_the_first(directory: Path) -> None:
+    words = ["resim", str(directory), "--service", "planner", "--param", "gains.k_p_x=2000"]
+    assert cli.main(words) == 0
+    new = directory / "run.resim.mcap"
+    try:
+        assert read_run(new).metadata["resim"]["params"] == "gains.k_p_x=2000"
+        assert len(read_run(directory).files) == 3, "it is no part of the run"
+    finally:
+        new.unlink()
+
+
+def test_a_directory_without_a_run_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"holds no \.mcap file"):
+        read_run(tmp_path)

@@ -16,8 +16,7 @@ from shared.exceptions import RunError
 from tests.lockstep.runs import kill, push, run, still
 from tools.lab.studies.counterfactual.moments import Moment, moments_of
 from tools.lab.studies.counterfactual.run import Task, counterfactual_of, scenario_from
-from tools.logs.recorded_robot import robot_of
-from tools.logs.run_log import RunLog, read_run
+from tools.logs.run_log import RunLog, read_run, robot_of
 from tools.sim.network import BASE
 from tools.sim.recorded_lockstep import simulate
 from tools.verbs import whatif

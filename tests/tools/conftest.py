@@ -1,9 +1,14 @@
+"""One recorded run, for all tests that read one."""
+
 from __future__ import annotations
+
+from pathlib import Path
 
 import pytest
 
 from tests.tools.judge.reports import runs
 from tests.tools.judge.reports.runs import Made
+from tools import cli
 from tools.judge.reports.page import render
 from tools.logs.run_log import RunLog, read_run
 
@@ -22,3 +27,11 @@ def log(made: Made) -> RunLog:
 @pytest.fixture(scope="session")
 def page(log: RunLog) -> str:
     return render(log)
+
+
+@pytest.fixture(scope="session")
+def shown(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run with its scene."""
+    out = tmp_path_factory.mktemp("shown") / "shown.mcap"
+    assert cli.main(["export", str(made.path), "--scene", "-o", str(out)]) == 0
+    return out
