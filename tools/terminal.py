@@ -32,12 +32,7 @@ _FIELD: Final = re.compile(r"\{(?:![rs])?(?::[^{}]*)?\}")
 
 
 def marked(template: str, *values: object) -> Text:
-    """Return a text in which the template alone is markup.
-
-    Args:
-        template: Rich markup with fields as of `str.format`: `"[bold]{}[/]: {:.1f} s"`.
-        values: of the fields; data.
-    """
+    """Return a text in which the template alone is markup."""
     whole = Text()
     given = zip(_FIELD.findall(template), values, strict=True)
     frame = Text.from_markup(_FIELD.sub(_HOLE, template), emoji=False)
@@ -112,12 +107,7 @@ class Console(rich.console.Console):
 def renewed(
     console: Console, *, screen: bool = False
 ) -> Iterator[Callable[[RenderableType], None]]:
-    """Give what shows the newest of something: in its place on a terminal, else below the last.
-
-    Args:
-        console: to print on.
-        screen: take a terminal's whole screen meanwhile.
-    """
+    """Give what shows the newest of something: in its place on a terminal, else below the last."""
     if not console.is_terminal:
 
         def show(shown: RenderableType) -> None:

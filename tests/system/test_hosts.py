@@ -21,7 +21,7 @@ from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
 from tests.certified import certified, install_all
-from tests.system.waiting import wait_for
+from tests.system.fleets import wait_for
 from tools import cli
 from tools.fleet import procfs
 from tools.fleet.supervise import SupervisedFleet

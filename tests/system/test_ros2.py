@@ -12,8 +12,8 @@ import pytest
 from shared.bus.messages import Mode
 from shared.joints import JOINTS, MODULES
 from shared.places import DEFAULT_CONFIG
+from tests.system.fleets import wait_for
 from tests.system.ros2_network import OtherNode, free_port, router, session
-from tests.system.waiting import wait_for
 
 pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(180)]
 

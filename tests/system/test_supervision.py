@@ -20,10 +20,11 @@ from supervisor.states import ProcessStates
 
 from shared.exceptions import FleetError
 from shared.places import DEFAULT_CONFIG
-from tests.system.waiting import wait_for
+from tests.system.fleets import wait_for
 from tools import cli
 from tools.fleet import procfs, supervise
 from tools.fleet import run_dir as run_dir_module
+from tools.fleet.process_table import FleetOptions
 from tools.fleet.run_dir import MARKER
 from tools.fleet.supervise import ServiceInfo, SupervisedFleet
 from tools.fleet.supervisor_process import BACKOFF_MAX_S, Service
@@ -93,7 +94,8 @@ def start(run_dir: Path, tmp_path: Path) -> Start:
         table = write_table(
             tmp_path / "processes.toml", programs or {"planner": SLEEPER, "harness": SLEEPER}
         )
-        return SupervisedFleet.start(DEFAULT_CONFIG, run_dir, table_path=table, **arguments)
+        options = FleetOptions(table_path=table, **arguments)
+        return SupervisedFleet.start(DEFAULT_CONFIG, run_dir, options)
 
     return start
 
@@ -332,7 +334,9 @@ def test_a_start_that_nobody_asked_for_ends_nothing_when_a_service_fails(start: 
 def test_a_service_that_never_listens_fails_the_start(run_dir: Path, tmp_path: Path) -> None:
     table = write_table(tmp_path / "p.toml", {"planner": SLEEPER}, ready="endpoint")
     with pytest.raises(FleetError, match="not up after 2 s: planner"):
-        SupervisedFleet.start(DEFAULT_CONFIG, run_dir, table_path=table, timeout_s=2.0)
+        SupervisedFleet.start(
+            DEFAULT_CONFIG, run_dir, FleetOptions(table_path=table, timeout_s=2.0)
+        )
     assert_nothing_left(run_dir, [])
 
 
@@ -346,7 +350,7 @@ def test_a_port_in_use_is_refused_before_anything_starts(run_dir: Path, tmp_path
         config.write_text(text.replace("unixsock-stream/{run}/planner.zenoh", endpoint))
         table = write_table(tmp_path / "p.toml", {"planner": SLEEPER})
         with pytest.raises(FleetError, match=f"planner: {endpoint}: port in use"):
-            SupervisedFleet.start(config, run_dir, table_path=table)
+            SupervisedFleet.start(config, run_dir, FleetOptions(table_path=table))
     assert_nothing_left(run_dir, [])
 
 
@@ -356,8 +360,9 @@ def up_in_a_process(run_dir: Path, table: Path, *, then: str = "") -> subprocess
         "import sys, time, tools.cli, tools.verbs.up, tools.fleet.supervise as s\n"
         "from pathlib import Path\n"
         "def run(args):\n"
-        f"    s.SupervisedFleet.start(args.config, args.run_dir, table_path=Path({str(table)!r}),"
-        f" leashed={bool(then)}, timeout_s=60)\n"
+        f"    options = s.FleetOptions(table_path=Path({str(table)!r}), leashed={bool(then)},"
+        " timeout_s=60)\n"
+        "    s.SupervisedFleet.start(args.config, args.run_dir, options)\n"
         f"    {then or 'return 0'}\n"
         "tools.verbs.up.run = run\n"
         f"sys.exit(tools.cli.main(['up', '--run-dir', {str(run_dir)!r}]))\n"

@@ -25,7 +25,7 @@ from shared.extras import require
 from tools.bringup.boards import FoundBoards
 from tools.bringup.can_monitor import listen
 from tools.fleet import procfs
-from tools.fleet.process_table import SIMULATED_CAN, is_simulated
+from tools.fleet.process_table import SIMULATED_CAN, FleetOptions, is_simulated
 from tools.fleet.run_dir import RunDir
 from tools.fleet.supervise import SupervisedFleet
 
@@ -133,10 +133,12 @@ def drives_within_reach(
         simulator = SupervisedFleet.start(
             config_path,
             run_dir,
-            overrides={"simulator": words},
-            no_restart=frozenset({"simulator"}),
-            services=["simulator"],
-            leashed=True,
+            FleetOptions(
+                overrides={"simulator": words},
+                no_restart=("simulator",),
+                services=["simulator"],
+                leashed=True,
+            ),
         )
     try:
         wait_for_simulator(robot, run_dir, UP_S if simulator is None else STARTED_S)

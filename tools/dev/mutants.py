@@ -181,11 +181,7 @@ def _prepare(group: Group, folder: Path) -> None:
 
 
 def _mutmut_run(folder: Path, words: Sequence[str], console: Console) -> None:
-    """Run mutmut; its own words go into run.log, its count is shown.
-
-    Raises:
-        RunError: it failed before the first mutant.
-    """
+    """Run mutmut; its own words go into run.log, its count is shown."""
     command = [sys.executable, "-m", "mutmut", "run", *words]
     with (
         (folder / "run.log").open("w", encoding="utf-8") as log,
@@ -231,12 +227,7 @@ def _statuses(folder: Path) -> list[tuple[str, str]]:
 
 
 def change_of(name: str, shown: str) -> Mutation:
-    """Return what a mutant changes.
-
-    Args:
-        name: mutmut's, such as `services.joint.torque_limiter.x_limit_torque__mutmut_3`.
-        shown: its unified diff.
-    """
+    """Return what a mutant changes."""
     lines = [line for line in shown.splitlines() if not line.startswith(("---", "+++"))]
     was, becomes = (
         " ".join(line[1:].strip() for line in lines if line.startswith(sign)) for sign in "-+"

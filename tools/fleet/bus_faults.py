@@ -36,12 +36,8 @@ class BusFaults:
         """Count from here on."""
         self._arrivals.flood(now_ns())
 
-    def told(self, pids: dict[str, int]) -> tuple[str, ...]:
-        """Return what is wrong, in words; takes up to 2 s if a link does not come.
-
-        Args:
-            pids: of this host's services that run.
-        """
+    def describe(self, pids: dict[str, int]) -> tuple[str, ...]:
+        """Return what is wrong, in words; takes up to 2 s if a link does not come."""
         if self._robot.bus.security.mode != "mtls":
             return ()
         flood = self._arrivals.flood(now_ns())

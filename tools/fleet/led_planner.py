@@ -33,15 +33,7 @@ class LedPlanner:
     """
 
     def __init__(self, session: Session, verb: str) -> None:
-        """Meet it.
-
-        Args:
-            session: of an operator.
-            verb: that asks; it stands in the planner's status.
-
-        Raises:
-            FleetError: it is silent, does not lead, or somebody else asks it for something.
-        """
+        """Meet it."""
         self._intents = session.publisher(topics.OPERATOR_INTENT, OperatorIntent)
         self._statuses = session.latest(topics.PLANNER_STATUS, PlannerStatus)
         self.source = f"xrl {verb} by {user_name()} ({os.getpid()})"

@@ -52,11 +52,7 @@ def usual_pace() -> float:
 
 
 def check_pace(pace: float, *, simulated: bool) -> None:
-    """Refuse a pace that cannot be kept.
-
-    Raises:
-        FleetError: it is out of range, or the drives are real and know no slow motion.
-    """
+    """Refuse a pace that cannot be kept."""
     if not PACE_MIN <= pace <= 1.0:
         raise FleetError(f"--pace {pace:g}: {PACE_MIN:g} to 1 is right")
     if pace != 1.0 and not simulated:
@@ -64,18 +60,7 @@ def check_pace(pace: float, *, simulated: bool) -> None:
 
 
 def run_at_fitting_pace(run: Callable[[float], T], tell: Callable[[str], None]) -> T:
-    """Run at the default pace, and again at a slower one while the cores are full.
-
-    Args:
-        run: runs a fleet at a pace.
-        tell: takes a line of text each time the pace is lowered.
-
-    Returns:
-        The result of `run`. The pace found becomes the default of this process.
-
-    Raises:
-        CoresFullError: the cores do not carry the fleet at any pace.
-    """
+    """Run at the default pace, and again at a slower one while the cores are full."""
     while True:
         pace = usual_pace()
         try:

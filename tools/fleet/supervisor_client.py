@@ -64,12 +64,7 @@ class Supervisor:
         return answer["lost"], answer["why"]
 
     def call(self, method: str, *arguments: object) -> Any:
-        """Call the supervisor; the method has its namespace, `supervisor` or `xrl`.
-
-        Raises:
-            FleetError: it does not answer.
-            RefusedError: it refuses the request.
-        """
+        """Call the supervisor; the method has its namespace, `supervisor` or `xrl`."""
         transport = _Transport(self._run.supervisor_socket)
         try:
             with xmlrpc.client.ServerProxy("http://localhost", transport=transport) as proxy:

@@ -63,11 +63,7 @@ class HostRow(NamedTuple):
 def files_of(
     hosts: Hosts, host: Host, robot: RobotConfig, schedule: bytes, authority: Authority | None
 ) -> list[HostFile]:
-    """Return what a host has to have; without an authority all but its keys.
-
-    Raises:
-        BusError: the authority has no certificate of a name.
-    """
+    """Return what a host has to have; without an authority all but its keys."""
     spread = robot_on_hosts(robot, hosts)
     folder = hosts.folder
     files = [
@@ -85,17 +81,7 @@ def files_of(
 
 
 def update(hosts: Hosts, remote: Remote, files: list[HostFile], *, while_up: bool) -> str:
-    """Bring files to a host, and take away keys that it is not to have; a start takes them.
-
-    Args:
-        hosts: all of them.
-        remote: the host.
-        files: all that it is to have.
-        while_up: do so although its services are running.
-
-    Raises:
-        FleetError: the host is not reached, its services are running, or a file cannot be written.
-    """
+    """Bring files to a host, and take away keys that it is not to have; a start takes them."""
     if not while_up:
         why = "a service that crashes would come back with the new files beside the old"
         refuse_up(remote, why)
@@ -123,11 +109,7 @@ def update(hosts: Hosts, remote: Remote, files: list[HostFile], *, while_up: boo
 
 
 def refuse_up(remote: Remote, why: str) -> None:
-    """Refuse to go on while a host's services are up.
-
-    Raises:
-        FleetError: they are.
-    """
+    """Refuse to go on while a host's services are up."""
     state = _state(remote)
     if state not in _AT_REST:
         text = f"{remote.host.name}: its unit is {state}: {why}"
@@ -135,11 +117,7 @@ def refuse_up(remote: Remote, why: str) -> None:
 
 
 def check(hosts: Hosts, remote: Remote, files: list[HostFile]) -> HostRow:
-    """Look at a host, and compare it with what it has to have.
-
-    Raises:
-        FleetError: it is not reached, or has no checkout.
-    """
+    """Look at a host, and compare it with what it has to have."""
     python, config = f"{hosts.checkout}/.venv/bin/python", f"{hosts.folder}/{ROBOT_FILE}"
     # the module is found in the installed package, wherever the command starts
     words = ("-P", "-m", "tools.hosts.probe", "--config", config, "--run-dir", RUN_DIR)

@@ -52,12 +52,7 @@ class Probe(msgspec.Struct, frozen=True):
 
 
 def probe(config: Path, run_dir: Path) -> Probe:
-    """Look at this host.
-
-    Args:
-        config: robot file.
-        run_dir: of the fleet that runs here, if one does.
-    """
+    """Look at this host."""
     wrong, warnings, keys = [], [], dict[str, str]()
     try:
         robot = config_file.load(config)

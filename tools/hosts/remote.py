@@ -56,18 +56,7 @@ class Remote:
         on_bus: bool = False,
         timeout_s: float = TIMEOUT_S,
     ) -> Said:
-        """Run a command and wait for it.
-
-        Args:
-            words: the command; no shell takes them apart.
-            content: for its standard input.
-            as_user: as the user who runs the services, not as the one who logs in.
-            on_bus: it talks to the services: in their network, where that is their own.
-            timeout_s: time in which it has to end.
-
-        Raises:
-            FleetError: the host is not reached, or the command does not end.
-        """
+        """Run a command and wait for it."""
         before = [*(self._in_network if on_bus else []), *(self._as_user if as_user else [])]
         command = [*self._begin, shlex.join([*before, *words])]
         name = self.host.name
@@ -92,11 +81,7 @@ class Remote:
         on_bus: bool = False,
         timeout_s: float = TIMEOUT_S,
     ) -> str:
-        """Run a command that has to succeed, and return what it printed.
-
-        Raises:
-            FleetError: it failed, or as `run`.
-        """
+        """Run a command that has to succeed, and return what it printed."""
         said = self.run(
             *words, content=content, as_user=as_user, on_bus=on_bus, timeout_s=timeout_s
         )
@@ -106,11 +91,7 @@ class Remote:
         return said.out
 
     def fetch(self, *words: str, into: BinaryIO) -> None:
-        """Run a command as the services' user, and put what it prints into a file.
-
-        Raises:
-            FleetError: it failed, or the host is not reached; the file has what came until then.
-        """
+        """Run a command as the services' user, and put what it prints into a file."""
         command = [*self._begin, shlex.join([*self._as_user, *words])]
         try:
             done = subprocess.run(command, stdout=into, stderr=subprocess.PIPE, check=False)
@@ -121,11 +102,7 @@ class Remote:
             raise FleetError(f"{self.host.name}: {words[0]}: {why}")
 
     def write(self, path: str, content: bytes, mode: int, *, as_user: bool) -> None:
-        """Write a file whole or not at all; it belongs to who writes it.
-
-        Raises:
-            FleetError: it cannot be written.
-        """
+        """Write a file whole or not at all; it belongs to who writes it."""
         part = shlex.quote(f"{path}.part")
         script = (
             f"umask 077 && rm -f {part} && set -C && cat > {part} && chmod {mode:o} {part} && "
@@ -134,11 +111,7 @@ class Remote:
         self.must("sh", "-c", script, content=content, as_user=as_user)
 
     def echoed(self, *words: str) -> tuple[str, ClockOffset]:
-        """Return the first line of a command that then answers each line with its clock.
-
-        Raises:
-            FleetError: it does not answer.
-        """
+        """Return the first line of a command that then answers each line with its clock."""
         command = [*self._begin, shlex.join([*self._as_user, *words])]
         pipe = subprocess.PIPE
         with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
@@ -157,11 +130,7 @@ class Remote:
 
 
 def _talk(process: subprocess.Popen[str]) -> tuple[str, list[ClockOffset]]:
-    """Return the first line, and the answers.
-
-    Raises:
-        OSError, ValueError: it has ended, or answers something else.
-    """
+    """Return the first line, and the answers."""
     there, back = process.stdin, process.stdout
     if there is None or back is None:
         raise ValueError
@@ -183,16 +152,7 @@ def on_all(
     work: Callable[[Remote], R],
     tell: Callable[[str, R | FleetError], None] = lambda _name, _result: None,
 ) -> dict[str, R | FleetError]:
-    """Do the same on all hosts at a time; a host that fails gives its error.
-
-    Args:
-        remotes: the hosts.
-        work: what to do.
-        tell: takes a host's name and result as soon as it has one.
-
-    Returns:
-        Each host's result, in the order of the hosts.
-    """
+    """Do the same on all hosts at a time; a host that fails gives its error."""
 
     def attempt(remote: Remote) -> R | FleetError:
         try:

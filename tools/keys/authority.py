@@ -35,11 +35,7 @@ class Authority:
     """A robot's authority, as its folder holds it."""
 
     def __init__(self, folder: Path) -> None:
-        """Open a folder.
-
-        Raises:
-            BusError: it holds no authority, or one that others may read.
-        """
+        """Open a folder."""
         self.folder = folder
         self.names = credentials.read_names(folder)
         key = folder / _KEY
@@ -54,19 +50,11 @@ class Authority:
         return self._issued.certificate
 
     def renew(self, robot: RobotConfig, names: Iterable[str], days: int) -> None:
-        """Make new certificates and keys in the current generation; the old ones stay valid.
-
-        Raises:
-            BusError: the endpoint of a service has no certificate; nothing is changed.
-        """
+        """Make new certificates and keys in the current generation; the old ones stay valid."""
         self._issue(robot, {name: self.names.generations.get(name, 1) for name in names}, days)
 
     def revoke(self, robot: RobotConfig, names: Iterable[str], days: int) -> None:
-        """Go on to the next generation; once all hosts know of it the old one is let in nowhere.
-
-        Raises:
-            BusError: the endpoint of a service has no certificate; nothing is changed.
-        """
+        """Go on to the next generation; once all hosts know of it the old one is let in nowhere."""
         self._issue(robot, {n: self.names.generations.get(n, 0) + 1 for n in names}, days)
 
     def _issue(self, robot: RobotConfig, generations: Mapping[str, int], days: int) -> None:
@@ -86,12 +74,7 @@ class Authority:
 
 
 def make(folder: Path, robot: RobotConfig, days: int) -> Authority:
-    """Make a robot's authority and a certificate for each name.
-
-    Raises:
-        BusError: there is an authority already, the folder cannot be written, or a service's
-            endpoint has no certificate.
-    """
+    """Make a robot's authority and a certificate for each name."""
     if (folder / _KEY).exists():
         right = "`xrl keys renew` makes new certificates, `xrl keys revoke` shuts old ones out"
         raise BusError(f"{folder}: holds an authority already; {right}")
@@ -118,11 +101,7 @@ def principals_of(robot: RobotConfig) -> tuple[str, ...]:
 
 
 def hosts_of(robot: RobotConfig, name: str) -> tuple[str, ...]:
-    """Return what a service is dialled by: the host of its endpoint. Tools listen nowhere.
-
-    Raises:
-        BusError: the endpoint is none of TLS.
-    """
+    """Return what a service is dialled by: the host of its endpoint. Tools listen nowhere."""
     if name not in SERVICES:
         return ()
     endpoint = robot.bus.endpoints[name]

@@ -15,11 +15,7 @@ from tools.keys.authority import Authority
 
 
 def bundle(authority: Authority, names: Iterable[str]) -> dict[str, bytes]:
-    """Return the files of a bundle by their names.
-
-    Raises:
-        BusError: a name has no certificate.
-    """
+    """Return the files of a bundle by their names."""
     folder = authority.folder
     files = {
         credentials.AUTHORITY: authority.certificate,
@@ -54,11 +50,7 @@ def held_files(folder: Path) -> list[str]:
 
 
 def install(files: dict[str, bytes], folder: Path) -> None:
-    """Write a bundle into this host's folder of keys, and take away keys that are not in it.
-
-    Raises:
-        BusError: the folder cannot be written.
-    """
+    """Write a bundle into this host's folder of keys, and take away keys that are not in it."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         folder.chmod(0o700)

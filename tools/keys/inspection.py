@@ -34,11 +34,7 @@ class KeyRow(NamedTuple):
 
 
 def look(folder: Path, robot: RobotConfig) -> list[KeyRow]:
-    """Return a row for each certificate in a folder, the authority's own first.
-
-    Raises:
-        BusError: the folder holds no keys, or another robot's.
-    """
+    """Return a row for each certificate in a folder, the authority's own first."""
     names = credentials.read_names(folder)
     if names.robot != robot.name:
         right = f"those of {robot.name!r} are right"

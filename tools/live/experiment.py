@@ -216,16 +216,7 @@ def parse_fault(text: str) -> Fault:
 
 
 def scenario_file(name: str, config: Path = DEFAULT_CONFIG) -> Path:
-    """Return the file of a scenario given by name or path, absolute.
-
-    Args:
-        name: a path that ends with .toml; or a name: first from the folder `scenarios` beside the
-            robot file, then from those that are shipped.
-        config: the robot file.
-
-    Raises:
-        FleetError: there is none; the message lists the names.
-    """
+    """Return the file of a scenario given by name or path, absolute."""
     folders = (config.parent / SCENARIOS.name, SCENARIOS)
     paths = [Path(name)] if name.endswith(".toml") else [at / f"{name}.toml" for at in folders]
     for path in paths:
@@ -240,9 +231,6 @@ def make_scenario(args: argparse.Namespace) -> Scenario:
 
     A shorter duration drops the file's rows beyond it; a flag that names a time beyond it is
     refused.
-
-    Raises:
-        ConfigError: file and flags make no valid scenario.
     """
     path = scenario_file(args.scenario, args.config)
     scenario = scenarios.load(path)
@@ -290,11 +278,7 @@ def introduce(scenario: Scenario, console: Console) -> None:
 
 
 def make_robot(args: argparse.Namespace) -> RobotConfig:
-    """Return the robot with the flags laid over it.
-
-    Raises:
-        ConfigError: the file cannot be used, or the gain split lacks its schedule.
-    """
+    """Return the robot with the flags laid over it."""
     changes = {
         key: value
         for key, value in (("split", args.split), ("jacobian", args.jacobian))
@@ -306,16 +290,7 @@ def make_robot(args: argparse.Namespace) -> RobotConfig:
 
 
 def load_robot(path: Path, *, imu: bool = False, **law: str) -> RobotConfig:
-    """Return the robot of a file, ready to run.
-
-    Args:
-        path: the robot file.
-        imu: fit one, whatever the file says.
-        law: keys of `[law]` to change, and their values.
-
-    Raises:
-        ConfigError: the file cannot be used, or the gain split lacks its schedule.
-    """
+    """Return the robot of a file, ready to run."""
     robot = config_file.load(path)
     robot = msgspec.structs.replace(robot, law=msgspec.structs.replace(robot.law, **law))
     if imu:
@@ -326,11 +301,7 @@ def load_robot(path: Path, *, imu: bool = False, **law: str) -> RobotConfig:
 
 
 def make_out(out: Path | None, verb: str) -> Path:
-    """Make the directory of a run's results; without a name, one of this verb and time.
-
-    Raises:
-        RunError: it cannot be made, or holds a run already.
-    """
+    """Make the directory of a run's results; without a name, one of this verb and time."""
     out = out if out is not None else Path("out") / time.strftime(f"{verb}-%Y%m%d-%H%M%S")
     if (out / "run.mcap").exists():
         raise RunError(f"{out}: holds a run already; choose another --out, or remove it")
@@ -344,11 +315,7 @@ def make_out(out: Path | None, verb: str) -> Path:
 def write_inputs(
     out: Path, robot: RobotConfig, scenario: Scenario, true_plant: PlantConfig
 ) -> tuple[Path, ...]:
-    """Write the run's inputs beside its results.
-
-    Returns:
-        The files: robot, scenario, plant and, if the robot has one, its gain schedule.
-    """
+    """Write the run's inputs beside its results."""
     robot_path, scenario_path = out / "robot.toml", out / "scenario.toml"
     plant_path = out / PLANT_FILE
     replace_file(plant_path, plant.to_toml(true_plant).encode())

@@ -33,13 +33,7 @@ class LiveView:
     def __init__(
         self, console: Console, injects: Sequence[Inject] = (), planner: PlannerNews | None = None
     ) -> None:
-        """Start.
-
-        Args:
-            console: shows the line.
-            injects: the scenario's impairments.
-            planner: its wait after drop-outs is shown; None: it is not.
-        """
+        """Start."""
         self._console = console
         self._injects = injects
         self._planner = planner

@@ -99,11 +99,9 @@ class CpuMeter:
     def sample(self, pids: Iterable[int]) -> None:
         """Add what each process has used since the sample before."""
         self._end_s = time.monotonic()
-        for pid in (*pids, os.getpid()):
-            used = procfs.cpu_s(pid)
-            if used is not None:
-                self._spent_s += used - self._last.get(pid, used)
-                self._last[pid] = used
+        for pid, use in procfs.use_of((*pids, os.getpid())).items():
+            self._spent_s += use.cpu_s - self._last.get(pid, use.cpu_s)
+            self._last[pid] = use.cpu_s
 
     @property
     def share_pct(self) -> float:
@@ -123,16 +121,7 @@ class ScenarioRunner:
         triggered_kill: TriggeredKill | None = None,
         tell: Callable[[str], None] = lambda _text: None,
     ) -> None:
-        """Take the scenario's kills, and perhaps one that the modules' modes trigger.
-
-        Args:
-            fleet: that runs.
-            session: on its bus.
-            scenario: what is to be done.
-            show: shows how the run is.
-            triggered_kill: besides those of the scenario.
-            tell: takes what is to be known of the machine before the scenario starts.
-        """
+        """Take the scenario's kills, and perhaps one that the modules' modes trigger."""
         self._fleet = fleet
         self._scenario = scenario
         self._show = show
@@ -162,17 +151,7 @@ class ScenarioRunner:
         self._killed = False
 
     def run(self, is_over: Callable[[], bool] = lambda: False) -> EndOfRun:
-        """Wait until the robot stands, run the scenario to its end.
-
-        Args:
-            is_over: returns True to end it sooner.
-
-        Raises:
-            CoresFullError: the cores do not carry the fleet at its pace, so it does not come to
-                stand.
-            RunError: the robot did not come to stand, or the simulated world went silent.
-            FleetError: a service that was to be restarted could not be.
-        """
+        """Wait until the robot stands, run the scenario to its end."""
         with self._stalls.watched(self._fleet.run.path / STALLS_FILE):
             return self._run(is_over)
 
@@ -234,9 +213,6 @@ class ScenarioRunner:
         """Wait until the hoist is down and all six modules have tracked for a while.
 
         Returns False if the robot falls first: that is a finding, not an error.
-
-        Raises:
-            KeyboardInterrupt: it is over before that.
         """
         begin_s = time.monotonic()
         deadline, next_look_s = begin_s + machine_s(READY_TIMEOUT_S), begin_s

@@ -112,11 +112,7 @@ class _Movement:
 def calibrate(
     device: PadDevice, say: Callable[[str], None], patience_s: float = PATIENCE_S
 ) -> PadMapping:
-    """Ask for every stick, trigger and button, and return the mapping.
-
-    Raises:
-        FleetError: a stick or trigger was not moved, or the pad is gone.
-    """
+    """Ask for every stick, trigger and button, and return the mapping."""
     movement = _Movement(device)
     found: dict[str, PadControl] = {}
     try:
@@ -153,11 +149,7 @@ def _asked(
 
 
 def keep(device: PadDevice, mapping: PadMapping) -> str:
-    """Write a mapping into the user's file, in place of an older one; return the file's name.
-
-    Raises:
-        FleetError: there is no home, or the file cannot be written.
-    """
+    """Write a mapping into the user's file, in place of an older one; return the file's name."""
     file = own_file()
     if file is None:
         raise FleetError(f"{OWN_FILE}: this user has no home directory; set HOME")

@@ -51,11 +51,7 @@ class Axis:
     """
 
     def __init__(self, name: str, control: PadControl, device: PadDevice) -> None:
-        """Take its range and its value.
-
-        Raises:
-            FleetError: it has no range.
-        """
+        """Take its range and its value."""
         self.name, self.control = name, control
         self._sign = -1.0 if control.inverted else 1.0
         low, high = 0.0, 1.0
@@ -118,11 +114,7 @@ class Gamepad:
         self, device: PadDevice, mapping: PadMapping, *, hold: str = "rightshoulder",
         stop: str = "b",
     ) -> None:  # fmt: skip
-        """Take an open device, its mapping, and the dead man's button and the stop by name.
-
-        Raises:
-            FleetError: the mapping lacks one of them.
-        """
+        """Take an open device, its mapping, and the dead man's button and the stop by name."""
         for name in (hold, stop):
             if name not in mapping:
                 raise FleetError(f"{device.name}: its mapping has no {name}; choose another button")
@@ -197,24 +189,13 @@ class Gamepad:
 
 
 def open_pad(path: str | None) -> PadDevice:
-    """Return a pad: of several, the first one with a known mapping.
-
-    Raises:
-        FleetError: there is none, a mapping for one cannot be used, or evdev is not installed.
-    """
+    """Return a pad: of several, the first one with a known mapping."""
     found = open_pads(path)
     return next((pad for pad in found if _mapping_or_none(pad) is not None), found[0])
 
 
 def open_pads(path: str | None) -> list[PadDevice]:
-    """Return the pads that are there, one at least, known or not.
-
-    Args:
-        path: such as /dev/input/event7; None: any.
-
-    Raises:
-        FleetError: there is none, or evdev is not installed.
-    """
+    """Return the pads that are there, one at least, known or not."""
     require("pad", "lead by keys: --keys")
     found: list[PadDevice] = []
     for candidate in [path] if path is not None else evdev.list_devices():
@@ -237,11 +218,7 @@ def open_pads(path: str | None) -> list[PadDevice]:
 
 
 def mapping_of(device: PadDevice) -> PadMapping:
-    """Return what a pad's controls mean: as the user gives it, else as the table knows it.
-
-    Raises:
-        FleetError: nobody knows; it is not guessed.
-    """
+    """Return what a pad's controls mean: as the user gives it, else as the table knows it."""
     mapping = _mapping_or_none(device)
     if mapping is None:
         raise FleetError(

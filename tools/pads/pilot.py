@@ -52,12 +52,7 @@ class Pilot:
         self.led = self.led._replace(assist_n=max(0.0, min(self.led.assist_n, given_n)))
 
     def advance(self, wanted: Deflection, dt: float) -> Led:
-        """Go on by dt, s.
-
-        Args:
-            wanted: deflections; the dead man's button is held.
-            dt: since the last call, s.
-        """
+        """Go on by dt, s."""
         height, pitch, assist_n = self.led
         self.led = Led(
             clamp(height + HEIGHT_RATE * _beyond(wanted.height) * dt, *HEIGHTS),

@@ -58,11 +58,7 @@ def own_file() -> Path | None:
 
 
 def given_lines(environment: Mapping[str, str] = os.environ) -> Iterator[GivenLine]:
-    """Yield the lines of the environment, of the file that it names, and of the user's file.
-
-    Raises:
-        FleetError: a file cannot be read.
-    """
+    """Yield the lines of the environment, of the file that it names, and of the user's file."""
     yield from _lines(TEXT_VARIABLE, environment.get(TEXT_VARIABLE, ""))
     named = environment.get(FILE_VARIABLE, "")
     if named:
@@ -96,11 +92,7 @@ def guid_of(device: PadDevice) -> str:
 
 
 def mapping_from(line: GivenLine, device: PadDevice) -> PadMapping | None:
-    """Return what a line says about a device; None if it is about another one.
-
-    Raises:
-        FleetError: it is about this one, and cannot be used.
-    """
+    """Return what a line says about a device; None if it is about another one."""
     if not line_is_of(line.text, device):
         return None
     _, _, rest = line.text.partition(",")

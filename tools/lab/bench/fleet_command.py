@@ -16,8 +16,8 @@ from shared.config import gain_schedule
 from shared.exceptions import FAULT_EXIT_CODE
 from shared.extras import require
 from shared.places import CHECKOUT
-from tools.fleet.others import warn_of_others
 from tools.fleet.pace import check_pace
+from tools.fleet.status_table import warn_of_others
 from tools.judge.verdict_table import digits
 from tools.lab.bench import fleet
 from tools.lab.bench.flags import add_flags, write_rows
