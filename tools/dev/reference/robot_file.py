@@ -13,7 +13,7 @@ from shared.config.gain_schedule import inputs_of
 from shared.config.robot_config import RobotConfig
 from shared.places import DEFAULT_CONFIG
 from shared.toml_file import Range
-from tools.dev.reference.field_docs import field_docs, one_line, summary
+from tools.dev.reference.markdown import field_docs, one_line, summary, table
 
 _INTRODUCTION: Final = """\
 # The robot file
@@ -136,31 +136,21 @@ def _same_as_sibling(section: type[msgspec.Struct], name: str) -> bool:
 
 def _table(section: type[msgspec.Struct], prefix: str, shipped: _Shipped) -> Iterator[str]:
     docs = field_docs(section)
-    hints = get_type_hints(section, include_extras=True)
     fields = {field.name: field for field in msgspec.structs.fields(section)}
-    yield "| key | type | unit | range | default | shipped | meaning |"
-    yield "|---|---|---|---|---|---|---|"
-    for name, hint in hints.items():
+    rows: list[tuple[str, ...]] = []
+    for name, hint in get_type_hints(section, include_extras=True).items():
+        key, doc = prefix + name, docs.get(name, "")
         if name == _NOT_IN_THE_FILE:
             continue
         if _section(hint) is not None:
-            yield f"| `{name}` | table | | | | | {docs.get(name, '') or _see(prefix, name)} |"
+            rows.append((f"`{name}`", "table", "", "", "", "", doc or f"see `[{key}]`"))
             continue
-        kind, unit, limits = _described(hint)
-        default = _default(fields[name])
-        value = shipped.values.get(prefix + name, "")
+        value = shipped.values.get(key, "")
         value = f"`{value}`" if value and len(value) <= _LONGEST else ""
-        meaning = _meaning(docs.get(name, ""), shipped.comments.get(prefix + name, ""))
-        yield f"| `{name}` | {kind} | {unit} | {limits} | {default} | {value} | {meaning} |"
+        meaning = doc or shipped.comments.get(key, "")
+        rows.append((f"`{name}`", *_described(hint), _default(fields[name]), value, meaning))
+    yield from table("key | type | unit | range | default | shipped | meaning", rows)
     yield ""
-
-
-def _see(prefix: str, name: str) -> str:
-    return f"see `[{prefix}{name}]`"
-
-
-def _meaning(doc: str, comment: str) -> str:
-    return doc or comment
 
 
 def _default(field: msgspec.structs.FieldInfo) -> str:

@@ -7,6 +7,7 @@ import importlib
 import os
 from typing import Any, Final
 
+from tools.dev.reference.markdown import table
 from tools.verb_table import VERBS
 
 _WIDTH: Final = "96"
@@ -42,8 +43,8 @@ def page() -> str:
             del os.environ["COLUMNS"]
         else:
             os.environ["COLUMNS"] = before
-    lines = [_INTRODUCTION, "| verb | what it does |", "|---|---|"]
-    lines += [f"| [`{verb.name}`](#xrl-{verb.name}) | {verb.help} |" for verb in VERBS]
+    rows = ((f"[`{verb.name}`](#xrl-{verb.name})", verb.help) for verb in VERBS)
+    lines = [_INTRODUCTION, *table("verb | what it does", rows)]
     for name, text in parsers:
         lines += ["", f"## xrl {name}", "", "```text", text.rstrip(), "```"]
     return "\n".join(lines) + "\n"

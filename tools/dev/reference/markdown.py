@@ -1,4 +1,4 @@
-"""Docstrings of a struct's fields: the string below each field in the class body."""
+"""Tables of Markdown, and what stands in their cells: docstrings of structs and their fields."""
 
 from __future__ import annotations
 
@@ -7,10 +7,19 @@ import inspect
 import itertools
 import re
 import textwrap
+from collections.abc import Iterable, Iterator
+
+
+def table(headings: str, rows: Iterable[Iterable[object]]) -> Iterator[str]:
+    """Yield the lines of a table; `|` separates the headings."""
+    columns = [heading.strip() for heading in headings.split("|")]
+    yield f"| {' | '.join(columns)} |"
+    yield "|---" * len(columns) + "|"
+    yield from (f"| {' | '.join(map(str, row))} |" for row in rows)
 
 
 def field_docs(struct: type) -> dict[str, str]:
-    """Return the docstring of each documented field, in one line, base classes included."""
+    """Return the docstring below each field, in one line, base classes included."""
     docs: dict[str, str] = {}
     for owner in reversed(struct.__mro__):
         if owner.__module__.partition(".")[0] in ("shared", "services"):
