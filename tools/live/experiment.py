@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import argparse
 import re
-import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar, get_args, get_type_hints
+from typing import Any, Final, get_args, get_type_hints
 
 import msgspec
 
@@ -24,7 +24,6 @@ from shared.config.scenarios import (
     FAULT_KINDS,
     SIGNALS,
     Fault,
-    Inject,
     Kill,
     Push,
     Restart,
@@ -37,10 +36,9 @@ from shared.places import DEFAULT_CONFIG, SCENARIOS
 from tools.guarded_streams import printable
 from tools.live.describe_inject import in_words_of, parse_inject
 from tools.number_arguments import finite, natural
+from tools.output import make_folder
 from tools.terminal import Console, marked
 from tools.verb_table import add_config
-
-E = TypeVar("E", Kill, Restart, Push, Fault, Inject)
 
 PLANT_FILE = "plant.toml"
 """Name of the plant among a run's results and in its log."""
@@ -67,48 +65,14 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         "shipped), or a file (default: squat, the paper's Fig. 7)",
     )
     parser.add_argument("--duration", type=finite, metavar="S", help="scenario time to run, s")
-    parser.add_argument(
-        "--kill",
-        action="append",
-        type=parse_kill,
-        metavar="SERVICE@T[:SIGNAL]",
-        help=f"send a signal ({', '.join(SIGNALS)}; default KILL) at scenario time T; "
-        "replaces the scenario's kills; may be repeated",
-    )
-    parser.add_argument(
-        "--restart",
-        action="append",
-        type=parse_restart,
-        metavar="SERVICE@T",
-        help="start a killed service again, or continue a stopped one; may be repeated",
-    )
-    parser.add_argument(
-        "--push",
-        action="append",
-        type=parse_push,
-        metavar="T:DUR:FX,FY,FZ",
-        help="push the torso by a force in N from T for DUR s; replaces the scenario's "
-        "pushes; may be repeated",
-    )
-    parser.add_argument(
-        "--fault",
-        action="append",
-        type=parse_fault,
-        metavar="MODULE:KIND@T",
-        help=f"a fault of a module's drive ({', '.join(FAULT_KINDS)}) at scenario time T; "
-        "MODULE.1 is its second axis, @T:DUR lasts DUR s; replaces the scenario's faults; "
-        "may be repeated",
-    )
-    parser.add_argument(
-        "--inject",
-        action="append",
-        type=parse_inject,
-        metavar="'LINK KEY=VALUE ...'",
-        help="what the network does to a link, such as 'planner->joints delay=30 jitter=10 at=3 "
-        "for=4' (ms and s), 'all loss=20%% burst=5', 'planner->left partition at=3'; at is "
-        "scenario time; `xrl inject --help` explains each word, and which of several counts; "
-        "replaces the scenario's; may be repeated",
-    )
+    for field, (parse, metavar, words) in _ROWS.items():
+        parser.add_argument(
+            f"--{field}",
+            action="append",
+            type=parse,
+            metavar=metavar,
+            help=f"{words}; may be repeated",
+        )
     add_plant(parser)
     add_controller(parser)
     add_imu(parser)
@@ -215,8 +179,52 @@ def parse_fault(text: str) -> Fault:
     return msgspec.convert({**row, "axis": axis, "duration": duration}, Fault)
 
 
+_ROWS: Final[dict[str, tuple[Callable[[str], object], str, str]]] = {
+    "kill": (
+        parse_kill,
+        "SERVICE@T[:SIGNAL]",
+        (
+            f"send a signal ({', '.join(SIGNALS)}; default KILL) at scenario time T; "
+            "replaces the scenario's kills"
+        ),
+    ),
+    "restart": (
+        parse_restart,
+        "SERVICE@T",
+        "start a killed service again, or continue a stopped one",
+    ),
+    "push": (
+        parse_push,
+        "T:DUR:FX,FY,FZ",
+        "push the torso by a force in N from T for DUR s; replaces the scenario's pushes",
+    ),
+    "fault": (
+        parse_fault,
+        "MODULE:KIND@T",
+        (
+            f"a fault of a module's drive ({', '.join(FAULT_KINDS)}) at scenario time T; "
+            "MODULE.1 is its second axis, @T:DUR lasts DUR s; replaces the scenario's faults"
+        ),
+    ),
+    "inject": (
+        parse_inject,
+        "'LINK KEY=VALUE ...'",
+        (
+            "what the network does to a link, such as 'planner->joints delay=30 jitter=10 at=3 "
+            "for=4' (ms and s), 'all loss=20%% burst=5', 'planner->left partition at=3'; at is "
+            "scenario time; `xrl inject --help` explains each word, and which of several counts; "
+            "replaces the scenario's"
+        ),
+    ),
+}
+"""Rows of a scenario that flags of the same name give: parser, form, help."""
+
+
 def scenario_file(name: str, config: Path = DEFAULT_CONFIG) -> Path:
-    """Return the file of a scenario given by name or path, absolute."""
+    """Return the file of a scenario, absolute: a path to a .toml file, or a name.
+
+    A name stands for a file in `scenarios` beside the robot file, or else for a shipped one.
+    """
     folders = (config.parent / SCENARIOS.name, SCENARIOS)
     paths = [Path(name)] if name.endswith(".toml") else [at / f"{name}.toml" for at in folders]
     for path in paths:
@@ -237,28 +245,16 @@ def make_scenario(args: argparse.Namespace) -> Scenario:
     duration = args.duration if args.duration is not None else scenario.duration
     if duration <= 0.0:
         raise RunError(f"--duration {duration:g}: must be more than 0 s")
-    kills = tuple(args.kill) if args.kill is not None else _inside(scenario.kill, duration)
-    restarts = tuple(args.restart or ()) if args.kill or args.restart else scenario.restart
-    pushes = tuple(args.push) if args.push is not None else _inside(scenario.push, duration)
-    faults = tuple(args.fault) if args.fault is not None else _inside(scenario.fault, duration)
-    injects = tuple(args.inject) if args.inject is not None else _inside(scenario.inject, duration)
-    scenario = msgspec.structs.replace(
-        scenario,
-        duration=duration,
-        fault=faults,
-        inject=injects,
-        kill=kills,
-        restart=_inside(restarts, duration) if not args.restart else restarts,
-        push=pushes,
-    )
-    flags = (args.kill, args.restart, args.push, args.fault, args.inject, args.duration)
+    rows: dict[str, tuple[Any, ...]] = {}
+    for field in _ROWS:
+        given = getattr(args, field)
+        own = () if field == "restart" and args.kill else getattr(scenario, field)
+        rows[field] = tuple(given or (row for row in own if row.at < duration))
+    scenario = msgspec.structs.replace(scenario, duration=duration, **rows)
+    flags = (args.duration, *(getattr(args, field) for field in _ROWS))
     by_flags = " with the flags of this command" if any(flag is not None for flag in flags) else ""
     scenarios.check(f"{path}{by_flags}", scenario)
     return scenario
-
-
-def _inside(rows: tuple[E, ...], duration: float) -> tuple[E, ...]:
-    return tuple(row for row in rows if row.at < duration)
 
 
 def describe(scenario: Scenario) -> str:
@@ -279,11 +275,8 @@ def introduce(scenario: Scenario, console: Console) -> None:
 
 def make_robot(args: argparse.Namespace) -> RobotConfig:
     """Return the robot with the flags laid over it."""
-    changes = {
-        key: value
-        for key, value in (("split", args.split), ("jacobian", args.jacobian))
-        if value is not None
-    }
+    flags = (("split", args.split), ("jacobian", args.jacobian))
+    changes = {key: value for key, value in flags if value is not None}
     if changes.get("jacobian") == "average" and "split" not in changes:
         changes["split"] = "diagonal"  # no local gains certify it, so there is no schedule
     return load_robot(args.config, imu=args.imu, **changes)
@@ -302,22 +295,19 @@ def load_robot(path: Path, *, imu: bool = False, **law: str) -> RobotConfig:
 
 def make_out(out: Path | None, verb: str) -> Path:
     """Make the directory of a run's results; without a name, one of this verb and time."""
-    out = out if out is not None else Path("out") / time.strftime(f"{verb}-%Y%m%d-%H%M%S")
+    out = make_folder(out, verb)
     if (out / "run.mcap").exists():
         raise RunError(f"{out}: holds a run already; choose another --out, or remove it")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RunError(f"{out}: cannot be made: {error.strerror}; choose another --out") from None
     return out
 
 
 def write_inputs(
     out: Path, robot: RobotConfig, scenario: Scenario, true_plant: PlantConfig
 ) -> tuple[Path, ...]:
-    """Write the run's inputs beside its results."""
-    robot_path, scenario_path = out / "robot.toml", out / "scenario.toml"
-    plant_path = out / PLANT_FILE
+    """Write robot, scenario, plant and gain schedule, if there is one, beside a run's results."""
+    robot_path, scenario_path, plant_path = (
+        out / name for name in ("robot.toml", "scenario.toml", PLANT_FILE)
+    )
     replace_file(plant_path, plant.to_toml(true_plant).encode())
     replace_file(robot_path, config_file.to_toml(robot).encode())
     replace_file(scenario_path, scenarios.to_toml(scenario).encode())
