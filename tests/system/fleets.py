@@ -88,7 +88,7 @@ def leaving_nothing() -> Iterator[Callable[[], set[str]]]:
     assert present() <= before
 
 
-class Ear:
+class FleetEar:
     """Hears modules, planner and world of a fleet by links that stay open."""
 
     def __init__(self, session: Session) -> None:
@@ -145,6 +145,6 @@ class Ear:
 
 
 @contextmanager
-def heard(robot: RobotConfig, run_dir: Path) -> Iterator[Ear]:
+def heard(robot: RobotConfig, run_dir: Path) -> Iterator[FleetEar]:
     with open_session(robot, "test", run_dir) as session:
-        yield Ear(session)
+        yield FleetEar(session)

@@ -20,7 +20,7 @@ from shared.bus.messages import Mode
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
 from shared.places import CHECKOUT
-from tests.system.fleets import Ear, command, heard, started, wait_for, xrl
+from tests.system.fleets import FleetEar, command, heard, started, wait_for, xrl
 from tools.fleet import procfs
 from tools.fleet.supervise import SupervisedFleet
 
@@ -34,14 +34,14 @@ def fleet(run_dir: Path) -> Iterator[SupervisedFleet]:
 
 
 @pytest.fixture
-def ear(fleet: SupervisedFleet, robot: RobotConfig) -> Iterator[Ear]:
+def ear(fleet: SupervisedFleet, robot: RobotConfig) -> Iterator[FleetEar]:
     """Hear six modules that hold."""
     with heard(robot, fleet.run.path) as ear:
         ear.wait_for(Mode.HOLD)
         yield ear
 
 
-def test_with_planner_and_bus_dead_it_sinks_by_shared_memory(ear: Ear, run_dir: Path) -> None:
+def test_with_planner_and_bus_dead_it_sinks_by_shared_memory(ear: FleetEar, run_dir: Path) -> None:
     """`--local` opens no session: of the bus nothing is used. Asked for anew, a module waits."""
     done = xrl("estop", "--local", run_dir=run_dir)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -58,7 +58,9 @@ def test_with_planner_and_bus_dead_it_sinks_by_shared_memory(ear: Ear, run_dir: 
     ear.wait_for(dict.fromkeys(MODULES, Mode.DAMP) | {"hip_left": waiting})
 
 
-def test_a_pendant_that_is_killed_stops_all_six_without_a_planner(ear: Ear, run_dir: Path) -> None:
+def test_a_pendant_that_is_killed_stops_all_six_without_a_planner(
+    ear: FleetEar, run_dir: Path
+) -> None:
     words = command("pendant", "--run-dir", run_dir)
     quiet = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL}
     with subprocess.Popen(words, cwd=CHECKOUT, **quiet) as held:
@@ -75,7 +77,7 @@ def test_a_pendant_that_is_killed_stops_all_six_without_a_planner(ear: Ear, run_
 
 @pytest.mark.parametrize("disaster", ["hung", "dead, disk full", "dead, directory gone"])
 def test_it_needs_no_supervisor(
-    disaster: str, fleet: SupervisedFleet, ear: Ear, run_dir: Path
+    disaster: str, fleet: SupervisedFleet, ear: FleetEar, run_dir: Path
 ) -> None:
     """The services hold on without it, and hear both ways, or else a signal."""
     supervisor = int(fleet.run.supervisor_pid.read_text(encoding="utf-8"))
@@ -105,7 +107,7 @@ def test_it_needs_no_supervisor(
 
 
 def test_one_that_waits_says_whom_it_hears_and_stops_at_enter_but_not_at_q(
-    ear: Ear, run_dir: Path
+    ear: FleetEar, run_dir: Path
 ) -> None:
     person, terminal = pty.openpty()
     words = [sys.executable, "-u", *command("estop", "--wait", "--run-dir", run_dir)[1:]]

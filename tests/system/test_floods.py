@@ -20,7 +20,7 @@ from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.places import CHECKOUT, DEFAULT_CONFIG
 from tests.certified import certified
-from tests.system.fleets import Ear, heard, started
+from tests.system.fleets import FleetEar, heard, started
 from tools.fleet.supervise import SupervisedFleet
 
 pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(180)]
@@ -35,7 +35,7 @@ class Flooded(NamedTuple):
 
     up: SupervisedFleet
     config: Path
-    ear: Ear
+    ear: FleetEar
 
     def recorder_bytes(self) -> int:
         pid = self.up.pids()["recorder"]

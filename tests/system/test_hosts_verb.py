@@ -21,7 +21,7 @@ from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
 from tests.certified import install_all
-from tests.system.fleets import Ear, heard, wait_for
+from tests.system.fleets import FleetEar, heard, wait_for
 from tests.system.test_hosts import with_drives_in
 from tests.tools.hosts.places import SHARED, make_hosts
 from tools import cli
@@ -54,7 +54,7 @@ class Place(NamedTuple):
         words = [str(self.base / "bin/ssh"), host, "systemctl start xrl.service"]
         assert subprocess.run(words, capture_output=True, check=False).returncode == 0
 
-    def cut_power(self, host: str, ear: Ear) -> None:
+    def cut_power(self, host: str, ear: FleetEar) -> None:
         """Kill all that runs on a host, and boot it again; its drives have power of their own."""
         for pid in procfs.fleet_pids(self.run_dir(host)):
             os.kill(pid, signal.SIGKILL)
@@ -101,7 +101,7 @@ def test_hosts_come_up_take_over_after_a_power_cut_and_stay_stopped_until_somebo
     assert not list(place.base.rglob("*.rearm")), "the stop is over: a person has asked for that"
 
 
-def lead_through(place: Place, ear: Ear, capsys: Any) -> None:
+def lead_through(place: Place, ear: FleetEar, capsys: Any) -> None:
     def are_down() -> bool:
         modes = ear.modes()
         return len(modes) == len(MODULES) and {*modes.values()} <= {Mode.DISARMED, Mode.FAULT}
