@@ -130,7 +130,6 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(group: Group, args: argparse.Namespace, console: Console) -> GroupResult:
-    """Run one group."""
     folder = args.out.resolve() / group.name
     patterns = [args.only] if args.only else [SAMPLE] if args.sample else []
     if args.survivors:
@@ -238,7 +237,6 @@ def change_of(name: str, shown: str) -> Mutation:
 def _judge(
     groups: Sequence[GroupResult], told: MutantsFile, args: argparse.Namespace, console: Console
 ) -> int:
-    """Print the score and who lives; return the exit code."""
     counts = sum((found.counts for found in groups), Counter[str]())
     total, dead = counts.total(), sum(counts[word] for word in DEAD)
     if not total:

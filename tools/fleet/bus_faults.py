@@ -26,7 +26,6 @@ class BusFaults:
     """Looks at the links that this host's services, and this tool, dial over TLS."""
 
     def __init__(self, robot: RobotConfig, session: Session) -> None:
-        """Begin to count who comes to this host's ports."""
         self._robot, self._session = robot, session
         self._here = same_host.services_here(robot)
         self._arrivals = Arrivals(same_host.ports_here(robot))

@@ -70,7 +70,6 @@ class BusStop:
     """The way over the bus, on a session that is open: nothing is dialled when it is asked for."""
 
     def __init__(self, robot: RobotConfig, session: Session, here: Path | None) -> None:
-        """Take an open session."""
         self._robot, self._here = robot, here
         self._publisher = session.publisher(topics.ESTOP, Estop)
         self._states = {m: session.latest(topics.JOINT_STATE, JointState, m) for m in MODULES}

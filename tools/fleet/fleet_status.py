@@ -280,7 +280,6 @@ def _service_status(
 
 
 def _trouble_of(fleet: SupervisedFleet, services: Iterable[ServiceInfo]) -> tuple[str, ...]:
-    """Return what is wrong with supervision, logs and disk, a line each."""
     fault = fleet.supervision_fault()
     lines = [fault] if fault else []
     lost, why = (0, "") if fault else fleet.lost_lines()  # it would only be waited for again

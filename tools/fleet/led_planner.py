@@ -33,7 +33,6 @@ class LedPlanner:
     """
 
     def __init__(self, session: Session, verb: str) -> None:
-        """Meet it."""
         self._intents = session.publisher(topics.OPERATOR_INTENT, OperatorIntent)
         self._statuses = session.latest(topics.PLANNER_STATUS, PlannerStatus)
         self.source = f"xrl {verb} by {user_name()} ({os.getpid()})"

@@ -77,7 +77,6 @@ class IdleMeter:
     """Idle fraction of all cores over the last `WINDOW_S`."""
 
     def __init__(self) -> None:
-        """Take the first sample."""
         self._looks: deque[tuple[float, int, int]] = deque()
         self.look()
 

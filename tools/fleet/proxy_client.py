@@ -29,7 +29,6 @@ class ProxyClient:
     """One question, one answer, one connection each."""
 
     def __init__(self, run_dir: Path) -> None:
-        """Name the fleet's run directory; nothing is opened yet."""
         self._path = run_dir / SOCKET
 
     def begin(self, inject: Inject, in_s: float = 0.0) -> tuple[RequestedImpairment, ...]:

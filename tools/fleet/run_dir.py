@@ -216,7 +216,6 @@ class RunDir:
             self.path.rmdir()
 
     def _remove_logs(self) -> None:
-        """Remove the services' logs, and their folder if it is then empty."""
         with contextlib.suppress(OSError):  # none there, or it holds files of others
             for name in _LOGGED:
                 for ending in (".log", ".log.1", ".stderr"):

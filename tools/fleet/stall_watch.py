@@ -46,7 +46,6 @@ class StallWatch:
     """The program beside a fleet, from `__enter__` to `__exit__`."""
 
     def __init__(self, path: Path) -> None:
-        """Take the file for the gaps; it is made."""
         self._path = path
 
     def __enter__(self) -> Self:

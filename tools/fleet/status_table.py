@@ -99,7 +99,6 @@ def describe_sessions(status: FleetStatus) -> str:
 
 
 def _gathered(pairs: Iterable[tuple[K, str]]) -> dict[K, list[str]]:
-    """Gather words under their keys, in order."""
     found: dict[K, list[str]] = {}
     for key, word in pairs:
         found.setdefault(key, []).append(word)
@@ -161,7 +160,6 @@ def tables(status: FleetStatus) -> Group:
 
 
 def _lines(status: FleetStatus) -> Iterator[str | Text]:
-    """Yield what there is to say beside the tables."""
     red, yellow = " [bold red]{}[/]", " [bold yellow]{}[/]"
     way_out = "kill network_proxy" if SILENT_PROXY in status.network else "inject --clear"
     impaired = f" [bold yellow]impaired on purpose: {{}}[/] (xrl {way_out})"

@@ -234,12 +234,10 @@ class SupervisedFleet:
         self._wait_or_kill(_KILLED_S)
 
     def _clear(self, *, keep_logs: bool, keep_stops: bool) -> None:
-        """Remove the fleet's files from the run directory."""
         usb_standin.clear(self.run.path)
         self.run.clear(keep_logs=keep_logs, keep_stops=keep_stops)
 
     def _end(self) -> None:
-        """End every process of the fleet."""
         manifest = self.run.read_manifest() if self.run.is_marked else None
         procfs.signal_all(procfs.fleet_pids(self.run.path), signal.SIGCONT)
         try:
@@ -337,7 +335,6 @@ def _unsupervised(name: str, pid: int | None) -> ServiceInfo:
 
 @contextlib.contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Hold back interrupts meanwhile."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _INTERRUPTS)
     try:
         yield
@@ -352,7 +349,6 @@ def _is_up(row: Process, service: ServiceInfo, endpoint: str | None) -> bool:
 
 
 def _tail(log: Path, lines: int = 5) -> str:
-    """Return the last lines of a log, indented."""
     with contextlib.suppress(OSError):
         text = log.read_text(encoding="utf-8", errors="replace").rstrip()
         return "\n".join(f"  {line}" for line in text.splitlines()[-lines:])

@@ -39,7 +39,6 @@ class KeyTraffic:
     """
 
     def __init__(self, key: TopicKey, *, here: bool = True) -> None:
-        """Begin with nothing received."""
         self.key = key
         self._here = here
         self._counted = KeyCount(several=several_may_write(f"xrl/robot/{key.name}"))
@@ -98,7 +97,6 @@ class Traffic:
     def __init__(
         self, session: Session, keys: Iterable[TopicKey], elsewhere: Collection[str] = ()
     ) -> None:
-        """Subscribe."""
         self.keys = {
             key.topic.key(session.robot, key.module): KeyTraffic(
                 key, here=not elsewhere or sender_of(key.topic, key.module) not in {"", *elsewhere}

@@ -25,8 +25,7 @@ from tools.hosts.layout import (
 )
 from tools.hosts.probe import Probe, digest
 from tools.hosts.remote import ClockOffset, Remote
-from tools.keys.authority import Authority
-from tools.keys.bundle import bundle
+from tools.keys.authority import Authority, bundle
 
 CLOCK_MAX_S: Final = 1.0
 """Certificates and the names of records go by the clock; ages do not."""
@@ -173,7 +172,6 @@ def _about_keys(probe: Probe, wanted: dict[str, bytes]) -> list[str]:
 
 
 def _state(remote: Remote) -> str:
-    """Return the state of a host's unit by systemd."""
     return remote.run("systemctl", "is-active", UNIT).out.strip() or "no systemd"
 
 

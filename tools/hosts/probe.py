@@ -24,7 +24,7 @@ from shared.exceptions import XrlError
 from shared.places import CHECKOUT, IS_CHECKOUT
 from shared.revision import UNKNOWN, code
 from tools.fleet.run_dir import SUPERVISOR_PID
-from tools.keys.bundle import held_files
+from tools.keys.authority import held_files
 from tools.keys.inspection import look
 
 FREE_MIB: Final = 4096

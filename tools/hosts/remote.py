@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from typing import BinaryIO, Final, NamedTuple, TypeVar
+from typing import BinaryIO, Final, NamedTuple, TypedDict, TypeVar, Unpack
 
 from shared.exceptions import FleetError
 from tools.guarded_streams import printable
@@ -38,6 +38,18 @@ class ClockOffset(NamedTuple):
     """Shortest of `ECHOES`; half of it bounds the offset's error."""
 
 
+class Manner(TypedDict, total=False):
+    """How a command runs on a host."""
+
+    content: bytes
+    """For its standard input."""
+    as_user: bool
+    """As the user who runs the services, not as the one who logs in."""
+    on_bus: bool
+    """It talks to the services: in their network, where that is their own."""
+    timeout_s: float
+
+
 class Remote:
     """One host, by ssh."""
 
@@ -48,22 +60,24 @@ class Remote:
         # from a folder that every user may enter: find and others go back to where they began
         self._as_user = ["env", "-C", "/", "runuser", "-u", hosts.user, "--"]
 
-    def run(
-        self,
-        *words: str,
-        content: bytes = b"",
-        as_user: bool = False,
-        on_bus: bool = False,
-        timeout_s: float = TIMEOUT_S,
-    ) -> Said:
-        """Run a command and wait for it."""
-        before = [*(self._in_network if on_bus else []), *(self._as_user if as_user else [])]
+    def run(self, *words: str, **manner: Unpack[Manner]) -> Said:
+        """Run a command, which no shell takes apart, and wait for it.
+
+        Raises:
+            FleetError: the host is not reached, or the command does not end in time.
+        """
+        timeout_s = manner.get("timeout_s", TIMEOUT_S)
+        before = [
+            *(self._in_network if manner.get("on_bus") else []),
+            *(self._as_user if manner.get("as_user") else []),
+        ]
         command = [*self._begin, shlex.join([*before, *words])]
         name = self.host.name
         try:
             done = subprocess.run(
-                command, input=content, capture_output=True, timeout=timeout_s, check=False
-            )
+                command, input=manner.get("content", b""), capture_output=True, timeout=timeout_s,
+                check=False,
+            )  # fmt: skip
         except subprocess.TimeoutExpired:
             raise FleetError(f"{name}: {words[0]}: no end after {timeout_s:g} s") from None
         except OSError as error:
@@ -73,18 +87,9 @@ class Remote:
             raise FleetError(f"{name}: {self.host.ssh} is not reached: {_last(told)}")
         return Said(done.returncode, done.stdout.decode(errors="replace"), told)
 
-    def must(
-        self,
-        *words: str,
-        content: bytes = b"",
-        as_user: bool = False,
-        on_bus: bool = False,
-        timeout_s: float = TIMEOUT_S,
-    ) -> str:
+    def must(self, *words: str, **manner: Unpack[Manner]) -> str:
         """Run a command that has to succeed, and return what it printed."""
-        said = self.run(
-            *words, content=content, as_user=as_user, on_bus=on_bus, timeout_s=timeout_s
-        )
+        said = self.run(*words, **manner)
         if said.code != 0:
             why = _last(said.error) or f"exit status {said.code}"
             raise FleetError(f"{self.host.name}: {shlex.join(words)[:120]}: {why}")
@@ -130,7 +135,6 @@ class Remote:
 
 
 def _talk(process: subprocess.Popen[str]) -> tuple[str, list[ClockOffset]]:
-    """Return the first line, and the answers."""
     there, back = process.stdin, process.stdout
     if there is None or back is None:
         raise ValueError

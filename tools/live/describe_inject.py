@@ -121,7 +121,6 @@ def check_link(link: str, dash: str = "") -> None:
 
 
 def _split(words: Iterable[str]) -> dict[str, str]:
-    """Return the keys of `--inject` with their values."""
     found: dict[str, str] = {}
     for word in words:
         key, equals, value = word.partition("=")

@@ -85,7 +85,6 @@ def _run_once(
     pace: float,
     controller: str | None,
 ) -> T:
-    """Run at one pace."""
     robot_path, scenario_path, plant_path, *_ = experiment.write_inputs(
         out, robot, scenario, true_plant
     )

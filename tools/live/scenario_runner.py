@@ -338,7 +338,6 @@ class ScenarioRunner:
         self._events.say(RunEventKind.STARTED, self._scenario.name, "")
 
     def _listen(self) -> None:
-        """Receive new messages and show them."""
         for module, latest in self._states.items():
             state = latest.take()
             if state is not None:
@@ -393,7 +392,6 @@ class ScenarioRunner:
             )
 
     def _follow(self, scenario_s: float) -> None:
-        """Kill the triggered service when its time has come."""
         service = self._armed.due(list(self._modes.values()).count(Mode.TRACK))
         if service is not None:
             self._act(Kill(service=service, at=scenario_s))

@@ -20,7 +20,7 @@ from tools.pads.controls import (
     PadMapping,
     counted,
 )
-from tools.pads.sdl_mapping import OWN_FILE, line_for, line_is_of, own_file
+from tools.pads.mappings import OWN_FILE, line_for, line_is_of, own_file
 
 ASKED: Final = {
     "lefty": "push the left stick forward, away from you, and let go",

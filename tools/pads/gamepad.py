@@ -20,11 +20,9 @@ from tools.pads.controls import (
     PadDevice,
     PadMapping,
     codes_of,
-    identity_of,
 )
-from tools.pads.layouts import known_mapping
+from tools.pads.mappings import mapping_or_none
 from tools.pads.pilot import DEAD_ZONE, Deflection
-from tools.pads.sdl_mapping import given_lines, mapping_from
 
 evdev: Any = late("evdev")
 
@@ -191,7 +189,7 @@ class Gamepad:
 def open_pad(path: str | None) -> PadDevice:
     """Return a pad: of several, the first one with a known mapping."""
     found = open_pads(path)
-    return next((pad for pad in found if _mapping_or_none(pad) is not None), found[0])
+    return next((pad for pad in found if mapping_or_none(pad) is not None), found[0])
 
 
 def open_pads(path: str | None) -> list[PadDevice]:
@@ -215,19 +213,3 @@ def open_pads(path: str | None) -> list[PadDevice]:
             f"no gamepad: {where}; join group `input`, name it with --pad, or use --keys"
         )
     return found
-
-
-def mapping_of(device: PadDevice) -> PadMapping:
-    """Return what a pad's controls mean: as the user gives it, else as the table knows it."""
-    mapping = _mapping_or_none(device)
-    if mapping is None:
-        raise FleetError(
-            f"{identity_of(device)}: what its axes mean is not known; "
-            "`xrl lead --calibrate` asks for each, or set SDL_GAMECONTROLLERCONFIG"
-        )
-    return mapping
-
-
-def _mapping_or_none(device: PadDevice) -> PadMapping | None:
-    given = (mapping_from(line, device) for line in given_lines())
-    return next((mapping for mapping in given if mapping is not None), known_mapping(device))

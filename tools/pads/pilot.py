@@ -43,7 +43,6 @@ class Pilot:
     """
 
     def __init__(self, height: float, pitch: float, assist_max_n: float) -> None:
-        """Begin where the robot is, without assist."""
         self._assist_max_n = assist_max_n
         self.led = Led(clamp(height, *HEIGHTS), clamp(pitch, *PITCHES), 0.0)
 

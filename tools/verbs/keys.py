@@ -17,8 +17,15 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, BusError
 from tools.hosts import hosts_file
 from tools.hosts.layout import robot_on_hosts
-from tools.keys.authority import Authority, default_folder, make, principals_of
-from tools.keys.bundle import bundle, install, to_tar
+from tools.keys.authority import (
+    Authority,
+    bundle,
+    default_folder,
+    install,
+    make,
+    principals_of,
+    to_tar,
+)
 from tools.keys.certificates import CERTIFICATE_DAYS
 from tools.keys.inspection import KeyRow, look
 from tools.number_arguments import count

@@ -29,7 +29,8 @@ from tools.fleet.supervise import SupervisedFleet
 from tools.keyboard import Keyboard
 from tools.pads.calibration import calibrate, keep
 from tools.pads.controls import BUTTONS
-from tools.pads.gamepad import Gamepad, mapping_of, open_pad, open_pads
+from tools.pads.gamepad import Gamepad, open_pad, open_pads
+from tools.pads.mappings import mapping_of
 from tools.pads.pilot import Deflection, Led, Pilot
 from tools.terminal import Console
 from tools.verb_table import Subparsers, add_run_dir, add_verb

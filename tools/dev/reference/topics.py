@@ -83,7 +83,6 @@ def _message(kind: type[msgspec.Struct]) -> Iterator[str]:
 
 
 def _parts(kind: type[msgspec.Struct]) -> Iterator[type[msgspec.Struct]]:
-    """Yield the structs that a message's fields hold."""
     for hint in get_type_hints(kind).values():
         for part in (hint, *get_args(hint)):
             if isinstance(part, type) and issubclass(part, msgspec.Struct):
