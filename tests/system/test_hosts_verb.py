@@ -11,19 +11,20 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import pytest
 
 from services.joint.drivers.base import DriveStatus
 from shared.bus import topics
 from shared.bus.messages import Mode
+from shared.bus.topics import HOST_RECORDER
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
 from tests.certified import install_all
 from tests.system.fleets import FleetEar, heard, wait_for
-from tests.system.test_hosts import with_drives_in
-from tests.tools.hosts.places import SHARED, make_hosts
+from tests.tools.hosts.places import BODY, LEGS, SHARED, make_hosts
 from tools import cli
 from tools.fleet import procfs
 from tools.fleet.process_table import FleetOptions
@@ -34,6 +35,15 @@ from tools.logs.run_log import read_run
 pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(240)]
 
 NAMES = ("body", "right", "left")
+
+
+def with_drives_in(robot: RobotConfig, drives: Path) -> RobotConfig:
+    """Return the robot with its drives in one place."""
+    can = {
+        name: msgspec.structs.replace(bus, channel=bus.channel.replace("{run}", str(drives)))
+        for name, bus in robot.can.items()
+    }
+    return msgspec.structs.replace(robot, can=can)
 
 
 class Place(NamedTuple):
@@ -118,6 +128,11 @@ def lead_through(place: Place, ear: FleetEar, capsys: Any) -> None:
     assert "body: planner" in said
     assert "left: knee_left" in said
     assert all(f"\n{module} " in said for module in MODULES)
+    for host, services in {"body": BODY, **LEGS}.items():
+        up = {*SupervisedFleet.attach(place.run_dir(host)).pids()} - {HOST_RECORDER}
+        assert up == {*services}, "each host its own"
+        assert place.xrl("status", host) == 0
+        assert capsys.readouterr().out.count("TRACK") == len(MODULES), "and it hears all"
     assert place.xrl("update") == 3
     assert "`xrl hosts down` first" in " ".join(capsys.readouterr().out.split())
 
