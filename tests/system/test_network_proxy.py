@@ -39,9 +39,7 @@ def descriptors(rig: Proxied) -> int:
     return len(list(Path(f"/proc/{rig.proxy.pid}/fd").iterdir()))
 
 
-def test_unimpaired_nothing_is_lost_and_with_a_delay_it_comes_so_much_later(
-    rig: Proxied,
-) -> None:
+def test_unimpaired_nothing_is_lost_and_with_a_delay_it_comes_so_much_later(rig: Proxied) -> None:
     near = list(rig.send_to_the_last(200))
     assert len(near) == 200
     inject(rig, delay_ms=25.0)
@@ -68,9 +66,7 @@ def test_the_requested_fraction_is_lost_and_reported(rig: Proxied) -> None:
     assert len(rig.send_to_the_last(100)) == 100
 
 
-def test_a_duplicate_is_received_once_and_an_overtaken_message_not_at_all(
-    rig: Proxied,
-) -> None:
+def test_a_duplicate_is_received_once_and_an_overtaken_message_not_at_all(rig: Proxied) -> None:
     """Zenoh's own sequence numbers: doubles and what is overtaken are dropped."""
     inject(rig, duplicate=0.5)
     heard = rig.send_to_the_last(200)
@@ -90,9 +86,7 @@ def test_a_stream_keeps_the_order_and_loses_nothing(rig: Proxied) -> None:
     assert numbers(rows) == list(range(rig.sent - 299, rig.sent + 1))
 
 
-def test_a_partition_is_total_and_once_it_is_over_the_link_is_whole_again(
-    rig: Proxied,
-) -> None:
+def test_a_partition_is_total_and_once_it_is_over_the_link_is_whole_again(rig: Proxied) -> None:
     """Longer than the lease: Zenoh gives the link up and dials again through the proxy."""
     inject(rig, partition=True)
     assert rig.send(500) == []
@@ -101,9 +95,7 @@ def test_a_partition_is_total_and_once_it_is_over_the_link_is_whole_again(
     assert len(rig.send_to_the_last(100)) == 100
 
 
-def test_what_a_partition_held_on_a_stream_that_is_given_up_counts_as_lost(
-    rig: Proxied,
-) -> None:
+def test_what_a_partition_held_on_a_stream_that_is_given_up_counts_as_lost(rig: Proxied) -> None:
     inject(rig, partition=True, ordered=True)
     assert rig.send(500) == []
     rig.client.clear("all")

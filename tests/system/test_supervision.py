@@ -128,10 +128,7 @@ def supervisor_pid(fleet: SupervisedFleet) -> int:
 def assert_nothing_left(run_dir: Path, pids: Sequence[int]) -> None:
     assert procfs.fleet_pids(run_dir) == set()
     assert all(procfs.is_gone(pid) for pid in pids)
-    assert not run_dir.exists() or {path.name for path in run_dir.iterdir()} <= {
-        "logs",
-        MARKER,
-    }
+    assert not run_dir.exists() or {path.name for path in run_dir.iterdir()} <= {"logs", MARKER}
 
 
 def test_a_stopped_fleet_leaves_no_process_and_no_file(start: Start, run_dir: Path) -> None:

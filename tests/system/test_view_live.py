@@ -24,7 +24,6 @@ from tools.logs.run_log import read_run
 pytestmark = [pytest.mark.system, pytest.mark.timeout(240)]
 
 PATIENCE_S = 60.0
-HAND_S = 0.05
 
 
 class Client:

@@ -77,13 +77,6 @@ def command(path: Path) -> list[str]:
     return [sys.executable, "-I", "-S", __file__, str(path), str(os.getpid())]
 
 
-def gaps_in(path: Path, from_ns: int = 0) -> list[Gap]:
-    """Return what was written, from a time on; a last line that is not whole is left out."""
-    lines = path.read_bytes().splitlines(keepends=True)
-    found = [_parsed(line) for line in lines if line.endswith(b"\n")]
-    return [gap for gap in found if gap.end_ns >= from_ns]
-
-
 def _parsed(line: bytes) -> Gap:
     return Gap(*map(int, line.split()))
 

@@ -14,15 +14,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError
 from tools.hosts import private_network
 from tools.hosts.hosts_file import Host, Hosts, principals_on
-from tools.hosts.layout import (
-    KEYS,
-    ROBOT_FILE,
-    RUN_DIR,
-    SCHEDULE,
-    UNIT,
-    robot_on_hosts,
-    unit,
-)
+from tools.hosts.layout import KEYS, ROBOT_FILE, RUN_DIR, SCHEDULE, UNIT, robot_on_hosts, unit
 from tools.hosts.probe import Probe, digest
 from tools.hosts.remote import ClockOffset, Remote
 from tools.keys.authority import Authority, bundle

@@ -29,10 +29,7 @@ def set_up_commands(host: Host) -> list[list[str]]:
     leg stands by, come before the network.
     """
     inside = [IP, "-n", NAMESPACE]
-    commands = [
-        [IP, "netns", "add", NAMESPACE],
-        [*inside, "link", "set", "lo", "up"],
-    ]
+    commands = [[IP, "netns", "add", NAMESPACE], [*inside, "link", "set", "lo", "up"]]
     for name in host.private:
         commands += move_commands(name)
     duplicates = ["nodad"] if ":" in host.address else []

@@ -20,15 +20,7 @@ from shared.config import checks as config_check
 from shared.config import files as config_file
 from shared.config import gain_schedule, scenarios
 from shared.config.robot_config import SERVICES, RobotConfig
-from shared.config.scenarios import (
-    FAULT_KINDS,
-    SIGNALS,
-    Fault,
-    Kill,
-    Push,
-    Restart,
-    Scenario,
-)
+from shared.config.scenarios import FAULT_KINDS, SIGNALS, Fault, Kill, Push, Restart, Scenario
 from shared.config.sections import LawConfig
 from shared.exceptions import FleetError, RunError
 from shared.joints import MODULES

@@ -16,13 +16,7 @@ from shared.exceptions import ConfigError, FleetError, MissingPackageError
 from shared.joints import MODULES
 from shared.links import PAIRS
 from tests.tools.fleet.plans import plan, robot_file, table_file
-from tools.fleet.process_table import (
-    UNIX,
-    ListenPoint,
-    check_free,
-    is_simulated,
-    load_table,
-)
+from tools.fleet.process_table import UNIX, ListenPoint, check_free, is_simulated, load_table
 from tools.fleet.run_dir import RunDir, supervisor_config
 
 REAL = ('"xrl_unix"', '"socketcan"')
