@@ -8,7 +8,7 @@ from shared.bus.credentials import keys_folder
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import XrlError
 from tools.bringup.rows import Finding, ok, warning, wrong
-from tools.keys.inspection import KeyRow, look
+from tools.keys.inspection import KeyRow, inspect_keys
 
 SUBJECT: Final = "bus"
 
@@ -23,7 +23,7 @@ def security_rows(robot: RobotConfig) -> list[Finding]:
     if mode == "local":
         return [ok(SUBJECT, "security", mode, "who may link: this user alone")]
     try:
-        rows = look(keys_folder(robot), robot)
+        rows = inspect_keys(keys_folder(robot), robot)
     except XrlError as error:
         return [wrong(SUBJECT, "keys", str(error), "this host's own", "`xrl keys pack`")]
     return [_row(row) for row in rows]

@@ -46,12 +46,12 @@ class LedPlanner:
         deadline = time.monotonic() + LEADS_S
         while (why := self.trouble()) and time.monotonic() < deadline:
             time.sleep(LOOK_S)
-            self.look()
+            self.listen()
         if why:
             raise FleetError(f"{why}; see `xrl status`")
 
-    def look(self) -> bool:
-        """Take a newer status, if there is one; return True if there was."""
+    def listen(self) -> bool:
+        """Receive a newer status; return True if there was one."""
         newer = self._statuses.take()
         if newer is not None:
             self.status, self._heard_ns = newer, now_ns()

@@ -77,16 +77,16 @@ class IdleMeter:
     """Idle fraction of all cores over the last `WINDOW_S`."""
 
     def __init__(self) -> None:
-        self._looks: deque[tuple[float, int, int]] = deque()
-        self.look()
+        self._samples: deque[tuple[float, int, int]] = deque()
+        self.sample()
 
-    def look(self) -> float | None:
+    def sample(self) -> float | None:
         """Sample; return the idle fraction, or None until the window is full."""
         now_s = time.monotonic()
-        self._looks.append((now_s, *idle_and_total()))
-        while len(self._looks) > 1 and now_s - self._looks[1][0] >= WINDOW_S:
-            self._looks.popleft()
-        begin_s, *before = self._looks[0]
+        self._samples.append((now_s, *idle_and_total()))
+        while len(self._samples) > 1 and now_s - self._samples[1][0] >= WINDOW_S:
+            self._samples.popleft()
+        begin_s, *before = self._samples[0]
         return None if now_s - begin_s < WINDOW_S else idle_share((before[0], before[1]))
 
 

@@ -12,9 +12,19 @@ from shared.bus.credentials import NAMES
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError
-from tools.hosts import private_network
 from tools.hosts.hosts_file import Host, Hosts, principals_on
-from tools.hosts.layout import KEYS, ROBOT_FILE, RUN_DIR, SCHEDULE, UNIT, robot_on_hosts, unit
+from tools.hosts.layout import (
+    KEYS,
+    LINK,
+    NETWORK_UNIT,
+    ROBOT_FILE,
+    RUN_DIR,
+    SCHEDULE,
+    UNIT,
+    network_unit,
+    robot_on_hosts,
+    unit,
+)
 from tools.hosts.probe import Probe, digest
 from tools.hosts.remote import ClockOffset, Remote
 from tools.keys.authority import Authority, bundle
@@ -63,8 +73,8 @@ def files_of(
         HostFile(f"{_UNIT_FOLDER}/{UNIT}", unit(hosts, host).encode(), 0o644, False),
     ]
     if host.private:
-        text = private_network.unit(host).encode()
-        files.append(HostFile(f"{_UNIT_FOLDER}/{private_network.UNIT}", text, 0o644, False))
+        text = network_unit(host).encode()
+        files.append(HostFile(f"{_UNIT_FOLDER}/{NETWORK_UNIT}", text, 0o644, False))
     if authority is not None:
         keys = bundle(authority, principals_on(host))
         files += [HostFile(f"{folder}/{KEYS}/{n}", text, 0o600, True) for n, text in keys.items()]
@@ -77,11 +87,11 @@ def update(hosts: Hosts, remote: Remote, files: list[HostFile], *, while_up: boo
         why = "a service that crashes would come back with the new files beside the old"
         refuse_up(remote, why)
     state = _state(remote)
-    network_unit = f"{_UNIT_FOLDER}/{private_network.UNIT}"
-    if state in _AT_REST and remote.run("test", "-e", network_unit).code == 0:
+    network_file = f"{_UNIT_FOLDER}/{NETWORK_UNIT}"
+    if state in _AT_REST and remote.run("test", "-e", network_file).code == 0:
         # the next start makes the services' network as it is to be then
-        remote.must("systemctl", "stop", "--quiet", private_network.UNIT)
-        remote.must("rm", "-f", network_unit)
+        remote.must("systemctl", "stop", "--quiet", NETWORK_UNIT)
+        remote.must("rm", "-f", network_file)
     folder = hosts.folder
     keys = f"{folder}/{KEYS}"
     remote.must("install", "-d", "-m", "755", folder)
@@ -124,14 +134,14 @@ def check(hosts: Hosts, remote: Remote, files: list[HostFile]) -> HostRow:
     if probe.schedule != wanted[SCHEDULE]:
         wrong.append("another gain schedule; `xrl hosts update`")
     wrong += _about_keys(probe, {Path(f.path).name: f.content for f in files if f.of_service})
-    for name in (UNIT, private_network.UNIT):
+    for name in (UNIT, NETWORK_UNIT):
         own_unit = remote.run("cat", f"{_UNIT_FOLDER}/{name}").out if name in wanted else ""
         if name in wanted and digest(own_unit.encode()) != wanted[name]:
             wrong.append(f"another {name}; `xrl hosts update`")
     state = _state(remote)
     if remote.host.private and state not in _AT_REST:
         inside = remote.run("cat", "/proc/net/dev", on_bus=True).out
-        outside = [n for n in (*remote.host.private, private_network.LINK) if f"{n}:" not in inside]
+        outside = [n for n in (*remote.host.private, LINK) if f"{n}:" not in inside]
         if outside:
             wrong.append(f"not in the services' network: {', '.join(outside)} (docs/hosts.md)")
     if not probe.revision:

@@ -25,7 +25,7 @@ from shared.places import CHECKOUT, IS_CHECKOUT
 from shared.revision import UNKNOWN, code
 from tools.fleet.run_dir import SUPERVISOR_PID
 from tools.keys.authority import held_files
-from tools.keys.inspection import look
+from tools.keys.inspection import inspect_keys
 
 FREE_MIB: Final = 4096
 """Less is warned of: an hour of records is 2.4 GiB."""
@@ -57,7 +57,7 @@ def probe(config: Path, run_dir: Path) -> Probe:
     try:
         robot = config_file.load(config)
         folder = keys_folder(robot)
-        for row in look(folder, robot):
+        for row in inspect_keys(folder, robot):
             wrong += [f"{row.name}: {row.wrong}"] if row.wrong else []
             warnings += [f"{row.name}: {row.warning}"] if row.warning else []
         keys = {name: _hash_of(folder / name) for name in (NAMES, *held_files(folder))}

@@ -13,7 +13,7 @@ from typing import BinaryIO, Final, NamedTuple, TypedDict, TypeVar, Unpack
 from shared.exceptions import FleetError
 from tools.guarded_streams import printable
 from tools.hosts.hosts_file import Host, Hosts
-from tools.hosts.private_network import IP, NAMESPACE
+from tools.hosts.layout import IP, NAMESPACE
 
 R = TypeVar("R")
 

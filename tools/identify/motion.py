@@ -86,7 +86,7 @@ class Motion:
             if (wrench := self._wrench.take()) is not None:
                 wrenches[0].append(now_ns())
                 wrenches[1].append(wrench)
-            self._planner.look()
+            self._planner.listen()
             ended = "stopped" if stopped() else self._planner.trouble()
             time.sleep(LISTEN_S)
         return MotionRecord(tuple(TimedRows(*one) for one in states), TimedRows(*wrenches), ended)

@@ -33,7 +33,7 @@ class KeyRow(NamedTuple):
     warning: str = ""
 
 
-def look(folder: Path, robot: RobotConfig) -> list[KeyRow]:
+def inspect_keys(folder: Path, robot: RobotConfig) -> list[KeyRow]:
     """Return a row for each certificate in a folder, the authority's own first."""
     names = credentials.read_names(folder)
     if names.robot != robot.name:
@@ -48,7 +48,7 @@ def look(folder: Path, robot: RobotConfig) -> list[KeyRow]:
     if not held:
         raise BusError(f"{folder}: holds no certificate of a process; `xrl keys pack` makes some")
     own = _row(signer, *_validity(signer, "a new authority: `xrl keys make --authority DIR`"))
-    return [own, *(_look(folder, robot, names, name, authority) for name in held)]
+    return [own, *(_inspect(folder, robot, names, name, authority) for name in held)]
 
 
 def _validity(found: Details, renewal: str) -> tuple[str, str]:
@@ -71,7 +71,7 @@ def _row(found: Details, wrong: str, warning: str) -> KeyRow:
     return KeyRow(found.common_name, begins, expires, found.hosts, wrong, warning)
 
 
-def _look(folder: Path, robot: RobotConfig, names: Names, name: str, authority: bytes) -> KeyRow:
+def _inspect(folder: Path, robot: RobotConfig, names: Names, name: str, authority: bytes) -> KeyRow:
     try:
         credentials.check_private(key_file(folder, name))
         certificate = certificate_file(folder, name).read_bytes()

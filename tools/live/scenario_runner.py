@@ -281,7 +281,7 @@ class ScenarioRunner:
                 raise KeyboardInterrupt
             if time.monotonic() >= next_look_s:
                 next_look_s += IDLE_EVERY_S
-                idle = meter.look()
+                idle = meter.sample()
                 late = time.monotonic() - begin_s >= PATIENCE_S
                 if late:
                     self._check_cores(idle)

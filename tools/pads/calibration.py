@@ -69,7 +69,7 @@ class _Movement:
         while time.monotonic() < deadline:
             if select.select([self._device], [], [], 0.05)[0]:
                 for event in self._device.read():
-                    self._take(event.type, event.code, event.value)
+                    self._receive(event.type, event.code, event.value)
             resting = not self._down and all(abs(off) < AT_REST for off in self._off.values())
             if resting and (self.farthest or self.pressed):
                 return True
@@ -85,7 +85,7 @@ class _Movement:
         self._rest = {axis: float(self._device.absinfo(axis).value) for axis in self._range}
         return pressed
 
-    def _take(self, kind: int, code: int, value: int) -> None:
+    def _receive(self, kind: int, code: int, value: int) -> None:
         if kind == EV_KEY:
             (self._down.add if value else self._down.discard)(code)
             self.pressed += [code] if value and code not in self.pressed else []

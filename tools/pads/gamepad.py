@@ -61,9 +61,9 @@ class Axis:
         self._middle, self._half = 0.5 * (low + high), 0.5 * (high - low)
         self._rest = 0.0 if name in STICKS else -1.0
         self.value = self._middle
-        self.look(device)
+        self.read(device)
 
-    def look(self, device: PadDevice) -> None:
+    def read(self, device: PadDevice) -> None:
         """Ask the kernel for its value now."""
         if self.control.kind == EV_ABS:
             self.value = device.absinfo(self.control.code).value
@@ -162,12 +162,12 @@ class Gamepad:
         try:
             if select.select([self._device], [], [], timeout_s)[0]:
                 for event in self._device.read():
-                    self._take(event)
+                    self._receive(event)
         except OSError:
             self.gone = True
             self._down.clear()
 
-    def _take(self, event: Any) -> None:
+    def _receive(self, event: Any) -> None:
         axis = self._by_control.get((event.type, event.code))
         if axis is not None:
             axis.value = event.value
@@ -176,14 +176,14 @@ class Gamepad:
             self.stopped |= event.code == self._stop and bool(event.value)
             self._pressed |= event.code == self._hold and bool(event.value)
         elif event.type == EV_SYN and event.code == SYN_DROPPED:
-            self._look_again()
+            self._read_again()
 
-    def _look_again(self) -> None:
+    def _read_again(self) -> None:
         """Read what is down after a loss; the dead man's button counts once it is pressed again."""
         self._down.clear()
         self.stopped |= self._stop in self._device.active_keys()
         for axis in self._axes.values():
-            axis.look(self._device)
+            axis.read(self._device)
 
 
 def open_pad(path: str | None) -> PadDevice:

@@ -50,7 +50,7 @@ class Pilot:
         """Ask for no more assist than is given now, N."""
         self.led = self.led._replace(assist_n=max(0.0, min(self.led.assist_n, given_n)))
 
-    def advance(self, wanted: Deflection, dt: float) -> Led:
+    def integrate(self, wanted: Deflection, dt: float) -> Led:
         """Go on by dt, s."""
         height, pitch, assist_n = self.led
         self.led = Led(

@@ -151,7 +151,7 @@ class LiveProbe:
                 self._planner.ask(probe_row=row, probe=excitation.at(t_s))
                 progress(t_s)
                 ask_s = t_s + ASK_S
-            if self._planner.look() and self._planner.status.probe_row == row:
+            if self._planner.listen() and self._planner.status.probe_row == row:
                 statuses.append(self._planner.status)
             ended = "stopped" if stopped() else self._planner.trouble()
             time.sleep(LISTEN_S)

@@ -27,7 +27,7 @@ from tools.keys.authority import (
     to_tar,
 )
 from tools.keys.certificates import CERTIFICATE_DAYS
-from tools.keys.inspection import KeyRow, look
+from tools.keys.inspection import KeyRow, inspect_keys
 from tools.number_arguments import count
 from tools.output import write_atomically
 from tools.terminal import Console
@@ -149,7 +149,7 @@ def _pack(args: argparse.Namespace, robot: RobotConfig) -> int:
 
 def _check(args: argparse.Namespace, robot: RobotConfig) -> int:
     folder = keys_folder(robot) if args.authority is None else args.authority
-    rows = look(folder, robot)
+    rows = inspect_keys(folder, robot)
     Console().print(_table(folder, rows))
     return 0 if all(not row.wrong for row in rows) else FAULT_EXIT_CODE
 

@@ -177,7 +177,7 @@ class Leader:
 
     def lead(self, wanted: Deflection, dt: float) -> None:
         """Go on by dt, s, and tell the robot; assist only while nobody else asks for it."""
-        led = self.pilot.advance(wanted, dt)
+        led = self.pilot.integrate(wanted, dt)
         now, self._sent = now_ns(), self._sent + 1
         if self._hand is not None:
             self._hand.put(

@@ -25,7 +25,7 @@ from tools.fleet.pace import add_pace
 from tools.fleet.process_table import FleetOptions, check_known, is_simulated, load_table
 from tools.fleet.status_table import warn_of_others
 from tools.fleet.supervise import SupervisedFleet
-from tools.keys.inspection import look
+from tools.keys.inspection import inspect_keys
 from tools.live.experiment import add_controller, add_plant, make_out, scenario_file
 from tools.number_arguments import finite
 from tools.terminal import Console, marked
@@ -199,7 +199,7 @@ def _check_keys(robot: RobotConfig, *, must: bool) -> None:
         BusError: they cannot be used now, and they must.
     """
     folder = keys_folder(robot)
-    wrong = [f"{row.name}: {row.wrong}" for row in look(folder, robot) if row.wrong]
+    wrong = [f"{row.name}: {row.wrong}" for row in inspect_keys(folder, robot) if row.wrong]
     if not wrong:
         return
     more = f"; and {len(wrong) - 1} more, by `xrl keys check`" if len(wrong) > 1 else ""

@@ -97,7 +97,7 @@ def test_whatever_came_a_pad_at_rest_leads_nowhere(
         device.move(axis, 0.0 if axis in seen.triggers else 0.5 + 0.5 * drift)
     pad.wait(0.1)
     pilot = Pilot(1.0, 0.1, 150.0)
-    assert pilot.advance(pad.deflection, 1.0) == (1.0, 0.1, 0.0)
+    assert pilot.integrate(pad.deflection, 1.0) == (1.0, 0.1, 0.0)
     device.close()
 
 
@@ -112,7 +112,7 @@ def test_only_the_right_trigger_raises_the_assist(name: str, events: list[tuple[
         kind, code = inputs[which % len(inputs)]
         device.send(kind, code, value if kind == EV_ABS else value % 2)
         pad.wait(0.1)
-        assert pilot.advance(pad.deflection, 0.1).assist_n == 0.0
+        assert pilot.integrate(pad.deflection, 0.1).assist_n == 0.0
     device.close()
 
 
