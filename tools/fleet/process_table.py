@@ -151,7 +151,7 @@ def make_plan(config_path: Path, run_dir: Path, options: FleetOptions) -> FleetP
     config = load(path)
     table = load_table(options.table_path)
     rows = _selected(table, config, options)
-    _check_run_dir(run_dir, config)
+    _check_lengths(run_dir, _listeners(table.process, config, run_dir))
     on_usb = config.joint_service.driver == "odrive_usb"
     for row in rows:
         for extra in (row.extra, "usb" if row.kind == "joint" and on_usb else ""):
@@ -285,17 +285,9 @@ def _listeners(
     return tuple(listeners)
 
 
-def _check_run_dir(run_dir: Path, config: RobotConfig) -> None:
-    """Refuse a run directory that is too long for the fleet's UNIX sockets."""
-    here = same_host.services_here(config)
-    endpoints = [same_host.endpoint_here(config, name, here) for name in config.bus.endpoints]
-    paths = [expand(at.removeprefix(UNIX), run_dir) for at in endpoints if at.startswith(UNIX)]
-    paths += [
-        expand(bus.channel, run_dir)
-        for bus in config.can.values()
-        if bus.interface == SIMULATED_CAN
-    ]
-    paths += [expand(endpoint_through(pair), run_dir).removeprefix(UNIX) for pair in PAIRS]
+def _check_lengths(run_dir: Path, listeners: Iterable[ListenPoint]) -> None:
+    """Refuse a run directory that is too long for its UNIX sockets, of whoever listens or dials."""
+    paths = [at.endpoint.removeprefix(UNIX) for at in listeners if at.endpoint.startswith(UNIX)]
     # supervisord binds NAME.PID first, and renames it
     paths.append(f"{run_dir / SUPERVISOR_SOCKET}.4194304")
     excess = max(len(os.fsencode(path)) for path in paths) - SOCKET_PATH_MAX

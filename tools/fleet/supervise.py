@@ -88,10 +88,10 @@ class SupervisedFleet:
                     f"{run.path}: {len(running)} processes of a fleet run, and its files are gone; "
                     "`xrl estop` stops the robot, `xrl down` ends them"
                 )
-            raise FleetError(f"no fleet is up in {run.path}; `xrl up` starts one")
+            raise _not_up(run)
         if fault := attached.supervision_fault():
             if not running:
-                raise FleetError(f"no fleet is up in {run.path}; `xrl up` starts one ({fault})")
+                raise _not_up(run, f" ({fault})")
             if warn:
                 log.get("xrl").warning("%s", fault)
         return attached
@@ -109,7 +109,7 @@ class SupervisedFleet:
         """Facts of the start: robot file, services, topics."""
         manifest = self.run.read_manifest()
         if manifest is None:
-            raise FleetError(f"no fleet is up in {self.run.path}; `xrl up` starts one")
+            raise _not_up(self.run)
         return manifest
 
     def info(self) -> list[ServiceInfo]:
@@ -242,7 +242,7 @@ class SupervisedFleet:
         procfs.signal_all(procfs.fleet_pids(self.run.path), signal.SIGCONT)
         try:
             if manifest is None:
-                raise FleetError(f"no fleet is up in {self.run.path}")
+                raise _not_up(self.run)
             self._supervisor.call("supervisor.stopAllProcesses", False)  # all at once,
             self._supervisor.call("supervisor.shutdown")  # which by itself goes one by one
         except FleetError:
@@ -323,6 +323,10 @@ class SupervisedFleet:
         how = service.last_exit or "could not be run"
         words = _tail(log) or service.last_line
         return f"{service.name} ended at once ({how}); {log}:\n{words}".rstrip()
+
+
+def _not_up(run: RunDir, why: str = "") -> FleetError:
+    return FleetError(f"no fleet is up in {run.path}; `xrl up` starts one{why}")
 
 
 def _unsupervised(name: str, pid: int | None) -> ServiceInfo:

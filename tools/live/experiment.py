@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final, get_args, get_type_hints
 
@@ -116,14 +116,17 @@ def add_plant(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _refused(text: str, form: str, **known: Iterable[str]) -> argparse.ArgumentTypeError:
+    names = "".join(f"; {what}: {', '.join(names)}" for what, names in known.items())
+    return argparse.ArgumentTypeError(f"{text!r}; write {form}{names}")
+
+
 def parse_kill(text: str) -> Kill:
     """Read SERVICE@T[:SIGNAL]."""
     match = re.fullmatch(rf"(\w+)@({_NUMBER})(?::(?:SIG)?(\w+))?", text)
     if match is None or match[1] not in SERVICES or (match[3] or "KILL") not in SIGNALS:
-        raise argparse.ArgumentTypeError(
-            f"{text!r}; write SERVICE@SECONDS or SERVICE@SECONDS:SIGNAL, for example "
-            f"planner@10:STOP; services: {', '.join(SERVICES)}; signals: {', '.join(SIGNALS)}"
-        )
+        form = "SERVICE@SECONDS or SERVICE@SECONDS:SIGNAL, for example planner@10:STOP"
+        raise _refused(text, form, services=SERVICES, signals=SIGNALS)
     if match[1] in UNJUDGED:
         raise argparse.ArgumentTypeError(
             f"{text!r}: without the {match[1]} there is nothing to judge the run by; "
@@ -137,10 +140,7 @@ def parse_restart(text: str) -> Restart:
     """Read SERVICE@T."""
     match = re.fullmatch(rf"(\w+)@({_NUMBER})", text)
     if match is None or match[1] not in SERVICES:
-        raise argparse.ArgumentTypeError(
-            f"{text!r}; write SERVICE@SECONDS, for example planner@9; "
-            f"services: {', '.join(SERVICES)}"
-        )
+        raise _refused(text, "SERVICE@SECONDS, for example planner@9", services=SERVICES)
     return Restart(service=match[1], at=float(match[2]))
 
 
@@ -149,10 +149,8 @@ def parse_push(text: str) -> Push:
     signed = rf"(-?{_NUMBER})"
     match = re.fullmatch(rf"({_NUMBER}):({_NUMBER}):{signed},{signed},{signed}", text)
     if match is None:
-        raise argparse.ArgumentTypeError(
-            f"{text!r}; write START:DURATION:FX,FY,FZ in s and N, for example 12:0.3:40,0,0"
-        )
-    t, duration, x, y, z = (float(number) for number in match.groups())
+        raise _refused(text, "START:DURATION:FX,FY,FZ in s and N, for example 12:0.3:40,0,0")
+    t, duration, x, y, z = map(float, match.groups())
     return Push(at=t, duration=duration, force=(x, y, z))
 
 
@@ -160,14 +158,11 @@ def parse_fault(text: str) -> Fault:
     """Read MODULE[.AXIS]:KIND@T[:DUR]."""
     match = re.fullmatch(rf"(\w+)(?:\.([01]))?:(\w+)@({_NUMBER})(?::({_NUMBER}))?", text)
     if match is None or match[1] not in MODULES or match[3] not in FAULT_KINDS:
-        raise argparse.ArgumentTypeError(
-            f"{text!r}; write MODULE:KIND@SECONDS, for example knee_left:encoder@8, or "
-            f"knee_left.1:encoder@8:0.5; modules: {', '.join(MODULES)}; "
-            f"kinds: {', '.join(FAULT_KINDS)}"
-        )
-    row = {"module": match[1], "kind": match[3], "at": float(match[4])}
+        form = "MODULE:KIND@SECONDS, for example knee_left:encoder@8, or knee_left.1:encoder@8:0.5"
+        raise _refused(text, form, modules=MODULES, kinds=FAULT_KINDS)
     axis = int(match[2]) if match[2] else None
     duration = float(match[5]) if match[5] else None
+    row = {"module": match[1], "kind": match[3], "at": float(match[4])}
     return msgspec.convert({**row, "axis": axis, "duration": duration}, Fault)
 
 

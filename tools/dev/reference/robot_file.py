@@ -41,11 +41,7 @@ def page() -> str:
     text = DEFAULT_CONFIG.read_text(encoding="utf-8")
     shipped = _Shipped(text)
     lines = [_INTRODUCTION.format(inputs=_schedule_inputs()), "## Top level", ""]
-    lines += _table(RobotConfig, "", shipped)
-    for name, hint in get_type_hints(RobotConfig, include_extras=True).items():
-        section = _section(hint)
-        if section is not None and name != _NOT_IN_THE_FILE:
-            lines += _sections(section, name, shipped)
+    lines += [*_table(RobotConfig, "", shipped), *_sections(RobotConfig, "", shipped)]
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -117,14 +113,15 @@ def _section(hint: Any) -> type[msgspec.Struct] | None:
     return None
 
 
-def _sections(section: type[msgspec.Struct], key: str, shipped: _Shipped) -> Iterator[str]:
-    yield f"## [{key}]\n"
-    yield summary(section) + "\n"
-    yield from _table(section, f"{key}.", shipped)
-    for name, hint in get_type_hints(section, include_extras=True).items():
-        part = _section(hint)
-        if part is not None and not _same_as_sibling(section, name):
-            yield from _sections(part, f"{key}.{name}", shipped)
+def _sections(whole: type[msgspec.Struct], prefix: str, shipped: _Shipped) -> Iterator[str]:
+    for name, hint in get_type_hints(whole, include_extras=True).items():
+        section = _section(hint)
+        if section is None or name == _NOT_IN_THE_FILE or _same_as_sibling(whole, name):
+            continue
+        yield f"## [{prefix}{name}]\n"
+        yield summary(section) + "\n"
+        yield from _table(section, f"{prefix}{name}.", shipped)
+        yield from _sections(section, f"{prefix}{name}.", shipped)
 
 
 def _same_as_sibling(section: type[msgspec.Struct], name: str) -> bool:
