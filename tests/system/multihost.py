@@ -66,7 +66,7 @@ class Cut(msgspec.Struct):
     host: str
     duration_s: float
     pulled: bool
-    """True: its cable is pulled. False: the switch loses its frames, and nobody is told."""
+    """True: its cable is pulled. False: the switch loses its frames, and no carrier shows it."""
     down_ns: int = 0
     """Monotonic clock, the same for all: no frame passes after this."""
     up_ns: int = 0

@@ -80,7 +80,7 @@ def undisturbed(live: dict[str, Any], lockstep: dict[str, Any]) -> bool:
 
 
 def test_live_and_lockstep_agree_on_a_kill_a_restart_and_two_pushes(tmp_path: Path) -> None:
-    """A planner's process takes a second to come up, which lockstep is told as a later restart."""
+    """A planner's process takes a second to come up, which lockstep gets as a later restart."""
     exit_lockstep, lockstep = summary_of("sim", tmp_path / "lockstep", *experiment(RESTART_S))
     assert exit_lockstep == 0
     began_ns, apart = time.monotonic_ns(), []

@@ -42,7 +42,7 @@ def ear(fleet: SupervisedFleet, robot: RobotConfig) -> Iterator[FleetEar]:
 
 
 def test_with_planner_and_bus_dead_it_sinks_by_shared_memory(ear: FleetEar, run_dir: Path) -> None:
-    """`--local` opens no session: of the bus nothing is used. Asked for anew, a module waits."""
+    """`--local` opens no session: of the bus nothing is used. Asked for again, a module waits."""
     done = xrl("estop", "--local", run_dir=run_dir)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "all six modules are stopped" in done.stdout

@@ -34,8 +34,9 @@ def place() -> Iterator[Path]:
     with tempfile.TemporaryDirectory(dir="/tmp", prefix="xrl-t-") as path:
         run_dir = Path(path) / "r"
         services = ("simulator", *MODULES, "harness", "planner")
-        with started(run_dir, *services), heard(load(DEFAULT_CONFIG), run_dir) as ear:
-            ear.wait_until_led()
+        with started(run_dir, *services):
+            with heard(load(DEFAULT_CONFIG), run_dir) as ear:
+                ear.wait_until_led()
             yield run_dir
 
 

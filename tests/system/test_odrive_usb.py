@@ -285,7 +285,7 @@ def test_close_carries_out_the_last_idle_and_leaves_no_task(
 
 
 def told_in_state(usb: UsbRobot, monkeypatch: pytest.MonkeyPatch) -> list[AxisState]:
-    """Return a list that fills with the states in which axes are told their positions."""
+    """Return a list that fills with the states in which axes get their positions."""
     states: list[AxisState] = []
     set_count = usb.bank.set_count
 
@@ -300,7 +300,7 @@ def told_in_state(usb: UsbRobot, monkeypatch: pytest.MonkeyPatch) -> list[AxisSt
 def test_a_position_set_right_after_idle_finds_both_axes_idle(
     usb: UsbRobot, armed: Control, drive: OdriveUsb, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An armed axis would jump by what it is told: 64 turns where a lost zero is forgotten."""
+    """An armed axis would jump by what it gets: 64 turns where a lost zero is forgotten."""
     armed.target = HOLD
     assert eventually(lambda: usb.bank.vel_gain[4] > 0.0)
     states = told_in_state(usb, monkeypatch)

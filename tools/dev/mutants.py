@@ -235,13 +235,13 @@ def change_of(name: str, shown: str) -> Mutation:
 
 
 def _judge(
-    groups: Sequence[GroupResult], told: MutantsFile, args: argparse.Namespace, console: Console
+    groups: Sequence[GroupResult], allowed: MutantsFile, args: argparse.Namespace, console: Console
 ) -> int:
     counts = sum((found.counts for found in groups), Counter[str]())
     total, dead = counts.total(), sum(counts[word] for word in DEAD)
     if not total:
         raise RunError("no mutant has such a name")
-    listed = {change for reason in told.reason for change in reason.lives}
+    listed = {change for reason in allowed.reason for change in reason.lives}
     alive = [row for found in groups for row in found.alive]
     unlisted = [(name, change) for name, change in alive if change not in listed]
     for name, change in unlisted:

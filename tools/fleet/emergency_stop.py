@@ -101,11 +101,11 @@ class BusStop:
             self.listen()
             going = [module for module in going if not self._has_stopped(module)]
         modes = {module: name_of(Mode, mode) for module, mode in self._modes.items()}
-        told = [f"{module} {modes.get(module, 'silent')}" for module in going]
-        if told and self._robot.bus.security.mode == "mtls":
+        failed = [f"{module} {modes.get(module, 'silent')}" for module in going]
+        if failed and self._robot.bus.security.mode == "mtls":
             name = read_credentials(self._robot, "estop").name
-            told += [] if name == topics.OPERATOR else [f"this host has the key of a {name} only"]
-        return told
+            failed += [] if name == topics.OPERATOR else [f"this host has the key of a {name} only"]
+        return failed
 
     def _has_stopped(self, module: str) -> bool:
         by_memory = self._here is not None and _is_stopped(self._here, module)
@@ -119,7 +119,7 @@ def stop_all(robot: RobotConfig, run_dir: Path, *, here: bool) -> list[str]:
 
 
 def _source() -> str:
-    """Return who asks for the stop; never raises, for nothing may keep a stop from going out."""
+    """Return who asks for the stop; never raises: nothing may keep a stop from going out."""
     text = f"xrl estop by {user_name()} on {platform.node()}"
     return text.encode(errors="replace").decode()
 

@@ -44,7 +44,7 @@ mode the joint service does not, and the mode says why."""
 PLANNER: Final = "planner"
 ROSTER: Final = "tools"
 """Whom the recorder hears of; no service has this name."""
-SILENT_PROXY: Final = "not known, for the network proxy does not answer"
+SILENT_PROXY: Final = "not known: the network proxy does not answer"
 
 OPEN: Final = "bus.security.mode is open: anyone who reaches its ports commands this robot"
 
@@ -100,7 +100,7 @@ class ModuleStatus(msgspec.Struct, frozen=True):
     way_out: str = ""
     """Remedy that lets it track again; empty if none is needed."""
     stiffened: bool = False
-    """It holds with all of its stand gains, for another may be limp."""
+    """It holds with all of its stand gains, because another may be limp."""
     outside: str = ""
     """Name of the refused part of the newest command (`Outside`); empty if it is accepted."""
     session: int = 0

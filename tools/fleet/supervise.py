@@ -332,9 +332,9 @@ def _not_up(run: RunDir, why: str = "") -> FleetError:
 def _unsupervised(name: str, pid: int | None) -> ServiceInfo:
     """Return what the kernel knows of a service whose supervisor is dead."""
     if pid is None:
-        return ServiceInfo(name, None, "gone", 0.0, 0, "")
+        return ServiceInfo(name, None, "gone", 0.0)
     state = "suspended" if procfs.is_suspended(pid) else "unsupervised"
-    return ServiceInfo(name, pid, state, procfs.uptime_s(pid), 0, "")
+    return ServiceInfo(name, pid, state, procfs.uptime_s(pid))
 
 
 @contextlib.contextmanager

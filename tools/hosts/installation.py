@@ -152,25 +152,30 @@ def check(hosts: Hosts, remote: Remote, files: list[HostFile]) -> HostRow:
     if abs(clock.offset_s) > CLOCK_MAX_S + clock.round_trip_s:
         warnings.append(f"its clock is {clock.offset_s:+.1f} s off: certificates go by it")
     return HostRow(
-        remote.host.name, probe.revision, clock, state, (probe.lock, probe.python),
-        tuple(wrong), tuple(warnings),
-    )  # fmt: skip
+        name=remote.host.name,
+        revision=probe.revision,
+        clock=clock,
+        unit=state,
+        made_from=(probe.lock, probe.python),
+        wrong=tuple(wrong),
+        warnings=tuple(warnings),
+    )
 
 
 def _about_keys(probe: Probe, wanted: dict[str, bytes]) -> list[str]:
     """Return what is wrong with a host's keys against those that it is to have."""
-    told = []
+    wrong = []
     wanted_now = {name: digest(content) for name, content in wanted.items()}
     other = sorted(n for n, found in wanted_now.items() if probe.keys.get(n) != found)
     extra = sorted(set(probe.keys) - set(wanted))
     if NAMES in other:
-        told.append("lets in other generations than the authority; `xrl hosts update`")
+        wrong.append("lets in other generations than the authority; `xrl hosts update`")
         other.remove(NAMES)
     if other:
-        told.append(f"other keys than the authority's: {', '.join(other)}; `xrl hosts update`")
+        wrong.append(f"other keys than the authority's: {', '.join(other)}; `xrl hosts update`")
     if wanted and extra:
-        told.append(f"keys that it is not to have: {', '.join(extra)}; `xrl hosts update`")
-    return told
+        wrong.append(f"keys that it is not to have: {', '.join(extra)}; `xrl hosts update`")
+    return wrong
 
 
 def _state(remote: Remote) -> str:
@@ -179,13 +184,13 @@ def _state(remote: Remote) -> str:
 
 def disagreements(rows: list[HostRow]) -> list[str]:
     """Return what is not the same on all hosts that were reached."""
-    told = []
+    wrong = []
     for word, value_of in _SAME_ON_ALL.items():
         found = {row.name: value_of(row) for row in rows if row.clock is not None}
         if len(set(found.values())) > 1:
             rest = ", ".join(f"{name} {value or 'none'}" for name, value in found.items())
-            told.append(f"several {word}: {rest}")
-    return told
+            wrong.append(f"several {word}: {rest}")
+    return wrong
 
 
 _SAME_ON_ALL: Final[dict[str, Callable[[HostRow], str]]] = {

@@ -82,10 +82,10 @@ class Remote:
             raise FleetError(f"{name}: {words[0]}: no end after {timeout_s:g} s") from None
         except OSError as error:
             raise FleetError(f"{name}: {command[0]}: {error.strerror}") from None
-        told = done.stderr.decode(errors="replace").strip()
+        errors = done.stderr.decode(errors="replace").strip()
         if done.returncode == 255:  # ssh's own
-            raise FleetError(f"{name}: {self.host.ssh} is not reached: {_last(told)}")
-        return Said(done.returncode, done.stdout.decode(errors="replace"), told)
+            raise FleetError(f"{name}: {self.host.ssh} is not reached: {_last(errors)}")
+        return Said(done.returncode, done.stdout.decode(errors="replace"), errors)
 
     def must(self, *words: str, **manner: Unpack[Manner]) -> str:
         """Run a command that has to succeed, and return what it printed."""
@@ -126,8 +126,8 @@ class Remote:
                 first, found = _talk(process)
             except (OSError, ValueError):
                 process.kill()
-                _, told = process.communicate()
-                text = f"{self.host.ssh} does not answer: {_last(told)}"
+                _, errors = process.communicate()
+                text = f"{self.host.ssh} does not answer: {_last(errors)}"
                 raise FleetError(f"{self.host.name}: {text}") from None
             finally:
                 limit.cancel()

@@ -87,7 +87,7 @@ class CommonSilence:
 
 
 class StallFinder:
-    """Finds the stalls of a live run, each once, whatever told of it."""
+    """Finds the stalls of a live run, each once, whatever shows it."""
 
     def __init__(self, cores: int, gaps: Callable[[], Sequence[Gap]]) -> None:
         """Take what watches."""

@@ -56,7 +56,7 @@ PIDS_EVERY_S: Final = 1.0
 STALLS_FILE: Final = "stalls"
 """In the run directory: what `StallWatch` finds."""
 ENDING_S: Final = 3.0
-"""s; a service that was told to end has done so by then, or was killed by its supervisor."""
+"""s; a service that was asked to end has done so by then, or was killed by its supervisor."""
 
 
 class LiveSnapshot(NamedTuple):

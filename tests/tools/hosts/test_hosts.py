@@ -53,7 +53,7 @@ def make_keys(base: Path) -> None:
 
 
 def changed(file: Path, **changes: Any) -> Path:
-    """Write the hosts file anew; `services0` is a key of the first host."""
+    """Change the hosts file; `services0` is a key of the first host."""
     table = tomllib.loads(file.read_text(encoding="utf-8"))
     for key, value in changes.items():
         found = re.fullmatch(r"([a-z]+)(\d)", key)
