@@ -12,7 +12,7 @@ import msgspec
 
 from shared.config.robot_config import SERVICES, RobotConfig
 from shared.config.sections import BusSecurityConfig
-from tools.keys import authority, bundle, certificates
+from tools.keys import authority, certificates
 from tools.keys.authority import Authority
 from tools.keys.certificates import CERTIFICATE_DAYS, Issued
 
@@ -48,7 +48,7 @@ def certified(
 
 def install_all(made: Authority, folder: Path, *names: str) -> None:
     """Install a bundle of these names, or of all."""
-    bundle.install(bundle.bundle(made, names or made.names.generations), folder)
+    authority.install(authority.bundle(made, names or made.names.generations), folder)
 
 
 def opened(robot: RobotConfig, endpoints: Mapping[str, str]) -> RobotConfig:

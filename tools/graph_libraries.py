@@ -65,19 +65,7 @@ def graphs_of(robot: RobotConfig) -> list[ca.Function]:
 
 
 def build(function: ca.Function, folder: Path = FOLDER) -> Path:
-    """Translate a graph into C, compile it, compare both, and keep the library.
-
-    Args:
-        function: the graph.
-        folder: where libraries are kept; made if absent.
-
-    Returns:
-        The library's path.
-
-    Raises:
-        RunError: there is no compiler, it failed, the library gives other numbers, or cannot be
-            written.
-    """
+    """Translate a graph into C, compile it, compare both, and keep the library."""
     compiler = shutil.which("cc")
     if compiler is None:
         raise RunError(_NO_COMPILER)
@@ -132,11 +120,7 @@ def _sync(path: Path) -> None:
 
 
 def compare(function: ca.Function, translated: ca.Function) -> None:
-    """Compare a graph with its translation on drawn arguments.
-
-    Raises:
-        RunError: a number differs in any bit.
-    """
+    """Compare a graph with its translation on drawn arguments."""
     draw, finite = np.random.default_rng(1), 0
     for sample in range(SAMPLES):
         most = DRAWN_MAX[sample % 2]

@@ -20,7 +20,6 @@ class Keyboard(Generic[K]):
     """Waits, and returns early when a key is pressed; gives the terminal back at the end."""
 
     def __init__(self, codes: Mapping[bytes, K]) -> None:
-        """Take what the bytes of each key mean."""
         self._codes = codes
         self._descriptor = -1
         self._before: list[Any] = []
@@ -87,3 +86,14 @@ def understood(text: bytes, codes: Mapping[bytes, K]) -> tuple[list[K], bytes]:
                 return presses, text
             text = text[1:]
     return presses, b""
+
+
+def typed_line(wait_s: float) -> str | None:
+    """Return the line that a person enters within a time, s; None: none, "": the terminal is gone.
+
+    Without a terminal there is nobody to enter one.
+    """
+    if not sys.stdin.isatty():
+        time.sleep(wait_s)
+        return None
+    return sys.stdin.readline() if select.select([sys.stdin], [], [], wait_s)[0] else None

@@ -29,11 +29,7 @@ def progress_along(what: str, length_s: float) -> Iterator[Callable[[float], Non
 
 
 def make_folder(out: Path | None, verb: str) -> Path:
-    """Make the folder of a verb's pictures; without a name, `out/VERB-<time>`.
-
-    Raises:
-        RunError: it cannot be made.
-    """
+    """Make the folder of a verb's pictures; without a name, `out/VERB-<time>`."""
     out = out if out is not None else Path("out") / time.strftime(f"{verb}-%Y%m%d-%H%M%S")
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -43,16 +39,7 @@ def make_folder(out: Path | None, verb: str) -> Path:
 
 
 def write_atomically(out: Path, content: bytes, *, private: bool = False) -> None:
-    """Write a file whole or not at all.
-
-    Args:
-        out: the file.
-        content: of it.
-        private: for this user alone.
-
-    Raises:
-        RunError: the file cannot be written.
-    """
+    """Write a file whole or not at all."""
     if out.exists() and not out.is_file():
         raise RunError(f"{out}: is no ordinary file; give another -o")
     try:
@@ -62,16 +49,7 @@ def write_atomically(out: Path, content: bytes, *, private: bool = False) -> Non
 
 
 def new_figure(width: float, height: float, dpi: int = 110) -> Figure:
-    """Return an empty picture of Matplotlib, laid out by itself.
-
-    Args:
-        width: inches.
-        height: inches.
-        dpi: dots per inch.
-
-    Raises:
-        MissingPackageError: there is no Matplotlib.
-    """
+    """Return an empty picture of Matplotlib, laid out by itself."""
     require("plot")
     from matplotlib.figure import Figure  # noqa: PLC0415 - takes a second, and needs the extra
 
@@ -79,10 +57,6 @@ def new_figure(width: float, height: float, dpi: int = 110) -> Figure:
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a picture of Matplotlib whole or not at all; the suffix names its format.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write a picture of Matplotlib whole or not at all; the suffix names its format."""
     with atomic_file(path) as file:
         figure.savefig(file, format=path.suffix.removeprefix("."))

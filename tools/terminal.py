@@ -32,12 +32,7 @@ _FIELD: Final = re.compile(r"\{(?:![rs])?(?::[^{}]*)?\}")
 
 
 def marked(template: str, *values: object) -> Text:
-    """Return a text in which the template alone is markup.
-
-    Args:
-        template: Rich markup with fields as of `str.format`: `"[bold]{}[/]: {:.1f} s"`.
-        values: of the fields; data.
-    """
+    """Return a text in which the template alone is markup."""
     whole = Text()
     given = zip(_FIELD.findall(template), values, strict=True)
     frame = Text.from_markup(_FIELD.sub(_HOLE, template), emoji=False)
@@ -110,14 +105,9 @@ class Console(rich.console.Console):
 
 @contextlib.contextmanager
 def renewed(
-    console: Console, *, screen: bool = False
+    console: Console, *, screen: bool = False, transient: bool = False
 ) -> Iterator[Callable[[RenderableType], None]]:
-    """Give what shows the newest of something: in its place on a terminal, else below the last.
-
-    Args:
-        console: to print on.
-        screen: take a terminal's whole screen meanwhile.
-    """
+    """Give what shows the newest of something: in its place on a terminal, else below the last."""
     if not console.is_terminal:
 
         def show(shown: RenderableType) -> None:
@@ -126,5 +116,5 @@ def renewed(
 
         yield show
         return
-    with Live(console=console, auto_refresh=False, screen=screen) as live:
+    with Live(console=console, auto_refresh=False, screen=screen, transient=transient) as live:
         yield lambda shown: live.update(shown, refresh=True)

@@ -36,15 +36,7 @@ def every_key() -> list[TopicKey]:
 
 
 def keys_named(patterns: Sequence[str], left_out: Collection[Topic] = ()) -> list[TopicKey]:
-    """Return the keys whose names match a pattern, in the order of the table of topics.
-
-    Args:
-        patterns: such as `joint/*/state`; none: all keys.
-        left_out: topics that are left out where there is no pattern.
-
-    Raises:
-        RunError: a pattern matches no key.
-    """
+    """Return the keys whose names match a pattern, in the order of the table of topics."""
     known = every_key()
     for pattern in patterns:
         if not any(fnmatch.fnmatch(key.name, pattern) for key in known):

@@ -19,7 +19,7 @@ FULL: Final = 0.75
 """Fraction of all cores: a fleet that takes more drops out now and then, and its tests with it."""
 
 LED: Final = {
-    "test_agreement", "test_crashtest", "test_demo", "test_estop_live", "test_floods", "test_hosts",
+    "test_agreement", "test_crashtest", "test_demo", "test_estop_live", "test_floods",
     "test_hosts_verb", "test_identify_live", "test_namespaces",
     "test_old_commands", "test_ros2", "test_usb_fleet", "test_view_live", "test_zero_and_jog",
 }  # fmt: skip

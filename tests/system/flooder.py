@@ -134,7 +134,7 @@ def connect(endpoint: str, source: str = STRANGER) -> socket.socket:
 
 
 def held(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
-    """Hold connections, and say nothing; each that is closed is opened anew."""
+    """Hold connections, and say nothing; each that is closed is opened again."""
     endpoints = itertools.cycle(expand(robot.bus.endpoints[name], run_dir) for name in VICTIMS)
     kept: list[socket.socket] = []
     for endpoint in endpoints:

@@ -39,6 +39,7 @@ from tests.system.namespaces import Network
 from tools.fleet import process_table
 from tools.fleet.pace import run_at_fitting_pace
 from tools.fleet.parent_death import die_with_parent
+from tools.fleet.process_table import FleetOptions
 from tools.fleet.supervise import SupervisedFleet
 from tools.live import experiment
 from tools.live.scenario_runner import LiveSnapshot, ScenarioRunner
@@ -65,7 +66,7 @@ class Cut(msgspec.Struct):
     host: str
     duration_s: float
     pulled: bool
-    """True: its cable is pulled. False: the switch loses its frames, and nobody is told."""
+    """True: its cable is pulled. False: the switch loses its frames, and no carrier shows it."""
     down_ns: int = 0
     """Monotonic clock, the same for all: no frame passes after this."""
     up_ns: int = 0
@@ -193,9 +194,7 @@ def lead(out: Path, run_dir: Path, network: Network, report: Report, pace: float
     robot = spread(experiment.load_robot(DEFAULT_CONFIG), network, keyring)
     told = scenario()
     robot_path, scenario_path, *_ = experiment.write_inputs(out, robot, told, PlantConfig())
-    started = SupervisedFleet.start(
-        robot_path,
-        run_dir,
+    options = FleetOptions(
         overrides={
             "recorder": ["--out", str(out), "--scenario", str(scenario_path)],
             HOST_RECORDER: ["--out", str(out / RECORDED), "--of", ",".join(LEGS[RECORDED])],
@@ -206,6 +205,7 @@ def lead(out: Path, run_dir: Path, network: Network, report: Report, pace: float
         pace=pace,
         table_path=write_table(out / "processes.toml", network),
     )
+    started = SupervisedFleet.start(robot_path, run_dir, options)
     try:
         with open_session(robot, "multihost", run_dir) as session:
             try:

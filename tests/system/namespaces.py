@@ -68,7 +68,7 @@ class Network:
     """
 
     def __init__(self, hosts: Sequence[str]) -> None:
-        """Take the names of the hosts; at most 15 letters each, for they name interfaces."""
+        """Take the names of the hosts; at most 15 letters each, because they name interfaces."""
         self._hosts = tuple(hosts)
         self._pids = {hosts[0]: os.getpid()}
         self._switch: subprocess.Popen[str]

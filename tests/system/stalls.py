@@ -20,7 +20,7 @@ from shared.bus.messages import Mode
 from shared.clock import NS_PER_S
 from shared.joints import MODULES
 from tools.fleet import stall_watch
-from tools.fleet.stall_watch import gaps_in
+from tools.fleet.stall_watch import Gap
 from tools.logs.run_log import read_run
 
 NEVER_READY: Final = "not all six modules track after"
@@ -37,6 +37,13 @@ def start_watch() -> None:
     atexit.register(Path(path).unlink)
     os.environ[FILE_VARIABLE] = path
     subprocess.Popen(stall_watch.command(Path(path)))
+
+
+def gaps_in(path: Path, from_ns: int = 0) -> list[Gap]:
+    """Return what was written, from a time on; a last line that is not whole is left out."""
+    lines = path.read_bytes().splitlines(keepends=True)
+    found = [Gap(*map(int, line.split())) for line in lines if line.endswith(b"\n")]
+    return [gap for gap in found if gap.end_ns >= from_ns]
 
 
 def has_stalled(since_ns: int) -> bool:

@@ -8,12 +8,8 @@ narrow against what a law, a plant or a failsafe that differ would show.
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -22,26 +18,18 @@ import numpy as np
 import pytest
 
 from shared.bus import topics
-from shared.bus.codec import Decoder
-from shared.bus.messages import JointState
-from shared.bus.session import Publisher, Session, open_session
-from shared.clock import NS_PER_MS, NS_PER_S, now_ns
-from shared.config import files as config_file
+from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.impairment import Impairer, Impairment
 from shared.config.scenarios import Inject
 from shared.joints import MODULES
 from shared.links import DIRECTIONS
-from shared.network.proxy_protocol import SOCKET
-from shared.places import DEFAULT_CONFIG
-from tests.shared.mcap_log.runs import sample
+from tests.system.fleets import xrl
+from tests.system.proxied import PERIOD_S, Proxied, proxied
 from tests.system.stalls import has_stalled, stalled_before_it_began
-from tools.fleet.proxy_client import ProxyClient
 from tools.logs.run_log import read_run
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(240)]
 
-ROOT = Path(__file__).resolve().parents[2]
-ROBOT = config_file.load(DEFAULT_CONFIG)
 RESTART_S = 8.6
 PUSHES = ("--push", "7:0.3:40,0,0", "--push", "8:0.3:0,40,0")
 
@@ -74,10 +62,7 @@ def experiment(restart_s: float) -> tuple[str, ...]:
 
 def summary_of(verb: str, out: Path, *flags: str) -> tuple[int, dict[str, Any]]:
     """Run the experiment; return its exit code and summary."""
-    command = [sys.executable, "-m", "tools.cli", verb, "--out", str(out), *flags]
-    done = subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, timeout=200, check=False
-    )
+    done = xrl(verb, "--out", out, *flags, timeout_s=200.0)
     output = done.stdout + done.stderr
     if stalled_before_it_began(done.returncode, output, out):
         return 0, {"in_real_time": False}
@@ -95,7 +80,7 @@ def undisturbed(live: dict[str, Any], lockstep: dict[str, Any]) -> bool:
 
 
 def test_live_and_lockstep_agree_on_a_kill_a_restart_and_two_pushes(tmp_path: Path) -> None:
-    """A planner's process takes a second to come up, which lockstep is told as a later restart."""
+    """A planner's process takes a second to come up, which lockstep gets as a later restart."""
     exit_lockstep, lockstep = summary_of("sim", tmp_path / "lockstep", *experiment(RESTART_S))
     assert exit_lockstep == 0
     began_ns, apart = time.monotonic_ns(), []
@@ -183,8 +168,6 @@ def test_live_and_lockstep_agree_on_a_bad_network(tmp_path: Path) -> None:
 NEAR = "hip_right"
 """Nothing is done to this module's link; a stall of the machine meets it too."""
 COUNT = 800
-PERIOD_S = 0.004
-PATIENCE_S = 20.0
 LATE_PCT = (10, 50, 90)
 LATE_MS = 2.5
 """How far a quantile may be from the modelled one, on top of half of what the link beside scatters:
@@ -206,72 +189,15 @@ LATE = dict(zip(JITTERS, (name for name in MODULES if name != NEAR), strict=Fals
 """The module whose link the proxy makes late in this way; all of them at the same time."""
 
 
-class Wire:
-    """Joint services' sessions, a planner's that dials them through the network proxy."""
-
-    def __init__(self, run_dir: Path, planner: Session, modules: dict[str, Session]) -> None:
-        self.client = ProxyClient(run_dir)
-        self._put: dict[str, Publisher[JointState]] = {
-            module: session.publisher(topics.JOINT_STATE, JointState, module)
-            for module, session in modules.items()
-        }
-        self._streams = {
-            module: planner.stream([topics.JOINT_STATE.key(ROBOT.name, module)])
-            for module in modules
-        }
-        self._decode = Decoder(JointState).decode
-        self._seq = 0
-        self.sent_ns: list[int] = []
-        self.came_ms: dict[str, list[float]] = {}
-
-    def send(self, count: int) -> None:
-        """Send states of each module at 250 Hz, and hear how late each comes, ms."""
-        first = self._seq + 1
-        self.sent_ns, self.came_ms = [], {module: [] for module in self._put}
-        for _ in range(count):
-            self._seq += 1
-            self.sent_ns.append(now_ns())
-            for publisher in self._put.values():
-                publisher.put(sample(JointState, seq=self._seq, t_ns=self.sent_ns[-1]))
-            self._listen(PERIOD_S, first)
-        self._listen(0.5, first)
-
-    def _listen(self, seconds: float, first: int) -> None:
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            items = {module: stream.take() for module, stream in self._streams.items()}
-            for module, item in items.items():
-                state = self._decode(item[1]) if item is not None else None
-                if state is not None and state.seq >= first:
-                    self.came_ms[module].append((now_ns() - state.t_ns) / NS_PER_MS)
-            if not any(items.values()):
-                time.sleep(0.0002)
-
-
 @pytest.fixture(scope="module")
-def wire() -> Iterator[Wire]:
-    with tempfile.TemporaryDirectory(dir="/tmp", prefix="xrl-a-") as folder, ExitStack() as stack:
-        run_dir = Path(folder) / "r"
-        run_dir.mkdir()
-        command = [sys.executable, "-m", "services.network_proxy", "--run-dir", str(run_dir)]
-        proxy = stack.enter_context(subprocess.Popen([*command, "--seed", "3"], cwd=ROOT))
-        stack.callback(proxy.kill)
-        modules = {
-            module: stack.enter_context(open_session(ROBOT, module, run_dir))
-            for module in (*LATE.values(), NEAR)
-        }
-        planner = stack.enter_context(open_session(ROBOT, "planner", run_dir, injected=True))
-        made = Wire(run_dir, planner, modules)
-        deadline = time.monotonic() + PATIENCE_S
-        while not ((run_dir / SOCKET).exists() and all(made.came_ms.values())):
-            assert time.monotonic() < deadline, "the links did not come up"
-            made.send(1)
+def wire() -> Iterator[Proxied]:
+    with proxied(*LATE.values(), NEAR) as links:
         for name, what in JITTERS.items():
             link = f"{LATE[name]}->planner"
-            made.client.begin(Inject(link=link, at=0.0, **msgspec.to_builtins(what)))
-        made.send(COUNT)
-        made.client.clear("all")
-        yield made
+            links.client.begin(Inject(link=link, at=0.0, **msgspec.to_builtins(what)))
+        links.send(COUNT, quiet_s=0.5)
+        links.client.clear("all")
+        yield links
 
 
 def modelled(what: Impairment, seed: int, sent_ns: list[int]) -> list[float]:
@@ -287,10 +213,12 @@ def modelled(what: Impairment, seed: int, sent_ns: list[int]) -> list[float]:
 
 
 @pytest.mark.parametrize("name", JITTERS)
-def test_on_the_wire_messages_are_as_late_as_in_the_modelled_network(name: str, wire: Wire) -> None:
+def test_on_the_wire_messages_are_as_late_as_in_the_modelled_network(
+    name: str, wire: Proxied
+) -> None:
     """Quantiles of many messages, relative to a link beside it to which nothing is done."""
     what = JITTERS[name]
-    late, near = np.array(wire.came_ms[LATE[name]]), np.array(wire.came_ms[NEAR])
+    late, near = (np.array([ms for _, ms in wire.heard[m]]) for m in (LATE[name], NEAR))
     assert len(near) > 0.9 * COUNT, "nothing is done to this link"
     wanted = [modelled(what, seed, wire.sent_ns) for seed in range(MODELLED)]
     pooled = np.concatenate(wanted)

@@ -7,7 +7,6 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -17,6 +16,8 @@ from shared.bus import topics
 from shared.bus.messages import PlannerStatus, Wrench
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
+from shared.places import CHECKOUT
+from tests.system.fleets import command, leaving_nothing, xrl_led
 from tests.system.stalls import stalled_before_it_began
 from tools.fleet import procfs
 from tools.judge.stalls import stalls_of
@@ -38,38 +39,13 @@ SUMMARY_KEYS = {
 }  # fmt: skip
 
 
-def demo(out: Path, *flags: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "tools.cli", "demo", "--out", str(out), *flags]
-    root = Path(__file__).resolve().parents[2]
-    done = subprocess.run(
-        command, cwd=root, capture_output=True, text=True, timeout=150, check=False
-    )
-    if stalled_before_it_began(done.returncode, done.stdout + done.stderr, out):
-        pytest.skip("this machine stalled so often that the scenario could not begin")
-    return done
-
-
-def fleet_processes() -> list[int]:
-    """Return processes of demo fleets that are alive."""
-    left = []
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdecimal():
-            try:
-                environment = (entry / "environ").read_bytes()
-            except OSError:
-                continue
-            if b"XRL_FLEET=/tmp/xrl-demo-" in environment and not procfs.is_gone(int(entry.name)):
-                left.append(int(entry.name))
-    return left
-
-
 def test_a_killed_and_restarted_planner_is_survived_and_recorded(
     tmp_path: Path, robot: RobotConfig
 ) -> None:
-    before = set(fleet_processes())
     flags = ("--duration", "8", "--kill", "planner@2.2", "--restart", "planner@4")
     uphill = ("--imu", "--plant", "floor.slope=[0.05,0.0]")
-    result = demo(tmp_path, *flags, *uphill, "--push", "3:0.3:30,0,0")
+    with leaving_nothing():
+        result = xrl_led("demo", tmp_path, *flags, *uphill, "--push", "3:0.3:30,0,0")
     assert result.returncode == 0, result.stdout + result.stderr
     assert "STOOD" in result.stdout
     summary = json.loads((tmp_path / "summary.json").read_text())
@@ -95,45 +71,42 @@ def test_a_killed_and_restarted_planner_is_survived_and_recorded(
     given = max(abs(row.operator_force[2]) for row in log.messages(topics.SIM_TRUTH))
     assert felt == pytest.approx(given, rel=0.25)
     assert {"robot.toml", "robot.gains.json", "scenario.toml", "model.xml"} <= set(log.attachments)
-    assert set(fleet_processes()) <= before
 
 
 def test_a_robot_that_cannot_stand_is_a_finding_and_not_an_error(tmp_path: Path) -> None:
-    result = demo(tmp_path, "--push", "1:3:0,250,0", "--duration", "6")
+    result = xrl_led("demo", tmp_path, "--push", "1:3:0,250,0", "--duration", "6")
     assert result.returncode == 1, result.stdout + result.stderr
     assert "FELL" in result.stdout
     assert json.loads((tmp_path / "summary.json").read_text())["stood"] is False
 
 
 def test_an_interrupted_demo_leaves_nothing_behind(tmp_path: Path) -> None:
-    before = set(fleet_processes())
-    folders = set(Path("/tmp").glob("xrl-demo-*"))
-    command = [sys.executable, "-m", "tools.cli", "demo", "--out", str(tmp_path)]
-    root = Path(__file__).resolve().parents[2]
-    process = subprocess.Popen(
-        command, cwd=root, stdout=subprocess.PIPE, text=True, start_new_session=True
-    )
-    assert process.stdout is not None
-    for line in process.stdout:
-        if "modes" in line:
-            break
-    os.killpg(process.pid, 2)
-    assert process.wait(timeout=60) == 130
-    process.stdout.close()
-    assert set(fleet_processes()) <= before
-    assert set(Path("/tmp").glob("xrl-demo-*")) <= folders
+    with leaving_nothing():
+        process = subprocess.Popen(
+            command("demo", "--out", tmp_path), cwd=CHECKOUT, stdout=subprocess.PIPE, text=True,
+            start_new_session=True,
+        )  # fmt: skip
+        assert process.stdout is not None
+        for line in process.stdout:
+            if "modes" in line:
+                break
+        os.killpg(process.pid, signal.SIGINT)
+        assert process.wait(timeout=60) == 130
+        process.stdout.close()
 
 
 def test_a_stall_of_all_services_is_told_in_line_record_and_verdict(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "tools.cli", "demo", "--out", str(tmp_path)]
-    command += ["--duration", "5", "--kill", "planner@4.5"]
-    before, said, stopped = procfs.fleets(), [], False
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    words = command("demo", "--out", tmp_path, "--duration", "5", "--kill", "planner@4.5")
+    said, stopped = list[str](), False
+    with (
+        leaving_nothing() as mine,
+        subprocess.Popen(words, cwd=CHECKOUT, stdout=subprocess.PIPE, text=True) as process,
+    ):
         assert process.stdout is not None
         for line in process.stdout:
             said.append(line)
             if not stopped and re.match(r" +[1-9]\.\d+ s ", line):
-                (run_dir,) = procfs.fleets() - before
+                (run_dir,) = mine()
                 stop_all(run_dir, 0.12)
                 stopped = True
     text = "".join(said)

@@ -3,29 +3,24 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import os
 import pty
 import select
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from shared.bus import topics
-from shared.bus.messages import JointState, Mode, PlannerMode, PlannerStatus, SimTruth
-from shared.bus.session import open_session
+from shared.bus.messages import Mode
 from shared.config.files import load
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
 from shared.run_directory import RUN_DIR_VARIABLE
-from tests.system.waiting import wait_for
-from tools.fleet.supervise import SupervisedFleet
+from tests.system.fleets import heard, started, wait_for
 
 pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(180)]
 
@@ -33,27 +28,16 @@ ROOT = DEFAULT_CONFIG.parents[1]
 SCRIPT = ROOT / "examples" / "send_intent.py"
 
 
-def wait_until_led(robot: RobotConfig, run_dir: Path) -> None:
-    """Wait until the planner leads."""
-    with open_session(robot, "test", run_dir) as session:
-        statuses = session.latest(topics.PLANNER_STATUS, PlannerStatus)
-        deadline = time.monotonic() + 60.0
-        while (status := statuses.take()) is None or status.mode != PlannerMode.LEADING:
-            assert time.monotonic() < deadline, status
-            time.sleep(0.01)
-
-
 @pytest.fixture(scope="module")
 def place() -> Iterator[Path]:
     """Return the run directory of a fleet that leads."""
     with tempfile.TemporaryDirectory(dir="/tmp", prefix="xrl-t-") as path:
-        services = ["simulator", *MODULES, "harness", "planner"]
-        fleet = SupervisedFleet.start(DEFAULT_CONFIG, Path(path) / "r", services=services)
-        try:
-            wait_until_led(load(DEFAULT_CONFIG), fleet.run.path)
-            yield fleet.run.path
-        finally:
-            fleet.stop()
+        run_dir = Path(path) / "r"
+        services = ("simulator", *MODULES, "harness", "planner")
+        with started(run_dir, *services):
+            with heard(load(DEFAULT_CONFIG), run_dir) as ear:
+                ear.wait_until_led()
+            yield run_dir
 
 
 def test_the_planner_gives_the_assist_that_a_script_asks_for(place: Path) -> None:
@@ -104,24 +88,15 @@ class Typist:
 def test_a_person_leads_the_robot_down_by_keys_lets_go_and_stops_it(
     place: Path, robot: RobotConfig
 ) -> None:
-    with open_session(robot, "test", place) as session:
-        truths = session.latest(topics.SIM_TRUTH, SimTruth)
-        states = [session.latest(topics.JOINT_STATE, JointState, name) for name in MODULES]
-        heights: list[float] = []
-
-        def height() -> float:
-            truth = truths.take()
-            heights.extend([] if truth is None else [truth.torso[2]])
-            return heights[-1] if heights else math.inf
-
-        assert wait_for(lambda: height() < 2.0)
-        before = height()
+    with heard(robot, place) as ear:
+        before = ear.world().torso[2]
         person = Typist(place)
         assert wait_for(lambda: person.shows(b"arrows"))
 
         def goes_down() -> bool:
             person.types(b"\x1b[B")  # as a key that is held
-            return height() < before - 0.08
+            ear.listen()
+            return ear.world().torso[2] < before - 0.08
 
         assert wait_for(goes_down), person.shown[-300:]
         person.types(b"q")
@@ -130,9 +105,6 @@ def test_a_person_leads_the_robot_down_by_keys_lets_go_and_stops_it(
         assert wait_for(lambda: person.shows(b"arrows"))
         person.types(b" ")
         assert person.ends() == 0
-        stopped: set[int] = set()
-        for number, latest in enumerate(states):
-            state = latest.take()
-            if state is not None and state.mode == Mode.DAMP:
-                stopped.add(number)
-        assert len(stopped) == len(MODULES)
+        ear.listen()
+        assert {state.mode for state in ear.states.values()} == {Mode.DAMP}
+        assert len(ear.states) == len(MODULES)

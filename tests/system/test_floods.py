@@ -9,21 +9,18 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 
-from shared.bus import topics
-from shared.bus.messages import JointState, Mode, SimTruth
-from shared.bus.session import Latest, Session, open_session
+from shared.bus.messages import Mode
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
-from shared.joints import MODULES
 from shared.places import CHECKOUT, DEFAULT_CONFIG
 from tests.certified import certified
+from tests.system.fleets import FleetEar, heard, started
 from tools.fleet.supervise import SupervisedFleet
 
 pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(180)]
@@ -33,43 +30,19 @@ LEADS_AGAIN_S = 40.0
 RECORDER_MAX = 500 << 20
 
 
-class Fleet(NamedTuple):
+class Flooded(NamedTuple):
     """A live fleet, and an ear on its bus."""
 
-    supervised: SupervisedFleet
+    up: SupervisedFleet
     config: Path
-    states: dict[str, Latest[JointState]]
-    truths: Latest[SimTruth]
-    modes: dict[str, int]
-
-    def listen(self) -> None:
-        for module, latest in self.states.items():
-            state = latest.take()
-            if state is not None:
-                self.modes[module] = state.mode
-        truth = self.truths.take()
-        assert truth is None or not truth.fallen, "it fell"
-
-    def wait_for(self, mode: Mode, within_s: float) -> float:
-        """Wait until all six are in a mode, and return how long it took."""
-        begin = time.monotonic()
-        while self.modes != dict.fromkeys(MODULES, mode):
-            assert time.monotonic() - begin < within_s, self.modes
-            self.listen()
-            time.sleep(0.002)
-        return time.monotonic() - begin
+    ear: FleetEar
 
     def recorder_bytes(self) -> int:
-        pid = self.supervised.pids()["recorder"]
+        pid = self.up.pids()["recorder"]
         for line in Path(f"/proc/{pid}/status").read_text().splitlines():
             if line.startswith("RssAnon:"):
                 return int(line.split()[1]) << 10
         raise AssertionError(pid)
-
-
-def fleet_of(robot: RobotConfig, session: Session, up: SupervisedFleet, config: Path) -> Fleet:
-    states = {m: session.latest(topics.JOINT_STATE, JointState, m) for m in MODULES}
-    return Fleet(up, config, states, session.latest(topics.SIM_TRUTH, SimTruth), {})
 
 
 SAMPLE = [
@@ -83,47 +56,40 @@ SAMPLE = [
 
 
 @pytest.fixture(scope="module")
-def fleet(request: pytest.FixtureRequest, robot: RobotConfig) -> Iterator[Fleet]:
-    folder = Path(tempfile.mkdtemp(prefix="xrl-t-", dir="/tmp"))
-    config = folder / "robot.toml"
-    own = certified(robot, folder, allow=("127.0.0.1",))[0] if request.param == "mtls" else robot
-    config.write_text(config_file.to_toml(own), encoding="utf-8")
-    shutil.copy(DEFAULT_CONFIG.with_suffix(".gains.json"), folder / "robot.gains.json")
-    overrides = {"recorder": ["--out", str(folder / "out")]}
-    up = SupervisedFleet.start(config, folder / "run", overrides=overrides)
-    try:
-        with open_session(own, "test", folder / "run") as session:
-            found = fleet_of(own, session, up, config)
-            found.wait_for(Mode.TRACK, 60.0)
-            yield found
-    finally:
-        up.stop()
-        shutil.rmtree(folder)
+def fleet(request: pytest.FixtureRequest, robot: RobotConfig) -> Iterator[Flooded]:
+    with tempfile.TemporaryDirectory(prefix="xrl-t-", dir="/tmp") as name:
+        folder = Path(name)
+        config, run_dir = folder / "robot.toml", folder / "run"
+        secured = request.param == "mtls"
+        own = certified(robot, folder, allow=("127.0.0.1",))[0] if secured else robot
+        config.write_text(config_file.to_toml(own), encoding="utf-8")
+        shutil.copy(DEFAULT_CONFIG.with_suffix(".gains.json"), folder / "robot.gains.json")
+        overrides = {"recorder": ["--out", str(folder / "out")]}
+        with started(run_dir, config=config, overrides=overrides) as up, heard(own, run_dir) as ear:
+            yield Flooded(up, config, ear)
 
 
 @pytest.mark.parametrize(("fleet", "kind"), SAMPLE, indirect=["fleet"], scope="module")
 def test_it_stands_and_its_planner_leads_again_while_somebody_floods_the_bus(
-    fleet: Fleet, kind: str
+    fleet: Flooded, kind: str
 ) -> None:
-    fleet.wait_for(Mode.TRACK, 60.0)
-    command = [sys.executable, "-m", "tests.system.flooder", kind]
-    command += [str(fleet.config), str(fleet.supervised.run.path)]
-    with subprocess.Popen(command, cwd=CHECKOUT, stdout=subprocess.PIPE, text=True) as flooder:
+    ear = fleet.ear
+    ear.wait_for(Mode.TRACK, 60.0)
+    words = [sys.executable, "-m", "tests.system.flooder", kind]
+    words += [str(fleet.config), str(fleet.up.run.path)]
+    with subprocess.Popen(words, cwd=CHECKOUT, stdout=subprocess.PIPE, text=True) as flooder:
         try:
             assert flooder.stdout is not None
             assert flooder.stdout.readline() == "flooding\n"
-            until = time.monotonic() + BEFORE_KILL_S
-            while time.monotonic() < until:
-                fleet.listen()
-                time.sleep(0.002)
-            before = dict(fleet.modes)
-            fleet.supervised.kill("planner")
-            fleet.modes.clear()
-            held_s = fleet.wait_for(Mode.HOLD, 10.0)
-            again_s = fleet.wait_for(Mode.TRACK, LEADS_AGAIN_S)
+            ear.world(after_s=BEFORE_KILL_S)
+            before = ear.modes()
+            fleet.up.kill("planner")
+            held_s = ear.wait_for(Mode.HOLD, 10.0)
+            again_s = ear.wait_for(Mode.TRACK, LEADS_AGAIN_S)
             assert flooder.poll() is None, "the flood went on until here"
         finally:
             flooder.kill()
+    assert not ear.fell
     grown = fleet.recorder_bytes()
     tracked = sum(mode == Mode.TRACK for mode in before.values())
     sys.stdout.write(

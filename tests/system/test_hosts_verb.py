@@ -7,27 +7,27 @@ import shutil
 import signal
 import subprocess
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import pytest
 
 from services.joint.drivers.base import DriveStatus
 from shared.bus import topics
-from shared.bus.messages import JointState, Mode
-from shared.bus.session import Session, open_session
+from shared.bus.messages import Mode
+from shared.bus.topics import HOST_RECORDER
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
 from tests.certified import install_all
-from tests.system.test_hosts import with_drives_in
-from tests.system.waiting import wait_for
-from tests.tools.hosts.places import SHARED, make_hosts
+from tests.system.fleets import FleetEar, heard, wait_for
+from tests.tools.hosts.places import BODY, LEGS, SHARED, make_hosts
 from tools import cli
 from tools.fleet import procfs
+from tools.fleet.process_table import FleetOptions
 from tools.fleet.supervise import SupervisedFleet
 from tools.keys.authority import Authority
 from tools.logs.run_log import read_run
@@ -35,7 +35,15 @@ from tools.logs.run_log import read_run
 pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(240)]
 
 NAMES = ("body", "right", "left")
-SILENT_S = 0.3
+
+
+def with_drives_in(robot: RobotConfig, drives: Path) -> RobotConfig:
+    """Return the robot with its drives in one place."""
+    can = {
+        name: msgspec.structs.replace(bus, channel=bus.channel.replace("{run}", str(drives)))
+        for name, bus in robot.can.items()
+    }
+    return msgspec.structs.replace(robot, can=can)
 
 
 class Place(NamedTuple):
@@ -56,42 +64,12 @@ class Place(NamedTuple):
         words = [str(self.base / "bin/ssh"), host, "systemctl start xrl.service"]
         assert subprocess.run(words, capture_output=True, check=False).returncode == 0
 
-    def cut_power(self, host: str, watch: Watch) -> None:
+    def cut_power(self, host: str, ear: FleetEar) -> None:
         """Kill all that runs on a host, and boot it again; its drives have power of their own."""
         for pid in procfs.fleet_pids(self.run_dir(host)):
             os.kill(pid, signal.SIGKILL)
-        watch.wait_for_silence()
+        assert wait_for(lambda: len(ear.modes()) < len(MODULES)), "somebody was killed"
         self.boot(host)
-
-
-class Watch:
-    """Hears the six modules by links that stay open."""
-
-    def __init__(self, session: Session) -> None:
-        self._latest = {m: session.latest(topics.JOINT_STATE, JointState, m) for m in MODULES}
-        self._states: dict[str, JointState] = {}
-        self._heard_s: dict[str, float] = {}
-
-    def states(self) -> list[JointState | None]:
-        """Return each module's state; None of one that is silent."""
-        now_s = time.monotonic()
-        for module, latest in self._latest.items():
-            state = latest.take()
-            if state is not None:
-                self._states[module], self._heard_s[module] = state, now_s
-        return [
-            self._states[module] if now_s - self._heard_s.get(module, 0.0) < SILENT_S else None
-            for module in MODULES
-        ]
-
-    def all_in(self, *modes: Mode) -> bool:
-        return all(state is not None and state.mode in modes for state in self.states())
-
-    def wait_for(self, *modes: Mode) -> None:
-        assert wait_for(lambda: self.all_in(*modes), timeout_s=60.0), self.states()
-
-    def wait_for_silence(self) -> None:
-        assert wait_for(lambda: None in self.states()), "somebody was killed"
 
 
 @pytest.fixture
@@ -122,29 +100,39 @@ def test_hosts_come_up_take_over_after_a_power_cut_and_stay_stopped_until_somebo
     install_all(Authority(place.base / "auth"), of_simulator / "keys", "simulator", "operator")
     for name in ("robot.toml", "robot.gains.json"):
         shutil.copy(place.base / "body" / SHARED / name, of_simulator)
-    SupervisedFleet.start(of_simulator / "robot.toml", place.base / "sim", services=("simulator",))
+    config = of_simulator / "robot.toml"
+    options = FleetOptions(services=("simulator",))
+    SupervisedFleet.start(config, place.base / "sim", options)
     for host in NAMES:
         place.boot(host)
-    secured = config_file.load(of_simulator / "robot.toml")
-    with open_session(secured, "test", place.base / "sim") as session:
-        lead_through(place, Watch(session), capsys)
+    with heard(config_file.load(config), place.base / "sim") as ear:
+        lead_through(place, ear, capsys)
     assert [procfs.fleet_pids(place.run_dir(host)) for host in NAMES] == [set(), set(), set()]
     assert not list(place.base.rglob("*.rearm")), "the stop is over: a person has asked for that"
 
 
-def lead_through(place: Place, watch: Watch, capsys: Any) -> None:
-    watch.wait_for(Mode.DISARMED, Mode.FAULT)
-    drives = {state.drive for state in watch.states() if state is not None}
+def lead_through(place: Place, ear: FleetEar, capsys: Any) -> None:
+    def are_down() -> bool:
+        modes = ear.modes()
+        return len(modes) == len(MODULES) and {*modes.values()} <= {Mode.DISARMED, Mode.FAULT}
+
+    assert wait_for(are_down, timeout_s=60.0), ear.modes()
+    drives = {state.drive for state in ear.states.values()}
     assert drives == {DriveStatus.IDLE}, "nobody has asked for them"
 
     assert place.xrl("up") == 0
-    watch.wait_for(Mode.TRACK)
+    ear.wait_for(Mode.TRACK, 60.0)
     capsys.readouterr()
     assert place.xrl("status") == 0
     said = capsys.readouterr().out
     assert "body: planner" in said
     assert "left: knee_left" in said
     assert all(f"\n{module} " in said for module in MODULES)
+    for host, services in {"body": BODY, **LEGS}.items():
+        up = {*SupervisedFleet.attach(place.run_dir(host)).pids()} - {HOST_RECORDER}
+        assert up == {*services}, "each host its own"
+        assert place.xrl("status", host) == 0
+        assert capsys.readouterr().out.count("TRACK") == len(MODULES), "and it hears all"
     assert place.xrl("update") == 3
     assert "`xrl hosts down` first" in " ".join(capsys.readouterr().out.split())
 
@@ -154,21 +142,21 @@ def lead_through(place: Place, watch: Watch, capsys: Any) -> None:
     assert read_run(place.base / "so far" / "joined").count(topics.PLANNER_STATUS.key("xrl"))
 
     before = procfs.fleet_pids(place.run_dir("right"))
-    place.cut_power("left", watch)
-    watch.wait_for(Mode.TRACK)
+    place.cut_power("left", ear)
+    ear.wait_for(Mode.TRACK, 60.0)
     assert place.xrl("up") == 0, "asked for again it restarts nothing"
     assert procfs.fleet_pids(place.run_dir("right")) == before
 
     assert place.xrl("estop") == 0
-    watch.wait_for(Mode.DAMP)
-    place.cut_power("left", watch)
-    assert wait_for(lambda: None not in watch.states(), timeout_s=60.0)
-    assert watch.all_in(Mode.DAMP), "the stop holds on"
+    ear.wait_for(Mode.DAMP, 60.0)
+    place.cut_power("left", ear)
+    assert wait_for(lambda: len(ear.modes()) == len(MODULES), timeout_s=60.0)
+    assert {*ear.modes().values()} == {Mode.DAMP}, "the stop holds on"
     capsys.readouterr()
     assert place.xrl("up") == 3
     said = " ".join(capsys.readouterr().out.split())
     assert "an emergency stop by xrl estop by" in said
-    assert watch.all_in(Mode.DAMP)
+    assert ear.modes() == dict.fromkeys(MODULES, Mode.DAMP)
     assert place.xrl("down") == 0
 
     out = place.base / "records"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,6 +11,7 @@ from shared.clock import keep_pace
 from shared.config import files as config_file
 from shared.config.scenarios import Keyframe, Scenario
 from shared.places import DEFAULT_CONFIG
+from tests.system.fleets import xrl
 from tools.bringup.identify.body_lead import BodyLead
 from tools.bringup.identify.quasi_static import moments_of
 from tools.bringup.tune.excitation import Excitation, SinePart
@@ -28,18 +27,10 @@ HELD = Excitation(0.008, (SinePart(9.0, 2.0, 4),))
 STEP = Excitation(0.008, (SinePart(9.0, 1.0, 3),))
 
 
-def xrl(*words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "tools.cli", *words],
-        capture_output=True, text=True, timeout=90, check=False,
-    )  # fmt: skip
-
-
 def test_a_live_robot_is_led_for_a_fit_and_probed_and_leads_on(
     run_dir: Path, tmp_path: Path
 ) -> None:
-    place = ("--run-dir", str(run_dir))
-    up = xrl("up", *place, "--out", str(tmp_path / "run"))
+    up = xrl("up", "--out", tmp_path / "run", run_dir=run_dir)
     assert up.returncode == 0, up.stderr
     try:
         keep_pace(run_dir)
@@ -53,7 +44,7 @@ def test_a_live_robot_is_led_for_a_fit_and_probed_and_leads_on(
             assert moments.q[:, 5].max() - moments.q[:, 5].min() > 0.05, "the hips went down"
             stopped = body.go(SHORT, lambda *_: None, lambda: True)
             assert stopped.ended == "stopped"
-            applied = xrl("identify", "body", *place, "--apply")
+            applied = xrl("identify", "body", "--apply", run_dir=run_dir)
             assert applied.returncode == 2
             assert "runs with it" in applied.stderr, "and nothing was led"
         with open_session(robot, "tune", run_dir) as session:
@@ -65,7 +56,7 @@ def test_a_live_robot_is_led_for_a_fit_and_probed_and_leads_on(
             led = LiveProbe(session).go(2, HELD, lambda _: None, lambda: False)
             assert led.ended == "", "a led row is held and given back"
             assert led.r.max() == pytest.approx(0.008, rel=0.1)
-        status = xrl("status", *place)
+        status = xrl("status", run_dir=run_dir)
         assert "LEADING" in status.stdout
         with open_session(robot, "tune", run_dir) as session:
             probe = LiveProbe(session)
@@ -73,12 +64,12 @@ def test_a_live_robot_is_led_for_a_fit_and_probed_and_leads_on(
 
             def kill(t_s: float) -> None:
                 if t_s > 1.5 and not killed:
-                    killed.append(xrl("kill", "planner", *place).returncode)
+                    killed.append(xrl("kill", "planner", run_dir=run_dir).returncode)
 
             course = probe.go(0, STEP, kill, lambda: False)
             assert killed == [0]
             assert course.ended != "", "a planner that is gone leads nothing"
     finally:
-        down = xrl("down", *place)
+        down = xrl("down", run_dir=run_dir)
         keep_pace(tmp_path)
     assert down.returncode == 0, down.stderr

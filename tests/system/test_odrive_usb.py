@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import math
 import time
 
@@ -24,6 +25,10 @@ pytestmark = [pytest.mark.system, pytest.mark.timeout(60)]
 
 AXES = slice(4, 6)
 HOLD = MotorTarget((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), (20.0, 20.0), (0.05, 0.05))
+
+
+def is_status(reading: DriveReading | None, status: DriveStatus) -> bool:
+    return reading is not None and reading.status is status
 
 
 def test_the_genuine_package_reads_arms_streams_and_meets_a_disarm(usb: UsbRobot) -> None:
@@ -279,5 +284,71 @@ def test_close_carries_out_the_last_idle_and_leaves_no_task(
     drive.close()
 
 
-def is_status(reading: DriveReading | None, status: DriveStatus) -> bool:
-    return reading is not None and reading.status is status
+def told_in_state(usb: UsbRobot, monkeypatch: pytest.MonkeyPatch) -> list[AxisState]:
+    """Return a list that fills with the states in which axes get their positions."""
+    states: list[AxisState] = []
+    set_count = usb.bank.set_count
+
+    def spy(axis: int, count: float) -> None:
+        states.append(usb.bank.state[axis])
+        set_count(axis, count)
+
+    monkeypatch.setattr(usb.bank, "set_count", spy)
+    return states
+
+
+def test_a_position_set_right_after_idle_finds_both_axes_idle(
+    usb: UsbRobot, armed: Control, drive: OdriveUsb, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An armed axis would jump by what it gets: 64 turns where a lost zero is forgotten."""
+    armed.target = HOLD
+    assert eventually(lambda: usb.bank.vel_gain[4] > 0.0)
+    states = told_in_state(usb, monkeypatch)
+    armed.stop()
+    drive.idle()
+    drive.set_position((-64.0, -64.0))
+    assert eventually(lambda: len(states) == 2)
+    assert states == [AxisState.IDLE] * 2
+
+
+def test_a_position_set_right_before_arm_comes_before_it(
+    usb: UsbRobot, control: Control, drive: OdriveUsb, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    states = told_in_state(usb, monkeypatch)
+    control.stop()
+    drive.set_position((0.5, 0.25))
+    drive.arm(onboard=True)
+    closed = AxisState.CLOSED_LOOP_CONTROL
+    assert eventually(lambda: usb.bank.state[4:6] == [closed] * 2)
+    assert states == [AxisState.IDLE] * 2
+    assert usb.bank.input_pos[4:6].tolist() == pytest.approx([0.5, 0.25], abs=1e-3)
+
+
+def test_a_drive_missing_from_the_bus_is_reported_once_with_its_number(
+    usb: UsbRobot,
+    config: RobotConfig,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr(odrive_usb, "REPORT_S", 0.1)
+    with caplog.at_level(logging.WARNING, "xrl"):
+        drive = OdriveUsb("0000000000AB", config.drive)
+        assert eventually(lambda: bool(caplog.records))
+        time.sleep(0.5)
+        drive.close()
+    assert [record.getMessage().split(";")[0] for record in caplog.records] == [
+        "ODrive 0000000000AB: not on USB"
+    ]
+
+
+def test_a_drive_that_is_present_is_not_reported(
+    usb: UsbRobot,
+    config: RobotConfig,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with caplog.at_level(logging.WARNING, "xrl"):
+        drive = OdriveUsb(serial_number(MODULE), config.drive)
+        assert eventually(lambda: is_status(drive.read(0.01), DriveStatus.IDLE))
+        drive.close()
+    assert not caplog.records

@@ -128,10 +128,7 @@ def test_a_loop_runs_until_ctrl_c_and_then_reports_its_counts(
 ) -> None:
     rows = items(0.5)
     log = write(tmp_path, rows, monkeypatch)
-    with (
-        listening(run_dir) as ear,
-        playing(run_dir, str(log), "--loop", "--wait", "60") as process,
-    ):
+    with listening(run_dir) as ear, playing(run_dir, str(log), "--loop", "--wait", "60") as process:
         assert ear.has(2 * len(rows) + 5)
         process.send_signal(signal.SIGINT)
         done = ended(process)
@@ -148,10 +145,7 @@ def test_sigterm_ends_it_as_cleanly(
     run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = write(tmp_path, items(0.5), monkeypatch)
-    with (
-        listening(run_dir) as ear,
-        playing(run_dir, str(log), "--loop", "--wait", "60") as process,
-    ):
+    with listening(run_dir) as ear, playing(run_dir, str(log), "--loop", "--wait", "60") as process:
         assert ear.has(1)
         process.terminate()
         done = ended(process)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import stat
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from tests.system.fleets import command
 from tools import cli
 
 pytestmark = pytest.mark.system
@@ -21,13 +21,11 @@ def test_a_fleet_that_was_started_with_umask_0_leaves_nothing_to_others(
 ) -> None:
     before = set(SHARED_MEMORY.iterdir())
     out = tmp_path / "record"
-    words = [
-        "up", "--run-dir", str(run_dir), "--out", str(out), "--scenario", "stand",
-        "--only", "ankle_right,simulator,recorder",
-    ]  # fmt: skip
-    script = 'umask 0; exec "$0" -m tools.cli "$@"'
+    only = ("--only", "ankle_right,simulator,recorder", "--scenario", "stand")
+    words = command("up", "--run-dir", run_dir, "--out", out, *only)
+    script = 'umask 0; exec "$@"'
     try:
-        subprocess.run(["bash", "-c", script, sys.executable, *words], check=True, timeout=90)
+        subprocess.run(["bash", "-c", script, "-", *words], check=True, timeout=90)
         found = [run_dir, *run_dir.rglob("*"), *(set(SHARED_MEMORY.iterdir()) - before)]
         modes = {str(path): stat.S_IMODE(path.lstat().st_mode) for path in found}
         assert {path.suffix for path in found} >= {".rearm", ".near", ".log"}

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -12,19 +10,12 @@ import pytest
 from shared.bus.messages import Mode
 from shared.joints import JOINTS, MODULES
 from shared.places import DEFAULT_CONFIG
+from tests.system.fleets import wait_for, xrl
 from tests.system.ros2_network import OtherNode, free_port, router, session
-from tests.system.waiting import wait_for
 
 pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(180)]
 
 DOMAIN = 37
-
-
-def xrl(*words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "tools.cli", *words],
-        capture_output=True, text=True, timeout=90, check=False,
-    )  # fmt: skip
 
 
 def robot_file(folder: Path, port: int) -> Path:
@@ -39,10 +30,9 @@ def test_a_node_of_another_finds_the_robot_reads_it_all_leads_it_a_little_and_st
     run_dir: Path, tmp_path: Path
 ) -> None:
     port = free_port()
-    config, place = robot_file(tmp_path, port), ("--run-dir", str(run_dir))
-    asked = ("--config", str(config), "--domain", str(DOMAIN))
-    up = xrl("up", *asked, *place, "--out", str(tmp_path / "run"), "--ros2",
-             "--accept", "intent,estop", "--scenario", "squat")  # fmt: skip
+    asked = ("--config", robot_file(tmp_path, port), "--domain", str(DOMAIN))
+    up = xrl("up", *asked, "--out", tmp_path / "run", "--ros2", "--accept", "intent,estop",
+             "--scenario", "squat", run_dir=run_dir)  # fmt: skip
     assert up.returncode == 0, up.stderr
     try:
         absent = xrl("ros2", "check", *asked, "--wait", "1")
@@ -84,7 +74,7 @@ def test_a_node_of_another_finds_the_robot_reads_it_all_leads_it_a_little_and_st
                 for name in MODULES
             ))  # fmt: skip
     finally:
-        down = xrl("down", *place)
+        down = xrl("down", run_dir=run_dir)
     assert down.returncode == 0, down.stderr
 
 

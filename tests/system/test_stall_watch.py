@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from tests.system import stalls
-from tools.fleet.stall_watch import CORES_MAX, Gap, StallWatch, gaps_in
+from tests.system.stalls import gaps_in
+from tools.fleet.stall_watch import CORES_MAX, Gap, StallWatch
 
 
 def test_a_stall_is_measured_as_long_as_it_was_on_every_core(tmp_path: Path) -> None:

@@ -14,16 +14,20 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
+import tomli_w
 from supervisor.states import ProcessStates
 
 from shared.exceptions import FleetError
 from shared.places import DEFAULT_CONFIG
-from tests.system.waiting import wait_for
+from tests.system.fleets import wait_for
+from tests.tools.fleet.plans import robot_file
 from tools import cli
 from tools.fleet import procfs, supervise
 from tools.fleet import run_dir as run_dir_module
+from tools.fleet.process_table import FleetOptions
 from tools.fleet.run_dir import MARKER
 from tools.fleet.supervise import SupervisedFleet
 from tools.fleet.supervisor_client import ServiceInfo
@@ -54,26 +58,19 @@ with open_session(load(Path(sys.argv[1])), "ankle_right", Path(sys.argv[2])) as 
 
 
 def write_table(path: Path, programs: dict[str, str], *, ready: str = "running") -> Path:
-    files = {name: path.with_name(f"{name}.py") for name in programs}
+    rows = []
     for name, program in programs.items():
-        files[name].write_text(program, encoding="utf-8")
-    rows = [
-        f"""
-[[process]]
-name = {json.dumps(name)}
-kind = "planner"
-command = ["{{python}}", {json.dumps(str(files[name]))}, "{{config}}", "{{run}}"]
-autostart = true
-ready = {json.dumps(ready)}
-topic = {json.dumps("joint/*/state" if name == "ankle_right" else "")}
-stop_signal = "TERM"
-stop_s = 1
-settle_s = 1
-why = "a stand-in"
-"""
-        for name in programs
-    ]
-    path.write_text("[environment]\n" + "".join(rows), encoding="utf-8")
+        file = path.with_name(f"{name}.py")
+        file.write_text(program, encoding="utf-8")
+        rows.append(
+            {
+                "name": name, "kind": "planner", "autostart": True, "ready": ready,
+                "command": ["{python}", str(file), "{config}", "{run}"],
+                "topic": "joint/*/state" if name == "ankle_right" else "",
+                "stop_signal": "TERM", "stop_s": 1, "settle_s": 1, "why": "a stand-in",
+            }
+        )  # fmt: skip
+    path.write_text(tomli_w.dumps({"environment": {}, "process": rows}), encoding="utf-8")
     return path
 
 
@@ -90,13 +87,35 @@ Start = Callable[..., SupervisedFleet]
 
 @pytest.fixture
 def start(run_dir: Path, tmp_path: Path) -> Start:
-    def start(programs: dict[str, str] | None = None, **arguments: object) -> SupervisedFleet:
-        table = write_table(
-            tmp_path / "processes.toml", programs or {"planner": SLEEPER, "harness": SLEEPER}
-        )
-        return SupervisedFleet.start(DEFAULT_CONFIG, run_dir, table_path=table, **arguments)
+    def start(
+        programs: dict[str, str] | None = None,
+        config: Path = DEFAULT_CONFIG,
+        ready: str = "running",
+        **options: Any,
+    ) -> SupervisedFleet:
+        two = {"planner": SLEEPER, "harness": SLEEPER}
+        table = write_table(tmp_path / "processes.toml", programs or two, ready=ready)
+        return SupervisedFleet.start(config, run_dir, FleetOptions(table_path=table, **options))
 
     return start
+
+
+Order = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture
+def order(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> Iterator[Order]:
+    """Return what runs a verb on the fleet in this process, and gives its exit code and words."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+
+    def run(*words: str) -> tuple[int, str]:
+        capsys.readouterr()
+        code = cli.main([*words, "--run-dir", str(run_dir)])
+        return code, "".join(capsys.readouterr())
+
+    yield run
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 def service(fleet: SupervisedFleet, name: str) -> ServiceInfo:
@@ -110,10 +129,7 @@ def supervisor_pid(fleet: SupervisedFleet) -> int:
 def assert_nothing_left(run_dir: Path, pids: Sequence[int]) -> None:
     assert procfs.fleet_pids(run_dir) == set()
     assert all(procfs.is_gone(pid) for pid in pids)
-    assert not run_dir.exists() or {path.name for path in run_dir.iterdir()} <= {
-        "logs",
-        MARKER,
-    }
+    assert not run_dir.exists() or {path.name for path in run_dir.iterdir()} <= {"logs", MARKER}
 
 
 def test_a_stopped_fleet_leaves_no_process_and_no_file(start: Start, run_dir: Path) -> None:
@@ -145,14 +161,11 @@ def test_a_service_that_is_not_to_restart_stays_down_until_it_is_started(start: 
     assert wait_for(lambda: service(fleet, "planner").state == "running")
 
 
-@pytest.mark.usefixtures("signal_handlers")
-def test_a_service_that_is_asleep_waits_until_it_is_started(
-    start: Start, run_dir: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_service_that_is_asleep_waits_until_it_is_started(start: Start, order: Order) -> None:
     fleet = start(not_started=("planner",))
     assert [service(fleet, name).state for name in ("planner", "harness")] == ["stopped", "running"]
-    assert cli.main(["start", "planner", "--run-dir", str(run_dir)]) == 0
-    assert "planner: started" in capsys.readouterr().out
+    code, said = order("start", "planner")
+    assert (code, "planner: started" in said) == (0, True)
     assert wait_for(lambda: service(fleet, "planner").state == "running")
 
 
@@ -183,34 +196,28 @@ def test_a_suspended_supervisor_does_not_hold_the_stop(start: Start, run_dir: Pa
     assert_nothing_left(run_dir, [pid])
 
 
-@pytest.mark.usefixtures("signal_handlers")
 def test_services_outlive_their_supervisor_and_are_shown_signalled_and_ended(
-    start: Start,
-    run_dir: Path,
-    capsys: pytest.CaptureFixture[str],
-    caplog: pytest.LogCaptureFixture,
+    start: Start, run_dir: Path, order: Order, caplog: pytest.LogCaptureFixture
 ) -> None:
     """They keep a robot standing, and nothing but a person may end that."""
     fleet = start({"planner": STUBBORN, "harness": SLEEPER})
     pids = fleet.pids()
-    where = ["--run-dir", str(run_dir)]
     os.kill(supervisor_pid(fleet), signal.SIGKILL)
     assert wait_for(lambda: bool(fleet.supervision_fault()))
     assert [row.state for row in fleet.info()] == ["unsupervised", "unsupervised"]
-    assert cli.main(["status", *where]) == 0
-    shown = " ".join(capsys.readouterr().out.split())
-    assert "nothing restarts what ends" in shown
+    code, said = order("status")
+    assert (code, "nothing restarts what ends" in " ".join(said.split())) == (0, True)
     assert fleet.pids() == pids
     with pytest.raises(FleetError, match="processes of a fleet without a supervisor"):
         start()
     assert fleet.pids() == pids, "a refused start ends nothing"
-    assert cli.main(["start", "planner", *where]) == 0
-    assert "runs already" in capsys.readouterr().out
-    assert cli.main(["kill", "harness", *where]) == 0
+    code, said = order("start", "planner")
+    assert (code, "runs already" in said) == (0, True)
+    assert order("kill", "harness")[0] == 0
     assert "nothing restarts what ends" in caplog.text
     assert wait_for(lambda: [row.state for row in fleet.info()] == ["unsupervised", "gone"])
-    assert cli.main(["start", "harness", *where]) == 2
-    assert cli.main(["down", *where]) == 0
+    assert order("start", "harness")[0] == 2
+    assert order("down")[0] == 0
     assert_nothing_left(run_dir, list(pids.values()))
 
 
@@ -234,10 +241,9 @@ def test_a_fleet_can_start_where_one_was_killed(start: Start, run_dir: Path) -> 
     assert len(start().pids()) == 2
 
 
-@pytest.mark.usefixtures("signal_handlers")
 @pytest.mark.parametrize("disaster", ["full", "removed", "a file in the place of the folder"])
 def test_supervision_goes_on_without_a_place_for_its_logs(
-    start: Start, run_dir: Path, disaster: str, capsys: pytest.CaptureFixture[str]
+    start: Start, disaster: str, order: Order
 ) -> None:
     """supervisord itself died of a log line on a full disk, and its services with it."""
     fleet = start({"planner": SLEEPER, "harness": SLEEPER})
@@ -260,20 +266,15 @@ def test_supervision_goes_on_without_a_place_for_its_logs(
         assert wait_for(lambda: "awake" in fleet.run.log_of("planner").read_text())
         return
     assert wait_for(lambda: fleet.lost_lines()[0] > 3)
-    assert cli.main(["status", "--run-dir", str(run_dir)]) == 0
-    shown = " ".join(capsys.readouterr().out.split())
+    shown = " ".join(order("status")[1].split())
     assert "log lines are lost" in shown
     assert fleet.lost_lines()[1] in shown
 
 
-@pytest.mark.usefixtures("signal_handlers")
-def test_status_says_why_a_service_does_not_come_up(
-    start: Start, run_dir: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_status_says_why_a_service_does_not_come_up(start: Start, order: Order) -> None:
     fleet = start({"planner": FAILING, "harness": SLEEPER}, disarmed=True)
     assert wait_for(lambda: service(fleet, "planner").restarts > 0)
-    assert cli.main(["status", "--run-dir", str(run_dir)]) == 0
-    shown = " ".join(capsys.readouterr().out.split())
+    shown = " ".join(order("status")[1].split())
     assert "planner: exit status 3" in shown
     assert "no drive on can0" in shown
 
@@ -287,17 +288,23 @@ def test_the_wait_before_another_start_is_bounded() -> None:
     assert waiting.delay <= time.time() + BACKOFF_MAX_S
 
 
-def test_a_start_with_too_few_open_files_says_so(
-    start: Start, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(supervise.resource, "getrlimit", lambda _limit: (100, 100))
-    with pytest.raises(FleetError, match="100 files may be open, and a fleet needs 128"):
-        start()
-
-
-def test_a_start_on_a_full_disk_says_so(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run_dir_module, "free_mib_at", lambda _path: 0.4)
-    with pytest.raises(FleetError, match=r"0\.4 MiB free, and a fleet needs 4 MiB"):
+@pytest.mark.parametrize(
+    ("module", "name", "short", "words"),
+    [
+        (
+            supervise.resource, "getrlimit", (100, 100),
+            "100 files may be open, and a fleet needs 128",
+        ),
+        (run_dir_module, "free_mib_at", 0.4, r"0\.4 MiB free, and a fleet needs 4 MiB"),
+    ],
+    ids=["open files", "disk"],
+)  # fmt: skip
+def test_a_start_without_room_says_so(
+    module: object, name: str, short: object, words: str,
+    start: Start, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(module, name, lambda _: short)
+    with pytest.raises(FleetError, match=words):
         start()
 
 
@@ -330,24 +337,24 @@ def test_a_start_that_nobody_asked_for_ends_nothing_when_a_service_fails(start: 
         fleet.stop()
 
 
-def test_a_service_that_never_listens_fails_the_start(run_dir: Path, tmp_path: Path) -> None:
-    table = write_table(tmp_path / "p.toml", {"planner": SLEEPER}, ready="endpoint")
+def test_a_service_that_never_listens_fails_the_start(start: Start, run_dir: Path) -> None:
     with pytest.raises(FleetError, match="not up after 2 s: planner"):
-        SupervisedFleet.start(DEFAULT_CONFIG, run_dir, table_path=table, timeout_s=2.0)
+        start({"planner": SLEEPER}, ready="endpoint", timeout_s=2.0)
     assert_nothing_left(run_dir, [])
 
 
-def test_a_port_in_use_is_refused_before_anything_starts(run_dir: Path, tmp_path: Path) -> None:
-    text = DEFAULT_CONFIG.read_text(encoding="utf-8")
+def test_a_port_in_use_is_refused_before_anything_starts(
+    start: Start, run_dir: Path, tmp_path: Path
+) -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{other.getsockname()[1]}"
-        config = tmp_path / "robot.toml"
-        text = text.replace('mode = "local"', 'mode = "open"', 1)
-        config.write_text(text.replace("unixsock-stream/{run}/planner.zenoh", endpoint))
-        table = write_table(tmp_path / "p.toml", {"planner": SLEEPER})
+        config = robot_file(
+            tmp_path, ('mode = "local"', 'mode = "open"'),
+            ("unixsock-stream/{run}/planner.zenoh", endpoint),
+        )  # fmt: skip
         with pytest.raises(FleetError, match=f"planner: {endpoint}: port in use"):
-            SupervisedFleet.start(config, run_dir, table_path=table)
+            start({"planner": SLEEPER}, config)
     assert_nothing_left(run_dir, [])
 
 
@@ -357,8 +364,9 @@ def up_in_a_process(run_dir: Path, table: Path, *, then: str = "") -> subprocess
         "import sys, time, tools.cli, tools.verbs.up, tools.fleet.supervise as s\n"
         "from pathlib import Path\n"
         "def run(args):\n"
-        f"    s.SupervisedFleet.start(args.config, args.run_dir, table_path=Path({str(table)!r}),"
-        f" leashed={bool(then)}, timeout_s=60)\n"
+        f"    options = s.FleetOptions(table_path=Path({str(table)!r}), leashed={bool(then)},"
+        " timeout_s=60)\n"
+        "    s.SupervisedFleet.start(args.config, args.run_dir, options)\n"
         f"    {then or 'return 0'}\n"
         "tools.verbs.up.run = run\n"
         f"sys.exit(tools.cli.main(['up', '--run-dir', {str(run_dir)!r}]))\n"
@@ -394,22 +402,11 @@ def test_a_leashed_fleet_ends_when_its_owner_is_killed(run_dir: Path, tmp_path: 
     assert wait_for(lambda: not procfs.fleet_pids(run_dir))
 
 
-@pytest.fixture
-def signal_handlers() -> Iterator[None]:
-    """Put back what `cli.main` changes in this process."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
-
-
-@pytest.mark.usefixtures("signal_handlers")
-def test_status_shows_mode_tier_age_and_rate(
-    start: Start, run_dir: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_status_shows_mode_tier_age_and_rate(start: Start, order: Order) -> None:
     fleet = start({"ankle_right": JOINT, "planner": SLEEPER})
-    assert cli.main(["status", "--json", "--run-dir", str(run_dir)]) == 0
-    status = json.loads(capsys.readouterr().out)
+    code, said = order("status", "--json")
+    assert code == 0
+    status = json.loads(said)
     ankle = status["services"]["ankle_right"]
     assert ankle["pid"] == fleet.pids()["ankle_right"]
     assert ankle["state"] == "running"
@@ -421,49 +418,40 @@ def test_status_shows_mode_tier_age_and_rate(
         "stopped_by": "",
     }  # fmt: skip
     assert status["services"]["planner"]["rate_hz"] is None
-    assert cli.main(["status", "--run-dir", str(run_dir)]) == 0
-    assert "ankle_right" in capsys.readouterr().out
+    assert "ankle_right" in order("status")[1]
 
 
-@pytest.mark.usefixtures("signal_handlers")
 def test_kill_and_down_work_from_the_command_line(
-    start: Start, run_dir: Path, capsys: pytest.CaptureFixture[str]
+    start: Start, run_dir: Path, order: Order
 ) -> None:
     fleet = start()
     pids = list(fleet.pids().values())
-    where = ["--run-dir", str(run_dir)]
-    assert cli.main(["kill", "plannr", *where]) == 2
-    assert "one of planner, harness" in capsys.readouterr().err
-    assert cli.main(["kill", "planner", "--signal", "STOP", *where]) == 0
+    code, said = order("kill", "plannr")
+    assert (code, "one of planner, harness" in said) == (2, True)
+    assert order("kill", "planner", "--signal", "STOP")[0] == 0
     assert wait_for(lambda: service(fleet, "planner").state == "suspended")
-    assert cli.main(["down", *where]) == 0
+    assert order("down")[0] == 0
     assert_nothing_left(run_dir, pids)
 
 
-@pytest.mark.usefixtures("signal_handlers")
-def test_top_hz_and_echo_show_what_the_services_send(
-    start: Start, run_dir: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_top_hz_and_echo_show_what_the_services_send(start: Start, order: Order) -> None:
     fleet = start({"ankle_right": JOINT, "planner": SLEEPER})
-    place = ["--run-dir", str(run_dir)]
-    assert cli.main(["hz", "joint/ankle_right/state", "--for", "1", *place]) == 0
-    row = next(line for line in capsys.readouterr().out.splitlines() if "ankle_right" in line)
-    assert row.split()[1].endswith("/250"), "the rate, and the nominal one"
+    code, said = order("hz", "joint/ankle_right/state", "--for", "1")
+    row = next(line for line in said.splitlines() if "ankle_right" in line)
+    assert (code, row.split()[1].endswith("/250")) == (0, True), "the rate, and the nominal one"
     assert 20 < float(row.split()[1].removesuffix("/250")) < 150
-    assert cli.main(["hz", "planner/status", "--for", "0.2", *place]) == 3, "nothing came"
-    capsys.readouterr()
+    assert order("hz", "planner/status", "--for", "0.2")[0] == 3, "nothing came"
 
     words = ["echo", "joint/*/state", "--count", "2", "--field", "mode", "--field", "seq"]
-    assert cli.main([*words, "--json", *place]) == 0
-    first, second = map(json.loads, capsys.readouterr().out.splitlines())
+    first, second = map(json.loads, order(*words, "--json")[1].splitlines())
     assert first["topic"] == "joint/ankle_right/state"
     assert second["seq"] == first["seq"] + 1, "none is lost"
     assert set(first) == {"topic", "mode", "seq"}
-    assert cli.main([*words, *place]) == 0
-    assert "mode: HOLD (1)" in capsys.readouterr().out
+    code, said = order(*words)
+    assert (code, "mode: HOLD (1)" in said) == (0, True)
 
-    assert cli.main(["top", "--once", *place]) == 0
-    shown = capsys.readouterr().out
+    code, shown = order("top", "--once")
+    assert code == 0
     assert str(fleet.pids()["ankle_right"]) in shown
     assert "joint/ankle_right/state" in shown
     assert "planner/status" not in shown, "on which nothing has come"

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from shared.joints import MODULES
-from tests.system.stalls import stalled_before_it_began
+from tests.system.fleets import leaving_nothing, xrl_led
 from tests.usb import robot_file
-from tools.fleet import procfs
 from tools.fleet.pace import PACE_VARIABLE, usual_pace
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(240)]
 
 BESIDE_CAN = 0.7
 """Factor on the pace of a fleet on CAN."""
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
@@ -33,25 +29,11 @@ def _boards_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(PACE_VARIABLE, f"{BESIDE_CAN * usual_pace():g}")
 
 
-def xrl(*arguments: str | Path) -> str:
+def led(verb: str, out: Path, *flags: str | Path) -> str:
     """Run a verb that has to end well; return what it printed."""
-    before, folders = procfs.fleets(), set(Path("/tmp").glob("xrl-*-*"))
-    done = subprocess.run(
-        [sys.executable, "-m", "tools.cli", *map(str, arguments)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=220,
-        check=False,
-    )
-    if "--out" in arguments:
-        out = Path(arguments[arguments.index("--out") + 1])
-        if stalled_before_it_began(done.returncode, done.stdout + done.stderr, out):
-            pytest.skip("this machine stalled so often that the scenario could not begin")
+    with leaving_nothing():
+        done = xrl_led(verb, out, *flags)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert procfs.fleets() <= before
-    left = set(Path("/tmp").glob("xrl-*-*")) - folders
-    assert not [path for path in left if path.name.startswith(("xrl-demo-", "xrl-crash-"))]
     return done.stdout
 
 
@@ -59,7 +41,7 @@ def xrl(*arguments: str | Path) -> str:
 def test_it_stands_when_the_planner_is_killed(tmp_path: Path, robot_path: Path) -> None:
     out = tmp_path / "out"
     flags = ("--duration", "7", "--kill", "planner@3", "--push", "4:0.3:30,0,0")
-    assert "STOOD" in xrl("demo", "--config", robot_path, "--out", out, *flags)
+    assert "STOOD" in led("demo", out, "--config", robot_path, *flags)
     summary = json.loads((out / "summary.json").read_text())
     assert summary["stood"] is True
     assert set(summary["handover_ms"]) == set(MODULES)
@@ -71,7 +53,7 @@ def test_a_killed_services_successor_takes_over_and_an_unplugged_drive_holds(
 ) -> None:
     out = tmp_path / "out"
     cases = ("--only", "kill-knee_left", "--only", "unplugged-knee_left")
-    xrl("crashtest", "--config", robot_path, "--out", out, *cases)
+    led("crashtest", out, "--config", robot_path, *cases)
     rows = {row["name"]: row for row in json.loads((out / "results.json").read_text())["cases"]}
     assert [row["verdict"] for row in rows.values()] == ["stood", "stood"]
     assert rows["kill-knee_left"]["leads_again_s"] is not None

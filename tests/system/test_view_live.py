@@ -7,7 +7,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,13 +17,13 @@ import pytest
 from shared.bus import topics
 from shared.bus.messages import Mode, RunEventKind
 from shared.places import CHECKOUT
+from tests.system.fleets import command
 from tools.logs.hand_path import hand_path
 from tools.logs.run_log import read_run
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(240)]
 
 PATIENCE_S = 60.0
-HAND_S = 0.05
 
 
 class Client:
@@ -91,10 +90,8 @@ async def lead(address: str) -> None:
 
 
 def test_a_page_leads_pushes_freezes_and_kills_and_the_log_has_it_all(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "tools.cli", "demo", "--view", "--port", "0"]
-    with subprocess.Popen(
-        [*command, "--out", str(tmp_path)], cwd=CHECKOUT, stdout=subprocess.PIPE, text=True
-    ) as process:
+    words = command("demo", "--view", "--port", "0", "--out", tmp_path)
+    with subprocess.Popen(words, cwd=CHECKOUT, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
             lines = iter(process.stdout.readline, "")

@@ -15,14 +15,8 @@ from tools.fleet import process_table
 
 
 def plan(path: Path, *, simulation: bool) -> process_table.FleetPlan:
-    return process_table.make_plan(
-        path,
-        Path("/tmp/xrl-t"),
-        overrides={},
-        services=None,
-        simulation=simulation,
-        table_path=process_table.TABLE,
-    )
+    options = process_table.FleetOptions(simulation=simulation)
+    return process_table.make_plan(path, Path("/tmp/xrl-t"), options)
 
 
 def test_the_shipped_robot_names_six_emulated_drives(robot: RobotConfig) -> None:

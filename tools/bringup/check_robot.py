@@ -14,7 +14,7 @@ from shared.joints import MODULES
 from tools.bringup.findings import Finding, judged, ok, warning, wrong
 from tools.fleet import process_table
 from tools.fleet.process_table import ListenPoint
-from tools.keys.inspection import KeyRow, look
+from tools.keys.inspection import KeyRow, inspect_keys
 
 SUBJECT: Final = "robot file"
 
@@ -88,7 +88,7 @@ def security_rows(robot: RobotConfig) -> list[Finding]:
     if mode == "local":
         return [ok("bus", "security", mode, "who may link: this user alone")]
     try:
-        return [_key_row(row) for row in look(keys_folder(robot), robot)]
+        return [_key_row(row) for row in inspect_keys(keys_folder(robot), robot)]
     except XrlError as error:
         return [wrong("bus", "keys", str(error), "this host's own", "`xrl keys pack`")]
 

@@ -31,7 +31,7 @@ from shared.joints import MODULES
 from tools.bringup.boards import FoundBoards
 from tools.bringup.can_monitor import bus_config, listen
 from tools.fleet import procfs
-from tools.fleet.process_table import SIMULATED_CAN, is_simulated
+from tools.fleet.process_table import SIMULATED_CAN, FleetOptions, is_simulated
 from tools.fleet.run_dir import RunDir
 from tools.fleet.supervise import SupervisedFleet
 
@@ -188,10 +188,13 @@ def drives_within_reach(
         words = [word for planted in plants for word in ("--drive-setting", planted)]
         # a light foot in the air on a damped drivetrain wants a finer step than a standing robot
         words += ["--lifted", f"{lifted:g}", "--plant", "steps=4"] if lifted else []
-        simulator = SupervisedFleet.start(
-            config_path, run_dir, overrides={"simulator": words},
-            no_restart=frozenset({"simulator"}), services=["simulator"], leashed=True,
-        )  # fmt: skip
+        alone = FleetOptions(
+            overrides={"simulator": words},
+            no_restart=("simulator",),
+            services=["simulator"],
+            leashed=True,
+        )
+        simulator = SupervisedFleet.start(config_path, run_dir, alone)
     try:
         _await_simulator(robot, run_dir, UP_S if simulator is None else STARTED_S)
         yield simulator is not None

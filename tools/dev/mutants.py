@@ -130,7 +130,6 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(group: Group, args: argparse.Namespace, console: Console) -> GroupResult:
-    """Run one group."""
     folder = args.out.resolve() / group.name
     patterns = [args.only] if args.only else [SAMPLE] if args.sample else []
     if args.survivors:
@@ -181,11 +180,7 @@ def _prepare(group: Group, folder: Path) -> None:
 
 
 def _mutmut_run(folder: Path, words: Sequence[str], console: Console) -> None:
-    """Run mutmut; its own words go into run.log, its count is shown.
-
-    Raises:
-        RunError: it failed before the first mutant.
-    """
+    """Run mutmut; its own words go into run.log, its count is shown."""
     command = [sys.executable, "-m", "mutmut", "run", *words]
     with (
         (folder / "run.log").open("w", encoding="utf-8") as log,
@@ -231,12 +226,7 @@ def _statuses(folder: Path) -> list[tuple[str, str]]:
 
 
 def change_of(name: str, shown: str) -> Mutation:
-    """Return what a mutant changes.
-
-    Args:
-        name: mutmut's, such as `services.joint.torque_limiter.x_limit_torque__mutmut_3`.
-        shown: its unified diff.
-    """
+    """Return what a mutant changes."""
     lines = [line for line in shown.splitlines() if not line.startswith(("---", "+++"))]
     was, becomes = (
         " ".join(line[1:].strip() for line in lines if line.startswith(sign)) for sign in "-+"
@@ -245,14 +235,13 @@ def change_of(name: str, shown: str) -> Mutation:
 
 
 def _judge(
-    groups: Sequence[GroupResult], told: MutantsFile, args: argparse.Namespace, console: Console
+    groups: Sequence[GroupResult], allowed: MutantsFile, args: argparse.Namespace, console: Console
 ) -> int:
-    """Print the score and who lives; return the exit code."""
     counts = sum((found.counts for found in groups), Counter[str]())
     total, dead = counts.total(), sum(counts[word] for word in DEAD)
     if not total:
         raise RunError("no mutant has such a name")
-    listed = {change for reason in told.reason for change in reason.lives}
+    listed = {change for reason in allowed.reason for change in reason.lives}
     alive = [row for found in groups for row in found.alive]
     unlisted = [(name, change) for name, change in alive if change not in listed]
     for name, change in unlisted:

@@ -25,7 +25,6 @@ class BusFaults:
     """Looks at the links that this host's services, and this tool, dial over TLS."""
 
     def __init__(self, robot: RobotConfig, session: Session) -> None:
-        """Begin to count who comes to this host's ports."""
         self._robot, self._session = robot, session
         self._here = security.services_here(robot)
         self._arrivals = Arrivals(security.ports_here(robot))
@@ -35,12 +34,8 @@ class BusFaults:
         """Count from here on."""
         self._arrivals.flood(now_ns())
 
-    def told(self, pids: dict[str, int]) -> tuple[str, ...]:
-        """Return what is wrong, in words; takes up to 2 s if a link does not come.
-
-        Args:
-            pids: of this host's services that run.
-        """
+    def describe(self, pids: dict[str, int]) -> tuple[str, ...]:
+        """Return what is wrong, in words; takes up to 2 s if a link does not come."""
         if self._robot.bus.security.mode != "mtls":
             return ()
         flood = self._arrivals.flood(now_ns())

@@ -54,16 +54,7 @@ def request_here(run_dir: Path) -> tuple[list[str], list[str]]:
 
 
 def wait_here(run_dir: Path, here: list[str], wanted: Sequence[str] = MODULES) -> list[str]:
-    """Wait until the services on this host have stopped.
-
-    Args:
-        run_dir: of the fleet.
-        here: the modules that were asked.
-        wanted: the modules that have to stop.
-
-    Returns:
-        One line for each of them that has not stopped, or was not asked.
-    """
+    """Wait until the services on this host have stopped."""
     deadline, going = time.monotonic() + GIVE_UP_S, list(here)
     while going and time.monotonic() < deadline:
         # one that has stopped stays so: it is not asked again, as its row might be half written
@@ -78,14 +69,6 @@ class BusStop:
     """The way over the bus, on a session that is open: nothing is dialled when it is asked for."""
 
     def __init__(self, robot: RobotConfig, session: Session, here: Path | None) -> None:
-        """Take an open session.
-
-        Args:
-            robot: the robot.
-            session: on its bus.
-            here: run directory of this robot's services on this host, whose shared memory tells of
-                them too; None: none of its services is here.
-        """
         self._robot, self._here = robot, here
         self._publisher = session.publisher(topics.ESTOP, Estop)
         self._states = {m: session.latest(topics.JOINT_STATE, JointState, m) for m in MODULES}
@@ -117,11 +100,11 @@ class BusStop:
             self.listen()
             going = [module for module in going if not self._has_stopped(module)]
         modes = {module: name_of(Mode, mode) for module, mode in self._modes.items()}
-        told = [f"{module} {modes.get(module, 'silent')}" for module in going]
-        if told and self._robot.bus.security.mode == "mtls":
+        failed = [f"{module} {modes.get(module, 'silent')}" for module in going]
+        if failed and self._robot.bus.security.mode == "mtls":
             name = read_credentials(self._robot, "estop").name
-            told += [] if name == topics.OPERATOR else [f"this host has the key of a {name} only"]
-        return told
+            failed += [] if name == topics.OPERATOR else [f"this host has the key of a {name} only"]
+        return failed
 
     def _has_stopped(self, module: str) -> bool:
         by_memory = self._here is not None and _is_stopped(self._here, module)
@@ -129,25 +112,13 @@ class BusStop:
 
 
 def stop_all(robot: RobotConfig, run_dir: Path, *, here: bool) -> list[str]:
-    """Open a session and publish the stop until all six modules have stopped.
-
-    Args:
-        robot: the robot.
-        run_dir: where the sockets of a fleet on this host are.
-        here: the robot's services are in that run directory.
-
-    Returns:
-        Each module that has not stopped, with its mode.
-
-    Raises:
-        BusError: the bus cannot be opened.
-    """
+    """Open a session and publish the stop until all six modules have stopped."""
     with open_session(robot, "estop", run_dir) as session:
         return BusStop(robot, session, run_dir if here else None).stop()
 
 
 def _source() -> str:
-    """Return who asks for the stop; never raises, for nothing may keep a stop from going out."""
+    """Return who asks for the stop; never raises: nothing may keep a stop from going out."""
     text = f"xrl estop by {user_name()} on {platform.node()}"
     return text.encode(errors="replace").decode()
 

@@ -44,7 +44,7 @@ mode the joint service does not, and the mode says why."""
 PLANNER: Final = "planner"
 ROSTER: Final = "tools"
 """Whom the recorder hears of; no service has this name."""
-SILENT_PROXY: Final = "not known, for the network proxy does not answer"
+SILENT_PROXY: Final = "not known: the network proxy does not answer"
 
 OPEN: Final = "bus.security.mode is open: anyone who reaches its ports commands this robot"
 
@@ -87,20 +87,20 @@ class RefusedCommands(msgspec.Struct, frozen=True):
 class ModuleStatus(msgspec.Struct, frozen=True):
     """One module, by the newest state of its joint service."""
 
-    mode: str | None
+    mode: str | None = None
     """Name of its `Mode`; None if its joint service sends nothing now."""
-    tier: int | None
+    tier: int | None = None
     """See `TIERS`; None in every other mode."""
-    cause: str | None
+    cause: str | None = None
     """Name of the `Cause` of its last change of mode."""
-    drive: str | None
+    drive: str | None = None
     """Name of the `DriveStatus` of its drive."""
-    q: Pair | None
+    q: Pair | None = None
     """(phi, theta), rad; None if its drive does not know."""
-    way_out: str
+    way_out: str = ""
     """Remedy that lets it track again; empty if none is needed."""
     stiffened: bool = False
-    """It holds with all of its stand gains, for another may be limp."""
+    """It holds with all of its stand gains, because another may be limp."""
     outside: str = ""
     """Name of the refused part of the newest command (`Outside`); empty if it is accepted."""
     session: int = 0
@@ -209,13 +209,8 @@ class RateMonitor:
         return (self.newest.seq - self._first.seq) * NS_PER_S / span_ns if span_ns > 0 else 0.0
 
 
-def ears_of(session: Session, topics: Mapping[str, str]) -> dict[str, RateMonitor]:
-    """Return an ear for each service that publishes something steadily.
-
-    Args:
-        session: on the bus.
-        topics: of the services of this fleet; modules and planner may run on other hosts.
-    """
+def monitors_of(session: Session, topics: Mapping[str, str]) -> dict[str, RateMonitor]:
+    """Return a monitor of each service that publishes steadily; modules may be on other hosts."""
     elsewhere = dict.fromkeys(MODULES, JOINT_STATE.name) | {
         PLANNER: PLANNER_STATUS.name, ROSTER: TOOLS.name,
     }  # fmt: skip
@@ -234,63 +229,57 @@ def listen_for_all(monitors: Mapping[str, RateMonitor]) -> None:
     _listen(monitors, _LINKS_S, until=lambda: all(monitor.newest for monitor in monitors.values()))
 
 
-def look(
-    fleet: SupervisedFleet,
-    monitors: Mapping[str, RateMonitor],
-    security: str,
-    bus: BusFaults,
+def read_status(
+    fleet: SupervisedFleet, monitors: Mapping[str, RateMonitor], security: str, bus: BusFaults
 ) -> FleetStatus:
-    """Listen for one window and return the fleet's status.
-
-    Args:
-        fleet: by its supervisor.
-        monitors: of `ears_of`.
-        security: `bus.security.mode` of its robot file.
-        bus: what is looked at beside, of its links.
-    """
+    """Listen for one window and return the fleet's status; `security` is `bus.security.mode`."""
     bus.begin()
     for monitor in monitors.values():
         monitor.new_window()
     _listen(monitors, _WINDOW_S)
     # before the call to the supervisor, which takes a while on a busy machine
     present = {name: (monitor.age_s(), monitor.rate_hz()) for name, monitor in monitors.items()}
-    fresh = {name for name, monitor in monitors.items() if monitor.is_fresh()}
-    services, infos = {}, fleet.info()
-    for service in infos:
-        age_s, rate_hz = present.get(service.name, (None, None))
-        services[service.name] = ServiceStatus(
-            pid=service.pid,
-            state=service.state,
-            uptime_s=service.uptime_s,
-            age_s=age_s,
-            rate_hz=rate_hz,
-            restarts=service.restarts,
-            last_exit=service.last_exit,
-            real_time=_real_time(service),
-        )
-    modules = {
-        module: module_status(
-            monitors[module].newest if module in fresh else None,
-            monitors[module].refusals(),
-            stop_source(fleet.run.path, module),
-        )
-        for module in MODULES
-        if module in monitors
-    }
-    roster = monitors[ROSTER].newest if ROSTER in fresh else None
+    newest = {name: one.newest if one.is_fresh() else None for name, one in monitors.items()}
+    infos = fleet.info()
+    roster = newest.get(ROSTER)
     recorder = roster.trouble if isinstance(roster, ToolRoster) else ()
-    lead = lead_status(monitors[PLANNER].newest if PLANNER in fresh else None)
-    tools = tools_of(roster)
-    config, network = fleet.manifest.config, impairments(fleet)
-    faults = bus.told({name: row.pid for name, row in services.items() if row.pid is not None})
     return FleetStatus(
-        str(fleet.run.path), config, services, modules, lead, network, pace(), security, tools,
-        (*trouble_of(fleet, infos), *recorder), faults,
-    )  # fmt: skip
+        run_dir=str(fleet.run.path),
+        config=fleet.manifest.config,
+        services={row.name: _service_status(row, *present.get(row.name, ())) for row in infos},
+        modules={
+            module: module_status(
+                newest[module], monitors[module].refusals(), stop_source(fleet.run.path, module)
+            )
+            for module in MODULES
+            if module in monitors
+        },
+        lead=lead_status(newest.get(PLANNER)),
+        network=impairments(fleet),
+        pace=pace(),
+        security=security,
+        tools=tools_of(roster),
+        trouble=(*_trouble_of(fleet, infos), *recorder),
+        bus_faults=bus.describe({row.name: row.pid for row in infos if row.pid is not None}),
+    )
 
 
-def trouble_of(fleet: SupervisedFleet, services: Iterable[ServiceInfo]) -> tuple[str, ...]:
-    """Return what is wrong with supervision, logs and disk, a line each."""
+def _service_status(
+    info: ServiceInfo, age_s: float | None = None, rate_hz: float | None = None
+) -> ServiceStatus:
+    return ServiceStatus(
+        pid=info.pid,
+        state=info.state,
+        uptime_s=info.uptime_s,
+        age_s=age_s,
+        rate_hz=rate_hz,
+        restarts=info.restarts,
+        last_exit=info.last_exit,
+        real_time=_real_time(info),
+    )
+
+
+def _trouble_of(fleet: SupervisedFleet, services: Iterable[ServiceInfo]) -> tuple[str, ...]:
     fault = fleet.supervision_fault()
     lines = [fault] if fault else []
     lost, why = (0, "") if fault else fleet.lost_lines()  # it would only be waited for again
@@ -333,26 +322,24 @@ def impairments(fleet: SupervisedFleet) -> tuple[str, ...]:
 def module_status(
     state: Message | None, refusals: tuple[RefusedCommands, ...] = (), stopped_by: str = ""
 ) -> ModuleStatus:
-    """Return a module's mode and tier from the newest state of its joint service.
-
-    Args:
-        state: that state; None: it sends nothing now.
-        refusals: commands that it refuses.
-        stopped_by: who engaged its emergency stop, if one holds.
-    """
+    """Return a module's mode and tier from the newest state of its joint service."""
     if not isinstance(state, JointState):
-        return ModuleStatus(None, None, None, None, None, "")
-    mode, drive = state.mode, name_of(DriveStatus, state.drive)
-    outside = name_of(Outside, state.outside) if state.outside else ""
+        return ModuleStatus()
+    mode = state.mode
     knows = state.drive not in (DriveStatus.LOST, DriveStatus.UNZEROED)
-    q = state.q if knows else None
-    stiffened = state.stiffened and mode in (Mode.HOLD, Mode.DAMP)
-    tier = TIERS.get(Mode(mode)) if mode in tuple(Mode) else None
     return ModuleStatus(
-        name_of(Mode, mode), tier, name_of(Cause, state.cause), drive, q, remedy_of(state),
-        stiffened, outside, state.session, refusals,
-        stopped_by if state.cause == Cause.ESTOP else "",
-    )  # fmt: skip
+        mode=name_of(Mode, mode),
+        tier=TIERS.get(Mode(mode)) if mode in tuple(Mode) else None,
+        cause=name_of(Cause, state.cause),
+        drive=name_of(DriveStatus, state.drive),
+        q=state.q if knows else None,
+        way_out=remedy_of(state),
+        stiffened=state.stiffened and mode in (Mode.HOLD, Mode.DAMP),
+        outside=name_of(Outside, state.outside) if state.outside else "",
+        session=state.session,
+        refusals=refusals,
+        stopped_by=stopped_by if state.cause == Cause.ESTOP else "",
+    )
 
 
 def lead_status(message: Message | None) -> LeadStatus | None:

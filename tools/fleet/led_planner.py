@@ -39,15 +39,6 @@ class LedPlanner:
     """
 
     def __init__(self, session: Session, verb: str) -> None:
-        """Meet it.
-
-        Args:
-            session: of an operator.
-            verb: that asks; it stands in the planner's status.
-
-        Raises:
-            FleetError: it is silent, does not lead, or somebody else asks it for something.
-        """
         self._intents = session.publisher(topics.OPERATOR_INTENT, OperatorIntent)
         self._statuses = session.latest(topics.PLANNER_STATUS, PlannerStatus)
         self.source = f"xrl {verb} by {user_name()} ({os.getpid()})"
@@ -61,12 +52,12 @@ class LedPlanner:
         deadline = time.monotonic() + LEADS_S
         while (why := self.trouble()) and time.monotonic() < deadline:
             time.sleep(LOOK_S)
-            self.look()
+            self.listen()
         if why:
             raise FleetError(f"{why}; see `xrl status`")
 
-    def look(self) -> bool:
-        """Take a newer status, if there is one; return True if there was."""
+    def listen(self) -> bool:
+        """Receive a newer status; return True if there was one."""
         newer = self._statuses.take()
         if newer is not None:
             self.status, self._heard_ns = newer, now_ns()

@@ -52,11 +52,7 @@ def usual_pace() -> float:
 
 
 def check_pace(pace: float, *, simulated: bool) -> None:
-    """Refuse a pace that cannot be kept.
-
-    Raises:
-        FleetError: it is out of range, or the drives are real and know no slow motion.
-    """
+    """Refuse a pace that cannot be kept."""
     if not PACE_MIN <= pace <= 1.0:
         raise FleetError(f"--pace {pace:g}: {PACE_MIN:g} to 1 is right")
     if pace != 1.0 and not simulated:
@@ -64,18 +60,7 @@ def check_pace(pace: float, *, simulated: bool) -> None:
 
 
 def run_at_fitting_pace(run: Callable[[float], T], tell: Callable[[str], None]) -> T:
-    """Run at the default pace, and again at a slower one while the cores are full.
-
-    Args:
-        run: runs a fleet at a pace.
-        tell: takes a line of text each time the pace is lowered.
-
-    Returns:
-        The result of `run`. The pace found becomes the default of this process.
-
-    Raises:
-        CoresFullError: the cores do not carry the fleet at any pace.
-    """
+    """Run at the default pace, and again at a slower one while the cores are full."""
     while True:
         pace = usual_pace()
         try:
@@ -92,17 +77,16 @@ class IdleMeter:
     """Idle fraction of all cores over the last `WINDOW_S`."""
 
     def __init__(self) -> None:
-        """Take the first sample."""
-        self._looks: deque[tuple[float, int, int]] = deque()
-        self.look()
+        self._samples: deque[tuple[float, int, int]] = deque()
+        self.sample()
 
-    def look(self) -> float | None:
+    def sample(self) -> float | None:
         """Sample; return the idle fraction, or None until the window is full."""
         now_s = time.monotonic()
-        self._looks.append((now_s, *idle_and_total()))
-        while len(self._looks) > 1 and now_s - self._looks[1][0] >= WINDOW_S:
-            self._looks.popleft()
-        begin_s, *before = self._looks[0]
+        self._samples.append((now_s, *idle_and_total()))
+        while len(self._samples) > 1 and now_s - self._samples[1][0] >= WINDOW_S:
+            self._samples.popleft()
+        begin_s, *before = self._samples[0]
         return None if now_s - begin_s < WINDOW_S else idle_share((before[0], before[1]))
 
 

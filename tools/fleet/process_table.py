@@ -100,11 +100,42 @@ class ListenPoint(NamedTuple):
     """As Zenoh writes it: unixsock-stream/PATH or tcp/HOST:PORT."""
 
 
+class FleetOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """How a fleet is started, beside its robot file and its run directory."""
+
+    services: Collection[str] | None = None
+    """To start, whatever their rows say; None for all that the table starts by default."""
+    not_started: Collection[str] = ()
+    """Those that wait for `SupervisedFleet.start_service`."""
+    overrides: Mapping[str, Sequence[str]] = {}
+    """Further arguments of some services."""
+    no_restart: Collection[str] = ()
+    """Services that stay down when they end."""
+    simulation: bool = True
+    """False leaves the simulator out; where all drives are real it always is."""
+    injected: bool = False
+    """With the network proxy on the links of planner, joints and sensors."""
+    ros2: bool = False
+    """With the gateway to ROS 2."""
+    pace: float | None = None
+    """Clock rate of a simulated fleet; None: `usual_pace` if it is simulated, else 1."""
+    leashed: bool = False
+    """Stop the fleet if this process or the supervisor dies."""
+    disarmed: bool = False
+    """No person asks for this start. It arms no drive, takes those over that hold, and keeps an
+    emergency stop and the logs of what ended. If a service does not come up it ends nothing, which
+    would idle the drives of the others: the supervisor goes on trying."""
+    table_path: Path = TABLE
+    timeout_s: float = 30.0
+    """Time in which every service has to be up."""
+
+
 class FleetPlan(NamedTuple):
     """A fleet that is to be started."""
 
     config_path: Path
     """The robot file, absolute."""
+    options: FleetOptions
     processes: tuple[Process, ...]
     commands: dict[str, list[str]]
     """Arguments of each service, placeholders filled in."""
@@ -114,83 +145,81 @@ class FleetPlan(NamedTuple):
     """The services look for their drives on USB, and find emulated ones there."""
 
 
-def make_plan(
-    config_path: Path,
-    run_dir: Path,
-    *,
-    overrides: Mapping[str, Sequence[str]],
-    services: Collection[str] | None,
-    not_started: Collection[str] = (),
-    simulation: bool,
-    injected: bool = False,
-    ros2: bool = False,
-    table_path: Path,
-) -> FleetPlan:
-    """Return the processes to start; arguments as for `SupervisedFleet.start`.
-
-    Raises:
-        ConfigError: the robot file or the table cannot be used.
-        FleetError: a service is unknown, or the run directory's path is too long.
-        MissingPackageError: a service needs a package that is not installed.
-    """
+def make_plan(config_path: Path, run_dir: Path, options: FleetOptions) -> FleetPlan:
+    """Return the processes to start; refuse what cannot be started here."""
     path = Path(os.path.abspath(config_path))  # noqa: PTH100 - symlinks stay as they were given
     config = load(path)
-    table = load_table(table_path)
-    emulated = simulation and is_simulated(config)
-    rows = select(
-        table, simulation=emulated, injected=injected, imu=config.imu.fitted, ros2=ros2,
-        services=services,
-    )  # fmt: skip
-    check_known([*overrides, *not_started], [row.name for row in rows])
-    rows = tuple(
-        msgspec.structs.replace(row, autostart=row.autostart and row.name not in not_started)
-        for row in rows
-    )
-    check_run_dir(run_dir, config)
-    _require_packages(rows, config)
-    through = {pair.dials for pair in PAIRS} if injected else set()
+    table = load_table(options.table_path)
+    rows = _selected(table, config, options)
+    _check_lengths(run_dir, _listeners(table.process, config, run_dir))
+    on_usb = config.joint_service.driver == "odrive_usb"
+    for row in rows:
+        for extra in (row.extra, "usb" if row.kind == "joint" and on_usb else ""):
+            if extra:
+                require(extra)
+    through = {pair.dials for pair in PAIRS} if options.injected else set()
+    values = {PYTHON: sys.executable, CONFIG: str(path), RUN: str(run_dir)}
     commands = {
         row.name: [
-            *command_of(row, path, run_dir),
+            *(filled(word, values) for word in row.command),
             *(["--injected"] if row.name in through else []),
-            *overrides.get(row.name, ()),
+            *options.overrides.get(row.name, ()),
         ]
         for row in rows
     }
-    listeners = listeners_of(rows, config, run_dir)
-    usb = emulated and config.joint_service.driver == "odrive_usb"
-    return FleetPlan(path, rows, commands, listeners, table.environment, emulated_usb=usb)
+    return FleetPlan(
+        config_path=path,
+        options=options,
+        processes=rows,
+        commands=commands,
+        listeners=_listeners(rows, config, run_dir),
+        environment=table.environment,
+        emulated_usb=options.simulation and is_simulated(config) and on_usb,
+    )
 
 
-def _require_packages(rows: Iterable[Process], config: RobotConfig) -> None:
-    """Make sure that each service has its packages."""
-    for row in rows:
-        if row.extra:
-            require(row.extra)
-        if row.kind == "joint" and config.joint_service.driver == "odrive_usb":
-            require("usb")
+def _selected(
+    table: ProcessTable, config: RobotConfig, options: FleetOptions
+) -> tuple[Process, ...]:
+    """Return the rows of a fleet; refuse a name that the table or this fleet does not have."""
+    services, named = options.services or (), options.services is not None
+    check_known(services, [row.name for row in table.process])
+    if "imu" in services and not config.imu.fitted:
+        raise FleetError("imu: this robot has none; `fitted` of [imu] in the robot file says so")
+    if "ros2_gateway" in services and not options.ros2:
+        raise FleetError("ros2_gateway: it is started with --ros2; add that")
+    wanted = {
+        "": True, "simulation": options.simulation and is_simulated(config), "named": named,
+        "injected": options.injected, "imu": config.imu.fitted, "ros2": options.ros2,
+    }  # fmt: skip
+    rows = [
+        row for row in table.process if wanted[row.only] and (row.name in services or not named)
+    ]
+    check_known([*options.overrides, *options.not_started], [row.name for row in rows])
+    return tuple(
+        msgspec.structs.replace(
+            row, autostart=(named or row.autostart) and row.name not in options.not_started
+        )
+        for row in rows
+    )
 
 
 def load_table(path: Path = TABLE) -> ProcessTable:
-    """Read the process table, with one row for each service: `{module}` rows are six.
-
-    Raises:
-        ConfigError: the table cannot be read, or a service stands in it twice.
-    """
+    """Read the process table, with one row for each service: `{module}` rows are six."""
     table = read_toml(path, ProcessTable)
-    topics = [topic.name for topic in TOPICS]
     rows: list[Process] = []
     for index, row in enumerate(table.process):
         if not row.command:
             raise ConfigError(str(path), f"process[{index}].command", "empty", "a program to run")
-        if row.topic and row.topic not in topics:
-            right = f"one of {', '.join(topics)}"
-            raise ConfigError(str(path), f"process[{index}].topic", f"{row.topic!r}", right)
-        if row.extra and row.extra not in EXTRAS:
-            right = f"one of {', '.join(EXTRAS)}"
-            raise ConfigError(str(path), f"process[{index}].extra", f"{row.extra!r}", right)
+        for key, value, known in (
+            ("topic", row.topic, [topic.name for topic in TOPICS]),
+            ("extra", row.extra, list(EXTRAS)),
+        ):
+            if value and value not in known:
+                right = f"one of {', '.join(known)}"
+                raise ConfigError(str(path), f"process[{index}].{key}", f"{value!r}", right)
         _check_placeholders(path, index, row)
-        rows += _for_each_module(row) if row.name == MODULE else [row]
+        rows += [_of_module(row, module) for module in MODULES] if row.name == MODULE else [row]
     names = [row.name for row in rows]
     for name in names:
         if names.count(name) > 1:
@@ -210,6 +239,11 @@ def _check_placeholders(path: Path, index: int, row: Process) -> None:
             raise ConfigError(str(path), f"process[{index}].{key}", found, right)
 
 
+def _of_module(row: Process, module: str) -> Process:
+    command = tuple(filled(word, {MODULE: module}) for word in row.command)
+    return msgspec.structs.replace(row, name=module, command=command)
+
+
 def is_simulated(config: RobotConfig) -> bool:
     """Return True if any drive of this robot file is an emulated one.
 
@@ -219,63 +253,14 @@ def is_simulated(config: RobotConfig) -> bool:
     return any(config.can[name].interface == SIMULATED_CAN for name in config.buses)
 
 
-def select(
-    table: ProcessTable,
-    *,
-    simulation: bool,
-    injected: bool = False,
-    imu: bool = False,
-    ros2: bool = False,
-    services: Collection[str] | None = None,
-) -> tuple[Process, ...]:
-    """Return the rows of a fleet.
-
-    Args:
-        table: from `load_table`.
-        simulation: False leaves out the rows that are for a simulated robot only.
-        injected: False leaves out those that impair the network.
-        imu: False leaves out those of the IMU.
-        ros2: False leaves out the gateway to ROS 2.
-        services: names; each is then started at once, whatever its row says. None for all.
-
-    Raises:
-        FleetError: a name is not in the table, or of what this fleet is not to have.
-    """
-    check_known(services or (), [row.name for row in table.process])
-    if "imu" in (services or ()) and not imu:
-        raise FleetError("imu: this robot has none; `fitted` of [imu] in the robot file says so")
-    if "ros2_gateway" in (services or ()) and not ros2:
-        raise FleetError("ros2_gateway: it is started with --ros2; add that")
-    wanted = {
-        "": True, "simulation": simulation, "injected": injected, "imu": imu, "ros2": ros2,
-        "named": services is not None,
-    }  # fmt: skip
-    rows = [row for row in table.process if wanted[row.only]]
-    if services is None:
-        return tuple(rows)
-    return tuple(
-        msgspec.structs.replace(row, autostart=True) for row in rows if row.name in services
-    )
-
-
 def check_known(names: Iterable[str], known: Collection[str]) -> None:
-    """Refuse service names that are not among the known ones.
-
-    Raises:
-        FleetError: naming the first one, and all that are known.
-    """
+    """Refuse service names that are not among the known ones."""
     for name in names:
         if name not in known:
             raise FleetError(f"no service {name!r}; one of {', '.join(known)}")
 
 
-def command_of(process: Process, config_path: Path, run_dir: Path) -> list[str]:
-    """Return a row's command with its placeholders filled in."""
-    values = {PYTHON: sys.executable, CONFIG: str(config_path), RUN: str(run_dir)}
-    return [filled(word, values) for word in process.command]
-
-
-def listeners_of(
+def _listeners(
     processes: Iterable[Process], config: RobotConfig, run_dir: Path
 ) -> tuple[ListenPoint, ...]:
     """Return where these services will listen: on the bus, and the emulated drives' buses."""
@@ -300,21 +285,9 @@ def listeners_of(
     return tuple(listeners)
 
 
-def check_run_dir(run_dir: Path, config: RobotConfig) -> None:
-    """Refuse a run directory that is too long for the fleet's UNIX sockets.
-
-    Raises:
-        FleetError: naming the longest socket path.
-    """
-    here = security.services_here(config)
-    endpoints = [security.endpoint_here(config, name, here) for name in config.bus.endpoints]
-    paths = [expand(at.removeprefix(UNIX), run_dir) for at in endpoints if at.startswith(UNIX)]
-    paths += [
-        expand(bus.channel, run_dir)
-        for bus in config.can.values()
-        if bus.interface == SIMULATED_CAN
-    ]
-    paths += [expand(endpoint_through(pair), run_dir).removeprefix(UNIX) for pair in PAIRS]
+def _check_lengths(run_dir: Path, listeners: Iterable[ListenPoint]) -> None:
+    """Refuse a run directory that is too long for its UNIX sockets, of whoever listens or dials."""
+    paths = [at.endpoint.removeprefix(UNIX) for at in listeners if at.endpoint.startswith(UNIX)]
     # supervisord binds NAME.PID first, and renames it
     paths.append(f"{run_dir / SUPERVISOR_SOCKET}.4194304")
     excess = max(len(os.fsencode(path)) for path in paths) - SOCKET_PATH_MAX
@@ -326,11 +299,7 @@ def check_run_dir(run_dir: Path, config: RobotConfig) -> None:
 
 
 def check_free(listeners: Iterable[ListenPoint]) -> None:
-    """Refuse endpoints that another process listens on.
-
-    Raises:
-        FleetError: naming the service and the endpoint.
-    """
+    """Refuse endpoints that another process listens on."""
     for service, key, endpoint in listeners:
         if endpoint.startswith(UNIX):
             fault = "in use" if is_listening(endpoint) else ""
@@ -359,28 +328,27 @@ def services_elsewhere(config: RobotConfig, run_dir: Path) -> tuple[str, ...]:
 
 def is_listening(endpoint: str) -> bool:
     """Return True if some process listens on a bus endpoint."""
+    address: str | tuple[str, int]
     if endpoint.startswith(UNIX):
-        return _accepts(socket.AF_UNIX, endpoint.removeprefix(UNIX))
-    host, port = host_and_port(endpoint)
-    return _accepts(socket.AF_INET6 if ":" in host else socket.AF_INET, (host, port))
-
-
-def _for_each_module(row: Process) -> list[Process]:
-    return [
-        msgspec.structs.replace(
-            row,
-            name=module,
-            command=tuple(filled(word, {MODULE: module}) for word in row.command),
-        )
-        for module in MODULES
-    ]
+        family, address = socket.AF_UNIX, endpoint.removeprefix(UNIX)
+    else:
+        address = host_and_port(endpoint)
+        family = _family_of(address[0])
+    with socket.socket(family) as probe:
+        probe.settimeout(0.5)
+        try:
+            probe.connect(address)
+        except BlockingIOError:
+            return True  # its backlog is full: it listens, and is slow
+        except OSError:
+            return False
+    return True
 
 
 def _tcp_fault(endpoint: str) -> str:
     """Return why a service could not listen there, or nothing."""
     host, port = host_and_port(endpoint)
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(family) as probe:
+    with socket.socket(_family_of(host)) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((host, port))
@@ -393,13 +361,5 @@ def _tcp_fault(endpoint: str) -> str:
     return ""
 
 
-def _accepts(family: socket.AddressFamily, address: str | tuple[str, int]) -> bool:
-    with socket.socket(family) as probe:
-        probe.settimeout(0.5)
-        try:
-            probe.connect(address)
-        except BlockingIOError:
-            return True  # its backlog is full: it listens, and is slow
-        except OSError:
-            return False
-    return True
+def _family_of(host: str) -> socket.AddressFamily:
+    return socket.AF_INET6 if ":" in host else socket.AF_INET

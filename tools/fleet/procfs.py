@@ -16,9 +16,8 @@ from typing import NamedTuple
 from shared.bus.sockets import established
 from shared.run_directory import FLEET_VARIABLE
 
+_TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 _POLL_S = 0.05
-
-"""Environment variable that marks a fleet's processes; set by the supervisor only."""
 _SERVICE_VARIABLE = b"SUPERVISOR_PROCESS_NAME="
 """Set by supervisord: the service's name."""
 
@@ -89,34 +88,40 @@ def use_of(pids: Iterable[int]) -> dict[int, ProcessUse]:
     """Return what processes have used; one that has ended is left out."""
     found = {}
     for pid in pids:
-        try:
-            fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        except OSError:
-            continue
-        ticks, pages = int(fields[11]) + int(fields[12]), int(fields[21])
-        memory_mib = pages * os.sysconf("SC_PAGE_SIZE") / (1 << 20)
-        found[pid] = ProcessUse(ticks / os.sysconf("SC_CLK_TCK"), memory_mib)
+        fields = _stat(pid)
+        if fields:
+            ticks, pages = int(fields[11]) + int(fields[12]), int(fields[21])
+            memory_mib = pages * os.sysconf("SC_PAGE_SIZE") / (1 << 20)
+            found[pid] = ProcessUse(ticks / _TICKS_PER_S, memory_mib)
     return found
 
 
 def uptime_s(pid: int) -> float:
     """Return how long ago a process was started; 0 if it is gone."""
-    try:
-        fields = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()
-    except OSError:
+    fields = _stat(pid)
+    if not fields:
         return 0.0
-    booted_s = time.clock_gettime(time.CLOCK_BOOTTIME)
-    return max(0.0, booted_s - int(fields[19]) / os.sysconf("SC_CLK_TCK"))
+    return max(0.0, time.clock_gettime(time.CLOCK_BOOTTIME) - int(fields[19]) / _TICKS_PER_S)
 
 
 def is_suspended(pid: int) -> bool:
     """Return True if the process has been stopped by SIGSTOP."""
-    return _state(pid) == "T"
+    return _stat(pid)[:1] == ["T"]
 
 
 def is_gone(pid: int) -> bool:
     """Return True if the process has ended: its files, sockets and locks are closed."""
-    return _state(pid) in {"", "Z", "X"}
+    fields = _stat(pid)
+    return not fields or fields[0] in {"Z", "X"}
+
+
+def _stat(pid: int) -> list[str]:
+    """Return the kernel's fields of a process, its state first (proc(5)); none if it is gone."""
+    try:
+        text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return []
+    return text.rpartition(")")[2].split()  # the name before may hold anything
 
 
 def signal_all(pids: Iterable[int], number: int) -> None:
@@ -139,22 +144,3 @@ def wait_until_gone(run_dir: Path, timeout_s: float) -> set[int]:
         if not left or time.monotonic() > deadline:
             return left
         time.sleep(_POLL_S)
-
-
-def _state(pid: int) -> str:
-    """Return the kernel's letter for a process's state; empty if the process is gone."""
-    try:
-        fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return ""
-    return fields.rpartition(")")[2].split()[0]
-
-
-def cpu_s(pid: int) -> float | None:
-    """Return the CPU time of a process and its threads so far, s; None if it is gone."""
-    try:
-        text = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace")
-    except OSError:
-        return None
-    fields = text.rpartition(")")[2].split()  # the name before may hold anything
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")

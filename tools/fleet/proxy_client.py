@@ -29,31 +29,18 @@ class ProxyClient:
     """One question, one answer, one connection each."""
 
     def __init__(self, run_dir: Path) -> None:
-        """Name the fleet's run directory; nothing is opened yet."""
         self._path = run_dir / SOCKET
 
     def begin(self, inject: Inject, in_s: float = 0.0) -> tuple[RequestedImpairment, ...]:
-        """Start an impairment after a delay, s; return all impairments then.
-
-        Raises:
-            FleetError: there is no network proxy, or it refuses.
-        """
+        """Start an impairment after a delay, s; return all impairments then."""
         return self._ask(Begin(inject, in_s))
 
     def clear(self, link: str) -> tuple[RequestedImpairment, ...]:
-        """End every impairment of a link; return those that remain.
-
-        Raises:
-            FleetError: there is no network proxy, or the link is unknown.
-        """
+        """End every impairment of a link; return those that remain."""
         return self._ask(Clear(link))
 
     def list(self) -> tuple[RequestedImpairment, ...]:
-        """Return all impairments.
-
-        Raises:
-            FleetError: there is no network proxy.
-        """
+        """Return all impairments."""
         return self._ask(List())
 
     def _ask(self, request: Request) -> tuple[RequestedImpairment, ...]:

@@ -30,13 +30,7 @@ class CheckRow(NamedTuple):
 
 
 def check(robot: RobotConfig, domain: int, wait_s: float) -> list[CheckRow]:
-    """Look at the network as a node of it.
-
-    Args:
-        robot: its `ros2` names router, distribution and namespace.
-        domain: ROS_DOMAIN_ID.
-        wait_s: time in which router and node must be there.
-    """
+    """Look at the network as a node of it."""
     ros2, types = robot.ros2, RosTypes(robot.ros2.distribution)
     ros = _opened(ros2.router, domain, types, wait_s)
     if ros is None:

@@ -7,7 +7,6 @@ import fcntl
 import os
 import shlex
 import stat
-from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -79,11 +78,7 @@ class RunDir:
 
     @property
     def is_marked(self) -> bool:
-        """True for a directory that is this user's, and a fleet's.
-
-        Raises:
-            FleetError: the directory is there, and is not this user's.
-        """
+        """True for a directory that is this user's, and a fleet's."""
         check_own(self.path, alone=False)
         return self.marker.exists()
 
@@ -91,16 +86,6 @@ class RunDir:
         """Make the directory, or take one that is empty or a fleet's; mark and lock it.
 
         The supervisor inherits the descriptor, so the lock lives as long as it does.
-
-        Args:
-            alone: refuse a directory that others may write to.
-
-        Returns:
-            The descriptor that holds the lock.
-
-        Raises:
-            FleetError: a fleet is up here, the directory is not this user's alone, or it holds
-                files that are no fleet's.
         """
         while True:
             descriptor = self._open(alone=alone)
@@ -151,44 +136,27 @@ class RunDir:
         except FileNotFoundError:
             return False
 
-    def prepare(
-        self,
-        plan: FleetPlan,
-        pace: float = 1.0,
-        no_restart: Collection[str] = (),
-        *,
-        disarmed: bool = False,
-    ) -> None:
+    def prepare(self, plan: FleetPlan, pace: float = 1.0) -> None:
         """Start with empty logs and no dead sockets; write what supervisor and services read.
 
-        Args:
-            plan: of the fleet.
-            pace: clock rate.
-            no_restart: services that stay down when they end.
-            disarmed: no person asks for this start: a drive that does not hold stays idle, an
-                emergency stop holds on, and the logs of what ended are kept. A disk that is nearly
-                full is no reason not to start.
-
-        Raises:
-            FleetError: the disk is full, or cannot be written.
+        A disk that is nearly full is no reason for a disarmed start to fail: nobody looks on.
         """
         try:
-            self._prepare(plan, pace, no_restart, disarmed=disarmed)
+            self._prepare(plan, pace)
             free_mib = free_mib_at(self.path)
         except OSError as error:
             raise FleetError(
                 f"{self.path}: {error.strerror}: a fleet keeps its sockets, shared memory and "
                 "logs there; free some space, or give another directory with --run-dir"
             ) from None
-        if free_mib < SPACE_MIN_MIB and not disarmed:
+        if free_mib < SPACE_MIN_MIB and not plan.options.disarmed:
             raise FleetError(
                 f"{self.path}: {free_mib:.1f} MiB free, and a fleet needs {SPACE_MIN_MIB} MiB "
                 "there for sockets, shared memory and logs; free some, or give another --run-dir"
             )
 
-    def _prepare(
-        self, plan: FleetPlan, pace: float, no_restart: Collection[str], *, disarmed: bool
-    ) -> None:
+    def _prepare(self, plan: FleetPlan, pace: float) -> None:
+        disarmed = plan.options.disarmed
         self.pace.unlink(missing_ok=True)
         if pace != 1.0:
             self.pace.write_text(f"{pace:g}\n", encoding="ascii")
@@ -205,8 +173,7 @@ class RunDir:
             stop_s=max(row.stop_s for row in plan.processes),
         )
         self.manifest.write_bytes(msgspec.json.format(msgspec.json.encode(manifest)))
-        text = supervisor_config(self, plan, no_restart)
-        self.supervisor_config.write_text(text, encoding="utf-8")
+        self.supervisor_config.write_text(supervisor_config(self, plan), encoding="utf-8")
         for path in (*manifest.sockets, str(self.supervisor_socket)):
             _remove_socket(Path(path))
         if disarmed:
@@ -232,10 +199,6 @@ class RunDir:
         """Remove the fleet's files, and the directory itself if it is then empty.
 
         In a directory that is no fleet's nothing is removed.
-
-        Args:
-            keep_logs: leave the services' logs.
-            keep_stops: leave what the joint services' successors must know, such as a stop.
         """
         if not self.is_marked:
             return
@@ -253,7 +216,6 @@ class RunDir:
             self.path.rmdir()
 
     def _remove_logs(self) -> None:
-        """Remove the services' logs, and their folder if it is then empty."""
         with contextlib.suppress(OSError):  # none there, or it holds files of others
             for name in _LOGGED:
                 for ending in (".log", ".log.1", ".stderr"):
@@ -262,52 +224,35 @@ class RunDir:
 
 
 def free_mib_at(path: Path) -> float:
-    """Return the free space where a directory is, MiB.
-
-    Raises:
-        OSError: it cannot be read.
-    """
+    """Return the free space where a directory is, MiB."""
     found = os.statvfs(path)
     return found.f_bavail * found.f_frsize / (1 << 20)
 
 
-def supervisor_config(run: RunDir, plan: FleetPlan, no_restart: Collection[str]) -> str:
-    """Return supervisord's configuration.
-
-    Args:
-        run: the run directory.
-        plan: the processes, in the order of the start.
-        no_restart: services that stay down when they end.
-    """
-    sections: list[tuple[str, Mapping[str, object]]] = [
-        ("unix_http_server", {"file": run.supervisor_socket, "chmod": "0700"}),
-        (
-            "supervisord",
-            {
-                "logfile": run.supervisor_log,
-                "pidfile": run.supervisor_pid,
-                "nodaemon": "true",
-                "silent": "true",
-                "nocleanup": "true",
-                "minfds": FILES_MIN,
-            },
-        ),
-        (
-            "rpcinterface:supervisor",
-            {"supervisor.rpcinterface_factory": "supervisor.rpcinterface:make_main_rpcinterface"},
-        ),
-        (
-            "rpcinterface:xrl",  # tools.fleet.supervisor_process, which is the main module there
-            {"supervisor.rpcinterface_factory": "__main__:make_interface"},
-        ),
-    ]
+def supervisor_config(run: RunDir, plan: FleetPlan) -> str:
+    """Return supervisord's configuration; services start in the plan's order."""
+    factory = "supervisor.rpcinterface_factory"
+    sections: dict[str, dict[str, object]] = {
+        "unix_http_server": {"file": run.supervisor_socket, "chmod": "0700"},
+        "supervisord": {
+            "logfile": run.supervisor_log,
+            "pidfile": run.supervisor_pid,
+            "nodaemon": "true",
+            "silent": "true",
+            "nocleanup": "true",
+            "minfds": FILES_MIN,
+        },
+        "rpcinterface:supervisor": {factory: "supervisor.rpcinterface:make_main_rpcinterface"},
+        # of tools.fleet.supervisor_process, which is the main module there
+        "rpcinterface:xrl": {factory: "__main__:make_interface"},
+    }
     for priority, row in enumerate(plan.processes):
-        restarts = row.name not in no_restart
-        settings = {
+        restarts = row.name not in plan.options.no_restart
+        sections[f"program:{row.name}"] = {
             "command": shlex.join(plan.commands[row.name]),
             "priority": priority,
-            "autostart": _word(row.autostart),
-            "autorestart": _word(restarts),
+            "autostart": str(row.autostart).lower(),
+            "autorestart": str(restarts).lower(),
             "startsecs": row.settle_s,
             "startretries": _NEVER_GIVE_UP if restarts else 0,
             "stopsignal": row.stop_signal,
@@ -319,17 +264,11 @@ def supervisor_config(run: RunDir, plan: FleetPlan, no_restart: Collection[str])
             "stdout_logfile_maxbytes": "5MB",
             "stdout_logfile_backups": 1,
         }
-        sections.append((f"program:{row.name}", settings))
-    return "\n".join(_section(name, settings) for name, settings in sections)
-
-
-def _section(name: str, settings: Mapping[str, object]) -> str:
-    lines = [f"{key}={value}".replace("%", "%%") for key, value in settings.items()]
-    return "\n".join([f"[{name}]", *lines, ""])
-
-
-def _word(value: bool) -> str:
-    return "true" if value else "false"
+    lines: list[str] = []
+    for name, settings in sections.items():
+        pairs = (f"{key}={value}".replace("%", "%%") for key, value in settings.items())
+        lines += [f"[{name}]", *pairs, ""]
+    return "\n".join(lines)
 
 
 def _remove_socket(path: Path) -> None:

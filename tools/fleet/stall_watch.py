@@ -46,7 +46,6 @@ class StallWatch:
     """The program beside a fleet, from `__enter__` to `__exit__`."""
 
     def __init__(self, path: Path) -> None:
-        """Take the file for the gaps; it is made."""
         self._path = path
 
     def __enter__(self) -> Self:
@@ -76,13 +75,6 @@ class StallWatch:
 def command(path: Path) -> list[str]:
     """Return the program's words; it ends with this process."""
     return [sys.executable, "-I", "-S", __file__, str(path), str(os.getpid())]
-
-
-def gaps_in(path: Path, from_ns: int = 0) -> list[Gap]:
-    """Return what was written, from a time on; a last line that is not whole is left out."""
-    lines = path.read_bytes().splitlines(keepends=True)
-    found = [_parsed(line) for line in lines if line.endswith(b"\n")]
-    return [gap for gap in found if gap.end_ns >= from_ns]
 
 
 def _parsed(line: bytes) -> Gap:

@@ -1,8 +1,10 @@
-"""A fleet's status as text and tables, for `xrl status` and `xrl hosts status`."""
+"""A fleet's status, processes and neighbours as text and tables."""
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Final, Literal, TypeVar
 
 from rich import box
 from rich.console import Group
@@ -10,12 +12,17 @@ from rich.table import Table
 from rich.text import Text
 
 from shared.bus.messages import DriveStatus, Refusal
+from tools.fleet import procfs
 from tools.fleet.fleet_status import OPEN, SILENT_PROXY, FleetStatus, LeadStatus
+from tools.fleet.procfs import ProcessUse
+from tools.fleet.supervisor_client import ServiceInfo
 from tools.guarded_streams import printable
-from tools.terminal import marked
+from tools.terminal import Console, marked
+
+K = TypeVar("K", bound=Hashable)
 
 _LABELS: Final = ("state", "last exit")
-GOOD_STATES: Final = ("running", "starting")
+_GOOD_STATES: Final = ("running", "starting")
 
 
 def describe_lead(lead: LeadStatus | None) -> str:
@@ -45,11 +52,11 @@ REMEDIES: Final = {
 
 def describe_refusals(status: FleetStatus) -> list[str]:
     """Return a line for each cause and sender of refused commands."""
-    found: dict[tuple[str, int], list[str]] = {}
-    for name, module in status.modules.items():
-        for row in module.refusals:
-            words = f"{name} {row.hz:.0f}/s"
-            found.setdefault((row.cause, row.session), []).append(words)
+    found = _gathered(
+        ((row.cause, row.session), f"{name} {row.hz:.0f}/s")
+        for name, module in status.modules.items()
+        for row in module.refusals
+    )
     return [
         f"refused, {cause}{f' of session {session}' if session else ''}: {', '.join(words)}; "
         f"{REMEDIES[cause]}"
@@ -59,39 +66,43 @@ def describe_refusals(status: FleetStatus) -> list[str]:
 
 def describe_ways_out(status: FleetStatus) -> list[str]:
     """Return a line for each way out of a state that a person must end, with its modules."""
-    found: dict[str, list[str]] = {}
-    for name, module in status.modules.items():
-        if module.way_out:
-            found.setdefault(module.way_out, []).append(name)
+    found = _gathered((module.way_out, name) for name, module in status.modules.items())
     return [
         f"{', '.join(names)}: {words.replace('MODULE', names[0]) if len(names) == 1 else words}"
         for words, names in found.items()
+        if words
     ]
 
 
 def describe_stop(status: FleetStatus) -> list[str]:
     """Return a line for each source of an emergency stop that holds."""
-    found: dict[str, list[str]] = {}
-    for name, module in status.modules.items():
-        if module.stopped_by:
-            found.setdefault(module.stopped_by, []).append(name)
+    found = _gathered((module.stopped_by, name) for name, module in status.modules.items())
     return [
         f"emergency stop by {printable(source)}: {', '.join(names)}"
         for source, names in found.items()
+        if source
     ]
 
 
 def describe_sessions(status: FleetStatus) -> str:
     """Return what to say if the modules do not all follow the planner that is heard; else ""."""
     lead = status.lead.session if status.lead is not None else 0
-    others: dict[int, list[str]] = {}
-    for name, module in status.modules.items():
-        if module.session and lead and module.session != lead and module.mode is not None:
-            others.setdefault(module.session, []).append(name)
+    others = _gathered(
+        (module.session, name)
+        for name, module in status.modules.items()
+        if module.session and lead and module.session != lead and module.mode is not None
+    )
     return "; ".join(
         f"{', '.join(names)}: last followed session {session}, and the planner heard is {lead}"
         for session, names in others.items()
     )
+
+
+def _gathered(pairs: Iterable[tuple[K, str]]) -> dict[K, list[str]]:
+    found: dict[K, list[str]] = {}
+    for key, word in pairs:
+        found.setdefault(key, []).append(word)
+    return found
 
 
 def describe_real_time(status: FleetStatus) -> str:
@@ -116,26 +127,15 @@ def tables(status: FleetStatus) -> Group:
     services = Table(
         title=f"services in {status.run_dir}", title_justify="left", box=box.SIMPLE_HEAD
     )
-    services.add_column(
-        "service", no_wrap=True, min_width=max(map(len, status.services), default=0)
-    )
-    for heading in (
-        "state",
-        "pid",
-        "up s",
-        "age ms",
-        "rate Hz",
-        "restarts",
-        "last exit",
-    ):
-        words = heading in _LABELS
-        services.add_column(
-            heading, justify="left" if words else "right", no_wrap=heading != "last exit"
-        )
+    longest = max(map(len, status.services), default=0)
+    services.add_column("service", no_wrap=True, min_width=longest)
+    for heading in ("state", "pid", "up s", "age ms", "rate Hz", "restarts", "last exit"):
+        justify: Literal["left", "right"] = "left" if heading in _LABELS else "right"
+        services.add_column(heading, justify=justify, no_wrap=heading != "last exit")
     for name, row in status.services.items():
         services.add_row(
             name,
-            row.state if row.state in GOOD_STATES else Text(row.state, "bold red"),
+            _state_cell(row.state),
             "-" if row.pid is None else str(row.pid),
             f"{row.uptime_s:.0f}",
             "-" if row.age_s is None else f"{1e3 * row.age_s:.0f}",
@@ -147,36 +147,90 @@ def tables(status: FleetStatus) -> Group:
     for heading in ("module", "mode", "tier", "because", "drive", "phi", "theta"):
         modules.add_column(heading, no_wrap=True)
     for name, module in status.modules.items():
-        mode = module.mode or "silent"
-        if module.stiffened:
-            mode = f"{mode}, stiffened"
         drive = module.drive or "-"
-        angles = ("-", "-") if module.q is None else (f"{a:+.3f}" for a in module.q)
         modules.add_row(
             name,
-            mode,
+            f"{module.mode or 'silent'}{', stiffened' if module.stiffened else ''}",
             str(module.tier or "-"),
             module.cause or "",
             drive if drive == DriveStatus.ARMED.name else Text(drive, "bold red"),
-            *angles,
+            *(("-", "-") if module.q is None else (f"{a:+.3f}" for a in module.q)),
         )
+    return Group(services, modules, *_lines(status))
+
+
+def _lines(status: FleetStatus) -> Iterator[str | Text]:
+    red, yellow = " [bold red]{}[/]", " [bold yellow]{}[/]"
     way_out = "kill network_proxy" if SILENT_PROXY in status.network else "inject --clear"
-    line = marked(
-        "[bold yellow]impaired on purpose: {}[/] (xrl {})", "; ".join(status.network), way_out
+    impaired = f" [bold yellow]impaired on purpose: {{}}[/] (xrl {way_out})"
+    slow = f"in slow motion: the fleet's clock goes at {status.pace:g} of real time"
+    sections: tuple[tuple[str, Iterable[str]], ...] = (
+        (" {}", [describe_lead(status.lead)]),
+        (" [bold yellow]way out[/], {}", describe_ways_out(status)),
+        (red, [OPEN] if status.security == "open" else []),
+        (red, status.bus_faults),
+        (yellow, describe_stop(status)),
+        (" {}", [slow] if status.pace != 1.0 else []),
+        (impaired, ["; ".join(status.network)]),
+        (yellow, describe_refusals(status)),
+        (" linked: {}", [describe_tools(status)]),
+        (" [dim]{}[/]", [describe_real_time(status)]),
+        (yellow, [describe_sessions(status)]),
+        (red, status.trouble),
     )
-    slow = f" in slow motion: the fleet's clock goes at {status.pace:g} of real time"
-    lines: list[str | Text] = [f" {describe_lead(status.lead)}"]
-    lines += [marked(" [bold yellow]way out[/], {}", text) for text in describe_ways_out(status)]
-    lines += [marked(" [bold red]{}[/]", OPEN)] if status.security == "open" else []
-    lines += [marked(" [bold red]{}[/]", text) for text in status.bus_faults]
-    lines += [marked(" [bold yellow]{}[/]", text) for text in describe_stop(status)]
-    lines += [slow] if status.pace != 1.0 else []
-    lines += [line] if status.network else []
-    lines += [marked(" [bold yellow]{}[/]", text) for text in describe_refusals(status)]
-    lines += [f" linked: {describe_tools(status)}"] if status.tools else []
-    refused = describe_real_time(status)
-    lines += [Text(f" {refused}", "dim")] if refused else []
-    sessions = describe_sessions(status)
-    lines += [marked(" [bold yellow]{}[/]", sessions)] if sessions else []
-    lines += [marked(" [bold red]{}[/]", words) for words in status.trouble]
-    return Group(services, modules, *lines)
+    for template, texts in sections:
+        yield from (marked(template, text) for text in texts if text)
+
+
+def process_table(
+    services: Sequence[ServiceInfo],
+    before: Mapping[int, ProcessUse],
+    after: Mapping[int, ProcessUse],
+    window_s: float,
+) -> Table:
+    """Return one row for each process, and their sum; the window is of the machine's clock."""
+    table = Table(box=box.SIMPLE_HEAD, show_footer=True)
+    shares = {
+        pid: 100.0 * (use.cpu_s - before[pid].cpu_s) / window_s
+        for pid, use in after.items()
+        if pid in before
+    }
+    total, memory = sum(shares.values()), sum(use.memory_mib for use in after.values())
+    table.add_column("process", "all", no_wrap=True)
+    table.add_column("state", no_wrap=True)
+    for heading, footer in (
+        ("pid", ""), ("CPU % of a core", f"{total:.1f}"), ("MiB", f"{memory:.0f}"),
+        ("up s", ""), ("restarts", ""),
+    ):  # fmt: skip
+        table.add_column(heading, footer, justify="right", no_wrap=True)
+    for row in services:
+        pid = row.pid or 0
+        table.add_row(
+            row.name,
+            _state_cell(row.state),
+            str(row.pid or "-"),
+            f"{shares[pid]:.1f}" if pid in shares else "-",
+            f"{after[pid].memory_mib:.0f}" if pid in after else "-",
+            f"{row.uptime_s:.0f}",
+            str(row.restarts),
+        )
+    return table
+
+
+def _state_cell(state: str) -> str | Text:
+    return state if state in _GOOD_STATES else Text(state, "bold red")
+
+
+def warn_of_others(console: Console, own: Path | None = None) -> None:
+    """Print a line for each fleet that runs on this machine, but for one's own."""
+    for other in sorted(procfs.fleets()):
+        if own is None or Path(other) != own:
+            console.print(
+                marked(
+                    "[yellow]another fleet runs in {}: two do not fit on two cores, and drives "
+                    "of either may be lost; `xrl down --run-dir {}` stops it[/]",
+                    other,
+                    other,
+                ),
+                soft_wrap=True,
+            )

@@ -13,7 +13,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Self
 
@@ -24,6 +24,7 @@ from shared.exceptions import FleetError
 from shared.run_directory import FLEET_VARIABLE, check_own, private_files
 from tools.fleet import process_table, procfs
 from tools.fleet.pace import check_pace, usual_pace
+from tools.fleet.process_table import FleetOptions, FleetPlan, Process
 from tools.fleet.run_dir import FILES_MIN, Manifest, RunDir
 from tools.fleet.supervisor_client import RefusedError, ServiceInfo, Supervisor
 
@@ -31,6 +32,7 @@ _POLL_S = 0.1
 _KILLED_S = 5.0  # until the kernel has cleared away what SIGKILL has ended
 _FAILED = ("backoff", "exited", "fatal")
 _INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_BY_DEFAULT = FleetOptions()
 
 
 class SupervisedFleet:
@@ -43,45 +45,10 @@ class SupervisedFleet:
         self._process: subprocess.Popen[bytes] | None = None
 
     @classmethod
-    def start(
-        cls,
-        config_path: Path,
-        run_dir: Path,
-        *,
-        overrides: Mapping[str, Sequence[str]] | None = None,
-        no_restart: frozenset[str] = frozenset(),
-        services: Collection[str] | None = None,
-        not_started: Collection[str] = (),
-        simulation: bool = True,
-        injected: bool = False,
-        ros2: bool = False,
-        pace: float | None = None,
-        leashed: bool = False,
-        disarmed: bool = False,
-        table_path: Path = process_table.TABLE,
-        timeout_s: float = 30.0,
-    ) -> Self:
-        """Start the services and wait until every one is up.
+    def start(cls, config_path: Path, run_dir: Path, options: FleetOptions = _BY_DEFAULT) -> Self:
+        """Start the services of a robot file and wait until every one is up.
 
         If it is interrupted or fails, it stops the started services; the logs of a failure stay.
-
-        Args:
-            config_path: the robot file.
-            run_dir: for sockets and logs; made if it is not there.
-            overrides: further arguments for some services.
-            no_restart: services that stay down when they end.
-            services: to start; None for all that the table starts by default.
-            not_started: those that wait for `start_service`.
-            simulation: False leaves the simulator out; where all drives are real it always is.
-            injected: with the network proxy on the links of planner, joints and sensors.
-            ros2: with the gateway to ROS 2.
-            pace: clock rate of a simulated fleet; None: `usual_pace` if it is simulated, else 1.
-            leashed: stop the fleet if this process or the supervisor dies.
-            disarmed: for a start that no person asks for: it arms no drive, takes those over that
-                hold, keeps an emergency stop, and ends nothing if a service does not come up, for
-                the drives of the others would be idled: the supervisor goes on trying.
-            table_path: the process table.
-            timeout_s: time in which every service has to be up.
 
         Raises:
             ConfigError: the robot file or the table cannot be used.
@@ -90,43 +57,27 @@ class SupervisedFleet:
                 there is no C compiler.
         """
         started = cls(run_dir)
-        plan = process_table.make_plan(
-            config_path,
-            started.run.path,
-            overrides=overrides or {},
-            services=services,
-            not_started=not_started,
-            simulation=simulation,
-            injected=injected,
-            ros2=ros2,
-            table_path=table_path,
-        )
-        process_table.check_known(no_restart, list(plan.commands))
+        plan = process_table.make_plan(config_path, started.run.path, options)
+        process_table.check_known(options.no_restart, list(plan.commands))
         simulated = "simulator" in plan.commands
-        clock_pace = pace if pace is not None else usual_pace() if simulated else 1.0
+        clock_pace = options.pace
+        if clock_pace is None:
+            clock_pace = usual_pace() if simulated else 1.0
         check_pace(clock_pace, simulated=simulated)
         files = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
         if 0 <= files < FILES_MIN:
             raise FleetError(f"{files} files may be open, and a fleet needs {FILES_MIN}: ulimit -n")
         lock = started.run.claim()
         try:
-            started._end_unsupervised(take_over=disarmed and not simulated)
-            started._start(plan, lock, clock_pace, no_restart, leashed, disarmed, timeout_s)
+            started._end_unsupervised(take_over=options.disarmed and not simulated)
+            started._start(plan, lock, clock_pace)
         finally:
             os.close(lock)
         return started
 
     @classmethod
     def attach(cls, run_dir: Path, *, warn: bool = True) -> Self:
-        """Return the fleet that is up in a run directory.
-
-        Args:
-            run_dir: the directory.
-            warn: log that its supervisor is dead, if it is.
-
-        Raises:
-            FleetError: none is.
-        """
+        """Return the fleet that is up in a run directory."""
         attached = cls(run_dir)
         run = attached.run
         check_own(run.path)
@@ -137,10 +88,10 @@ class SupervisedFleet:
                     f"{run.path}: {len(running)} processes of a fleet run, and its files are gone; "
                     "`xrl estop` stops the robot, `xrl down` ends them"
                 )
-            raise FleetError(f"no fleet is up in {run.path}; `xrl up` starts one")
+            raise _not_up(run)
         if fault := attached.supervision_fault():
             if not running:
-                raise FleetError(f"no fleet is up in {run.path}; `xrl up` starts one ({fault})")
+                raise _not_up(run, f" ({fault})")
             if warn:
                 log.get("xrl").warning("%s", fault)
         return attached
@@ -158,15 +109,11 @@ class SupervisedFleet:
         """Facts of the start: robot file, services, topics."""
         manifest = self.run.read_manifest()
         if manifest is None:
-            raise FleetError(f"no fleet is up in {self.run.path}; `xrl up` starts one")
+            raise _not_up(self.run)
         return manifest
 
     def info(self) -> list[ServiceInfo]:
-        """Return every service, in the order of the process table.
-
-        Raises:
-            FleetError: there is neither a supervisor nor a service.
-        """
+        """Return every service, in the order of the process table."""
         names = self.manifest.services
         try:
             return self._supervisor.info(names)
@@ -187,11 +134,7 @@ class SupervisedFleet:
         return procfs.service_pids(self.run.path)
 
     def kill(self, service: str, number: int = signal.SIGKILL) -> int:
-        """Send a signal to a service, at once, and return the process id it went to.
-
-        Raises:
-            FleetError: the service is unknown or has no process now.
-        """
+        """Send a signal to a service, at once, and return the process id it went to."""
         process_table.check_known([service], self.manifest.services)
         pid = self.pids().get(service)
         if pid is None:
@@ -213,9 +156,6 @@ class SupervisedFleet:
 
         A person has requested it, so a drive that lost torque is armed again
         (`services.joint.rearm_guard`). A suspended service is continued.
-
-        Raises:
-            FleetError: the service is unknown, or cannot be started.
         """
         process_table.check_known([service], self.manifest.services)
         pid = self.pids().get(service)
@@ -239,9 +179,6 @@ class SupervisedFleet:
         Each gets its own signal first, a suspended one too, and SIGKILL if it does not end in its
         time. Without a fleet it does nothing. Only the logs, if wanted, and files that are not the
         fleet's remain in the run directory.
-
-        Raises:
-            FleetError: a process survived SIGKILL.
         """
         self._end()
         if not self.run.is_marked:
@@ -255,26 +192,18 @@ class SupervisedFleet:
         finally:
             os.close(lock)
 
-    def _start(
-        self,
-        plan: process_table.FleetPlan,
-        lock: int,
-        clock_pace: float,
-        no_restart: frozenset[str],
-        leashed: bool,
-        disarmed: bool,
-        timeout_s: float,
-    ) -> None:
+    def _start(self, plan: FleetPlan, lock: int, clock_pace: float) -> None:
+        disarmed = plan.options.disarmed
         try:
             process_table.check_free(plan.listeners)
             with private_files():
-                self.run.prepare(plan, clock_pace, no_restart, disarmed=disarmed)
+                self.run.prepare(plan, clock_pace)
             environment = dict(plan.environment)
             if plan.emulated_usb:
                 environment |= usb_standin.prepare(self.run.path)
-            self._launch(environment, lock, leashed=leashed)
+            self._launch(environment, lock, leashed=plan.options.leashed)
             try:
-                self._wait_until_up(plan, timeout_s)
+                self._wait_until_up(plan)
             except FleetError as error:
                 if not (disarmed and self._is_supervised):
                     raise
@@ -291,14 +220,7 @@ class SupervisedFleet:
         return self._process is not None and self._process.poll() is None
 
     def _end_unsupervised(self, *, take_over: bool) -> None:
-        """End the services that a dead supervisor has left here, if their drives then hold.
-
-        Args:
-            take_over: the services that start now take over the drives that hold meanwhile.
-
-        Raises:
-            FleetError: they are not to end, or do not.
-        """
+        """End the services that a dead supervisor has left here, if their drives then hold."""
         left = procfs.fleet_pids(self.run.path)
         if not left:
             return
@@ -309,23 +231,18 @@ class SupervisedFleet:
             )
         procfs.signal_all(left, signal.SIGCONT)
         procfs.signal_all(left, signal.SIGTERM)  # by which a drive goes on holding
-        left = procfs.wait_until_gone(self.run.path, _KILLED_S)
-        procfs.signal_all(left, signal.SIGKILL)
-        if procfs.wait_until_gone(self.run.path, _KILLED_S):
-            raise FleetError(f"processes {sorted(left)} do not end, not even by SIGKILL")
+        self._wait_or_kill(_KILLED_S)
 
     def _clear(self, *, keep_logs: bool, keep_stops: bool) -> None:
-        """Remove the fleet's files from the run directory."""
         usb_standin.clear(self.run.path)
         self.run.clear(keep_logs=keep_logs, keep_stops=keep_stops)
 
     def _end(self) -> None:
-        """End every process of the fleet."""
         manifest = self.run.read_manifest() if self.run.is_marked else None
         procfs.signal_all(procfs.fleet_pids(self.run.path), signal.SIGCONT)
         try:
             if manifest is None:
-                raise FleetError(f"no fleet is up in {self.run.path}")
+                raise _not_up(self.run)
             self._supervisor.call("supervisor.stopAllProcesses", False)  # all at once,
             self._supervisor.call("supervisor.shutdown")  # which by itself goes one by one
         except FleetError:
@@ -333,6 +250,10 @@ class SupervisedFleet:
             # (SIGINT: a joint service then leaves its drive idle)
             procfs.signal_all(procfs.fleet_pids(self.run.path), signal.SIGINT)
         patience_s = (manifest.stop_s if manifest else 0.0) + 2.0
+        self._wait_or_kill(patience_s)
+
+    def _wait_or_kill(self, patience_s: float) -> None:
+        """Wait until every process of the fleet has ended; kill those that have not in time."""
         left = procfs.wait_until_gone(self.run.path, patience_s)
         if left:
             procfs.signal_all(left, signal.SIGKILL)
@@ -345,34 +266,23 @@ class SupervisedFleet:
 
     def _launch(self, environment: Mapping[str, str], lock: int, *, leashed: bool) -> None:
         leash = ["--parent", str(os.getpid())] if leashed else []
-        command = [
-            sys.executable,
-            "-m",
-            "tools.fleet.supervisor_process",
-            *leash,
-            "--",
-            "--nodaemon",
-        ]
-        command += ["--configuration", str(self.run.supervisor_config)]
-        marked = {**os.environ, **environment, FLEET_VARIABLE: str(self.run.path)}
+        command = [sys.executable, "-m", "tools.fleet.supervisor_process", *leash, "--"]
+        command += ["--nodaemon", "--configuration", str(self.run.supervisor_config)]
         # An interrupt between fork and exec would leave a process that nobody can find;
         # `tools.fleet.supervisor_process` unblocks in the child.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, _INTERRUPTS)
-        try:
-            with private_files(), self.run.supervisor_stderr.open("wb") as output:
-                self._process = subprocess.Popen(
-                    command,
-                    env=marked,
-                    stdin=subprocess.DEVNULL,
-                    stdout=output,
-                    stderr=output,
-                    start_new_session=True,  # Ctrl-C in the terminal is for us alone
-                    pass_fds=(lock,),
-                )
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        with _uninterrupted(), private_files(), self.run.supervisor_stderr.open("wb") as output:
+            self._process = subprocess.Popen(
+                command,
+                env={**os.environ, **environment, FLEET_VARIABLE: str(self.run.path)},
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                start_new_session=True,  # Ctrl-C in the terminal is for us alone
+                pass_fds=(lock,),
+            )
 
-    def _wait_until_up(self, plan: process_table.FleetPlan, timeout_s: float) -> None:
+    def _wait_until_up(self, plan: FleetPlan) -> None:
+        timeout_s = plan.options.timeout_s
         endpoints = {  # of a service that listens twice the first: its socket
             item.service: item.endpoint
             for item in reversed(plan.listeners)
@@ -396,11 +306,7 @@ class SupervisedFleet:
                 raise FleetError(f"{words}\n{_tail(log)}".rstrip())
 
     def _info_or_none(self) -> list[ServiceInfo]:
-        """Return every service; none while the supervisor is still starting.
-
-        Raises:
-            FleetError: the supervisor has ended.
-        """
+        """Return every service; none while the supervisor is still starting."""
         if self._process is not None and self._process.poll() is not None:
             words = _tail(self.run.supervisor_stderr) or _tail(self.run.supervisor_log)
             raise FleetError(f"supervisord has ended while starting\n{words}".rstrip())
@@ -419,17 +325,20 @@ class SupervisedFleet:
         return f"{service.name} ended at once ({how}); {log}:\n{words}".rstrip()
 
 
+def _not_up(run: RunDir, why: str = "") -> FleetError:
+    return FleetError(f"no fleet is up in {run.path}; `xrl up` starts one{why}")
+
+
 def _unsupervised(name: str, pid: int | None) -> ServiceInfo:
     """Return what the kernel knows of a service whose supervisor is dead."""
     if pid is None:
-        return ServiceInfo(name, None, "gone", 0.0, 0, "")
+        return ServiceInfo(name, None, "gone", 0.0)
     state = "suspended" if procfs.is_suspended(pid) else "unsupervised"
-    return ServiceInfo(name, pid, state, procfs.uptime_s(pid), 0, "")
+    return ServiceInfo(name, pid, state, procfs.uptime_s(pid))
 
 
 @contextlib.contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Hold back interrupts while the started services are stopped."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _INTERRUPTS)
     try:
         yield
@@ -437,14 +346,13 @@ def _uninterrupted() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _is_up(row: process_table.Process, service: ServiceInfo, endpoint: str | None) -> bool:
+def _is_up(row: Process, service: ServiceInfo, endpoint: str | None) -> bool:
     if row.ready == "running" or endpoint is None:
         return service.state == "running"
     return service.pid is not None and process_table.is_listening(endpoint)
 
 
 def _tail(log: Path, lines: int = 5) -> str:
-    """Return the last lines of a log, indented."""
     with contextlib.suppress(OSError):
         text = log.read_text(encoding="utf-8", errors="replace").rstrip()
         return "\n".join(f"  {line}" for line in text.splitlines()[-lines:])

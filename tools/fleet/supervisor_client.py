@@ -35,9 +35,9 @@ class ServiceInfo(msgspec.Struct, frozen=True):
     unsupervised, suspended or gone."""
     uptime_s: float
     """Since its start; 0 while it has no process."""
-    restarts: int
+    restarts: int = 0
     """Starts since the first one, wanted or not."""
-    last_exit: str
+    last_exit: str = ""
     """How it ended last, for example "terminated by SIGKILL"; empty if it never has."""
     last_line: str = ""
     """Newest line of its log, also if no disk took it."""
@@ -64,12 +64,7 @@ class Supervisor:
         return answer["lost"], answer["why"]
 
     def call(self, method: str, *arguments: object) -> Any:
-        """Call the supervisor; the method has its namespace, `supervisor` or `xrl`.
-
-        Raises:
-            FleetError: it does not answer.
-            RefusedError: it refuses the request.
-        """
+        """Call the supervisor; the method has its namespace, `supervisor` or `xrl`."""
         transport = _Transport(self._run.supervisor_socket)
         try:
             with xmlrpc.client.ServerProxy("http://localhost", transport=transport) as proxy:

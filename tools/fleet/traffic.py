@@ -7,6 +7,8 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Final
 
 import msgspec
+from rich import box
+from rich.table import Table
 
 from shared.bus.session import Session
 from shared.bus.topics import several_may_write
@@ -37,12 +39,6 @@ class KeyTraffic:
     """
 
     def __init__(self, key: TopicKey, *, here: bool = True) -> None:
-        """Begin with nothing received.
-
-        Args:
-            key: of the messages.
-            here: their sender is on this host, and has its clock.
-        """
         self.key = key
         self._here = here
         self._counted = KeyCount(several=several_may_write(f"xrl/robot/{key.name}"))
@@ -101,13 +97,6 @@ class Traffic:
     def __init__(
         self, session: Session, keys: Iterable[TopicKey], elsewhere: Collection[str] = ()
     ) -> None:
-        """Subscribe.
-
-        Args:
-            session: on the bus.
-            keys: to receive.
-            elsewhere: services on other hosts; where there are any, so may the tools be.
-        """
         self.keys = {
             key.topic.key(session.robot, key.module): KeyTraffic(
                 key, here=not elsewhere or sender_of(key.topic, key.module) not in {"", *elsewhere}
@@ -117,12 +106,7 @@ class Traffic:
         self._stream = session.stream(list(self.keys))
 
     def listen(self, seconds: float, left: Callable[[], bool] = lambda: False) -> float:
-        """Receive one window; return how long it was, s.
-
-        Args:
-            seconds: of the machine's clock.
-            left: ends it before.
-        """
+        """Receive one window; return how long it was, s."""
         for traffic in self.keys.values():
             traffic.begin()
         began = time.monotonic()
@@ -137,3 +121,32 @@ class Traffic:
 def rate_hz(traffic: KeyTraffic, window_s: float) -> float:
     """Return messages per second of a window."""
     return traffic.count / window_s if window_s > 0.0 else 0.0
+
+
+def traffic_table(traffic: Traffic, window_s: float, *, only_seen: bool = False) -> Table:
+    """Return one row for each key; the window is in s of the fleet's clock."""
+    table = Table(box=box.SIMPLE_HEAD)
+    table.add_column("topic", no_wrap=True)
+    for heading in ("Hz", "apart ms", "age ms", "bytes", "kB/s", "lost"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for one in traffic.keys.values():
+        if one.count or not only_seen:
+            table.add_row(one.key.name, *_cells(one, window_s))
+    return table
+
+
+def _cells(one: KeyTraffic, window_s: float) -> list[str]:
+    """Return rate and nominal rate, spacing and age (median, largest), size, flow and losses."""
+    nominal = f"/{one.key.topic.rate_hz:g}" if one.key.topic.rate_hz else ""
+    return [
+        f"{rate_hz(one, window_s):.0f}{nominal}" if one.count else f"-{nominal}",
+        _two(one.gaps_ms),
+        _two(one.ages_ms),
+        f"{one.size / one.count:.0f}" if one.count else "-",
+        f"{one.size / window_s / 1e3:.1f}" if one.count else "-",
+        str(one.lost) if one.lost else "",
+    ]
+
+
+def _two(values: tuple[float, float] | None) -> str:
+    return "-" if values is None else f"{values[0]:.1f}/{values[1]:.1f}"

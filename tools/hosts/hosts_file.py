@@ -72,11 +72,7 @@ class Hosts(Section, frozen=True):
         return next(host for host in self.host if service in host.services)
 
     def named(self, names: tuple[str, ...]) -> tuple[Host, ...]:
-        """Return hosts by their names; all of them without any.
-
-        Raises:
-            ConfigError: there is none of a name.
-        """
+        """Return hosts by their names; all of them without any."""
         known = {host.name: host for host in self.host}
         for name in names:
             if name not in known:
@@ -85,11 +81,7 @@ class Hosts(Section, frozen=True):
 
 
 def load(path: Path, robot: RobotConfig) -> Hosts:
-    """Read and check a hosts file against the robot that runs on them.
-
-    Raises:
-        ConfigError: a key or value is not as it should be, or a service runs nowhere or twice.
-    """
+    """Read and check a hosts file against the robot that runs on them."""
     hosts = read_toml(path, Hosts)
     _check(str(path), hosts, robot)
     return hosts

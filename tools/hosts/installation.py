@@ -12,21 +12,22 @@ from shared.bus.credentials import NAMES
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError
-from tools.hosts import private_network
 from tools.hosts.hosts_file import Host, Hosts, principals_on
 from tools.hosts.layout import (
     KEYS,
+    LINK,
+    NETWORK_UNIT,
     ROBOT_FILE,
     RUN_DIR,
     SCHEDULE,
     UNIT,
+    network_unit,
     robot_on_hosts,
     unit,
 )
 from tools.hosts.probe import Probe, digest
 from tools.hosts.remote import ClockOffset, Remote
-from tools.keys.authority import Authority
-from tools.keys.bundle import bundle
+from tools.keys.authority import Authority, bundle
 
 CLOCK_MAX_S: Final = 1.0
 """Certificates and the names of records go by the clock; ages do not."""
@@ -63,11 +64,7 @@ class HostRow(NamedTuple):
 def files_of(
     hosts: Hosts, host: Host, robot: RobotConfig, schedule: bytes, authority: Authority | None
 ) -> list[HostFile]:
-    """Return what a host has to have; without an authority all but its keys.
-
-    Raises:
-        BusError: the authority has no certificate of a name.
-    """
+    """Return what a host has to have; without an authority all but its keys."""
     spread = robot_on_hosts(robot, hosts)
     folder = hosts.folder
     files = [
@@ -76,8 +73,8 @@ def files_of(
         HostFile(f"{_UNIT_FOLDER}/{UNIT}", unit(hosts, host).encode(), 0o644, False),
     ]
     if host.private:
-        text = private_network.unit(host).encode()
-        files.append(HostFile(f"{_UNIT_FOLDER}/{private_network.UNIT}", text, 0o644, False))
+        text = network_unit(host).encode()
+        files.append(HostFile(f"{_UNIT_FOLDER}/{NETWORK_UNIT}", text, 0o644, False))
     if authority is not None:
         keys = bundle(authority, principals_on(host))
         files += [HostFile(f"{folder}/{KEYS}/{n}", text, 0o600, True) for n, text in keys.items()]
@@ -85,26 +82,16 @@ def files_of(
 
 
 def update(hosts: Hosts, remote: Remote, files: list[HostFile], *, while_up: bool) -> str:
-    """Bring files to a host, and take away keys that it is not to have; a start takes them.
-
-    Args:
-        hosts: all of them.
-        remote: the host.
-        files: all that it is to have.
-        while_up: do so although its services are running.
-
-    Raises:
-        FleetError: the host is not reached, its services are running, or a file cannot be written.
-    """
+    """Bring files to a host, and take away keys that it is not to have; a start takes them."""
     if not while_up:
         why = "a service that crashes would come back with the new files beside the old"
         refuse_up(remote, why)
     state = _state(remote)
-    network_unit = f"{_UNIT_FOLDER}/{private_network.UNIT}"
-    if state in _AT_REST and remote.run("test", "-e", network_unit).code == 0:
+    network_file = f"{_UNIT_FOLDER}/{NETWORK_UNIT}"
+    if state in _AT_REST and remote.run("test", "-e", network_file).code == 0:
         # the next start makes the services' network as it is to be then
-        remote.must("systemctl", "stop", "--quiet", private_network.UNIT)
-        remote.must("rm", "-f", network_unit)
+        remote.must("systemctl", "stop", "--quiet", NETWORK_UNIT)
+        remote.must("rm", "-f", network_file)
     folder = hosts.folder
     keys = f"{folder}/{KEYS}"
     remote.must("install", "-d", "-m", "755", folder)
@@ -123,11 +110,7 @@ def update(hosts: Hosts, remote: Remote, files: list[HostFile], *, while_up: boo
 
 
 def refuse_up(remote: Remote, why: str) -> None:
-    """Refuse to go on while a host's services are up.
-
-    Raises:
-        FleetError: they are.
-    """
+    """Refuse to go on while a host's services are up."""
     state = _state(remote)
     if state not in _AT_REST:
         text = f"{remote.host.name}: its unit is {state}: {why}"
@@ -135,11 +118,7 @@ def refuse_up(remote: Remote, why: str) -> None:
 
 
 def check(hosts: Hosts, remote: Remote, files: list[HostFile]) -> HostRow:
-    """Look at a host, and compare it with what it has to have.
-
-    Raises:
-        FleetError: it is not reached, or has no checkout.
-    """
+    """Look at a host, and compare it with what it has to have."""
     python, config = f"{hosts.checkout}/.venv/bin/python", f"{hosts.folder}/{ROBOT_FILE}"
     # the module is found in the installed package, wherever the command starts
     words = ("-P", "-m", "tools.hosts.probe", "--config", config, "--run-dir", RUN_DIR)
@@ -155,14 +134,14 @@ def check(hosts: Hosts, remote: Remote, files: list[HostFile]) -> HostRow:
     if probe.schedule != wanted[SCHEDULE]:
         wrong.append("another gain schedule; `xrl hosts update`")
     wrong += _about_keys(probe, {Path(f.path).name: f.content for f in files if f.of_service})
-    for name in (UNIT, private_network.UNIT):
+    for name in (UNIT, NETWORK_UNIT):
         own_unit = remote.run("cat", f"{_UNIT_FOLDER}/{name}").out if name in wanted else ""
         if name in wanted and digest(own_unit.encode()) != wanted[name]:
             wrong.append(f"another {name}; `xrl hosts update`")
     state = _state(remote)
     if remote.host.private and state not in _AT_REST:
         inside = remote.run("cat", "/proc/net/dev", on_bus=True).out
-        outside = [n for n in (*remote.host.private, private_network.LINK) if f"{n}:" not in inside]
+        outside = [n for n in (*remote.host.private, LINK) if f"{n}:" not in inside]
         if outside:
             wrong.append(f"not in the services' network: {', '.join(outside)} (docs/hosts.md)")
     if not probe.revision:
@@ -173,41 +152,45 @@ def check(hosts: Hosts, remote: Remote, files: list[HostFile]) -> HostRow:
     if abs(clock.offset_s) > CLOCK_MAX_S + clock.round_trip_s:
         warnings.append(f"its clock is {clock.offset_s:+.1f} s off: certificates go by it")
     return HostRow(
-        remote.host.name, probe.revision, clock, state, (probe.lock, probe.python),
-        tuple(wrong), tuple(warnings),
-    )  # fmt: skip
+        name=remote.host.name,
+        revision=probe.revision,
+        clock=clock,
+        unit=state,
+        made_from=(probe.lock, probe.python),
+        wrong=tuple(wrong),
+        warnings=tuple(warnings),
+    )
 
 
 def _about_keys(probe: Probe, wanted: dict[str, bytes]) -> list[str]:
     """Return what is wrong with a host's keys against those that it is to have."""
-    told = []
+    wrong = []
     wanted_now = {name: digest(content) for name, content in wanted.items()}
     other = sorted(n for n, found in wanted_now.items() if probe.keys.get(n) != found)
     extra = sorted(set(probe.keys) - set(wanted))
     if NAMES in other:
-        told.append("lets in other generations than the authority; `xrl hosts update`")
+        wrong.append("lets in other generations than the authority; `xrl hosts update`")
         other.remove(NAMES)
     if other:
-        told.append(f"other keys than the authority's: {', '.join(other)}; `xrl hosts update`")
+        wrong.append(f"other keys than the authority's: {', '.join(other)}; `xrl hosts update`")
     if wanted and extra:
-        told.append(f"keys that it is not to have: {', '.join(extra)}; `xrl hosts update`")
-    return told
+        wrong.append(f"keys that it is not to have: {', '.join(extra)}; `xrl hosts update`")
+    return wrong
 
 
 def _state(remote: Remote) -> str:
-    """Return the state of a host's unit by systemd."""
     return remote.run("systemctl", "is-active", UNIT).out.strip() or "no systemd"
 
 
 def disagreements(rows: list[HostRow]) -> list[str]:
     """Return what is not the same on all hosts that were reached."""
-    told = []
+    wrong = []
     for word, value_of in _SAME_ON_ALL.items():
         found = {row.name: value_of(row) for row in rows if row.clock is not None}
         if len(set(found.values())) > 1:
             rest = ", ".join(f"{name} {value or 'none'}" for name, value in found.items())
-            told.append(f"several {word}: {rest}")
-    return told
+            wrong.append(f"several {word}: {rest}")
+    return wrong
 
 
 _SAME_ON_ALL: Final[dict[str, Callable[[HostRow], str]]] = {

@@ -24,8 +24,8 @@ from shared.exceptions import XrlError
 from shared.places import CHECKOUT, IS_CHECKOUT
 from shared.revision import UNKNOWN, code
 from tools.fleet.run_dir import SUPERVISOR_PID
-from tools.keys.bundle import held_files
-from tools.keys.inspection import look
+from tools.keys.authority import held_files
+from tools.keys.inspection import inspect_keys
 
 FREE_MIB: Final = 4096
 """Less is warned of: an hour of records is 2.4 GiB."""
@@ -52,17 +52,12 @@ class Probe(msgspec.Struct, frozen=True):
 
 
 def probe(config: Path, run_dir: Path) -> Probe:
-    """Look at this host.
-
-    Args:
-        config: robot file.
-        run_dir: of the fleet that runs here, if one does.
-    """
+    """Look at this host."""
     wrong, warnings, keys = [], [], dict[str, str]()
     try:
         robot = config_file.load(config)
         folder = keys_folder(robot)
-        for row in look(folder, robot):
+        for row in inspect_keys(folder, robot):
             wrong += [f"{row.name}: {row.wrong}"] if row.wrong else []
             warnings += [f"{row.name}: {row.warning}"] if row.warning else []
         keys = {name: _hash_of(folder / name) for name in (NAMES, *held_files(folder))}

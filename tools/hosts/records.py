@@ -22,11 +22,7 @@ _PACK: Final = 'tar --warning=no-file-changed -cf - -C "$1" -- "$2"; [ $? -le 1 
 
 
 def newest(remote: Remote) -> str:
-    """Return the name of a host's newest record.
-
-    Raises:
-        FleetError: it has none, or is not reached.
-    """
+    """Return the name of a host's newest record."""
     listed = remote.must("find", RECORDS, "-name", "*.mcap", "-printf", "%T@ %h\\n", as_user=True)
     rows = [found for line in listed.splitlines() if (found := _DATED.fullmatch(line))]
     if not rows:
@@ -35,35 +31,14 @@ def newest(remote: Remote) -> str:
 
 
 def since(remote: Remote, wall_s: float) -> list[str]:
-    """Return the names of a host's records that were written to after a time.
-
-    Args:
-        remote: the host.
-        wall_s: s since 1970.
-
-    Raises:
-        FleetError: the host is not reached, or has no records.
-    """
+    """Return the names of a host's records that were written to after a time."""
     words = ("find", RECORDS, "-name", "*.mcap", "-newermt", f"@{wall_s:.0f}", "-printf", "%h\\n")
     listed = remote.must(*words, as_user=True)
     return sorted({_name_in(remote, line) for line in listed.splitlines() if line})
 
 
 def fetch(remote: Remote, name: str, into: Path) -> Path:
-    """Bring one record here; what is still being written comes as far as it is.
-
-    Args:
-        remote: the host.
-        name: of the record's folder there.
-        into: folder for the records of this host.
-
-    Returns:
-        The record's folder here.
-
-    Raises:
-        FleetError: the host is not reached.
-        RunError: it cannot be written here.
-    """
+    """Bring one record here; what is still being written comes as far as it is."""
     try:
         into.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=into) as packed:
@@ -82,28 +57,12 @@ def is_fleets(remote: Remote) -> bool:
 
 
 def fleets_run(folder: Path) -> RunIndex:
-    """Return the fleet's newest run in a folder: a recorder that was killed begins another.
-
-    Raises:
-        RunError: it holds none that can be read.
-    """
+    """Return the fleet's newest run in a folder: a recorder that was killed begins another."""
     return RunIndex(folder, runs_in(folder)[-1])
 
 
 def join_fetched(fleets: RunIndex, hosts: list[Path], out: Path) -> tuple[int, list[str]]:
-    """Join what was fetched.
-
-    Args:
-        fleets: the fleet's record.
-        hosts: folders of single hosts' records.
-        out: folder for the joined run.
-
-    Returns:
-        How many messages the fleet's record gained, and why some records were left out.
-
-    Raises:
-        RunError: the joined run cannot be written.
-    """
+    """Join what was fetched."""
     records: list[HostRecord] = []
     left_out: list[str] = []
     for folder in hosts:

@@ -8,12 +8,12 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from typing import BinaryIO, Final, NamedTuple, TypeVar
+from typing import BinaryIO, Final, NamedTuple, TypedDict, TypeVar, Unpack
 
 from shared.exceptions import FleetError
 from tools.guarded_streams import printable
 from tools.hosts.hosts_file import Host, Hosts
-from tools.hosts.private_network import IP, NAMESPACE
+from tools.hosts.layout import IP, NAMESPACE
 
 R = TypeVar("R")
 
@@ -38,6 +38,18 @@ class ClockOffset(NamedTuple):
     """Shortest of `ECHOES`; half of it bounds the offset's error."""
 
 
+class Manner(TypedDict, total=False):
+    """How a command runs on a host."""
+
+    content: bytes
+    """For its standard input."""
+    as_user: bool
+    """As the user who runs the services, not as the one who logs in."""
+    on_bus: bool
+    """It talks to the services: in their network, where that is their own."""
+    timeout_s: float
+
+
 class Remote:
     """One host, by ssh."""
 
@@ -48,69 +60,43 @@ class Remote:
         # from a folder that every user may enter: find and others go back to where they began
         self._as_user = ["env", "-C", "/", "runuser", "-u", hosts.user, "--"]
 
-    def run(
-        self,
-        *words: str,
-        content: bytes = b"",
-        as_user: bool = False,
-        on_bus: bool = False,
-        timeout_s: float = TIMEOUT_S,
-    ) -> Said:
-        """Run a command and wait for it.
-
-        Args:
-            words: the command; no shell takes them apart.
-            content: for its standard input.
-            as_user: as the user who runs the services, not as the one who logs in.
-            on_bus: it talks to the services: in their network, where that is their own.
-            timeout_s: time in which it has to end.
+    def run(self, *words: str, **manner: Unpack[Manner]) -> Said:
+        """Run a command, which no shell takes apart, and wait for it.
 
         Raises:
-            FleetError: the host is not reached, or the command does not end.
+            FleetError: the host is not reached, or the command does not end in time.
         """
-        before = [*(self._in_network if on_bus else []), *(self._as_user if as_user else [])]
+        timeout_s = manner.get("timeout_s", TIMEOUT_S)
+        before = [
+            *(self._in_network if manner.get("on_bus") else []),
+            *(self._as_user if manner.get("as_user") else []),
+        ]
         command = [*self._begin, shlex.join([*before, *words])]
         name = self.host.name
         try:
             done = subprocess.run(
-                command, input=content, capture_output=True, timeout=timeout_s, check=False
-            )
+                command, input=manner.get("content", b""), capture_output=True, timeout=timeout_s,
+                check=False,
+            )  # fmt: skip
         except subprocess.TimeoutExpired:
             raise FleetError(f"{name}: {words[0]}: no end after {timeout_s:g} s") from None
         except OSError as error:
             raise FleetError(f"{name}: {command[0]}: {error.strerror}") from None
-        told = done.stderr.decode(errors="replace").strip()
+        errors = done.stderr.decode(errors="replace").strip()
         if done.returncode == 255:  # ssh's own
-            raise FleetError(f"{name}: {self.host.ssh} is not reached: {_last(told)}")
-        return Said(done.returncode, done.stdout.decode(errors="replace"), told)
+            raise FleetError(f"{name}: {self.host.ssh} is not reached: {_last(errors)}")
+        return Said(done.returncode, done.stdout.decode(errors="replace"), errors)
 
-    def must(
-        self,
-        *words: str,
-        content: bytes = b"",
-        as_user: bool = False,
-        on_bus: bool = False,
-        timeout_s: float = TIMEOUT_S,
-    ) -> str:
-        """Run a command that has to succeed, and return what it printed.
-
-        Raises:
-            FleetError: it failed, or as `run`.
-        """
-        said = self.run(
-            *words, content=content, as_user=as_user, on_bus=on_bus, timeout_s=timeout_s
-        )
+    def must(self, *words: str, **manner: Unpack[Manner]) -> str:
+        """Run a command that has to succeed, and return what it printed."""
+        said = self.run(*words, **manner)
         if said.code != 0:
             why = _last(said.error) or f"exit status {said.code}"
             raise FleetError(f"{self.host.name}: {shlex.join(words)[:120]}: {why}")
         return said.out
 
     def fetch(self, *words: str, into: BinaryIO) -> None:
-        """Run a command as the services' user, and put what it prints into a file.
-
-        Raises:
-            FleetError: it failed, or the host is not reached; the file has what came until then.
-        """
+        """Run a command as the services' user, and put what it prints into a file."""
         command = [*self._begin, shlex.join([*self._as_user, *words])]
         try:
             done = subprocess.run(command, stdout=into, stderr=subprocess.PIPE, check=False)
@@ -121,11 +107,7 @@ class Remote:
             raise FleetError(f"{self.host.name}: {words[0]}: {why}")
 
     def write(self, path: str, content: bytes, mode: int, *, as_user: bool) -> None:
-        """Write a file whole or not at all; it belongs to who writes it.
-
-        Raises:
-            FleetError: it cannot be written.
-        """
+        """Write a file whole or not at all; it belongs to who writes it."""
         part = shlex.quote(f"{path}.part")
         script = (
             f"umask 077 && rm -f {part} && set -C && cat > {part} && chmod {mode:o} {part} && "
@@ -134,11 +116,7 @@ class Remote:
         self.must("sh", "-c", script, content=content, as_user=as_user)
 
     def echoed(self, *words: str) -> tuple[str, ClockOffset]:
-        """Return the first line of a command that then answers each line with its clock.
-
-        Raises:
-            FleetError: it does not answer.
-        """
+        """Return the first line of a command that then answers each line with its clock."""
         command = [*self._begin, shlex.join([*self._as_user, *words])]
         pipe = subprocess.PIPE
         with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
@@ -148,8 +126,8 @@ class Remote:
                 first, found = _talk(process)
             except (OSError, ValueError):
                 process.kill()
-                _, told = process.communicate()
-                text = f"{self.host.ssh} does not answer: {_last(told)}"
+                _, errors = process.communicate()
+                text = f"{self.host.ssh} does not answer: {_last(errors)}"
                 raise FleetError(f"{self.host.name}: {text}") from None
             finally:
                 limit.cancel()
@@ -157,11 +135,6 @@ class Remote:
 
 
 def _talk(process: subprocess.Popen[str]) -> tuple[str, list[ClockOffset]]:
-    """Return the first line, and the answers.
-
-    Raises:
-        OSError, ValueError: it has ended, or answers something else.
-    """
     there, back = process.stdin, process.stdout
     if there is None or back is None:
         raise ValueError
@@ -183,16 +156,7 @@ def on_all(
     work: Callable[[Remote], R],
     tell: Callable[[str, R | FleetError], None] = lambda _name, _result: None,
 ) -> dict[str, R | FleetError]:
-    """Do the same on all hosts at a time; a host that fails gives its error.
-
-    Args:
-        remotes: the hosts.
-        work: what to do.
-        tell: takes a host's name and result as soon as it has one.
-
-    Returns:
-        Each host's result, in the order of the hosts.
-    """
+    """Do the same on all hosts at a time; a host that fails gives its error."""
 
     def attempt(remote: Remote) -> R | FleetError:
         try:

@@ -25,21 +25,13 @@ _ARMABLE: Final = (DriveStatus.IDLE.name, DriveStatus.ERROR.name)
 
 
 def start(remote: Remote) -> str:
-    """Start a host's services; a drive that holds is taken over, and none is armed.
-
-    Raises:
-        FleetError: the unit does not start.
-    """
+    """Start a host's services; a drive that holds is taken over, and none is armed."""
     remote.must("systemctl", "start", UNIT)
     return f"up: {', '.join(remote.host.services)}"
 
 
 def heard(hosts: Hosts, remote: Remote) -> FleetStatus:
-    """Return a host's status, once each of its own modules is heard.
-
-    Raises:
-        FleetError: one is not.
-    """
+    """Return a host's status, once each of its own modules is heard."""
     deadline = time.monotonic() + HEARD_S
     while True:
         found = status(hosts, remote)
@@ -64,16 +56,7 @@ def stopped_in(found: Iterable[FleetStatus]) -> dict[str, str]:
 
 
 def arm(hosts: Hosts, remote: Remote, found: FleetStatus) -> str:
-    """Have the host's joint services arm the drives that are idle; what holds is left alone.
-
-    Args:
-        hosts: all of them.
-        remote: the host.
-        found: its status.
-
-    Raises:
-        FleetError: a service cannot be asked for.
-    """
+    """Have the host's joint services arm the drives that are idle; what holds is left alone."""
     idle = [name for name in _modules_of(remote) if found.modules[name].drive in _ARMABLE]
     for module in idle:
         remote.must(_xrl(hosts), "kill", module, "--run-dir", RUN_DIR, as_user=True)
@@ -85,11 +68,7 @@ def _modules_of(remote: Remote) -> list[str]:
 
 
 def estop(hosts: Hosts, remote: Remote) -> str:
-    """Stop a host's modules, by its shared memory.
-
-    Raises:
-        FleetError: the host is not reached, or a module has not stopped.
-    """
+    """Stop a host's modules, by its shared memory."""
     mine = _modules_of(remote)
     if not mine:
         return "no module here"
@@ -98,22 +77,14 @@ def estop(hosts: Hosts, remote: Remote) -> str:
 
 
 def down(hosts: Hosts, remote: Remote) -> str:
-    """Stop a host's services, and forget an emergency stop: a person asks for that.
-
-    Raises:
-        FleetError: they do not stop.
-    """
+    """Stop a host's services, and forget an emergency stop: a person asks for that."""
     remote.must("systemctl", "stop", UNIT)
     remote.must(_xrl(hosts), "down", "--run-dir", RUN_DIR, as_user=True)
     return "down"
 
 
 def status(hosts: Hosts, remote: Remote) -> FleetStatus:
-    """Return a host's status.
-
-    Raises:
-        FleetError: no fleet is up there.
-    """
+    """Return a host's status."""
     words = (_xrl(hosts), "status", "--json", "--run-dir", RUN_DIR)
     said = remote.must(*words, as_user=True, on_bus=True)
     try:

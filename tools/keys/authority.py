@@ -1,4 +1,7 @@
-"""The folder of a robot's authority: it signs certificates, and never leaves its machine.
+"""The folder of a robot's authority, and the bundles that hosts get of it.
+
+It signs certificates, and never leaves its machine. A host's bundle has certificates and keys of
+what the host runs, and never the authority's key.
 
 authority.key, authority.pem    the authority
 names.toml                      the current generation of each name
@@ -8,7 +11,9 @@ NAME.pem, NAME.key              the current certificate of each name
 from __future__ import annotations
 
 import datetime as dt
+import io
 import re
+import tarfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Final
@@ -36,11 +41,6 @@ class Authority:
     """A robot's authority, as its folder holds it."""
 
     def __init__(self, folder: Path) -> None:
-        """Open a folder.
-
-        Raises:
-            BusError: it holds no authority, or one that others may read.
-        """
         self.folder = folder
         self.names = credentials.read_names(folder)
         key = folder / _KEY
@@ -55,19 +55,11 @@ class Authority:
         return self._issued.certificate
 
     def renew(self, robot: RobotConfig, names: Iterable[str], days: int) -> None:
-        """Make new certificates and keys in the current generation; the old ones stay valid.
-
-        Raises:
-            BusError: the endpoint of a service has no certificate; nothing is changed.
-        """
+        """Make new certificates and keys in the current generation; the old ones stay valid."""
         self._issue(robot, {name: self.names.generations.get(name, 1) for name in names}, days)
 
     def revoke(self, robot: RobotConfig, names: Iterable[str], days: int) -> None:
-        """Go on to the next generation; once all hosts know of it the old one is let in nowhere.
-
-        Raises:
-            BusError: the endpoint of a service has no certificate; nothing is changed.
-        """
+        """Go on to the next generation; once all hosts know of it the old one is let in nowhere."""
         self._issue(robot, {n: self.names.generations.get(n, 0) + 1 for n in names}, days)
 
     def _issue(self, robot: RobotConfig, generations: Mapping[str, int], days: int) -> None:
@@ -87,12 +79,7 @@ class Authority:
 
 
 def make(folder: Path, robot: RobotConfig, days: int) -> Authority:
-    """Make a robot's authority and a certificate for each name.
-
-    Raises:
-        BusError: there is an authority already, the folder cannot be written, or a service's
-            endpoint has no certificate.
-    """
+    """Make a robot's authority and a certificate for each name."""
     if (folder / _KEY).exists():
         right = "`xrl keys renew` makes new certificates, `xrl keys revoke` shuts old ones out"
         raise BusError(f"{folder}: holds an authority already; {right}")
@@ -119,11 +106,7 @@ def principals_of(robot: RobotConfig) -> tuple[str, ...]:
 
 
 def hosts_of(robot: RobotConfig, name: str) -> tuple[str, ...]:
-    """Return what a service is dialled by: the host of its endpoint. Tools listen nowhere.
-
-    Raises:
-        BusError: the endpoint is none of TLS.
-    """
+    """Return what a service is dialled by: the host of its endpoint. Tools listen nowhere."""
     if name not in SERVICES:
         return ()
     endpoint = robot.bus.endpoints[name]
@@ -134,3 +117,51 @@ def hosts_of(robot: RobotConfig, name: str) -> tuple[str, ...]:
             "right, or --hosts FILE for a robot on several hosts"
         )
     return (found[1],)
+
+
+def bundle(authority: Authority, names: Iterable[str]) -> dict[str, bytes]:
+    """Return the files of a bundle by their names."""
+    folder = authority.folder
+    files = {
+        credentials.AUTHORITY: authority.certificate,
+        credentials.NAMES: credentials.to_toml(authority.names),
+    }
+    for name in names:
+        if name not in authority.names.generations:
+            right = f"one of {', '.join(authority.names.generations)}"
+            raise BusError(f"{name!r} has no certificate here; {right}")
+        for file in (certificate_file(folder, name), key_file(folder, name)):
+            try:
+                files[file.name] = file.read_bytes()
+            except OSError as error:
+                raise BusError(f"{file}: {error.strerror}; `xrl keys renew {name}`") from None
+    return files
+
+
+def to_tar(files: dict[str, bytes]) -> bytes:
+    """Return a tar file that unpacks into one folder, each file its owner's alone."""
+    written = io.BytesIO()
+    with tarfile.open(fileobj=written, mode="w") as tar:
+        for name, content in files.items():
+            entry = tarfile.TarInfo(f"keys/{name}")
+            entry.size, entry.mode = len(content), 0o600
+            tar.addfile(entry, io.BytesIO(content))
+    return written.getvalue()
+
+
+def held_files(folder: Path) -> list[str]:
+    """Return the names of the certificates and keys in a folder."""
+    return sorted(path.name for path in folder.iterdir() if path.suffix in (".pem", ".key"))
+
+
+def install(files: dict[str, bytes], folder: Path) -> None:
+    """Write a bundle into this host's folder of keys, and take away keys that are not in it."""
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        folder.chmod(0o700)
+        for name, content in files.items():
+            replace_file(folder / name, content, private=True)
+        for old in set(held_files(folder)) - set(files):
+            (folder / old).unlink()
+    except OSError as error:
+        raise BusError(f"{folder}: cannot be written: {error.strerror}") from None

@@ -87,11 +87,7 @@ def issue(
 
 
 def read(certificate: bytes) -> Details:
-    """Return what a certificate says.
-
-    Raises:
-        ValueError: it is none.
-    """
+    """Return what a certificate says."""
     found = x509.load_pem_x509_certificate(certificate)
     (name,) = found.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     hosts: list[str] = []

@@ -18,7 +18,7 @@ from tools.keys.certificates import Details
 _DAY: Final = "%Y-%m-%d"
 _TIME: Final = "%Y-%m-%d %H:%M UTC"
 WARN_DAYS: Final = 60
-"""An expiry within so many days is told."""
+"""An expiry within so many days is a warning."""
 
 
 class KeyRow(NamedTuple):
@@ -33,12 +33,8 @@ class KeyRow(NamedTuple):
     warning: str = ""
 
 
-def look(folder: Path, robot: RobotConfig) -> list[KeyRow]:
-    """Return a row for each certificate in a folder, the authority's own first.
-
-    Raises:
-        BusError: the folder holds no keys, or another robot's.
-    """
+def inspect_keys(folder: Path, robot: RobotConfig) -> list[KeyRow]:
+    """Return a row for each certificate in a folder, the authority's own first."""
     names = credentials.read_names(folder)
     if names.robot != robot.name:
         right = f"those of {robot.name!r} are right"
@@ -52,7 +48,7 @@ def look(folder: Path, robot: RobotConfig) -> list[KeyRow]:
     if not held:
         raise BusError(f"{folder}: holds no certificate of a process; `xrl keys pack` makes some")
     own = _row(signer, *_validity(signer, "a new authority: `xrl keys make --authority DIR`"))
-    return [own, *(_look(folder, robot, names, name, authority) for name in held)]
+    return [own, *(_inspect(folder, robot, names, name, authority) for name in held)]
 
 
 def _validity(found: Details, renewal: str) -> tuple[str, str]:
@@ -71,11 +67,17 @@ def _validity(found: Details, renewal: str) -> tuple[str, str]:
 
 
 def _row(found: Details, wrong: str, warning: str) -> KeyRow:
-    begins, expires = f"{found.begins:{_DAY}}", f"{found.expires:{_DAY}}"
-    return KeyRow(found.common_name, begins, expires, found.hosts, wrong, warning)
+    return KeyRow(
+        name=found.common_name,
+        begins=f"{found.begins:{_DAY}}",
+        expires=f"{found.expires:{_DAY}}",
+        hosts=found.hosts,
+        wrong=wrong,
+        warning=warning,
+    )
 
 
-def _look(folder: Path, robot: RobotConfig, names: Names, name: str, authority: bytes) -> KeyRow:
+def _inspect(folder: Path, robot: RobotConfig, names: Names, name: str, authority: bytes) -> KeyRow:
     try:
         credentials.check_private(key_file(folder, name))
         certificate = certificate_file(folder, name).read_bytes()
@@ -86,11 +88,11 @@ def _look(folder: Path, robot: RobotConfig, names: Names, name: str, authority: 
     wrong, warning = _validity(found, f"`xrl keys renew {name}`, then pack")
     wanted = hosts_of(robot, name)
     if not certificates.is_signed_by(certificate, authority):
-        wrong = "signed by another authority; `xrl keys pack` anew"
+        wrong = "signed by another authority; run `xrl keys pack` again"
     elif not certificates.is_key_of(key_file(folder, name).read_bytes(), certificate):
-        wrong = "its key is another's; `xrl keys pack` anew"
+        wrong = "its key is another's; run `xrl keys pack` again"
     elif found.common_name != current:
-        wrong = f"{found.common_name}, and {current} is let in; `xrl keys pack` anew"
+        wrong = f"{found.common_name}, and {current} is let in; run `xrl keys pack` again"
     elif not wrong and name in SERVICES and not set(wanted) <= set(found.hosts):
         wrong = f"not for {wanted[0]}, where the robot file has it; `xrl keys renew {name}`"
     return _row(found, wrong, warning)

@@ -61,11 +61,7 @@ _FILE: Final = "--inject"
 
 
 def parse_inject(text: str) -> Inject:
-    """Parse `LINK key=value ...` for argparse; without `at` it starts with the scenario.
-
-    Raises:
-        argparse.ArgumentTypeError: the text is malformed; the message says what is right.
-    """
+    """Parse `LINK key=value ...` for argparse; without `at` it starts with the scenario."""
     words = text.replace(",", " ").split()
     link = words.pop(0) if words else ""
     try:
@@ -114,11 +110,7 @@ def make(link: str, words: Mapping[str, str], dash: str = "") -> Inject:
 
 
 def check_link(link: str, dash: str = "") -> None:
-    """Refuse an unknown link, and name the closest one.
-
-    Raises:
-        ConfigError: there is no such link.
-    """
+    """Refuse an unknown link, and name the closest one."""
     try:
         directions_of(link, _FILE, f"{dash}link")
     except ConfigError as error:
@@ -129,11 +121,6 @@ def check_link(link: str, dash: str = "") -> None:
 
 
 def _split(words: Iterable[str]) -> dict[str, str]:
-    """Return the keys of `--inject` with their values.
-
-    Raises:
-        ConfigError: a key is unknown or comes twice.
-    """
     found: dict[str, str] = {}
     for word in words:
         key, equals, value = word.partition("=")

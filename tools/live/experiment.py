@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import argparse
 import re
-import time
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TypeVar, get_args, get_type_hints
+from typing import Any, Final, get_args, get_type_hints
 
 import msgspec
 
@@ -20,16 +20,7 @@ from shared.config import checks as config_check
 from shared.config import files as config_file
 from shared.config import gain_schedule, scenarios
 from shared.config.robot_config import SERVICES, RobotConfig
-from shared.config.scenarios import (
-    FAULT_KINDS,
-    SIGNALS,
-    Fault,
-    Inject,
-    Kill,
-    Push,
-    Restart,
-    Scenario,
-)
+from shared.config.scenarios import FAULT_KINDS, SIGNALS, Fault, Kill, Push, Restart, Scenario
 from shared.config.sections import LawConfig
 from shared.exceptions import FleetError, RunError
 from shared.joints import MODULES
@@ -37,10 +28,9 @@ from shared.places import DEFAULT_CONFIG, SCENARIOS
 from tools.guarded_streams import printable
 from tools.live.describe_inject import in_words_of, parse_inject
 from tools.number_arguments import finite, natural
+from tools.output import make_folder
 from tools.terminal import Console, marked
 from tools.verb_table import add_config
-
-E = TypeVar("E", Kill, Restart, Push, Fault, Inject)
 
 PLANT_FILE = "plant.toml"
 """Name of the plant among a run's results and in its log."""
@@ -67,48 +57,14 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         "shipped), or a file (default: squat, the paper's Fig. 7)",
     )
     parser.add_argument("--duration", type=finite, metavar="S", help="scenario time to run, s")
-    parser.add_argument(
-        "--kill",
-        action="append",
-        type=parse_kill,
-        metavar="SERVICE@T[:SIGNAL]",
-        help=f"send a signal ({', '.join(SIGNALS)}; default KILL) at scenario time T; "
-        "replaces the scenario's kills; may be repeated",
-    )
-    parser.add_argument(
-        "--restart",
-        action="append",
-        type=parse_restart,
-        metavar="SERVICE@T",
-        help="start a killed service again, or continue a stopped one; may be repeated",
-    )
-    parser.add_argument(
-        "--push",
-        action="append",
-        type=parse_push,
-        metavar="T:DUR:FX,FY,FZ",
-        help="push the torso by a force in N from T for DUR s; replaces the scenario's "
-        "pushes; may be repeated",
-    )
-    parser.add_argument(
-        "--fault",
-        action="append",
-        type=parse_fault,
-        metavar="MODULE:KIND@T",
-        help=f"a fault of a module's drive ({', '.join(FAULT_KINDS)}) at scenario time T; "
-        "MODULE.1 is its second axis, @T:DUR lasts DUR s; replaces the scenario's faults; "
-        "may be repeated",
-    )
-    parser.add_argument(
-        "--inject",
-        action="append",
-        type=parse_inject,
-        metavar="'LINK KEY=VALUE ...'",
-        help="what the network does to a link, such as 'planner->joints delay=30 jitter=10 at=3 "
-        "for=4' (ms and s), 'all loss=20%% burst=5', 'planner->left partition at=3'; at is "
-        "scenario time; `xrl inject --help` explains each word, and which of several counts; "
-        "replaces the scenario's; may be repeated",
-    )
+    for field, (parse, metavar, words) in _ROWS.items():
+        parser.add_argument(
+            f"--{field}",
+            action="append",
+            type=parse,
+            metavar=metavar,
+            help=f"{words}; may be repeated",
+        )
     add_plant(parser)
     add_controller(parser)
     add_imu(parser)
@@ -160,14 +116,17 @@ def add_plant(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _refused(text: str, form: str, **known: Iterable[str]) -> argparse.ArgumentTypeError:
+    names = "".join(f"; {what}: {', '.join(names)}" for what, names in known.items())
+    return argparse.ArgumentTypeError(f"{text!r}; write {form}{names}")
+
+
 def parse_kill(text: str) -> Kill:
     """Read SERVICE@T[:SIGNAL]."""
     match = re.fullmatch(rf"(\w+)@({_NUMBER})(?::(?:SIG)?(\w+))?", text)
     if match is None or match[1] not in SERVICES or (match[3] or "KILL") not in SIGNALS:
-        raise argparse.ArgumentTypeError(
-            f"{text!r}; write SERVICE@SECONDS or SERVICE@SECONDS:SIGNAL, for example "
-            f"planner@10:STOP; services: {', '.join(SERVICES)}; signals: {', '.join(SIGNALS)}"
-        )
+        form = "SERVICE@SECONDS or SERVICE@SECONDS:SIGNAL, for example planner@10:STOP"
+        raise _refused(text, form, services=SERVICES, signals=SIGNALS)
     if match[1] in UNJUDGED:
         raise argparse.ArgumentTypeError(
             f"{text!r}: without the {match[1]} there is nothing to judge the run by; "
@@ -181,10 +140,7 @@ def parse_restart(text: str) -> Restart:
     """Read SERVICE@T."""
     match = re.fullmatch(rf"(\w+)@({_NUMBER})", text)
     if match is None or match[1] not in SERVICES:
-        raise argparse.ArgumentTypeError(
-            f"{text!r}; write SERVICE@SECONDS, for example planner@9; "
-            f"services: {', '.join(SERVICES)}"
-        )
+        raise _refused(text, "SERVICE@SECONDS, for example planner@9", services=SERVICES)
     return Restart(service=match[1], at=float(match[2]))
 
 
@@ -193,10 +149,8 @@ def parse_push(text: str) -> Push:
     signed = rf"(-?{_NUMBER})"
     match = re.fullmatch(rf"({_NUMBER}):({_NUMBER}):{signed},{signed},{signed}", text)
     if match is None:
-        raise argparse.ArgumentTypeError(
-            f"{text!r}; write START:DURATION:FX,FY,FZ in s and N, for example 12:0.3:40,0,0"
-        )
-    t, duration, x, y, z = (float(number) for number in match.groups())
+        raise _refused(text, "START:DURATION:FX,FY,FZ in s and N, for example 12:0.3:40,0,0")
+    t, duration, x, y, z = map(float, match.groups())
     return Push(at=t, duration=duration, force=(x, y, z))
 
 
@@ -204,27 +158,59 @@ def parse_fault(text: str) -> Fault:
     """Read MODULE[.AXIS]:KIND@T[:DUR]."""
     match = re.fullmatch(rf"(\w+)(?:\.([01]))?:(\w+)@({_NUMBER})(?::({_NUMBER}))?", text)
     if match is None or match[1] not in MODULES or match[3] not in FAULT_KINDS:
-        raise argparse.ArgumentTypeError(
-            f"{text!r}; write MODULE:KIND@SECONDS, for example knee_left:encoder@8, or "
-            f"knee_left.1:encoder@8:0.5; modules: {', '.join(MODULES)}; "
-            f"kinds: {', '.join(FAULT_KINDS)}"
-        )
-    row = {"module": match[1], "kind": match[3], "at": float(match[4])}
+        form = "MODULE:KIND@SECONDS, for example knee_left:encoder@8, or knee_left.1:encoder@8:0.5"
+        raise _refused(text, form, modules=MODULES, kinds=FAULT_KINDS)
     axis = int(match[2]) if match[2] else None
     duration = float(match[5]) if match[5] else None
+    row = {"module": match[1], "kind": match[3], "at": float(match[4])}
     return msgspec.convert({**row, "axis": axis, "duration": duration}, Fault)
 
 
+_ROWS: Final[dict[str, tuple[Callable[[str], object], str, str]]] = {
+    "kill": (
+        parse_kill,
+        "SERVICE@T[:SIGNAL]",
+        (
+            f"send a signal ({', '.join(SIGNALS)}; default KILL) at scenario time T; "
+            "replaces the scenario's kills"
+        ),
+    ),
+    "restart": (
+        parse_restart,
+        "SERVICE@T",
+        "start a killed service again, or continue a stopped one",
+    ),
+    "push": (
+        parse_push,
+        "T:DUR:FX,FY,FZ",
+        "push the torso by a force in N from T for DUR s; replaces the scenario's pushes",
+    ),
+    "fault": (
+        parse_fault,
+        "MODULE:KIND@T",
+        (
+            f"a fault of a module's drive ({', '.join(FAULT_KINDS)}) at scenario time T; "
+            "MODULE.1 is its second axis, @T:DUR lasts DUR s; replaces the scenario's faults"
+        ),
+    ),
+    "inject": (
+        parse_inject,
+        "'LINK KEY=VALUE ...'",
+        (
+            "what the network does to a link, such as 'planner->joints delay=30 jitter=10 at=3 "
+            "for=4' (ms and s), 'all loss=20%% burst=5', 'planner->left partition at=3'; at is "
+            "scenario time; `xrl inject --help` explains each word, and which of several counts; "
+            "replaces the scenario's"
+        ),
+    ),
+}
+"""Rows of a scenario that flags of the same name give: parser, form, help."""
+
+
 def scenario_file(name: str, config: Path = DEFAULT_CONFIG) -> Path:
-    """Return the file of a scenario given by name or path, absolute.
+    """Return the file of a scenario, absolute: a path to a .toml file, or a name.
 
-    Args:
-        name: a path that ends with .toml; or a name: first from the folder `scenarios` beside the
-            robot file, then from those that are shipped.
-        config: the robot file.
-
-    Raises:
-        FleetError: there is none; the message lists the names.
+    A name stands for a file in `scenarios` beside the robot file, or else for a shipped one.
     """
     folders = (config.parent / SCENARIOS.name, SCENARIOS)
     paths = [Path(name)] if name.endswith(".toml") else [at / f"{name}.toml" for at in folders]
@@ -240,37 +226,22 @@ def make_scenario(args: argparse.Namespace) -> Scenario:
 
     A shorter duration drops the file's rows beyond it; a flag that names a time beyond it is
     refused.
-
-    Raises:
-        ConfigError: file and flags make no valid scenario.
     """
     path = scenario_file(args.scenario, args.config)
     scenario = scenarios.load(path)
     duration = args.duration if args.duration is not None else scenario.duration
     if duration <= 0.0:
         raise RunError(f"--duration {duration:g}: must be more than 0 s")
-    kills = tuple(args.kill) if args.kill is not None else _inside(scenario.kill, duration)
-    restarts = tuple(args.restart or ()) if args.kill or args.restart else scenario.restart
-    pushes = tuple(args.push) if args.push is not None else _inside(scenario.push, duration)
-    faults = tuple(args.fault) if args.fault is not None else _inside(scenario.fault, duration)
-    injects = tuple(args.inject) if args.inject is not None else _inside(scenario.inject, duration)
-    scenario = msgspec.structs.replace(
-        scenario,
-        duration=duration,
-        fault=faults,
-        inject=injects,
-        kill=kills,
-        restart=_inside(restarts, duration) if not args.restart else restarts,
-        push=pushes,
-    )
-    flags = (args.kill, args.restart, args.push, args.fault, args.inject, args.duration)
+    rows: dict[str, tuple[Any, ...]] = {}
+    for field in _ROWS:
+        given = getattr(args, field)
+        own = () if field == "restart" and args.kill else getattr(scenario, field)
+        rows[field] = tuple(given or (row for row in own if row.at < duration))
+    scenario = msgspec.structs.replace(scenario, duration=duration, **rows)
+    flags = (args.duration, *(getattr(args, field) for field in _ROWS))
     by_flags = " with the flags of this command" if any(flag is not None for flag in flags) else ""
     scenarios.check(f"{path}{by_flags}", scenario)
     return scenario
-
-
-def _inside(rows: tuple[E, ...], duration: float) -> tuple[E, ...]:
-    return tuple(row for row in rows if row.at < duration)
 
 
 def describe(scenario: Scenario) -> str:
@@ -290,32 +261,16 @@ def introduce(scenario: Scenario, console: Console) -> None:
 
 
 def make_robot(args: argparse.Namespace) -> RobotConfig:
-    """Return the robot with the flags laid over it.
-
-    Raises:
-        ConfigError: the file cannot be used, or the gain split lacks its schedule.
-    """
-    changes = {
-        key: value
-        for key, value in (("split", args.split), ("jacobian", args.jacobian))
-        if value is not None
-    }
+    """Return the robot with the flags laid over it."""
+    flags = (("split", args.split), ("jacobian", args.jacobian))
+    changes = {key: value for key, value in flags if value is not None}
     if changes.get("jacobian") == "average" and "split" not in changes:
         changes["split"] = "diagonal"  # no local gains certify it, so there is no schedule
     return load_robot(args.config, imu=args.imu, **changes)
 
 
 def load_robot(path: Path, *, imu: bool = False, **law: str) -> RobotConfig:
-    """Return the robot of a file, ready to run.
-
-    Args:
-        path: the robot file.
-        imu: fit one, whatever the file says.
-        law: keys of `[law]` to change, and their values.
-
-    Raises:
-        ConfigError: the file cannot be used, or the gain split lacks its schedule.
-    """
+    """Return the robot of a file, ready to run."""
     robot = config_file.load(path)
     robot = msgspec.structs.replace(robot, law=msgspec.structs.replace(robot.law, **law))
     if imu:
@@ -326,31 +281,20 @@ def load_robot(path: Path, *, imu: bool = False, **law: str) -> RobotConfig:
 
 
 def make_out(out: Path | None, verb: str) -> Path:
-    """Make the directory of a run's results; without a name, one of this verb and time.
-
-    Raises:
-        RunError: it cannot be made, or holds a run already.
-    """
-    out = out if out is not None else Path("out") / time.strftime(f"{verb}-%Y%m%d-%H%M%S")
+    """Make the directory of a run's results; without a name, one of this verb and time."""
+    out = make_folder(out, verb)
     if (out / "run.mcap").exists():
         raise RunError(f"{out}: holds a run already; choose another --out, or remove it")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RunError(f"{out}: cannot be made: {error.strerror}; choose another --out") from None
     return out
 
 
 def write_inputs(
     out: Path, robot: RobotConfig, scenario: Scenario, true_plant: PlantConfig
 ) -> tuple[Path, ...]:
-    """Write the run's inputs beside its results.
-
-    Returns:
-        The files: robot, scenario, plant and, if the robot has one, its gain schedule.
-    """
-    robot_path, scenario_path = out / "robot.toml", out / "scenario.toml"
-    plant_path = out / PLANT_FILE
+    """Write robot, scenario, plant and gain schedule, if there is one, beside a run's results."""
+    robot_path, scenario_path, plant_path = (
+        out / name for name in ("robot.toml", "scenario.toml", PLANT_FILE)
+    )
     replace_file(plant_path, plant.to_toml(true_plant).encode())
     replace_file(robot_path, config_file.to_toml(robot).encode())
     replace_file(scenario_path, scenarios.to_toml(scenario).encode())

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -16,6 +17,7 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Scenario
 from shared.robot.robot_model import mjcf
 from tools.fleet.pace import run_at_fitting_pace
+from tools.fleet.process_table import FleetOptions
 from tools.fleet.supervise import SupervisedFleet
 from tools.live import experiment
 from tools.live.experiment import PLANT_FILE
@@ -54,25 +56,20 @@ def run_live(
             full; the pace found becomes the default of this process.
         controller: of somebody's own, `FILE.py[:NAME]`, in the place of the law.
         tell: takes a line of text each time the pace is lowered.
-
-    Raises:
-        CoresFullError: they do not carry it at any pace, or at the one asked for.
-        FleetError: the fleet cannot be started or stopped.
     """
-
-    def at(pace: float) -> T:
-        return _run_once(
-            out, robot, scenario, lead,
-            verb=verb, seed=seed, true_plant=true_plant, no_restart=no_restart, pace=pace,
-            controller=controller,
-        )  # fmt: skip
+    at = partial(
+        _run_once, out.absolute(), robot, scenario, lead,
+        verb=verb, seed=seed, true_plant=true_plant, no_restart=no_restart, controller=controller,
+    )  # fmt: skip
 
     def again(text: str) -> None:
         for record in out.glob("run*.mcap"):
             record.unlink()  # of a robot that stood and waited
         tell(text)
 
-    return at(pace) if pace is not None else run_at_fitting_pace(at, again)
+    if pace is not None:
+        return at(pace=pace)
+    return run_at_fitting_pace(lambda fitting: at(pace=fitting), again)
 
 
 def _run_once(
@@ -88,7 +85,6 @@ def _run_once(
     pace: float,
     controller: str | None,
 ) -> T:
-    """Run at one pace."""
     robot_path, scenario_path, plant_path, *_ = experiment.write_inputs(
         out, robot, scenario, true_plant
     )
@@ -97,26 +93,28 @@ def _run_once(
     attached = {"model.xml": model_path, PLANT_FILE: plant_path}
     if controller is not None:
         attached[ATTACHED] = split_spec(controller)[0]
+    seeded = ["--seed", str(seed)]
+    led_by = ["--scenario", str(scenario_path)]
+    overrides = {
+        "simulator": [*led_by, "--plant", str(plant_path), *seeded],
+        "recorder": ["--out", str(out), *led_by, "--scenario-text", scenario.name],
+    }
+    for name, path in attached.items():
+        overrides["recorder"] += ["--attach", f"{name}={path.absolute()}"]
+    if controller is not None:
+        overrides["planner"] = ["--controller", absolute(controller)]
+    if scenario.inject:
+        overrides["network_proxy"] = seeded
+    options = FleetOptions(
+        overrides=overrides,
+        no_restart=no_restart,
+        injected=bool(scenario.inject),
+        pace=pace,
+        leashed=True,
+    )
     run_dir = Path(tempfile.mkdtemp(prefix=f"xrl-{verb}-", dir="/tmp"))
     try:
-        fleet = SupervisedFleet.start(
-            robot_path.absolute(),
-            run_dir,
-            overrides={
-                "recorder": _recorder_arguments(out, scenario, scenario_path, attached),
-                **({"planner": ["--controller", absolute(controller)]} if controller else {}),
-                "simulator": [
-                    *("--scenario", str(scenario_path.absolute())),
-                    *("--plant", str(plant_path.absolute())),
-                    *("--seed", str(seed)),
-                ],
-                **({"network_proxy": ["--seed", str(seed)]} if scenario.inject else {}),
-            },
-            no_restart=frozenset(no_restart),
-            injected=bool(scenario.inject),
-            pace=pace,
-            leashed=True,
-        )
+        fleet = SupervisedFleet.start(robot_path, run_dir, options)
         try:
             with open_session(robot, verb, run_dir) as session:
                 return lead(fleet, session)
@@ -127,21 +125,3 @@ def _run_once(
             shutil.copytree(fleet.run.logs, logs, dirs_exist_ok=True)
     finally:
         shutil.rmtree(run_dir, ignore_errors=True)
-
-
-def _recorder_arguments(
-    out: Path, scenario: Scenario, scenario_path: Path, attached: Mapping[str, Path]
-) -> list[str]:
-    return [
-        "--out",
-        str(out.absolute()),
-        "--scenario",
-        str(scenario_path.absolute()),
-        "--scenario-text",
-        scenario.name,
-        *(
-            word
-            for name, path in attached.items()
-            for word in ("--attach", f"{name}={path.absolute()}")
-        ),
-    ]

@@ -87,15 +87,10 @@ class CommonSilence:
 
 
 class StallFinder:
-    """Finds the stalls of a live run, each once, whatever told of it."""
+    """Finds the stalls of a live run, each once, whatever shows it."""
 
     def __init__(self, cores: int, gaps: Callable[[], Sequence[Gap]]) -> None:
-        """Take what watches.
-
-        Args:
-            cores: how many threads watch a core of their own; fewer gaps are not the machine's.
-            gaps: returns the new ones, CLOCK_MONOTONIC.
-        """
+        """Take what watches."""
         self._cores, self._gaps = cores, gaps
         self._services, self._world = CommonSilence(), Silence(TRUTH_NS)
         self._pending: list[Stall] = []
@@ -139,10 +134,6 @@ def merged(stalls: Iterable[Stall], cores: int) -> list[Stall]:
     """Return stalls that overlap as one, of all that stood still.
 
     What a thread without real time saw alone is left out.
-
-    Args:
-        stalls: in any order.
-        cores: that are watched, each by itself.
     """
     found = (_joined(group, cores) for group in _overlapping(stalls))
     return [stall for stall in found if stall.who != A_THREAD]
@@ -232,11 +223,7 @@ class LiveStalls:
         return found
 
     def words(self, modes: Sequence[int]) -> str:
-        """Return what to show of the newest stall; empty if it was a while ago.
-
-        Args:
-            modes: of the modules that are heard; none where they hold for another reason.
-        """
+        """Return what to show of the newest stall; empty if it was a while ago."""
         if not self.found or now_ns() - self.found[-1].end_ns > STALL_SHOWN_NS:
             return ""
         held = modes.count(Mode.HOLD)
@@ -247,12 +234,7 @@ class LiveStalls:
         return f"{self.found[-1].words}: {who} {'hold' if held else 'held'}"
 
     def describe_machine(self, idle: float, least: float) -> str:
-        """Return how the machine carries the fleet.
-
-        Args:
-            idle: fraction of all cores' time, beside the fleet.
-            least: below it the cores count as full.
-        """
+        """Return how the machine carries the fleet."""
         words = f"{self.cores} cores, {100 * idle:.0f} % idle beside the fleet"
         if idle < least:
             words += f": too little, modules may hold; `--pace {pace() / 2:g}` asks for half of it"

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
-from rich.live import Live
 from rich.text import Text
 
-from shared.bus.messages import PlannerStatus
+from shared.bus.messages import PlannerStatus, SimTruth
 from shared.config.scenarios import Inject
 from tools.live.scenario_runner import LiveSnapshot
-from tools.terminal import Console
+from tools.terminal import Console, renewed
 
 PERIOD_S = 0.1
 PLAIN_PERIOD_S = 1.0
@@ -33,33 +32,22 @@ class LiveView:
     def __init__(
         self, console: Console, injects: Sequence[Inject] = (), planner: PlannerNews | None = None
     ) -> None:
-        """Start.
-
-        Args:
-            console: shows the line.
-            injects: the scenario's impairments.
-            planner: its wait after drop-outs is shown; None: it is not.
-        """
-        self._console = console
         self._injects = injects
         self._planner = planner
         self._status: PlannerStatus | None = None
         self._heard_s = 0.0
         self._period_s = PERIOD_S if console.is_terminal else PLAIN_PERIOD_S
         self._next_s = 0.0
-        self._live: Live | None = None
+        self._renewed = renewed(console, transient=True)
 
     def __enter__(self) -> LiveView:
         """Start the display."""
-        if self._console.is_terminal:
-            self._live = Live(console=self._console, auto_refresh=False, transient=True)
-            self._live.__enter__()
+        self._print = self._renewed.__enter__()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *error: Any) -> None:
         """End the display; the line goes away."""
-        if self._live is not None:
-            self._live.__exit__(None, None, None)
+        self._renewed.__exit__(*error)
 
     def show(self, snapshot: LiveSnapshot) -> None:
         """Show the run as it is now, unless that was done a moment ago."""
@@ -72,14 +60,10 @@ class LiveView:
             active(self._injects, snapshot.truth.scenario_s),
             waiting(self._hear(now)),
         )
-        line = _line(snapshot, "; ".join(word for word in words if word))
-        if self._live is not None:
-            self._live.update(Text(line), refresh=True)
-        else:
-            self._console.print(line, highlight=False, soft_wrap=True)
+        note = "; ".join(word for word in words if word)
+        self._print(Text(_line(snapshot.truth, snapshot.modes, note)))
 
     def _hear(self, now_s: float) -> PlannerStatus | None:
-        """Return the planner's state as text; None if it is silent."""
         status = None if self._planner is None else self._planner.take()
         if status is not None:
             self._status, self._heard_s = status, now_s
@@ -99,12 +83,10 @@ def waiting(status: PlannerStatus | None) -> str:
     return f"leads again in {status.wait_s:.0f} s" if status.wait_s >= 1.0 else "leads again soon"
 
 
-def _line(snapshot: LiveSnapshot, note: str) -> str:
-    truth = snapshot.truth
-    assert truth is not None  # noqa: S101 - `show` has looked
+def _line(truth: SimTruth, modes: Sequence[str], note: str) -> str:
     clock = f"{truth.scenario_s:6.2f} s" if truth.scenario_s >= 0.0 else "   --  s"
     x, y = (1e3 * part for part in truth.over)
     return (
         f"{clock}  height {truth.torso[2]:.3f} m  COM {x:+5.1f} {y:+5.1f} mm  "
-        f"hand {truth.operator_force[2]:+6.1f} N  modes {''.join(snapshot.modes)}  {note}"
+        f"hand {truth.operator_force[2]:+6.1f} N  modes {''.join(modes)}  {note}"
     )

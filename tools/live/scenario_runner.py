@@ -56,7 +56,7 @@ PIDS_EVERY_S: Final = 1.0
 STALLS_FILE: Final = "stalls"
 """In the run directory: what `StallWatch` finds."""
 ENDING_S: Final = 3.0
-"""s; a service that was told to end has done so by then, or was killed by its supervisor."""
+"""s; a service that was asked to end has done so by then, or was killed by its supervisor."""
 
 
 class LiveSnapshot(NamedTuple):
@@ -99,16 +99,68 @@ class CpuMeter:
     def sample(self, pids: Iterable[int]) -> None:
         """Add what each process has used since the sample before."""
         self._end_s = time.monotonic()
-        for pid in (*pids, os.getpid()):
-            used = procfs.cpu_s(pid)
-            if used is not None:
-                self._spent_s += used - self._last.get(pid, used)
-                self._last[pid] = used
+        for pid, use in procfs.use_of((*pids, os.getpid())).items():
+            self._spent_s += use.cpu_s - self._last.get(pid, use.cpu_s)
+            self._last[pid] = use.cpu_s
 
     @property
     def share_pct(self) -> float:
         """Mean use from the first sample to the last: 100 is one core."""
         return 100.0 * self._spent_s / max(1e-9, self._end_s - self._begin_s)
+
+
+class _ArmedKill:
+    """A triggered kill that has not been done yet."""
+
+    def __init__(self, kill: TriggeredKill | None) -> None:
+        self._kill = kill
+        self._dropped_out = False
+        self._at_s = math.inf
+
+    def due(self, tracking: int) -> str | None:
+        """Return the service to kill, once, as soon as its time has come."""
+        kill, now_s = self._kill, time.monotonic()
+        if kill is None:
+            return None
+        self._dropped_out |= tracking == 0
+        if self._dropped_out and tracking >= kill.modules:
+            self._at_s = min(self._at_s, now_s + machine_s(kill.after_s))
+        if now_s < self._at_s:
+            return None
+        self._kill = None
+        return kill.service
+
+
+class _RunEvents:
+    """Publishes what is done to the run; the log alone then shows it."""
+
+    def __init__(self, session: Session) -> None:
+        self._publisher = session.publisher(topics.RUN_EVENT, RunEvent)
+        self.said: list[RunEvent] = []
+        self.start_ns = 0
+        """Time zero of the scenario on the fleet's clock; 0 before it starts."""
+
+    def say(self, kind: RunEventKind, subject: str, detail: str) -> None:
+        now = now_ns()
+        self._publish(
+            RunEvent(
+                t_ns=now,
+                seq=len(self.said) + 1,
+                kind=int(kind),
+                subject=subject,
+                detail=detail,
+                scenario_s=(now - self.start_ns) / NS_PER_S,
+            )
+        )
+
+    def tell(self, stalls: Iterable[Stall]) -> None:
+        for stall in stalls:
+            zero_ns = self.start_ns or stall.begin_ns + NS_PER_S
+            self._publish(stall.event(len(self.said) + 1, zero_ns))
+
+    def _publish(self, event: RunEvent) -> None:
+        self.said.append(event)
+        self._publisher.put(event)
 
 
 class ScenarioRunner:
@@ -123,38 +175,23 @@ class ScenarioRunner:
         triggered_kill: TriggeredKill | None = None,
         tell: Callable[[str], None] = lambda _text: None,
     ) -> None:
-        """Take the scenario's kills, and perhaps one that the modules' modes trigger.
-
-        Args:
-            fleet: that runs.
-            session: on its bus.
-            scenario: what is to be done.
-            show: shows how the run is.
-            triggered_kill: besides those of the scenario.
-            tell: takes what is to be known of the machine before the scenario starts.
-        """
+        """Subscribe; `tell` takes what is to be known of the machine before the start."""
         self._fleet = fleet
         self._scenario = scenario
         self._show = show
         self._tell = tell
-        self._triggered_kill = triggered_kill
-        self._dropped_out = False
-        self._triggered_kill_at_s = math.inf
-        self.said: list[RunEvent] = []
-        """Actions on the run so far."""
+        self._armed = _ArmedKill(triggered_kill)
+        self._events = _RunEvents(session)
         self._truths: Latest[SimTruth] = session.latest(topics.SIM_TRUTH, SimTruth)
         self._states = {
             module: session.latest(topics.JOINT_STATE, JointState, module) for module in MODULES
         }
         self._leads: Latest[PlannerStatus] = session.latest(topics.PLANNER_STATUS, PlannerStatus)
         self._control = session.publisher(topics.SIM_CONTROL, SimControl)
-        self._events = session.publisher(topics.RUN_EVENT, RunEvent)
         self._truth: SimTruth | None = None
         self._truth_at_s = time.monotonic()
         self._modes: dict[str, int] = {}
         self._heard_s: dict[str, float] = {}
-        self._said = 0
-        self._start_ns = 0
         self._note = ""
         self._pids: dict[str, int] = {}
         self._next_pids_s = 0.0
@@ -162,10 +199,7 @@ class ScenarioRunner:
         self._killed = False
 
     def run(self, is_over: Callable[[], bool] = lambda: False) -> EndOfRun:
-        """Wait until the robot stands, run the scenario to its end.
-
-        Args:
-            is_over: returns True to end it sooner.
+        """Wait until the robot stands, run the scenario to its end, or until `is_over`.
 
         Raises:
             CoresFullError: the cores do not carry the fleet at its pace, so it does not come to
@@ -176,53 +210,54 @@ class ScenarioRunner:
         with self._stalls.watched(self._fleet.run.path / STALLS_FILE):
             return self._run(is_over)
 
+    @property
+    def said(self) -> list[RunEvent]:
+        """What was done to the run so far."""
+        return self._events.said
+
     def _run(self, is_over: Callable[[], bool]) -> EndOfRun:
+        rows = self._scenario
         if not self._wait_until_tracking(is_over):
-            self._say(RunEventKind.FINISHED, self._scenario.name, "fell before the start")
-            time.sleep(LAST_WORDS_S)
-            return EndOfRun(None, self._scenario.duration)
+            self._finish("fell before the start")
+            return EndOfRun(None, rows.duration)
         self._start()
         todo: list[Kill | Restart | Push | Fault | Inject] = [
-            *self._scenario.kill,
-            *self._scenario.restart,
-            *self._scenario.push,
-            *self._scenario.fault,
-            *self._scenario.inject,
-        ]
+            *rows.kill, *rows.restart, *rows.push, *rows.fault, *rows.inject,
+        ]  # fmt: skip
         todo.sort(key=lambda row: row.at)
-        fallen_at_s, ended_at_s = None, self._scenario.duration
+        fallen_at_s, ended_at_s = math.inf, rows.duration
         meter = CpuMeter()
         while True:
             self._listen()
-            self._look_at_processes(meter)
+            self._sample_processes(meter)
             truth = self._truth
             if truth is not None and truth.scenario_s < 0.0:
                 raise RunError("the simulator was started again, and its scenario is gone")
             if truth is not None:
                 # between two truths the scenario's clock runs on with ours
-                self._start_ns = truth.t_ns - round(truth.scenario_s * NS_PER_S)
-                if truth.fallen and fallen_at_s is None:
+                self._events.start_ns = _zero_ns(truth)
+                if truth.fallen and truth.scenario_s < fallen_at_s:
                     fallen_at_s, self._note = truth.scenario_s, "FALLEN"
-                limit = self._scenario.duration
-                if fallen_at_s is not None:
-                    limit = min(limit, fallen_at_s + AFTER_FALL_S)
-                if truth.scenario_s >= limit:
+                if truth.scenario_s >= min(rows.duration, fallen_at_s + AFTER_FALL_S):
                     break
                 if is_over():
                     ended_at_s = truth.scenario_s
                     break
-            scenario_s = (now_ns() - self._start_ns) / NS_PER_S
+            scenario_s = (now_ns() - self._events.start_ns) / NS_PER_S
             while todo and scenario_s >= todo[0].at:
                 self._act(todo.pop(0))
             self._follow(scenario_s)
             time.sleep(POLL_S)
         meter.sample(self._pids.values())
-        self._tell_stalls(self._stalls.rest())
-        self._say(RunEventKind.FINISHED, self._scenario.name, "")
-        time.sleep(LAST_WORDS_S)
+        self._events.tell(self._stalls.rest())
+        self._finish("")
         return EndOfRun(meter.share_pct, ended_at_s)
 
-    def _look_at_processes(self, meter: CpuMeter) -> None:
+    def _finish(self, detail: str) -> None:
+        self._events.say(RunEventKind.FINISHED, self._scenario.name, detail)
+        time.sleep(LAST_WORDS_S)
+
+    def _sample_processes(self, meter: CpuMeter) -> None:
         """Once a second: a kill must not wait for the supervisor to tell the process."""
         now_s = time.monotonic()
         if now_s >= self._next_pids_s:
@@ -234,9 +269,6 @@ class ScenarioRunner:
         """Wait until the hoist is down and all six modules have tracked for a while.
 
         Returns False if the robot falls first: that is a finding, not an error.
-
-        Raises:
-            KeyboardInterrupt: it is over before that.
         """
         begin_s = time.monotonic()
         deadline, next_look_s = begin_s + machine_s(READY_TIMEOUT_S), begin_s
@@ -249,7 +281,7 @@ class ScenarioRunner:
                 raise KeyboardInterrupt
             if time.monotonic() >= next_look_s:
                 next_look_s += IDLE_EVERY_S
-                idle = meter.look()
+                idle = meter.sample()
                 late = time.monotonic() - begin_s >= PATIENCE_S
                 if late:
                     self._check_cores(idle)
@@ -294,26 +326,18 @@ class ScenarioRunner:
 
     def _start(self) -> None:
         """Ask the world to start until it has."""
-        deadline = time.monotonic() + 5.0
+        asked, deadline = 0, time.monotonic() + 5.0
         while self._truth is None or self._truth.scenario_s < 0.0:
-            self._said += 1
-            self._control.put(SimControl(t_ns=now_ns(), seq=self._said, start=True))
+            asked += 1
+            self._control.put(SimControl(t_ns=now_ns(), seq=asked, start=True))
             time.sleep(0.05)
             self._listen()
             if time.monotonic() > deadline:
                 raise RunError("the simulator does not start the scenario; see its log")
-        self._start_ns = self._truth.t_ns - round(self._truth.scenario_s * NS_PER_S)
-        self._say(RunEventKind.STARTED, self._scenario.name, "")
-
-    def _tell_stalls(self, found: Iterable[Stall]) -> None:
-        for stall in found:
-            self._said += 1
-            event = stall.event(self._said, self._start_ns or stall.begin_ns + NS_PER_S)
-            self.said.append(event)
-            self._events.put(event)
+        self._events.start_ns = _zero_ns(self._truth)
+        self._events.say(RunEventKind.STARTED, self._scenario.name, "")
 
     def _listen(self) -> None:
-        """Receive new messages and show them."""
         for module, latest in self._states.items():
             state = latest.take()
             if state is not None:
@@ -334,14 +358,14 @@ class ScenarioRunner:
             words = (self._note, self._stalls.words(held_by_it))
             note = "; ".join(word for word in words if word)
             self._show(LiveSnapshot(truth, modes, note))
-        elif time.monotonic() - self._truth_at_s > SILENT_S and self._start_ns:
+        elif time.monotonic() - self._truth_at_s > SILENT_S and self._events.start_ns:
             raise RunError(f"the simulator has said nothing for {SILENT_S:.0f} s; see its log")
-        self._tell_stalls(self._stalls.take())
+        self._events.tell(self._stalls.take())
 
     def _act(self, row: Kill | Restart | Push | Fault | Inject) -> None:
         """Do what is due; the simulator does pushes and faults, and they are only recorded here."""
         if isinstance(row, Kill):
-            self._say(RunEventKind.KILLED, row.service, row.signal)
+            self._events.say(RunEventKind.KILLED, row.service, row.signal)
             self._killed = True
             number = signal.Signals[f"SIG{row.signal}"]
             try:
@@ -352,32 +376,24 @@ class ScenarioRunner:
             self._note = f"{row.service} {'stopped' if row.signal == 'STOP' else 'killed'}"
         elif isinstance(row, Restart):
             self._wait_until_ended(row.service)
-            self._say(RunEventKind.RESTARTED, row.service, "")
+            self._events.say(RunEventKind.RESTARTED, row.service, "")
             self._fleet.start_service(row.service)
             self._next_pids_s = 0.0
             self._note = f"{row.service} back"
         elif isinstance(row, Inject):
             ProxyClient(self._fleet.run.path).begin(row)
         elif isinstance(row, Fault):
-            self._say(RunEventKind.FAULTED, row.module, row.kind)
+            self._events.say(RunEventKind.FAULTED, row.module, row.kind)
             self._note = f"{row.module}: {row.kind}"
         else:
             x, y, z = row.force
-            self._say(RunEventKind.PUSHED, "torso", f"{x:g},{y:g},{z:g} N for {row.duration:g} s")
+            self._events.say(
+                RunEventKind.PUSHED, "torso", f"{x:g},{y:g},{z:g} N for {row.duration:g} s"
+            )
 
     def _follow(self, scenario_s: float) -> None:
-        """Kill the triggered service when its time has come."""
-        if self._triggered_kill is None:
-            return
-        now_s = time.monotonic()
-        tracking = list(self._modes.values()).count(Mode.TRACK)
-        self._dropped_out |= tracking == 0
-        if self._dropped_out and tracking >= self._triggered_kill.modules:
-            self._triggered_kill_at_s = min(
-                self._triggered_kill_at_s, now_s + machine_s(self._triggered_kill.after_s)
-            )
-        if now_s >= self._triggered_kill_at_s:
-            service, self._triggered_kill = self._triggered_kill.service, None
+        service = self._armed.due(list(self._modes.values()).count(Mode.TRACK))
+        if service is not None:
             self._act(Kill(service=service, at=scenario_s))
 
     def _wait_until_ended(self, service: str) -> None:
@@ -389,16 +405,7 @@ class ScenarioRunner:
                 return
             time.sleep(POLL_S)
 
-    def _say(self, kind: RunEventKind, subject: str, detail: str) -> None:
-        now = now_ns()
-        self._said += 1
-        event = RunEvent(
-            t_ns=now,
-            seq=self._said,
-            kind=int(kind),
-            subject=subject,
-            detail=detail,
-            scenario_s=(now - self._start_ns) / NS_PER_S,
-        )
-        self.said.append(event)
-        self._events.put(event)
+
+def _zero_ns(truth: SimTruth) -> int:
+    """Return the time zero of the scenario on the fleet's clock."""
+    return truth.t_ns - round(truth.scenario_s * NS_PER_S)

@@ -20,7 +20,7 @@ from tools.pads.controls import (
     PadMapping,
     counted,
 )
-from tools.pads.sdl_mapping import OWN_FILE, line_for, line_is_of, own_file
+from tools.pads.mappings import OWN_FILE, line_for, line_is_of, own_file
 
 ASKED: Final = {
     "lefty": "push the left stick forward, away from you, and let go",
@@ -69,7 +69,7 @@ class _Movement:
         while time.monotonic() < deadline:
             if select.select([self._device], [], [], 0.05)[0]:
                 for event in self._device.read():
-                    self._take(event.type, event.code, event.value)
+                    self._receive(event.type, event.code, event.value)
             resting = not self._down and all(abs(off) < AT_REST for off in self._off.values())
             if resting and (self.farthest or self.pressed):
                 return True
@@ -85,7 +85,7 @@ class _Movement:
         self._rest = {axis: float(self._device.absinfo(axis).value) for axis in self._range}
         return pressed
 
-    def _take(self, kind: int, code: int, value: int) -> None:
+    def _receive(self, kind: int, code: int, value: int) -> None:
         if kind == EV_KEY:
             (self._down.add if value else self._down.discard)(code)
             self.pressed += [code] if value and code not in self.pressed else []
@@ -112,11 +112,7 @@ class _Movement:
 def calibrate(
     device: PadDevice, say: Callable[[str], None], patience_s: float = PATIENCE_S
 ) -> PadMapping:
-    """Ask for every stick, trigger and button, and return the mapping.
-
-    Raises:
-        FleetError: a stick or trigger was not moved, or the pad is gone.
-    """
+    """Ask for every stick, trigger and button, and return the mapping."""
     movement = _Movement(device)
     found: dict[str, PadControl] = {}
     try:
@@ -153,11 +149,7 @@ def _asked(
 
 
 def keep(device: PadDevice, mapping: PadMapping) -> str:
-    """Write a mapping into the user's file, in place of an older one; return the file's name.
-
-    Raises:
-        FleetError: there is no home, or the file cannot be written.
-    """
+    """Write a mapping into the user's file, in place of an older one; return the file's name."""
     file = own_file()
     if file is None:
         raise FleetError(f"{OWN_FILE}: this user has no home directory; set HOME")

@@ -20,11 +20,9 @@ from tools.pads.controls import (
     PadDevice,
     PadMapping,
     codes_of,
-    identity_of,
 )
-from tools.pads.layouts import known_mapping
+from tools.pads.mappings import mapping_or_none
 from tools.pads.pilot import DEAD_ZONE, Deflection
-from tools.pads.sdl_mapping import given_lines, mapping_from
 
 evdev: Any = late("evdev")
 
@@ -51,11 +49,7 @@ class Axis:
     """
 
     def __init__(self, name: str, control: PadControl, device: PadDevice) -> None:
-        """Take its range and its value.
-
-        Raises:
-            FleetError: it has no range.
-        """
+        """Take its range and its value."""
         self.name, self.control = name, control
         self._sign = -1.0 if control.inverted else 1.0
         low, high = 0.0, 1.0
@@ -67,9 +61,9 @@ class Axis:
         self._middle, self._half = 0.5 * (low + high), 0.5 * (high - low)
         self._rest = 0.0 if name in STICKS else -1.0
         self.value = self._middle
-        self.look(device)
+        self.read(device)
 
-    def look(self, device: PadDevice) -> None:
+    def read(self, device: PadDevice) -> None:
         """Ask the kernel for its value now."""
         if self.control.kind == EV_ABS:
             self.value = device.absinfo(self.control.code).value
@@ -118,11 +112,7 @@ class Gamepad:
         self, device: PadDevice, mapping: PadMapping, *, hold: str = "rightshoulder",
         stop: str = "b",
     ) -> None:  # fmt: skip
-        """Take an open device, its mapping, and the dead man's button and the stop by name.
-
-        Raises:
-            FleetError: the mapping lacks one of them.
-        """
+        """Take an open device, its mapping, and the dead man's button and the stop by name."""
         for name in (hold, stop):
             if name not in mapping:
                 raise FleetError(f"{device.name}: its mapping has no {name}; choose another button")
@@ -172,12 +162,12 @@ class Gamepad:
         try:
             if select.select([self._device], [], [], timeout_s)[0]:
                 for event in self._device.read():
-                    self._take(event)
+                    self._receive(event)
         except OSError:
             self.gone = True
             self._down.clear()
 
-    def _take(self, event: Any) -> None:
+    def _receive(self, event: Any) -> None:
         axis = self._by_control.get((event.type, event.code))
         if axis is not None:
             axis.value = event.value
@@ -186,35 +176,24 @@ class Gamepad:
             self.stopped |= event.code == self._stop and bool(event.value)
             self._pressed |= event.code == self._hold and bool(event.value)
         elif event.type == EV_SYN and event.code == SYN_DROPPED:
-            self._look_again()
+            self._read_again()
 
-    def _look_again(self) -> None:
+    def _read_again(self) -> None:
         """Read what is down after a loss; the dead man's button counts once it is pressed again."""
         self._down.clear()
         self.stopped |= self._stop in self._device.active_keys()
         for axis in self._axes.values():
-            axis.look(self._device)
+            axis.read(self._device)
 
 
 def open_pad(path: str | None) -> PadDevice:
-    """Return a pad: of several, the first one with a known mapping.
-
-    Raises:
-        FleetError: there is none, a mapping for one cannot be used, or evdev is not installed.
-    """
+    """Return a pad: of several, the first one with a known mapping."""
     found = open_pads(path)
-    return next((pad for pad in found if _mapping_or_none(pad) is not None), found[0])
+    return next((pad for pad in found if mapping_or_none(pad) is not None), found[0])
 
 
 def open_pads(path: str | None) -> list[PadDevice]:
-    """Return the pads that are there, one at least, known or not.
-
-    Args:
-        path: such as /dev/input/event7; None: any.
-
-    Raises:
-        FleetError: there is none, or evdev is not installed.
-    """
+    """Return the pads that are there, one at least, known or not."""
     require("pad", "lead by keys: --keys")
     found: list[PadDevice] = []
     for candidate in [path] if path is not None else evdev.list_devices():
@@ -234,23 +213,3 @@ def open_pads(path: str | None) -> list[PadDevice]:
             f"no gamepad: {where}; join group `input`, name it with --pad, or use --keys"
         )
     return found
-
-
-def mapping_of(device: PadDevice) -> PadMapping:
-    """Return what a pad's controls mean: as the user gives it, else as the table knows it.
-
-    Raises:
-        FleetError: nobody knows; it is not guessed.
-    """
-    mapping = _mapping_or_none(device)
-    if mapping is None:
-        raise FleetError(
-            f"{identity_of(device)}: what its axes mean is not known; "
-            "`xrl lead --calibrate` asks for each, or set SDL_GAMECONTROLLERCONFIG"
-        )
-    return mapping
-
-
-def _mapping_or_none(device: PadDevice) -> PadMapping | None:
-    given = (mapping_from(line, device) for line in given_lines())
-    return next((mapping for mapping in given if mapping is not None), known_mapping(device))

@@ -43,7 +43,6 @@ class Pilot:
     """
 
     def __init__(self, height: float, pitch: float, assist_max_n: float) -> None:
-        """Begin where the robot is, without assist."""
         self._assist_max_n = assist_max_n
         self.led = Led(clamp(height, *HEIGHTS), clamp(pitch, *PITCHES), 0.0)
 
@@ -51,13 +50,8 @@ class Pilot:
         """Ask for no more assist than is given now, N."""
         self.led = self.led._replace(assist_n=max(0.0, min(self.led.assist_n, given_n)))
 
-    def advance(self, wanted: Deflection, dt: float) -> Led:
-        """Go on by dt, s.
-
-        Args:
-            wanted: deflections; the dead man's button is held.
-            dt: since the last call, s.
-        """
+    def integrate(self, wanted: Deflection, dt: float) -> Led:
+        """Go on by dt, s."""
         height, pitch, assist_n = self.led
         self.led = Led(
             clamp(height + HEIGHT_RATE * _beyond(wanted.height) * dt, *HEIGHTS),

@@ -18,8 +18,8 @@ from shared.bus.session import Session
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Scenario
 from shared.extras import require
-from tools.fleet.others import warn_of_others
 from tools.fleet.pace import add_pace
+from tools.fleet.status_table import warn_of_others
 from tools.fleet.supervise import SupervisedFleet
 from tools.judge import verdict, verdict_table
 from tools.judge.judgement import judge_run

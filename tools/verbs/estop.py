@@ -19,8 +19,8 @@ from shared.places import ROBOT_FILE
 from shared.process import StopFlag
 from tools.fleet.emergency_stop import GIVE_UP_S, BusStop, request_here, stop_all, wait_here
 from tools.fleet.run_dir import RunDir
+from tools.keyboard import typed_line
 from tools.terminal import Console
-from tools.typed_line import typed_line
 from tools.verb_table import Subparsers, add_run_dir, add_verb
 
 EVERY_S: Final = 0.02

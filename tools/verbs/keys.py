@@ -17,10 +17,17 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, BusError
 from tools.hosts import hosts_file
 from tools.hosts.layout import robot_on_hosts
-from tools.keys.authority import Authority, default_folder, make, principals_of
-from tools.keys.bundle import bundle, install, to_tar
+from tools.keys.authority import (
+    Authority,
+    bundle,
+    default_folder,
+    install,
+    make,
+    principals_of,
+    to_tar,
+)
 from tools.keys.certificates import CERTIFICATE_DAYS
-from tools.keys.inspection import KeyRow, look
+from tools.keys.inspection import KeyRow, inspect_keys
 from tools.number_arguments import count
 from tools.output import write_atomically
 from tools.terminal import Console
@@ -142,7 +149,7 @@ def _pack(args: argparse.Namespace, robot: RobotConfig) -> int:
 
 def _check(args: argparse.Namespace, robot: RobotConfig) -> int:
     folder = keys_folder(robot) if args.authority is None else args.authority
-    rows = look(folder, robot)
+    rows = inspect_keys(folder, robot)
     Console().print(_table(folder, rows))
     return 0 if all(not row.wrong for row in rows) else FAULT_EXIT_CODE
 

@@ -29,7 +29,8 @@ from tools.fleet.supervise import SupervisedFleet
 from tools.keyboard import Keyboard
 from tools.pads.calibration import calibrate, keep
 from tools.pads.controls import BUTTONS
-from tools.pads.gamepad import Gamepad, mapping_of, open_pad, open_pads
+from tools.pads.gamepad import Gamepad, open_pad, open_pads
+from tools.pads.mappings import mapping_of
 from tools.pads.pilot import Deflection, Led, Pilot
 from tools.terminal import Console
 from tools.verb_table import Subparsers, add_run_dir, add_verb
@@ -176,7 +177,7 @@ class Leader:
 
     def lead(self, wanted: Deflection, dt: float) -> None:
         """Go on by dt, s, and tell the robot; assist only while nobody else asks for it."""
-        led = self.pilot.advance(wanted, dt)
+        led = self.pilot.integrate(wanted, dt)
         now, self._sent = now_ns(), self._sent + 1
         if self._hand is not None:
             self._hand.put(

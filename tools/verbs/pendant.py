@@ -11,9 +11,9 @@ from shared.exceptions import FleetError
 from shared.joints import MODULES
 from shared.process import StopFlag
 from tools.fleet.emergency_stop import GIVE_UP_S, request_here, wait_here
+from tools.keyboard import typed_line
 from tools.number_arguments import finite
 from tools.terminal import Console
-from tools.typed_line import typed_line
 from tools.verb_table import Subparsers, add_run_dir, add_verb
 
 EVERY_S: Final = 0.02

@@ -11,12 +11,7 @@ import msgspec
 from shared.bus.session import open_session
 from shared.config.files import load
 from tools.fleet.bus_faults import BusFaults
-from tools.fleet.fleet_status import (
-    RateMonitor,
-    ears_of,
-    listen_for_all,
-    look,
-)
+from tools.fleet.fleet_status import RateMonitor, listen_for_all, monitors_of, read_status
 from tools.fleet.status_table import tables
 from tools.fleet.supervise import SupervisedFleet
 from tools.terminal import Console, renewed
@@ -46,13 +41,13 @@ def run(args: argparse.Namespace) -> int:
     robot = load(Path(fleet.manifest.config))
     security = robot.bus.security.mode
     with open_session(robot, "status", fleet.run.path) as session:
-        monitors = ears_of(session, fleet.manifest.topics)
+        monitors = monitors_of(session, fleet.manifest.topics)
         listen_for_all(monitors)
         bus = BusFaults(robot, session)
         if args.watch:
             _watch(fleet, monitors, security, bus)
         else:
-            status = look(fleet, monitors, security, bus)
+            status = read_status(fleet, monitors, security, bus)
             if args.json:
                 print(msgspec.json.format(msgspec.json.encode(status)).decode())
             else:
@@ -65,4 +60,4 @@ def _watch(
 ) -> None:
     with renewed(Console()) as show:
         while True:
-            show(tables(look(fleet, monitors, security, bus)))
+            show(tables(read_status(fleet, monitors, security, bus)))

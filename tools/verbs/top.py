@@ -14,9 +14,9 @@ from shared.config.files import load
 from shared.process import StopFlag
 from tools.fleet.process_table import services_elsewhere
 from tools.fleet.procfs import use_of
+from tools.fleet.status_table import process_table
 from tools.fleet.supervise import SupervisedFleet
-from tools.fleet.traffic import LINKS_S, Traffic
-from tools.fleet.traffic_table import process_table, traffic_table
+from tools.fleet.traffic import LINKS_S, Traffic, traffic_table
 from tools.terminal import Console, renewed
 from tools.topic_keys import keys_named
 from tools.verb_table import Subparsers, add_run_dir, add_verb

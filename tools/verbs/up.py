@@ -20,11 +20,11 @@ from shared.exceptions import BusError, FleetError, RunError
 from shared.extras import require
 from shared.joints import MODULES
 from tools.fleet.fleet_status import OPEN
-from tools.fleet.others import warn_of_others
 from tools.fleet.pace import add_pace
-from tools.fleet.process_table import check_known, is_simulated, load_table
+from tools.fleet.process_table import FleetOptions, check_known, is_simulated, load_table
+from tools.fleet.status_table import warn_of_others
 from tools.fleet.supervise import SupervisedFleet
-from tools.keys.inspection import look
+from tools.keys.inspection import inspect_keys
 from tools.live.experiment import add_controller, add_plant, make_out, scenario_file
 from tools.number_arguments import finite
 from tools.terminal import Console, marked
@@ -162,14 +162,16 @@ def run(args: argparse.Namespace) -> int:
     fleet = SupervisedFleet.start(
         args.config,
         args.run_dir,
-        overrides=overrides,
-        services=services,
-        not_started=("planner",) if not_started else (),
-        simulation=not args.no_sim,
-        injected=args.injectable,
-        ros2=args.ros2,
-        pace=args.pace,
-        disarmed=args.disarmed,
+        FleetOptions(
+            overrides=overrides,
+            services=services,
+            not_started=("planner",) if not_started else (),
+            simulation=not args.no_sim,
+            injected=args.injectable,
+            ros2=args.ros2,
+            pace=args.pace,
+            disarmed=args.disarmed,
+        ),
     )
     warn_of_others(Console(), own=fleet.run.path)
     up = len(fleet.manifest.services) - not_started
@@ -196,7 +198,7 @@ def _check_keys(robot: RobotConfig, *, must: bool) -> None:
         BusError: they cannot be used now, and they must.
     """
     folder = keys_folder(robot)
-    wrong = [f"{row.name}: {row.wrong}" for row in look(folder, robot) if row.wrong]
+    wrong = [f"{row.name}: {row.wrong}" for row in inspect_keys(folder, robot) if row.wrong]
     if not wrong:
         return
     more = f"; and {len(wrong) - 1} more, by `xrl keys check`" if len(wrong) > 1 else ""

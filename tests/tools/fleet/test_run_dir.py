@@ -16,21 +16,12 @@ import pytest
 from services.joint.rearm_guard import LastState, RearmGuard, request_stop, stop_source
 from shared.exceptions import FleetError
 from shared.joints import MODULES
-from shared.places import DEFAULT_CONFIG
 from shared.run_directory import FLEET_VARIABLE, check_own
+from tests.tools.fleet.plans import plan
 from tools import cli
-from tools.fleet import process_table, procfs
+from tools.fleet import procfs
 from tools.fleet.run_dir import MARKER, RunDir
 from tools.fleet.supervise import SupervisedFleet
-
-WORDS = ("up", "down", "status", "kill")
-
-
-def plan(run_dir: Path) -> process_table.FleetPlan:
-    return process_table.make_plan(
-        DEFAULT_CONFIG, run_dir, overrides={}, services=None, simulation=True,
-        table_path=process_table.TABLE,
-    )  # fmt: skip
 
 
 @pytest.fixture
@@ -210,7 +201,7 @@ def test_a_start_that_nobody_asked_for_keeps_what_a_module_was_and_a_stop(
     RearmGuard(claimed.path, "knee_left").write(last)
     request_stop(claimed.path, "knee_left", "anna")
     claimed.log_of("knee_left").write_text("why it ended")
-    claimed.prepare(plan(claimed.path), disarmed=True)
+    claimed.prepare(plan(claimed.path, disarmed=True))
     guard = RearmGuard(claimed.path, "knee_left")
     assert (guard.read(), guard.stop_requested) == (last, True)
     assert stop_source(claimed.path, "knee_left") == "anna"
@@ -218,7 +209,7 @@ def test_a_start_that_nobody_asked_for_keeps_what_a_module_was_and_a_stop(
 
 
 def test_a_start_that_nobody_asked_for_arms_nothing_that_was_down(claimed: RunDir) -> None:
-    claimed.prepare(plan(claimed.path), disarmed=True)
+    claimed.prepare(plan(claimed.path, disarmed=True))
     found = {module: RearmGuard(claimed.path, module).read() for module in MODULES}
     assert set(found.values()) == {LastState.HELD}
 

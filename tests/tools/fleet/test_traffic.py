@@ -24,8 +24,7 @@ def message(seq: int, t_ms: float) -> bytes:
 
 
 @given(
-    periods=st.lists(st.floats(0.1, 100.0), min_size=1, max_size=40),
-    age_ms=st.floats(0.0, 50.0),
+    periods=st.lists(st.floats(0.1, 100.0), min_size=1, max_size=40), age_ms=st.floats(0.0, 50.0)
 )
 def test_median_and_longest_of_spacing_and_age(periods: list[float], age_ms: float) -> None:
     traffic, now = KeyTraffic(STATE), 1e6

@@ -53,7 +53,7 @@ def make_keys(base: Path) -> None:
 
 
 def changed(file: Path, **changes: Any) -> Path:
-    """Write the hosts file anew; `services0` is a key of the first host."""
+    """Change the hosts file; `services0` is a key of the first host."""
     table = tomllib.loads(file.read_text(encoding="utf-8"))
     for key, value in changes.items():
         found = re.fullmatch(r"([a-z]+)(\d)", key)
@@ -72,10 +72,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "an unknown service": ({"services0": ["planner", "cook"]}, "no service 'cook'"),
     "a simulator": ({"services0": ["simulator"]}, "no service 'simulator'"),
     "a split leg": (
-        {
-            "services1": [*LEGS["right"], "hip_left"],
-            "services2": ["ankle_left", "knee_left"],
-        },
+        {"services1": [*LEGS["right"], "hip_left"], "services2": ["ankle_left", "knee_left"]},
         "the left leg's services are on several hosts",
     ),
     "a name for an address": ({"address0": "body.local"}, "an IP address"),

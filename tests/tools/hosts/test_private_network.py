@@ -17,7 +17,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError
 from tests.system.namespaces import isolation
 from tests.tools.hosts.places import make_hosts
-from tools.hosts import hosts_file, installation, layout, private_network
+from tools.hosts import hosts_file, installation, layout
 from tools.hosts.hosts_file import Host
 from tools.hosts.remote import Remote
 
@@ -78,11 +78,9 @@ def test_in_it_are_the_can_interfaces_and_the_hosts_address_and_outside_is_neith
     if refusal:
         pytest.skip(refusal)
     of_can_alone = ("bitrate", "txqueuelen")
-    commands = [
-        row for row in private_network.set_up_commands(host) if not set(of_can_alone) & {*row}
-    ]
-    missing = private_network.move_commands("can1")[:1]
-    given = json.dumps([[*commands, *missing, *commands], private_network.tear_down_command()])
+    commands = [row for row in layout.set_up_commands(host) if not set(of_can_alone) & {*row}]
+    missing = layout.move_commands("can1")[:1]
+    given = json.dumps([[*commands, *missing, *commands], layout.tear_down_command()])
     done = subprocess.run(
         [*words, "--mount", "bash", "-c", IN_A_MACHINE_OF_ITS_OWN, "-", sys.executable, COMMANDS,
          given],
@@ -97,7 +95,7 @@ def test_in_it_are_the_can_interfaces_and_the_hosts_address_and_outside_is_neith
 
 
 def test_its_can_interfaces_are_set_up_as_without_it(host: Host) -> None:
-    inside = [" ".join(words) for words in private_network.move_commands("can0")]
+    inside = [" ".join(words) for words in layout.move_commands("can0")]
     assert inside[0] == "/sbin/ip link set can0 netns xrl"
     assert "/sbin/ip -n xrl link set can0 up type can bitrate 1000000 restart-ms 100" in inside
 
@@ -122,8 +120,8 @@ def test_the_services_wait_for_it_and_start_in_it(host: Host, robot: RobotConfig
 def test_systemd_takes_its_unit(host: Host, tmp_path: Path) -> None:
     if shutil.which("systemd-analyze") is None:
         pytest.skip("no systemd-analyze on this machine")
-    unit = tmp_path / private_network.UNIT
-    unit.write_text(private_network.unit(host).replace("/sbin/ip", "/bin/true"), encoding="utf-8")
+    unit = tmp_path / layout.NETWORK_UNIT
+    unit.write_text(layout.network_unit(host).replace("/sbin/ip", "/bin/true"), encoding="utf-8")
     words = ["systemd-analyze", "verify", "--man=no", str(unit)]
     said = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert [line for line in said.stderr.splitlines() if private_network.UNIT in line] == []
+    assert [line for line in said.stderr.splitlines() if layout.NETWORK_UNIT in line] == []

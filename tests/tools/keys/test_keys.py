@@ -121,7 +121,7 @@ def test_renewing_keeps_the_generation_and_revoking_goes_on_to_the_next(made: Pl
     renewed = (made.authority / "planner.pem").read_bytes()
     assert renewed != before
     assert certificates.read(renewed).common_name == "planner.1"
-    assert made.check() == 0, "the earlier one is let in until it is packed anew"
+    assert made.check() == 0, "the earlier one is let in until it is packed again"
     assert made.xrl("revoke", "planner") == 0
     assert certificates.read((made.authority / "planner.pem").read_bytes()).common_name == (
         "planner.2"

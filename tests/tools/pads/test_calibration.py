@@ -11,7 +11,7 @@ from shared.exceptions import FleetError
 from tests.tools.pads.fake_pad import PADS, FakePad
 from tools.pads.calibration import ASKED, calibrate, keep
 from tools.pads.controls import EV_ABS, EV_KEY, PadControl
-from tools.pads.gamepad import mapping_of
+from tools.pads.mappings import mapping_of
 
 UNKNOWN = PADS["Stadia"]._replace(vendor=0x1234)
 BUTTONS = {

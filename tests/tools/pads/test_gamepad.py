@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from shared.exceptions import FleetError, MissingPackageError
 from tests.tools.pads.fake_pad import PADS, S16, FakePad, Seen
-from tools.pads import controls, gamepad
+from tools.pads import controls, gamepad, mappings
 from tools.pads.controls import EV_ABS, EV_KEY, EV_SYN, SYN_DROPPED
-from tools.pads.gamepad import Gamepad, mapping_of, open_pad
-from tools.pads.layouts import LAYOUTS, known_mapping
+from tools.pads.gamepad import Gamepad, open_pad
+from tools.pads.mappings import LAYOUTS, known_mapping, mapping_of
 from tools.pads.pilot import DEAD_ZONE, Pilot
 
 XBOX = PADS["Xbox 360 by cable"]
@@ -27,7 +27,7 @@ SIGNED_8 = XBOX._replace(axes={**XBOX.axes, 2: (-127, 127), 5: (-127, 127)})
 
 @pytest.fixture(autouse=True)
 def _no_mappings_of_this_user(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gamepad, "given_lines", lambda: iter(()))
+    monkeypatch.setattr(mappings, "given_lines", lambda: iter(()))
 
 
 def pad_of(seen: Seen) -> tuple[FakePad, Gamepad]:
@@ -97,7 +97,7 @@ def test_whatever_came_a_pad_at_rest_leads_nowhere(
         device.move(axis, 0.0 if axis in seen.triggers else 0.5 + 0.5 * drift)
     pad.wait(0.1)
     pilot = Pilot(1.0, 0.1, 150.0)
-    assert pilot.advance(pad.deflection, 1.0) == (1.0, 0.1, 0.0)
+    assert pilot.integrate(pad.deflection, 1.0) == (1.0, 0.1, 0.0)
     device.close()
 
 
@@ -112,7 +112,7 @@ def test_only_the_right_trigger_raises_the_assist(name: str, events: list[tuple[
         kind, code = inputs[which % len(inputs)]
         device.send(kind, code, value if kind == EV_ABS else value % 2)
         pad.wait(0.1)
-        assert pilot.advance(pad.deflection, 0.1).assist_n == 0.0
+        assert pilot.integrate(pad.deflection, 0.1).assist_n == 0.0
     device.close()
 
 

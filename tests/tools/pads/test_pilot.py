@@ -7,14 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.simulator.physics.led_hand import HEIGHTS, PITCHES
-from tools.pads.pilot import (
-    ASSIST_RATE,
-    DEAD_ZONE,
-    HEIGHT_RATE,
-    PITCH_RATE,
-    Deflection,
-    Pilot,
-)
+from tools.pads.pilot import ASSIST_RATE, DEAD_ZONE, HEIGHT_RATE, PITCH_RATE, Deflection, Pilot
 
 ANY = st.floats(allow_nan=True, allow_infinity=True)
 
@@ -26,7 +19,7 @@ def test_whatever_is_done_it_stays_within_the_limits_and_makes_no_jump(
     pilot = Pilot(1.0, 0.1, 150.0)
     for *sticks, dt in done:
         before = pilot.led
-        led = pilot.advance(Deflection(*sticks), dt)
+        led = pilot.integrate(Deflection(*sticks), dt)
         assert HEIGHTS[0] <= led.height <= HEIGHTS[1]
         assert PITCHES[0] <= led.pitch <= PITCHES[1]
         assert 0.0 <= led.assist_n <= 150.0
@@ -39,8 +32,8 @@ def test_whatever_is_done_it_stays_within_the_limits_and_makes_no_jump(
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_a_stick_near_its_middle_is_none_and_a_whole_one_is_the_whole_rate(sign: float) -> None:
     pilot = Pilot(1.0, 0.0, 100.0)
-    assert pilot.advance(Deflection(height=sign * DEAD_ZONE), 1.0).height == 1.0
-    assert pilot.advance(Deflection(height=sign), 0.1).height == pytest.approx(
+    assert pilot.integrate(Deflection(height=sign * DEAD_ZONE), 1.0).height == 1.0
+    assert pilot.integrate(Deflection(height=sign), 0.1).height == pytest.approx(
         1.0 + sign * 0.1 * HEIGHT_RATE
     )
 

@@ -13,12 +13,11 @@ from rich.text import Text
 from shared.exceptions import FleetError
 from tests.tools.exit_codes import exit_code
 from tests.tools.pads.fake_pad import PADS, FakePad
-from tools.pads import gamepad
+from tools.pads import gamepad, mappings
 from tools.pads.controls import EV_KEY
 from tools.pads.gamepad import Gamepad
-from tools.pads.layouts import known_mapping
+from tools.pads.mappings import guid_of, known_mapping
 from tools.pads.pilot import Deflection
-from tools.pads.sdl_mapping import guid_of
 from tools.verbs import lead
 
 XBOX = PADS["Xbox 360 by cable"]
@@ -110,5 +109,5 @@ def test_a_pad_whose_kept_mapping_is_broken_can_be_calibrated(
     assert mapping is not None
     monkeypatch.setattr(lead, "calibrate", lambda *_: mapping)
     assert exit_code(["lead", "--calibrate"]) == 0
-    assert gamepad.mapping_of(device) == mapping
+    assert mappings.mapping_of(device) == mapping
     assert len(file.read_text().splitlines()) == 1

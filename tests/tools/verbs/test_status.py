@@ -39,7 +39,6 @@ from tools.fleet.fleet_status import (
     module_status,
     tools_of,
 )
-from tools.fleet.others import warn_of_others
 from tools.fleet.status_table import (
     describe_lead,
     describe_real_time,
@@ -48,6 +47,7 @@ from tools.fleet.status_table import (
     describe_tools,
     describe_ways_out,
     tables,
+    warn_of_others,
 )
 from tools.terminal import Console
 

@@ -66,7 +66,7 @@ class BodyLead:
             if (wrench := self._wrench.take()) is not None:
                 wrenches[0].append(now_ns())
                 wrenches[1].append(wrench)
-            self._planner.look()
+            self._planner.listen()
 
         ended = run_led(self._planner, scenario.duration, ask, listen, stopped, every_s=ASK_S)
         return LeadRecord(tuple(TimedRows(*one) for one in states), TimedRows(*wrenches), ended)

@@ -128,7 +128,7 @@ class LiveProbe:
             progress(t_s)
 
         def listen() -> None:
-            if self._planner.look() and self._planner.status.probe_row == row:
+            if self._planner.listen() and self._planner.status.probe_row == row:
                 statuses.append(self._planner.status)
 
         ended = run_led(self._planner, excitation.duration_s, ask, listen, stopped, every_s=ASK_S)

@@ -11,6 +11,7 @@ from shared.config.sections import TripLimit, TripsConfig
 from shared.places import DEFAULT_CONFIG
 from shared.robot.fault_table import DRIVE_FAULTS, LOSSES
 from shared.robot.trip_table import JOINT_TRIPS, PLANNER_TRIPS, TripRow
+from tools.dev.reference.markdown import table
 from tools.field_docs import one_line
 
 _INTRODUCTION: Final = """\
@@ -44,41 +45,37 @@ def page() -> str:
 
 def _lines() -> Iterator[str]:
     yield _INTRODUCTION
-    yield "| fault | what it is | the drive | limp | zero lost | cause | what a person does |"
-    yield "|---|---|---|---|---|---|---|"
-    for kind, row in DRIVE_FAULTS.items():
-        cells = (
-            f"`{kind}`",
-            FAULT_KINDS[kind].about,
-            row.drive,
-            "yes" if row.limp else "no",
-            "yes" if row.zero_lost else "no",
-            f"`{row.cause.name}`",
-            row.recovery,
-        )
-        yield _row(cells)
+    yield from table(
+        "fault | what it is | the drive | limp | zero lost | cause | what a person does",
+        (
+            _cleaned(
+                f"`{kind}`", FAULT_KINDS[kind].about, row.drive, "yes" if row.limp else "no",
+                "yes" if row.zero_lost else "no", f"`{row.cause.name}`", row.recovery,
+            )
+            for kind, row in DRIVE_FAULTS.items()
+        ),
+    )  # fmt: skip
     yield _LOSSES
-    yield "| lost | its module, or all six | the others | what you see | recovery |"
-    yield "|---|---|---|---|---|"
-    for name, loss in LOSSES.items():
-        yield _row((name, *loss))
+    losses = (_cleaned(name, *loss) for name, loss in LOSSES.items())
+    yield from table("lost | its module, or all six | the others | what you see | recovery", losses)
     yield _TRIPS
-    yield "| trip | noticed by | measured | limit | what a person does |"
-    yield "|---|---|---|---|---|"
     limits = load(DEFAULT_CONFIG).trips
-    for cause, trip in JOINT_TRIPS.items():
-        yield _trip(cause.name, "the module", trip, limits)
-    for number, trip in PLANNER_TRIPS.items():
-        yield _trip(number.name, "the planner", trip, limits)
+    trips = [(cause.name, "the module", row) for cause, row in JOINT_TRIPS.items()]
+    trips += [(number.name, "the planner", row) for number, row in PLANNER_TRIPS.items()]
+    yield from table(
+        "trip | noticed by | measured | limit | what a person does",
+        (
+            _cleaned(f"`{name}`", by, row.measured, _limit(row, limits), row.recovery)
+            for name, by, row in trips
+        ),
+    )
 
 
-def _trip(name: str, by: str, row: TripRow, limits: TripsConfig) -> str:
+def _limit(row: TripRow, limits: TripsConfig) -> str:
     limit: TripLimit = getattr(limits, row.key)
     lasting = f" for {limit.after_ms:g} ms" if limit.after_ms else ""
-    side = "below" if row.least else "above"
-    shown = f"{side} {limit.limit:g} {row.unit}{lasting}"
-    return _row((f"`{name}`", by, row.measured, shown, row.recovery))
+    return f"{'below' if row.least else 'above'} {limit.limit:g} {row.unit}{lasting}"
 
 
-def _row(cells: tuple[str, ...]) -> str:
-    return "| " + " | ".join(one_line(cell) for cell in cells) + " |"
+def _cleaned(*cells: str) -> Iterator[str]:
+    return map(one_line, cells)

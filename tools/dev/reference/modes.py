@@ -7,6 +7,7 @@ from typing import Final
 
 from services.joint.failsafe import TRANSITIONS, Event
 from shared.bus.messages import Mode
+from tools.dev.reference.markdown import table
 from tools.field_docs import cell_docs
 
 _INTRODUCTION: Final = """\
@@ -41,19 +42,19 @@ _COLOUR: Final = {
 def page() -> str:
     """Return the page in Markdown."""
     docs = cell_docs(Event)
-    lines = [_INTRODUCTION, "| event | " + " | ".join(f"in {mode.name}" for mode in Mode) + " |"]
-    lines.append("|---" * (len(Mode) + 1) + "|")
+    rows = []
     for event in Event:
-        cells = [_cell(mode, event) for mode in Mode]
+        cells = [_after(mode, event) for mode in Mode]
         if any(cells):
             about = f": {docs[event.name]}" if event.name in docs else ""
-            lines.append(f"| `{event.name}`{about} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+            rows.append([f"`{event.name}`{about}", *cells])
+    headings = " | ".join(["event", *(f"in {mode.name}" for mode in Mode)])
+    return "\n".join([_INTRODUCTION, *table(headings, rows)]) + "\n"
 
 
-def _cell(mode: Mode, event: Event) -> str:
+def _after(mode: Mode, event: Event) -> str:
     row = TRANSITIONS[mode].get(event)
-    return f"{row[0].name}" if row else ""
+    return row[0].name if row else ""
 
 
 def diagram() -> str:

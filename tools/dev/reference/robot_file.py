@@ -13,6 +13,7 @@ from shared.config.gain_schedule import inputs_of
 from shared.config.robot_config import RobotConfig
 from shared.places import DEFAULT_CONFIG
 from shared.toml_file import Range
+from tools.dev.reference.markdown import table
 from tools.field_docs import cell_docs, one_line, summary
 
 _INTRODUCTION: Final = """\
@@ -41,11 +42,7 @@ def page() -> str:
     text = DEFAULT_CONFIG.read_text(encoding="utf-8")
     shipped = _Shipped(text)
     lines = [_INTRODUCTION.format(inputs=_schedule_inputs()), "## Top level", ""]
-    lines += _table(RobotConfig, "", shipped)
-    for name, hint in get_type_hints(RobotConfig, include_extras=True).items():
-        section = _section(hint)
-        if section is not None and name != _NOT_IN_THE_FILE:
-            lines += _sections(section, name, shipped)
+    lines += [*_table(RobotConfig, "", shipped), *_sections(RobotConfig, "", shipped)]
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -117,14 +114,15 @@ def _section(hint: Any) -> type[msgspec.Struct] | None:
     return None
 
 
-def _sections(section: type[msgspec.Struct], key: str, shipped: _Shipped) -> Iterator[str]:
-    yield f"## [{key}]\n"
-    yield summary(section) + "\n"
-    yield from _table(section, f"{key}.", shipped)
-    for name, hint in get_type_hints(section, include_extras=True).items():
-        part = _section(hint)
-        if part is not None and not _same_as_sibling(section, name):
-            yield from _sections(part, f"{key}.{name}", shipped)
+def _sections(whole: type[msgspec.Struct], prefix: str, shipped: _Shipped) -> Iterator[str]:
+    for name, hint in get_type_hints(whole, include_extras=True).items():
+        section = _section(hint)
+        if section is None or name == _NOT_IN_THE_FILE or _same_as_sibling(whole, name):
+            continue
+        yield f"## [{prefix}{name}]\n"
+        yield summary(section) + "\n"
+        yield from _table(section, f"{prefix}{name}.", shipped)
+        yield from _sections(section, f"{prefix}{name}.", shipped)
 
 
 def _same_as_sibling(section: type[msgspec.Struct], name: str) -> bool:
@@ -136,31 +134,21 @@ def _same_as_sibling(section: type[msgspec.Struct], name: str) -> bool:
 
 def _table(section: type[msgspec.Struct], prefix: str, shipped: _Shipped) -> Iterator[str]:
     docs = cell_docs(section)
-    hints = get_type_hints(section, include_extras=True)
     fields = {field.name: field for field in msgspec.structs.fields(section)}
-    yield "| key | type | unit | range | default | shipped | meaning |"
-    yield "|---|---|---|---|---|---|---|"
-    for name, hint in hints.items():
+    rows: list[tuple[str, ...]] = []
+    for name, hint in get_type_hints(section, include_extras=True).items():
+        key, doc = prefix + name, docs.get(name, "")
         if name == _NOT_IN_THE_FILE:
             continue
         if _section(hint) is not None:
-            yield f"| `{name}` | table | | | | | {docs.get(name, '') or _see(prefix, name)} |"
+            rows.append((f"`{name}`", "table", "", "", "", "", doc or f"see `[{key}]`"))
             continue
-        kind, unit, limits = _described(hint)
-        default = _default(fields[name])
-        value = shipped.values.get(prefix + name, "")
+        value = shipped.values.get(key, "")
         value = f"`{value}`" if value and len(value) <= _LONGEST else ""
-        meaning = _meaning(docs.get(name, ""), shipped.comments.get(prefix + name, ""))
-        yield f"| `{name}` | {kind} | {unit} | {limits} | {default} | {value} | {meaning} |"
+        meaning = doc or shipped.comments.get(key, "")
+        rows.append((f"`{name}`", *_described(hint), _default(fields[name]), value, meaning))
+    yield from table("key | type | unit | range | default | shipped | meaning", rows)
     yield ""
-
-
-def _see(prefix: str, name: str) -> str:
-    return f"see `[{prefix}{name}]`"
-
-
-def _meaning(doc: str, comment: str) -> str:
-    return doc or comment
 
 
 def _default(field: msgspec.structs.FieldInfo) -> str:

@@ -12,6 +12,7 @@ from shared.bus import messages, topics
 from shared.bus.topics import Topic
 from shared.joints import MODULES
 from shared.mcap_log.schema import ENUMERATIONS
+from tools.dev.reference.markdown import table
 from tools.field_docs import cell_docs, one_line, summary
 
 ENUMS: Final[tuple[type[IntEnum], ...]] = tuple(
@@ -35,10 +36,8 @@ def page() -> str:
 
 def _lines() -> Iterator[str]:
     yield _INTRODUCTION
-    yield "| topic | message | rate | priority | from | to | purpose |"
-    yield "|---|---|---|---|---|---|---|"
-    for topic in topics.TOPICS:
-        yield _topic_row(topic)
+    headings = "topic | message | rate | priority | from | to | purpose"
+    yield from table(headings, map(_topic_row, topics.TOPICS))
     yield ""
     yield "## Messages\n"
     yield "Each message begins with the two fields of the base:\n"
@@ -47,17 +46,24 @@ def _lines() -> Iterator[str]:
         yield from _message(kind)
     yield "## Enumerations\n"
     for enum in ENUMS:
-        yield from _enumeration(enum)
+        yield f"### {enum.__name__}\n"
+        yield f"{summary(enum)}\n"
+        docs = cell_docs(enum)
+        members = ((one.value, f"`{one.name}`", docs.get(one.name, "")) for one in enum)
+        yield from table("value | name | meaning", members)
+        yield ""
 
 
-def _topic_row(topic: Topic) -> str:
-    rate = f"{topic.rate_hz:g} Hz" if topic.rate_hz else "event"
-    recorded = "" if topic.recorded else " (not recorded)"
-    link = f"[{topic.type.__name__}](#{topic.type.__name__.lower()})"
-    priority = topic.priority.name.lower().replace("_", " ")
-    why = f"{one_line(topic.why)}{recorded}"
-    sides = f"{_names(topic.writers)} | {_names(topic.readers)}"
-    return f"| `{topic.name}` | {link} | {rate} | {priority} | {sides} | {why} |"
+def _topic_row(topic: Topic) -> tuple[str, ...]:
+    return (
+        f"`{topic.name}`",
+        f"[{topic.type.__name__}](#{topic.type.__name__.lower()})",
+        f"{topic.rate_hz:g} Hz" if topic.rate_hz else "event",
+        topic.priority.name.lower().replace("_", " "),
+        _names(topic.writers),
+        _names(topic.readers),
+        f"{one_line(topic.why)}{'' if topic.recorded else ' (not recorded)'}",
+    )
 
 
 def _names(names: Sequence[str]) -> str:
@@ -78,7 +84,6 @@ def _message(kind: type[msgspec.Struct]) -> Iterator[str]:
 
 
 def _parts(kind: type[msgspec.Struct]) -> Iterator[type[msgspec.Struct]]:
-    """Yield the structs that a message's fields hold."""
     for hint in get_type_hints(kind).values():
         for part in (hint, *get_args(hint)):
             if isinstance(part, type) and issubclass(part, msgspec.Struct):
@@ -92,12 +97,13 @@ def _fields(kind: type[msgspec.Struct], *, own: bool = False) -> Iterator[str]:
     if not fields:
         yield "No fields of its own.\n"
         return
-    yield "| field | type | meaning |"
-    yield "|---|---|---|"
-    for name in fields:
-        enum = ENUMERATIONS.get((kind, name))
-        shown = f"[{enum.__name__}](#{enum.__name__.lower()})" if enum else _type(hints[name])
-        yield f"| `{name}` | {shown} | {docs.get(name, '')} |"
+    enums = {name: ENUMERATIONS.get((kind, name)) for name in fields}
+    types = {
+        name: f"[{enum.__name__}](#{enum.__name__.lower()})" if enum else _type(hints[name])
+        for name, enum in enums.items()
+    }
+    rows = ((f"`{name}`", shown, docs.get(name, "")) for name, shown in types.items())
+    yield from table("field | type | meaning", rows)
     yield ""
 
 
@@ -108,14 +114,3 @@ def _type(hint: object) -> str:
     if args[-1] is Ellipsis:
         return f"{_type(args[0])}[]"
     return f"{_type(args[0])}[{len(args)}]"
-
-
-def _enumeration(enum: type[IntEnum]) -> Iterator[str]:
-    docs = cell_docs(enum)
-    yield f"### {enum.__name__}\n"
-    yield f"{summary(enum)}\n"
-    yield "| value | name | meaning |"
-    yield "|---|---|---|"
-    for member in enum:
-        yield f"| {member.value} | `{member.name}` | {docs.get(member.name, '')} |"
-    yield ""

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from typing import Any, Final
 
 from tools.cli import whole_parser
+from tools.dev.reference.markdown import table
 from tools.verb_table import VERBS
 
 _WIDTH: Final = "96"
@@ -43,10 +44,8 @@ def page() -> str:
             del os.environ["COLUMNS"]
         else:
             os.environ["COLUMNS"] = before
-    lines = [_INTRODUCTION, "| verb | what it does |", "|---|---|"]
-    lines += [
-        f"| [`{verb.name}`](#xrl-{verb.name.replace(' ', '-')}) | {verb.help} |" for verb in VERBS
-    ]
+    rows = ((f"[`{verb.name}`](#xrl-{verb.name.replace(' ', '-')})", verb.help) for verb in VERBS)
+    lines = [_INTRODUCTION, *table("verb | what it does", rows)]
     for name, text in helps:
         lines += ["", f"## xrl {name}", "", "```text", text.rstrip(), "```"]
     return "\n".join(lines) + "\n"

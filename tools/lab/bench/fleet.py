@@ -31,8 +31,8 @@ from shared.exceptions import FAULT_EXIT_CODE, RunError
 from shared.extras import require
 from shared.joints import MODULES
 from shared.places import CHECKOUT
-from tools.fleet.others import warn_of_others
 from tools.fleet.pace import check_pace
+from tools.fleet.status_table import warn_of_others
 from tools.judge.verdict_table import digits
 from tools.lab.bench.revisions import environment, its_config, unpacked
 from tools.lab.bench.table import (

@@ -13,8 +13,7 @@ from shared.process import StopFlag
 from tools.flags import Duration, RunDirFlags, option, positional
 from tools.fleet.process_table import services_elsewhere
 from tools.fleet.supervise import SupervisedFleet
-from tools.fleet.traffic import LINKS_S, Traffic
-from tools.fleet.traffic_table import traffic_table
+from tools.fleet.traffic import LINKS_S, Traffic, traffic_table
 from tools.terminal import Console, renewed
 from tools.topic_keys import keys_named
 

@@ -9,11 +9,17 @@ import pytest
 
 from shared.exceptions import FleetError
 from tests.tools.pads.fake_pad import PADS, FakePad
-from tools.pads import sdl_mapping
+from tools.pads import mappings
 from tools.pads.controls import EV_ABS, EV_KEY, PadControl
-from tools.pads.gamepad import mapping_of
-from tools.pads.layouts import known_mapping
-from tools.pads.sdl_mapping import GivenLine, given_lines, guid_of, line_for, mapping_from
+from tools.pads.mappings import (
+    GivenLine,
+    given_lines,
+    guid_of,
+    known_mapping,
+    line_for,
+    mapping_from,
+    mapping_of,
+)
 
 UNKNOWN = PADS["Stadia"]._replace(vendor=0x1234, product=0x5678)
 GUID = "05000000341200007856000003090000"
@@ -30,8 +36,8 @@ def device() -> Iterator[FakePad]:
 @pytest.fixture(autouse=True)
 def _own_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.delenv(sdl_mapping.TEXT_VARIABLE, raising=False)
-    monkeypatch.delenv(sdl_mapping.FILE_VARIABLE, raising=False)
+    monkeypatch.delenv(mappings.TEXT_VARIABLE, raising=False)
+    monkeypatch.delenv(mappings.FILE_VARIABLE, raising=False)
 
 
 def test_axes_and_buttons_are_counted_as_sdl_does(device: FakePad) -> None:
@@ -88,9 +94,9 @@ def test_the_environment_comes_first_and_then_the_users_own_file(
     assert mapping_of(device)["righty"].inverted is False
     named = tmp_path / "db.txt"
     named.write_text(f"{GUID},x,{BASIC.replace('a3', 'a3~')},\n")
-    monkeypatch.setenv(sdl_mapping.FILE_VARIABLE, str(named))
+    monkeypatch.setenv(mappings.FILE_VARIABLE, str(named))
     assert mapping_of(device)["righty"].inverted
-    monkeypatch.setenv(sdl_mapping.TEXT_VARIABLE, f"{GUID},x,{BASIC.replace('a3', 'a2')},\n")
+    monkeypatch.setenv(mappings.TEXT_VARIABLE, f"{GUID},x,{BASIC.replace('a3', 'a2')},\n")
     assert mapping_of(device)["righty"] == PadControl(EV_ABS, 2)
     assert [line.where for line in given_lines()] == [
         "SDL_GAMECONTROLLERCONFIG: line 1", f"{named}: line 1", f"{own}: line 3",
@@ -98,6 +104,6 @@ def test_the_environment_comes_first_and_then_the_users_own_file(
 
 
 def test_a_file_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(sdl_mapping.FILE_VARIABLE, "/nowhere/db.txt")
+    monkeypatch.setenv(mappings.FILE_VARIABLE, "/nowhere/db.txt")
     with pytest.raises(FleetError, match=r"/nowhere/db\.txt: cannot be read"):
         list(given_lines())
