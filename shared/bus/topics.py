@@ -187,7 +187,7 @@ SIM_STATE: Final = Topic(
     priority=Priority.BACKGROUND,
     recorded=True,
     writers=("simulator",),
-    why="complete simulated world: `xrl whatif` continues from it",
+    why="complete simulated world: `xrl log whatif` continues from it",
 )
 SIM_CONTROL: Final = Topic(
     name="sim/control",

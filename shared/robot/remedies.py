@@ -33,7 +33,7 @@ def remedy_of(state: JointState) -> str:
     if mode is Mode.DAMP:
         return RESTART
     if drive is DriveStatus.UNZEROED:
-        return "hang the robot, xrl zero"
+        return "hang the robot, xrl drive zero"
     if drive is DriveStatus.HOLDING:
         return "by itself, with the planner: the drive holds"
     if mode is Mode.DISARMED and drive in (DriveStatus.IDLE, DriveStatus.ERROR):

@@ -52,7 +52,7 @@ which each doubles, it may be led again."""
 PLANNER_TRIPS: Final[dict[Trip, TripRow]] = {
     Trip.LEGS: TripRow(
         "legs", "the legs disagree about the torso", "m",
-        "stand both soles flat; if it lasts: `xrl zero`",
+        "stand both soles flat; if it lasts: `xrl drive zero`",
     ),
     Trip.REACH: TripRow(
         "reach", "the reference pose is out of reach", "m", "lead back to where the legs reach"

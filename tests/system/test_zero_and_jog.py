@@ -1,4 +1,4 @@
-"""`xrl zero` and `xrl jog` on the emulated robot, as a person types them."""
+"""`xrl drive zero` and `xrl drive jog` on the emulated robot, as a person types them."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def test_a_leg_of_the_emulated_robot_follows_and_nothing_is_left_behind(run_dir:
 
 
 def test_after_a_jog_the_doctor_finds_the_drive_as_it_was(run_dir: Path) -> None:
-    """Its limits too: `xrl configure --apply` would restart the board for them, zero and all."""
+    """Its limits too: `xrl drive configure --apply` would restart the board for them, zero and all."""
     fleet = SupervisedFleet.start(DEFAULT_CONFIG, run_dir, services=["simulator"])
     try:
         jogged = xrl("jog", MODULE, "--torque-limit", "4", "--yes", run_dir=run_dir)

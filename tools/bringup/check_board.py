@@ -53,7 +53,7 @@ def firmware_row(module: str, firmware: tuple[int, int, int]) -> Finding:
     found = describe_firmware(firmware)
     fix = (
         f"flash {wanted}: `odrivetool legacy-dfu FILE.elf`; then "
-        f"`xrl configure --apply --module {module}`"
+        f"`xrl drive configure --apply --module {module}`"
     )
     if is_known(firmware):
         why = "settings may have other names or defaults"
@@ -68,7 +68,7 @@ def firmware_row(module: str, firmware: tuple[int, int, int]) -> Finding:
 def settings_rows(module: str, wanted: tuple[WantedSetting, ...], values: Values) -> list[Finding]:
     """Compare a board's settings with the wanted ones; all that fit make one row."""
     rows = []
-    fix = f"`xrl configure --apply --module {module}`"
+    fix = f"`xrl drive configure --apply --module {module}`"
     for setting in wanted:
         subject, name = _subject(module, setting.name)
         value = values.get(setting.name)
@@ -190,7 +190,7 @@ def position_rows(module: str, turns: tuple[float, float], robot: RobotConfig) -
                 "zero",
                 f"motors at {turns[0]:.1f}, {turns[1]:.1f} turns",
                 f"about {mark:g}",
-                f"`xrl zero {module} --at PHI,THETA`",
+                f"`xrl drive zero {module} --at PHI,THETA`",
                 "it lost its zero with the power, and is not armed without one",
             )
         ]
@@ -205,7 +205,7 @@ def position_rows(module: str, turns: tuple[float, float], robot: RobotConfig) -
                 "angle",
                 f"{angle:.2f} rad",
                 f"{low:g} to {high:g}",
-                f"move it there by hand; if it is there, `xrl zero {module} --at PHI,THETA`",
+                f"move it there by hand; if it is there, `xrl drive zero {module} --at PHI,THETA`",
                 "it is not armed outside of its limits",
             )
         )

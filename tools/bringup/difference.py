@@ -1,4 +1,4 @@
-"""What `xrl configure` is going to write, for the terminal."""
+"""What `xrl drive configure` is going to write, for the terminal."""
 
 from __future__ import annotations
 

@@ -182,7 +182,7 @@ def outside(robot: RobotConfig, module: str, plan: MotionPlan, q: Pair) -> str:
         if not low <= q[axis] <= high:
             return (
                 f"{AXES[axis]} is at {q[axis]:.3f} rad, outside of {low:g} .. {high:g} rad; bring "
-                "it inside by hand, or correct its zero (`xrl zero`)"
+                "it inside by hand, or correct its zero (`xrl drive zero`)"
             )
         beyond = [to for to in reach if not low <= to <= high]
         if beyond:

@@ -1,6 +1,6 @@
 """The drives within reach of bring-up: real ones as they are, emulated ones by the same code.
 
-Where the drives are emulated, `xrl doctor` and `xrl configure` look at them by the same code as
+Where the drives are emulated, `xrl doctor` and `xrl drive configure` look at them by the same code as
 at real ones: over the emulated CAN buses, and with the genuine `odrive` package over the stand-in
 of libusb. A fleet that is up is looked at as it is; else the simulator runs alone for the while.
 """

@@ -1,4 +1,4 @@
-"""`xrl identify joint`: looks at a hanging leg, asks, moves its joints one by one, and tells."""
+"""`xrl drive identify joint`: looks at a hanging leg, asks, moves its joints one by one, and tells."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def _joint(
         return moved
     fit = fit_sines(moved.samples, moved.plan)
     if fit is None:
-        return Stopped(f"{joint}: too few samples for a fit; look at its bus (`xrl can test`)")
+        return Stopped(f"{joint}: too few samples for a fit; look at its bus (`xrl drive can test`)")
     return JointResult(joint, fit, moved.where.inertia)
 
 

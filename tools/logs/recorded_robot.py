@@ -61,5 +61,5 @@ def refuse_own_controller(log: RunLog | RunIndex) -> None:
     if has_own_controller(log):
         raise RunError(
             f"{log.path}: a controller of somebody's own led ({ATTACHED} in it), and this computes "
-            "the shipped law; `xrl resim --controller FILE` runs it again"
+            "the shipped law; `xrl log resim --controller FILE` runs it again"
         )

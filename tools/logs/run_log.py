@@ -38,7 +38,7 @@ PICTURE_MAX_S: Final = 120.0
 """Longest time in one picture of a run."""
 
 
-SEE_INFO: Final = "`xrl info` shows what the file holds"
+SEE_INFO: Final = "`xrl log info` shows what the file holds"
 """What to do about a part without messages."""
 
 

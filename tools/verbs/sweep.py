@@ -1,4 +1,4 @@
-"""`xrl sweep`: studies over many random runs in virtual time. One module a study."""
+"""`xrl study sweep`: studies over many random runs in virtual time. One module a study."""
 
 from __future__ import annotations
 

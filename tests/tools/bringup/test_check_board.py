@@ -46,7 +46,7 @@ def test_each_wrong_setting_has_its_own_row_with_both_values_and_the_command(
     ]
     row = next(row for row in rows if row.what.endswith("vel_limit"))
     assert (row.found, row.wanted) == ("2", "60")
-    assert "xrl configure --apply --module knee_left" in row.fix
+    assert "xrl drive configure --apply --module knee_left" in row.fix
     assert "OVERSPEED" in row.why
 
 
@@ -206,7 +206,7 @@ def test_an_armed_axis_is_right_only_where_a_service_has_it(
 def test_a_motor_that_counts_from_power_up_has_no_zero_and_no_angle(robot: RobotConfig) -> None:
     (row,) = check_board.position_rows(MODULE, (64.0, 0.7), robot)
     assert (row.what, row.verdict) == ("zero", FindingKind.WRONG)
-    assert "xrl zero knee_left" in row.fix
+    assert "xrl drive zero knee_left" in row.fix
 
 
 def test_without_a_mark_any_position_counts(robot: RobotConfig) -> None:

@@ -19,7 +19,7 @@ TRAP = wrong(
     "controller.config.vel_limit",
     "2",
     "60",
-    "`xrl configure --apply --module knee_left`",
+    "`xrl drive configure --apply --module knee_left`",
     "it disarms",
 )
 NOTED = warning("robot file", "assumed", "14 [assumed]", "none", "measure them")
@@ -42,7 +42,7 @@ def test_rows_that_are_not_ok_stay_themselves() -> None:
 
 def trap(subject: str, what: str = "controller.config.vel_limit") -> Finding:
     module = subject.partition(".")[0]
-    fix = f"`xrl configure --apply --module {module}`"
+    fix = f"`xrl drive configure --apply --module {module}`"
     return wrong(subject, what, "2", "60", fix, "it disarms")
 
 
@@ -50,7 +50,7 @@ def test_a_trap_of_all_twelve_axes_is_one_row_and_one_command_for_all() -> None:
     rows = [trap(f"{module}.{axis}") for module in MODULES for axis in AXES]
     (row,) = merged(rows)
     assert (row.subject, row.found, row.verdict) == ("all 12", "2", FindingKind.WRONG)
-    assert row.fix == "`xrl configure --apply`"
+    assert row.fix == "`xrl drive configure --apply`"
     assert verdict_line({"drives": rows}) == "12 wrong: all 12 vel_limit"
     assert report_of({"drives": rows}).wrong == 12
     assert len(report_of({"drives": rows}).groups["drives"]) == 12, "machines get every row"
@@ -70,7 +70,7 @@ def test_all_six_boards_are_one_row_and_five_are_not() -> None:
 
 def test_values_wanted_of_one_axis_only_are_not_put_together() -> None:
     rows = [
-        wrong(f"{module}.{axis}", "config.can.node_id", "0", str(i), "`xrl configure --apply`")
+        wrong(f"{module}.{axis}", "config.can.node_id", "0", str(i), "`xrl drive configure --apply`")
         for i, module in enumerate(MODULES)
         for axis in AXES
     ]
@@ -107,7 +107,7 @@ def test_name_values_reason_and_command_are_printed_whatever_the_width(width: in
     text = " ".join(printed({"drives": [TRAP, NOTED]}, width).split())
     for words in ("knee_left.axis0", "vel_limit", "it disarms", "wrong", "warning", "14 [assumed]"):
         assert words in text
-    assert "xrl configure" in text
+    assert "xrl drive configure" in text
 
 
 def test_verbose_prints_every_row() -> None:

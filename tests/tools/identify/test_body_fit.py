@@ -226,7 +226,7 @@ def test_a_payload_beyond_the_largest_is_not_written_but_the_rest_is(robot: Robo
 def test_a_new_torque_constant_comes_with_what_the_drives_need(
     robot: RobotConfig, fitted: BodyFit
 ) -> None:
-    assert any("xrl configure" in remark for remark in remarks(of_body(fitted, robot), robot))
+    assert any("xrl drive configure" in remark for remark in remarks(of_body(fitted, robot), robot))
 
 
 def test_a_weighed_payload_is_known(robot: RobotConfig, true_robot: RobotConfig) -> None:

@@ -1,4 +1,4 @@
-"""`xrl jog`: on a bench drive in virtual time, and the verb on the emulated robot."""
+"""`xrl drive jog`: on a bench drive in virtual time, and the verb on the emulated robot."""
 
 from __future__ import annotations
 
@@ -226,7 +226,7 @@ def test_the_reference_is_smooth_and_ends_where_it_began() -> None:
     ("q", "plan", "words"),
     [
         ((0.0, -0.21), PLAN, r"would go to -0\.160.*--by with the other"),
-        ((0.0, -0.1), PLAN, "outside.*xrl zero"),
+        ((0.0, -0.1), PLAN, "outside.*xrl drive zero"),
         ((0.61, -1.0), PLAN, "phi is at 0.610 rad, outside"),
         ((math.nan, -1.0), PLAN, "outside"),
     ],

@@ -1,4 +1,4 @@
-"""`xrl sweep certificate`: compares the sign of K_fail with falls in simulation."""
+"""`xrl study sweep certificate`: compares the sign of K_fail with falls in simulation."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ CODE: Final = code_of("tools.lab.studies.sweeps.certificate_study")
 LABELS: Final = {"stood": {"True", "False"}, "weakest": frozenset(DIRECTIONS)}
 
 EXAMPLES: Final = """
-    xrl sweep certificate
-    xrl sweep certificate --n 1000 --seed 3 --rigid
-    xrl sweep certificate --friction
+    xrl study sweep certificate
+    xrl study sweep certificate --n 1000 --seed 3 --rigid
+    xrl study sweep certificate --friction
 """
 
 

@@ -1,4 +1,4 @@
-"""`xrl sweep dynamics`: does anything grow that the dynamic certificate says fades?"""
+"""`xrl study sweep dynamics`: does anything grow that the dynamic certificate says fades?"""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ LABELS: Final = {
 Task: TypeAlias = "tuple[DynamicsTrial, RobotConfig]"
 
 EXAMPLES: Final = """
-    xrl sweep dynamics
-    xrl sweep dynamics --n 400 --out out/dynamics
-    xrl sweep dynamics --only 7
+    xrl study sweep dynamics
+    xrl study sweep dynamics --n 400 --out out/dynamics
+    xrl study sweep dynamics --only 7
 """
 
 
@@ -155,7 +155,7 @@ def _run_task(task: Task) -> DynamicsResult:
 
 
 def _name(task: Task) -> str:
-    return f"case {task[0].number} (xrl sweep dynamics --only {task[0].number})"
+    return f"case {task[0].number} (xrl study sweep dynamics --only {task[0].number})"
 
 
 def _rows(task: Task, outcome: DynamicsResult) -> list[dict[str, object]]:

@@ -1,4 +1,4 @@
-"""`xrl sweep kill`: the planner killed at random, in random postures and under pushes."""
+"""`xrl study sweep kill`: the planner killed at random, in random postures and under pushes."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ LABELS: Final = {"ending": ENDINGS}
 Task: TypeAlias = "tuple[cases.KillCase, RobotConfig]"
 
 EXAMPLES: Final = """
-    xrl sweep kill
-    xrl sweep kill --n 500 --seed 1 --out out/kill
-    xrl sweep kill --only 137 --seed 1
-    xrl sweep kill --only 137 --seed 1 --out out/case137
+    xrl study sweep kill
+    xrl study sweep kill --n 500 --seed 1 --out out/kill
+    xrl study sweep kill --only 137 --seed 1
+    xrl study sweep kill --only 137 --seed 1 --out out/case137
 """
 
 
@@ -143,7 +143,7 @@ def _run_task(task: Task) -> KillResult:
 
 
 def _name(task: Task) -> str:
-    return f"case {task[0].number} (xrl sweep kill --seed {task[0].seed} --only {task[0].number})"
+    return f"case {task[0].number} (xrl study sweep kill --seed {task[0].seed} --only {task[0].number})"
 
 
 def _rows(task: Task, outcome: KillResult) -> list[dict[str, object]]:

@@ -1,4 +1,4 @@
-"""`xrl sweep latency`: three controls over networks from good to hopeless, under pushes."""
+"""`xrl study sweep latency`: three controls over networks from good to hopeless, under pushes."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ LABELS: Final = {"control": frozenset(CONTROLS), "ending": ENDINGS}
 Task: TypeAlias = "tuple[LatencyTrial, RobotConfig]"
 
 EXAMPLES: Final = """
-    xrl sweep latency
-    xrl sweep latency --delay 0:200:10 --jitter 5 --loss 0,0.2 --trials 10 --out out/latency
-    xrl sweep latency --control distributed --delay 0:60:5 --loss 0 --lead-easing 0
-    xrl sweep latency --only 137 --out out/trial137
-    xrl sweep latency --cluster tcp://HOST:8786
+    xrl study sweep latency
+    xrl study sweep latency --delay 0:200:10 --jitter 5 --loss 0,0.2 --trials 10 --out out/latency
+    xrl study sweep latency --control distributed --delay 0:60:5 --loss 0 --lead-easing 0
+    xrl study sweep latency --only 137 --out out/trial137
+    xrl study sweep latency --cluster tcp://HOST:8786
 """
 
 

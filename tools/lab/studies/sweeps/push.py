@@ -1,4 +1,4 @@
-"""`xrl sweep push`: the hardest push by direction, duration, pose and mode, beside the limits."""
+"""`xrl study sweep push`: the hardest push by direction, duration, pose and mode, beside the limits."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ WORDS_OF: Final = {"led": "planner leads", "dead": "planner dead"}
 Task: TypeAlias = "tuple[PushTrial, RobotConfig, PlantConfig]"
 
 EXAMPLES: Final = """
-    xrl sweep push
-    xrl sweep push --pose stand --duration 3 --angle 90
-    xrl sweep push --plant drivetrain.stiffness=2000 --out out/soft
+    xrl study sweep push
+    xrl study sweep push --pose stand --duration 3 --angle 90
+    xrl study sweep push --plant drivetrain.stiffness=2000 --out out/soft
 """
 
 

@@ -1,4 +1,4 @@
-"""`xrl sweep robust`: every error of the plant drawn at once: who falls, what takes the margin."""
+"""`xrl study sweep robust`: every error of the plant drawn at once: who falls, what takes the margin."""
 
 from __future__ import annotations
 
@@ -56,11 +56,11 @@ FIGURES: Final = (
 Task: TypeAlias = "tuple[RobustTrial, RobotConfig]"
 
 EXAMPLES: Final = """
-    xrl sweep robust
-    xrl sweep robust --n 500 --out out/robust
-    xrl sweep robust --beyond 2
-    xrl sweep robust --slope 5 --imu
-    xrl sweep robust --only 17 --out out/trial17
+    xrl study sweep robust
+    xrl study sweep robust --n 500 --out out/robust
+    xrl study sweep robust --beyond 2
+    xrl study sweep robust --slope 5 --imu
+    xrl study sweep robust --only 17 --out out/trial17
 """
 
 
@@ -246,7 +246,7 @@ def _run_task(task: Task) -> RobustResult:
 
 
 def _name(task: Task) -> str:
-    return f"trial {task[0].number} (xrl sweep robust --only {task[0].number})"
+    return f"trial {task[0].number} (xrl study sweep robust --only {task[0].number})"
 
 
 def _rows(task: Task, outcome: RobustResult) -> list[dict[str, object]]:

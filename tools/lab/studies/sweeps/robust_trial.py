@@ -129,7 +129,7 @@ def scenario_of(robot: RobotConfig, trial: RobustTrial) -> Scenario:
         frames = (Keyframe(at=0.0, height=stand), Keyframe(at=LEAD_S, height=1.05))
     return Scenario(
         name=f"robust-{trial.seed}-{trial.number}",
-        about=f"trial {trial.number} of `xrl sweep robust --seed {trial.seed}`",
+        about=f"trial {trial.number} of `xrl study sweep robust --seed {trial.seed}`",
         duration=round(trial.kill_s + AFTER_KILL_S, DIGITS),
         keyframe=frames,
         kill=(Kill(service="planner", at=trial.kill_s),),

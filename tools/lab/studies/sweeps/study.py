@@ -54,7 +54,7 @@ class Study(NamedTuple, Generic[T, R]):
     """A study to run: one row per case, appended on completion; an interrupted study resumes."""
 
     name: str
-    """Its name after `xrl sweep`."""
+    """Its name after `xrl study sweep`."""
     table: str
     """File name of the table."""
     columns: Sequence[str]
@@ -147,7 +147,7 @@ def inputs(name: str, robot: RobotConfig, code: tuple[str, ...], **more: str) ->
 def command(name: str, args: argparse.Namespace, *flags: str) -> str:
     """Return the command of a study, with `--config` if it is not the shipped robot's."""
     config = [] if args.config == DEFAULT_CONFIG else [f"--config {args.config}"]
-    return " ".join([f"xrl sweep {name}", *flags, *config])
+    return " ".join([f"xrl study sweep {name}", *flags, *config])
 
 
 def run(

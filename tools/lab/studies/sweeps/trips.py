@@ -1,4 +1,4 @@
-"""`xrl sweep trips`: does each trip come where it is to, on each plant, and none where not?"""
+"""`xrl study sweep trips`: does each trip come where it is to, on each plant, and none where not?"""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ Task: TypeAlias = "tuple[int, str, str, RobotConfig, int]"
 """Number, trouble, plant, robot, seed of the noise."""
 
 EXAMPLES: Final = """
-    xrl sweep trips
-    xrl sweep trips --trouble sags --trouble drops
-    xrl sweep trips --on "k 2000" --out out/trips
+    xrl study sweep trips
+    xrl study sweep trips --trouble sags --trouble drops
+    xrl study sweep trips --on "k 2000" --out out/trips
 """
 
 

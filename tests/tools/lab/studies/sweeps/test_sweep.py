@@ -1,4 +1,4 @@
-"""`xrl sweep`: the pool, the words and the verb around them."""
+"""`xrl study sweep`: the pool, the words and the verb around them."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ def test_a_fall_is_exit_code_1_with_the_command_that_shows_it(
     assert sweep(*average, "--out", str(tmp_path)) == 1
     output = " ".join(capsys.readouterr().out.split())
     assert "1 falls of 1" in output
-    command = f"xrl sweep kill --seed {seed} --split diagonal --jacobian average --only 0"
+    command = f"xrl study sweep kill --seed {seed} --split diagonal --jacobian average --only 0"
     assert command in output
     assert cli.main(command.split()[1:]) == 1
 
@@ -245,5 +245,5 @@ def test_the_verb_and_its_study_have_help_with_examples(
         cli.main([*words, "--help"])
     assert left.value.code == 0
     shown = capsys.readouterr().out
-    assert f"examples:\n  xrl sweep {words[1] if len(words) > 1 else ''}" in shown
-    assert f"xrl sweep {words[-1] if len(words) > 1 else 'kill'}" in shown
+    assert f"examples:\n  xrl study sweep {words[1] if len(words) > 1 else ''}" in shown
+    assert f"xrl study sweep {words[-1] if len(words) > 1 else 'kill'}" in shown

@@ -1,4 +1,4 @@
-"""`xrl sweep certificate`: the table of a study, gone on with, and its exit code."""
+"""`xrl study sweep certificate`: the table of a study, gone on with, and its exit code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`xrl sweep latency`: its grid, its trials, its figures, and the verb around them."""
+"""`xrl study sweep latency`: its grid, its trials, its figures, and the verb around them."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ def test_of_a_few_trials_no_error_is_ranked(pushes: PushRange, few: bool) -> Non
     figures = dict.fromkeys((key for key, _, _ in robust.FIGURES), "")
     rows = [figures | row for row in rows_by(pushes, "drive.lag_s")[: robust.RANKED_LEAST - few]]
     printed = io.StringIO()
-    robust._show(rows, "xrl sweep robust", Console(width=200, file=printed))
+    robust._show(rows, "xrl study sweep robust", Console(width=200, file=printed))
     assert ("too few to tell" in printed.getvalue()) is few
     assert ("drive.lag_s" in printed.getvalue()) is not few
 
@@ -95,7 +95,7 @@ def test_an_impossible_width_is_refused(capsys: pytest.CaptureFixture[str]) -> N
 def test_with_every_error_drawn_it_is_led_pushed_killed_and_stands(
     robot: RobotConfig, pushes: PushRange, number: int
 ) -> None:
-    """A squat and a crawl, of the 500 that `xrl sweep robust --n 500` runs."""
+    """A squat and a crawl, of the 500 that `xrl study sweep robust --n 500` runs."""
     outcome = run_trial(draw(pushes, 1, number), robot)
     assert outcome.stood
     assert outcome.operator_peak_n is not None

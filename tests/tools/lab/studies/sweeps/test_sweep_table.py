@@ -151,12 +151,12 @@ def test_an_interrupted_study_prints_how_to_resume(
     job = study.Job(
         float, str, lambda n, value: [{"number": n, "value": value}], lambda _row: False
     )
-    plan = study.Study("kill", "t.csv", COLUMNS, {}, INPUTS, (), 2, job, "xrl sweep kill")
+    plan = study.Study("kill", "t.csv", COLUMNS, {}, INPUTS, (), 2, job, "xrl study sweep kill")
     executor = study.Executor(2, "tcp://host:8786", ())
     out = tmp_path / "a b"
     with pytest.raises(type(error)):
         study.run(plan, lambda _done: [1, 2], out, executor, Console())
-    words = f"xrl sweep kill --cluster tcp://host:8786 --out '{out}'"
+    words = f"xrl study sweep kill --cluster tcp://host:8786 --out '{out}'"
     assert f"1 cases are in {out}; resume with: {words}\n" in capsys.readouterr().out
     with CaseTable(out, "t.csv", COLUMNS, INPUTS) as table:
         assert table.numbers == {1}
