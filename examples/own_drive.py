@@ -58,7 +58,7 @@ class BenchDrive:
         self._armed = False
 
     def set_position(self, turns: Pair) -> None:
-        """Take the motors' position, as `xrl zero` writes it."""
+        """Take the motors' position, as `xrl drive zero` writes it."""
         self.q[:] = joint_torque(turns, 1.0 / GEAR_RATIO)
 
     def close(self) -> None:

@@ -41,7 +41,7 @@ REPORT_EVERY_NS: Final = 10 * NS_PER_S
 
 _WHY_NOT: Final = {
     ArmingInhibit.UNZEROED: "the drive has had no power since it was zeroed, or never was, or its "
-    "encoder is lost; hang the robot and tell it where it is with `xrl zero`",
+    "encoder is lost; hang the robot and tell it where it is with `xrl drive zero`",
     ArmingInhibit.OUTSIDE_LIMITS: "the joint is at phi {q[0]:.3f}, theta {q[1]:.3f} rad, outside "
     "its limits; bring it inside, or correct the joint's zero",
     ArmingInhibit.LOST_TORQUE: "the drive held the robot and lost torque while no service ran: "

@@ -3,11 +3,11 @@
 A new run never replaces a file: it is then run-1.mcap, run-2.mcap, ... A long run is split into
 run.mcap, run_1.mcap, ... as `[recorder]` of the robot file says. Unfinished files of earlier
 recorders in DIR are recovered meanwhile. With --snapshot nothing is written until a fault. SIGTERM
-and SIGINT finish the file; after SIGKILL the next recorder, or `xrl recover`, recovers what was
+and SIGINT finish the file; after SIGKILL the next recorder, or `xrl log recover`, recovers what was
 flushed.
 
 With --of it is one host's own recorder: it dials these services only, and records what they say
-though the network to the fleet's recorder is cut. `xrl join` joins the records.
+though the network to the fleet's recorder is cut. `xrl log join` joins the records.
 """
 
 from __future__ import annotations

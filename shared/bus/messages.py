@@ -475,7 +475,7 @@ class OperatorIntent(Message, frozen=True):
     source: str = ""
     """Name of the sender."""
     probe_row: Int64 = -1
-    """Row of p whose reference is offset to measure the answer; -1: none (`xrl tune`)."""
+    """Row of p whose reference is offset to measure the answer; -1: none (`xrl drive tune`)."""
     probe: float = 0.0
     """Its offset, m or rad."""
 

@@ -114,7 +114,7 @@ SIM_TRUTH: Final = Topic(
 )  # fmt: skip
 SIM_STATE: Final = Topic(
     "sim/state", traces.SimState, 10.0, _BACKGROUND, ("simulator",), (),
-    "complete simulated world: `xrl whatif` continues from it",
+    "complete simulated world: `xrl log whatif` continues from it",
 )  # fmt: skip
 SIM_CONTROL: Final = Topic(
     "sim/control", messages.SimControl, 0.0, _DATA, (OPERATOR,), ("simulator",),

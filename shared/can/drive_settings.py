@@ -2,7 +2,7 @@
 
 With factory settings an ODrive disarms, limits or answers in ways that make this robot fall
 (docs/drives.md#traps). The simulator's drives are set by this table, `xrl doctor` compares a drive
-with it and `xrl configure` writes it, so the three cannot disagree.
+with it and `xrl drive configure` writes it, so the three cannot disagree.
 
 Modes, gains and limits that the joint services write at arming or in every cycle are listed too,
 where a drive that somebody else armed would be wrong without them.

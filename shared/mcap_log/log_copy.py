@@ -51,7 +51,7 @@ class LogCopy:
     """
 
     def __init__(
-        self, file: BinaryIO, raw: Callable[[int, int], bytes], library: str = "xrl recover"
+        self, file: BinaryIO, raw: Callable[[int, int], bytes], library: str = "xrl log recover"
     ) -> None:
         self.channels: dict[int, Channel] = {}
         self.orphans = 0
@@ -285,7 +285,7 @@ def write_extended(
     """
     try:
         with open_log(path) as reader, atomic_file(out, lasting=True) as file:
-            copy = LogCopy(file, reader.raw, "xrl export")
+            copy = LogCopy(file, reader.raw, "xrl log export")
             for record in _extended(path, reader, channels, messages):
                 copy.take(record)
             copy.finish(Metadata(name=NOTE, metadata={"from": path.name}))

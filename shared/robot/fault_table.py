@@ -1,7 +1,7 @@
 """Faults, and what then happens: one table (docs/reference/faults.md).
 
 Each row is a claim. `tests/lockstep/test_faults.py` brings about every fault of a drive and
-compares module, neighbours and drive with the row; `xrl crashtest` does so live, with processes and
+compares module, neighbours and drive with the row; `xrl study crash` does so live, with processes and
 recovery. `xrl faults` prints the table.
 
 The rule behind the last column: a module that lost torque is never re-armed automatically. A person
@@ -33,7 +33,7 @@ class DriveFault(NamedTuple):
     cause: Cause
     """Cause of FAULT, as `xrl status` and the service's log show it."""
     zero_lost: bool
-    """True if the joint must be zeroed (`xrl zero`) before it can be armed again."""
+    """True if the joint must be zeroed (`xrl drive zero`) before it can be armed again."""
     recovery: str
     """Action of a person before the service is restarted."""
 
@@ -55,7 +55,7 @@ DRIVE_FAULTS: Final[dict[FaultKind, DriveFault]] = {
     "encoder": DriveFault(
         f"it goes on reporting the last position; {_LIMP}", limp=True,
         cause=Cause.DRIVE_DISARMED, zero_lost=True,
-        recovery=f"{_HANG}; repair the encoder or its cable, then `xrl zero`",
+        recovery=f"{_HANG}; repair the encoder or its cable, then `xrl drive zero`",
     ),
     "watchdog": DriveFault(
         _LIMP, limp=True, cause=Cause.DRIVE_DISARMED, zero_lost=False,
@@ -76,7 +76,7 @@ DRIVE_FAULTS: Final[dict[FaultKind, DriveFault]] = {
     "brown_out": DriveFault(
         "no power: both axes float; it restarts without a zero", limp=True,
         cause=Cause.DRIVE_LOST, zero_lost=True,
-        recovery=f"{_HANG}; mend the supply, then `xrl zero`",
+        recovery=f"{_HANG}; mend the supply, then `xrl drive zero`",
     ),
 }  # fmt: skip
 """By the name that scenarios and `--fault` use."""
@@ -173,7 +173,7 @@ LOSSES: Final[dict[str, LossRow]] = {
 def recovery_of(cause: Cause) -> str:
     """Return a person's action for a module in FAULT for this cause, in short."""
     if cause is Cause.DRIVE_LOST:
-        return "mend power or cable (after a loss of power: xrl zero)"
+        return "mend power or cable (after a loss of power: xrl drive zero)"
     if cause is Cause.POSITION_LOST:
-        return "hang the robot, mend the encoder, xrl zero"
+        return "hang the robot, mend the encoder, xrl drive zero"
     return "hang the robot, find out why it disarmed"

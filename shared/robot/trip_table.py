@@ -53,7 +53,7 @@ which each doubles, it may be led again."""
 PLANNER_TRIPS: Final[dict[Trip, TripRow]] = {
     Trip.LEGS: TripRow(
         "legs", "the legs disagree about the torso", "m",
-        "stand both soles flat; if it lasts: `xrl zero`",
+        "stand both soles flat; if it lasts: `xrl drive zero`",
     ),
     Trip.REACH: TripRow(
         "reach", "the reference pose is out of reach", "m", "lead back to where the legs reach"
@@ -127,7 +127,7 @@ def remedy_of(state: JointState) -> str:
     if mode is Mode.DAMP:
         return RESTART
     if drive is DriveStatus.UNZEROED:
-        return "hang the robot, xrl zero"
+        return "hang the robot, xrl drive zero"
     if drive is DriveStatus.HOLDING:
         return "by itself, with the planner: the drive holds"
     if mode is Mode.DISARMED and drive in (DriveStatus.IDLE, DriveStatus.ERROR):

@@ -69,7 +69,7 @@ def test_the_same_seed_gives_the_same_log(tmp_path: Path) -> None:
 def test_a_lean_that_was_asked_for_is_not_judged_as_an_excursion_and_comes_out_again(
     tmp_path: Path,
 ) -> None:
-    """`xrl resim` hears what was asked from the record."""
+    """`xrl log resim` hears what was asked from the record."""
     assert sim(tmp_path, "--scenario", "shift", "--duration", "2.5", "--kill", "planner@2.4") == 0
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["com_y_max_mm"] > 35.0

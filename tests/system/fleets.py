@@ -26,7 +26,7 @@ from tools.fleet.supervise import SupervisedFleet
 FRESH_S: Final = 0.3
 """A module whose last state is older is silent."""
 OF_VERBS: Final = ("/tmp/xrl-demo-", "/tmp/xrl-crash-")
-"""Run directories of the fleets that `xrl demo` and `xrl crashtest` start."""
+"""Run directories of the fleets that `xrl demo` and `xrl study crash` start."""
 
 
 def wait_for(truth: Callable[[], bool], timeout_s: float = 20.0) -> bool:

@@ -1,4 +1,4 @@
-"""`xrl identify` and `xrl tune` on a live fleet: asked for, led, measured, and left as it was."""
+"""`xrl drive identify` and `xrl drive tune` on a live fleet: asked for, led, measured, and left as it was."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`xrl play` on a real bus, as a person types it, with real subscribers."""
+"""`xrl log play` on a real bus, as a person types it, with real subscribers."""
 
 from __future__ import annotations
 

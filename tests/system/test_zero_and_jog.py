@@ -1,4 +1,4 @@
-"""`xrl zero` and `xrl jog` on the emulated robot, as a person types them."""
+"""`xrl drive zero` and `xrl drive jog` on the emulated robot, as a person types them."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def test_on_the_emulated_robot_a_small_limit_an_interrupt_and_a_service_stop_it(
 
 
 def test_after_a_jog_the_doctor_finds_the_drive_as_it_was(run_dir: Path) -> None:
-    """Its limits too: `xrl configure --apply` would restart the board for them, zero and all."""
+    """Its limits too: `xrl drive configure --apply` would restart the board for them, zero and all."""
     with started(run_dir, "simulator"):
         jogged = xrl("jog", MODULE, "--torque-limit", "4", "--yes", run_dir=run_dir)
         assert "both axes are idle" in jogged.stdout, jogged.stdout + jogged.stderr

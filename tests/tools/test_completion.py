@@ -50,4 +50,4 @@ def test_a_verbs_options_and_actions_are_offered(script: Path, tmp_path: Path) -
 
 def test_files_are_offered_where_a_verb_takes_one(script: Path, tmp_path: Path) -> None:
     (tmp_path / "run.mcap").touch()
-    assert offered(script, "xrl report ru", tmp_path) == {"run.mcap"}
+    assert offered(script, "xrl log report ru", tmp_path) == {"run.mcap"}

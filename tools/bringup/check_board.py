@@ -52,7 +52,7 @@ def firmware_row(module: str, firmware: tuple[int, int, int]) -> Finding:
     found = describe_firmware(firmware)
     fix = (
         f"flash {wanted}: `odrivetool legacy-dfu FILE.elf`; then "
-        f"`xrl configure --apply --module {module}`"
+        f"`xrl drive configure --apply --module {module}`"
     )
     if is_known(firmware):
         why = "settings may have other names or defaults"
@@ -64,7 +64,7 @@ def firmware_row(module: str, firmware: tuple[int, int, int]) -> Finding:
 def settings_rows(module: str, wanted: tuple[WantedSetting, ...], values: Values) -> list[Finding]:
     """Compare a board's settings with the wanted ones; all that fit make one row."""
     rows = []
-    fix = f"`xrl configure --apply --module {module}`"
+    fix = f"`xrl drive configure --apply --module {module}`"
     for setting in wanted:
         subject, name = split_name(module, setting.name)
         value = values.get(setting.name)
@@ -166,7 +166,7 @@ def state_row(subject: str, state: int, *, services_up: bool) -> Finding:
 
 def position_rows(module: str, turns: tuple[float, float], robot: RobotConfig) -> list[Finding]:
     """Judge where a module's joint is, by its motors' positions as the drive counts them."""
-    mark, again = robot.drive.zero_mark_turns, f"`xrl zero {module} --at PHI,THETA`"
+    mark, again = robot.drive.zero_mark_turns, f"`xrl drive zero {module} --at PHI,THETA`"
     a, b = turns[0] - mark, turns[1] - mark
     if mark > 0.0 and max(abs(a), abs(b)) > 0.5 * mark:
         found = f"motors at {turns[0]:.1f}, {turns[1]:.1f} turns"

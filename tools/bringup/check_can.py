@@ -174,7 +174,7 @@ def _period(
     if len(times_s) > 2 and mean_ms(times_s) < TWICE * wanted_ms:
         measured = mean_ms(times_s)  # two senders: gaps of 1 and 19 ms have a median like one's
     wanted = f"{wanted_ms:g} ms"
-    fix = f"config.can.{setting}: `xrl configure --apply --module {module}`"
+    fix = f"config.can.{setting}: `xrl drive configure --apply --module {module}`"
     if measured is None and not times_s:
         return wrong(subject, what, "none", wanted, fix, "they are the joint service's clock")
     if measured is None:

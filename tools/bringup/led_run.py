@@ -1,4 +1,4 @@
-"""A live robot that is asked for something for a while: by `xrl identify body`, by `xrl tune`."""
+"""A live robot that is asked for something for a while: by `xrl drive identify body`, by `xrl drive tune`."""
 
 from __future__ import annotations
 

@@ -194,7 +194,7 @@ def why_out_of_reach(robot: RobotConfig, module: str, plan: AnyPlan, q: Pair) ->
         if not low <= q[axis] <= high:  # so that a NaN is outside
             return (
                 f"{AXES[axis]} is at {q[axis]:.3f} rad, outside of {low:g} .. {high:g} rad; bring "
-                "it inside by hand, or correct its zero (`xrl zero`)"
+                "it inside by hand, or correct its zero (`xrl drive zero`)"
             )
         ends = [q[axis] + offset for offset in plan.reach[axis]]
         beyond = [end for end in ends if not low <= end <= high]

@@ -111,7 +111,7 @@ def idle_reading(drive: Drive, clock: Clock = now_ns) -> DriveReading:
     if reading is None:
         raise DriveError(NO_ANSWER)
     if reading.status is DriveStatus.UNZEROED:
-        raise DriveError("its drive does not know where the joint is; `xrl zero` first")
+        raise DriveError("its drive does not know where the joint is; `xrl drive zero` first")
     if reading.status is DriveStatus.ARMED:
         raise DriveError("its drive is armed (closed loop) by somebody else; make it idle first")
     return reading

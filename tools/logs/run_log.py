@@ -43,7 +43,7 @@ PICTURE_MAX_S: Final = 120.0
 """Longest time in one picture of a run."""
 
 
-SEE_INFO: Final = "`xrl info` shows what the file holds"
+SEE_INFO: Final = "`xrl log info` shows what the file holds"
 """What to do about a part without messages."""
 
 
@@ -353,7 +353,7 @@ def refuse_own_controller(log: RunLog | RunIndex) -> None:
     if has_own_controller(log):
         raise RunError(
             f"{log.path}: a controller of somebody's own led ({ATTACHED} in it), and this computes "
-            "the shipped law; `xrl resim --controller FILE` runs it again"
+            "the shipped law; `xrl log resim --controller FILE` runs it again"
         )
 
 

@@ -1,4 +1,4 @@
-"""`xrl can`: bring the CAN buses up, listen to them, measure how long drives take to answer."""
+"""`xrl drive can`: bring the CAN buses up, listen to them, measure how long drives take to answer."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "can",
         """
-        xrl can setup --config lab.toml             # prints the commands
-        sudo xrl can setup --config lab.toml --apply
-        xrl can test --config lab.toml --for 5      # listens, sends nothing
-        xrl can latency --config lab.toml           # asks each axis 200 times; the fleet is down
+        xrl drive can setup --config lab.toml             # prints the commands
+        sudo xrl drive can setup --config lab.toml --apply
+        xrl drive can test --config lab.toml --for 5      # listens, sends nothing
+        xrl drive can latency --config lab.toml           # asks each axis 200 times; the fleet is down
         """,
     )
     actions = parser.add_subparsers(metavar="ACTION", required=True, dest="action")
@@ -217,7 +217,7 @@ def _measure(
             bus = bus_config(robot, name, args.run_dir)
             found = round_trips(bus, nodes, args.count) if nodes else {}
         except DriveError as error:
-            raise FleetError(f"bus {name}: {error}; `xrl can setup`, `xrl doctor`") from None
+            raise FleetError(f"bus {name}: {error}; `xrl drive can setup`, `xrl doctor`") from None
         for node, trips in found.items():
             table.add_row(name, str(node), *_percentiles(trips), str(trips.lost or ""))
             complete &= bool(trips.times_ms)

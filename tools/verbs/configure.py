@@ -1,4 +1,4 @@
-"""`xrl configure`: write the drives' settings; the difference first, and a backup."""
+"""`xrl drive configure`: write the drives' settings; the difference first, and a backup."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "configure",
         """
-        xrl configure                          # what would be changed, and nothing else
-        xrl configure --apply
-        xrl configure --apply --module knee_left
-        xrl configure --restore out/drive-backups/20260301-101500.json --apply
+        xrl drive configure                          # what would be changed, and nothing else
+        xrl drive configure --apply
+        xrl drive configure --apply --module knee_left
+        xrl drive configure --restore out/drive-backups/20260301-101500.json --apply
         """,
     )
     what = parser.add_mutually_exclusive_group()
@@ -111,7 +111,7 @@ def look_and_write(
         for module, board in boards.items():
             changes.refuse_armed(module, board)
         kept = keep(args.out, boards, path)
-        console.print(f"\nwhat the boards had: {kept}; `xrl configure --restore {kept}` shows it")
+        console.print(f"\nwhat the boards had: {kept}; `xrl drive configure --restore {kept}` shows it")
         interrupts = Interrupts()
         with interrupts.kept():
             outcomes = apply(console, boards, difference, interrupts)
@@ -281,7 +281,7 @@ def conclude(
     if done and robot.drive.zero_mark_turns > 0.0:
         written = (outcome.change for outcome in outcomes if not outcome.change.inhibit)
         restarted = dict.fromkeys(change.module for change in written)
-        console.print(f"restarted, and so without a zero: {', '.join(restarted)}; `xrl zero`")
+        console.print(f"restarted, and so without a zero: {', '.join(restarted)}; `xrl drive zero`")
     if emulated and is_simulated(robot):
         console.print(drive_access.GONE)
     return FAULT_EXIT_CODE if bad else 0

@@ -1,4 +1,4 @@
-"""`xrl crashtest`: one thing after the other dies on the live fleet, and the robot is judged."""
+"""`xrl study crash`: one thing after the other dies on the live fleet, and the robot is judged."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "crashtest",
         """
-        xrl crashtest --quick
-        xrl crashtest --out out/matrix
-        xrl crashtest --only kill-knee_left
-        xrl crashtest --only 'pair-*' --only 'disarmed-*'
-        xrl crashtest --list
+        xrl study crash --quick
+        xrl study crash --out out/matrix
+        xrl study crash --only kill-knee_left
+        xrl study crash --only 'pair-*' --only 'disarmed-*'
+        xrl study crash --list
         """,
     )
     add_config(parser)
@@ -113,7 +113,7 @@ def select(
         if not any(fnmatchcase(case.name, name) for case in cases):
             near = difflib.get_close_matches(name, [case.name for case in cases], n=3, cutoff=0.4)
             hint = f"perhaps {', '.join(near)}; " if near else ""
-            raise RunError(f"--only {name}: no such case; {hint}`xrl crashtest --list` has all")
+            raise RunError(f"--only {name}: no such case; {hint}`xrl study crash --list` has all")
     return [
         case
         for case in cases

@@ -1,4 +1,4 @@
-"""`xrl echo`: the messages of a topic as they come."""
+"""`xrl topic echo`: the messages of a topic as they come."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "echo",
         """
-        xrl echo planner/status --count 1
-        xrl echo 'joint/*/state' --field q --hz 5
-        xrl echo joint/knee_left/event              # each change of mode
-        xrl echo harness/wrench --json | jq .force
+        xrl topic echo planner/status --count 1
+        xrl topic echo 'joint/*/state' --field q --hz 5
+        xrl topic echo joint/knee_left/event              # each change of mode
+        xrl topic echo harness/wrench --json | jq .force
         """,
     )
     add_run_dir(parser)

@@ -1,4 +1,4 @@
-"""`xrl explain`: one tick of the law laid open, from a run's log or for a pose."""
+"""`xrl log explain`: one tick of the law laid open, from a run's log or for a pose."""
 
 from __future__ import annotations
 
@@ -79,10 +79,10 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "explain",
         """
-        xrl explain out/a/run.mcap --at 2.5
-        xrl explain --q 0,0.139,0,-1.015,0,0.876,0,0.139,0,-1.015,0,0.876
-        xrl explain --q stand.txt --assist 200 --config lab.toml
-        xrl explain --p 0,0,0.75,0,0.6,0
+        xrl log explain out/a/run.mcap --at 2.5
+        xrl log explain --q 0,0.139,0,-1.015,0,0.876,0,0.139,0,-1.015,0,0.876
+        xrl log explain --q stand.txt --assist 200 --config lab.toml
+        xrl log explain --p 0,0,0.75,0,0.6,0
         """,
     )
     parser.add_argument("log", nargs="?", type=Path, metavar="RUN", help=RUN_HELP)

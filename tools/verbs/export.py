@@ -1,4 +1,4 @@
-"""`xrl export`: a run for others: a 3-D scene in it, a picture, tables, a bag of ROS 2."""
+"""`xrl log export`: a run for others: a 3-D scene in it, a picture, tables, a bag of ROS 2."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "export",
         """
-        xrl export out/a/run.mcap --scene
-        xrl export out/a/run.mcap --scene -o shown.mcap --layout layout.json
-        xrl export out/a/run.mcap --gif squat.gif     # the robot moving, from side and front
-        xrl export out/a/run.mcap --gif shove.gif --from 5 --to 9
-        xrl export out/a/run.mcap --gif fig7.gif --curves     # with curves, as the paper's Fig. 7
-        xrl export out/a --csv tables                         # a file for each topic and module
-        xrl export out/a --parquet t --rate 100 --topic 'joint/*/state' --topic harness/wrench
-        xrl export out/a --ros2bag bag                        # ros2 bag play bag
+        xrl log export out/a/run.mcap --scene
+        xrl log export out/a/run.mcap --scene -o shown.mcap --layout layout.json
+        xrl log export out/a/run.mcap --gif squat.gif     # the robot moving, from side and front
+        xrl log export out/a/run.mcap --gif shove.gif --from 5 --to 9
+        xrl log export out/a/run.mcap --gif fig7.gif --curves     # with curves, as the paper's Fig. 7
+        xrl log export out/a --csv tables                         # a file for each topic and module
+        xrl log export out/a --parquet t --rate 100 --topic 'joint/*/state' --topic harness/wrench
+        xrl log export out/a --ros2bag bag                        # ros2 bag play bag
         """,
     )
     parser.add_argument("file", type=Path, metavar="FILE", help=f"{RUN_HELP}; it is not touched")

@@ -1,4 +1,4 @@
-"""`xrl identify`: measure what the robot file assumes."""
+"""`xrl drive identify`: measure what the robot file assumes."""
 
 from __future__ import annotations
 
@@ -57,14 +57,14 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "identify",
         """
-        xrl identify body --dry-run                      # the motions, and nothing else
-        xrl identify body                                # lead the robot that is up, and fit
-        xrl identify body out/a/run.mcap                 # from a record of slow motions
-        xrl identify body run.mcap loaded.mcap --added 0 --added 10   # 10 kg more on the torso
-        xrl identify body run.mcap --weighed --config lab.toml --apply
-        xrl identify joint ankle_left --dry-run          # hanging, the fleet down
-        xrl identify joint ankle_left ankle_right --apply
-        xrl identify joint --all --axis theta
+        xrl drive identify body --dry-run                      # the motions, and nothing else
+        xrl drive identify body                                # lead the robot that is up, and fit
+        xrl drive identify body out/a/run.mcap                 # from a record of slow motions
+        xrl drive identify body run.mcap loaded.mcap --added 0 --added 10   # 10 kg more on the torso
+        xrl drive identify body run.mcap --weighed --config lab.toml --apply
+        xrl drive identify joint ankle_left --dry-run          # hanging, the fleet down
+        xrl drive identify joint ankle_left ankle_right --apply
+        xrl drive identify joint --all --axis theta
         """,
     )
     actions = parser.add_subparsers(metavar="WHAT", required=True, dest="what")
@@ -158,7 +158,7 @@ def run(args: argparse.Namespace) -> int:
     if corrections:
         console.print("zeros, with the robot hung and its services DISARMED or down:")
     for module, (phi, theta) in corrections.items():
-        console.print(f"  xrl zero {module} --by {phi:.4f},{theta:.4f}", highlight=False)
+        console.print(f"  xrl drive zero {module} --by {phi:.4f},{theta:.4f}", highlight=False)
     console.print(f"{picture}", style="dim")
     return 0
 

@@ -1,4 +1,4 @@
-"""`xrl info`: shows the contents of a log, finished or not."""
+"""`xrl log info`: shows the contents of a log, finished or not."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "info",
         """
-        xrl info out/a/run.mcap
-        xrl info out/a/run.mcap --run
-        xrl info out/a/run.mcap --json | jq '.topics | map_values(.lost)'
+        xrl log info out/a/run.mcap
+        xrl log info out/a/run.mcap --run
+        xrl log info out/a/run.mcap --json | jq '.topics | map_values(.lost)'
         """,
     )
     parser.add_argument(
@@ -161,10 +161,10 @@ def _show_file(file: FileFacts, console: Console) -> None:
     if not file.finished and not file.in_use:
         if flush_ms:
             console.print(f"  written every {printable(flush_ms)} ms: all after that is missing")
-        command = f"xrl recover {printable(str(file.path))}"
+        command = f"xrl log recover {printable(str(file.path))}"
         console.print(f"  finish it with: {command}", soft_wrap=True)
     elif file.damage:
-        command = f"xrl recover {printable(str(file.path))}"
+        command = f"xrl log recover {printable(str(file.path))}"
         console.print(f"  a copy without the damage: {command}", soft_wrap=True)
     note = file.metadata.get("recovered")
     if note is not None:

@@ -1,4 +1,4 @@
-"""`xrl jog`: move one joint a little and back, on the bench, and judge it."""
+"""`xrl drive jog`: move one joint a little and back, on the bench, and judge it."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "jog",
         """
-        xrl jog knee_left
-        xrl jog hip_right --axis phi --by -0.1 --period 4
-        xrl jog knee_left --torque-limit 30     # where its load needs more
+        xrl drive jog knee_left
+        xrl drive jog hip_right --axis phi --by -0.1 --period 4
+        xrl drive jog knee_left --torque-limit 30     # where its load needs more
         """,
     )
     parser.add_argument("module", choices=MODULES, metavar="MODULE", help="which module")

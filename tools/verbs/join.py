@@ -1,4 +1,4 @@
-"""`xrl join`: the fleet's record and those of single hosts become one run."""
+"""`xrl log join`: the fleet's record and those of single hosts become one run."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "join",
         """
-        xrl join out/body out/left out/right --out out/joined
-        xrl resim out/joined
+        xrl log join out/body out/left out/right --out out/joined
+        xrl log resim out/joined
         """,
     )
     parser.add_argument("fleets", type=Path, metavar="FLEET", help=f"the fleet's: {RUN_HELP}")

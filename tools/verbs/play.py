@@ -1,4 +1,4 @@
-"""`xrl play`: put a log back onto the bus, beside the live robot and not into it."""
+"""`xrl log play`: put a log back onto the bus, beside the live robot and not into it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`xrl recover`: give a log that was never finished its end."""
+"""`xrl log recover`: give a log that was never finished its end."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "recover",
         """
-        xrl recover out/a/run.mcap
-        xrl recover out/a/run.mcap -o rescued.mcap
+        xrl log recover out/a/run.mcap
+        xrl log recover out/a/run.mcap -o rescued.mcap
         """,
     )
     parser.add_argument("file", type=Path, metavar="FILE", help="an MCAP file; it is not touched")

@@ -1,4 +1,4 @@
-"""`xrl report`: writes a run as one page that opens in any browser without a network."""
+"""`xrl log report`: writes a run as one page that opens in any browser without a network."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "report",
         """
-        xrl report out/a/run.mcap
-        xrl report out/a/run.mcap -o report.html --open no
-        xrl report out/a/run.mcap --from 1200 --to 1260   # a minute of an hour
+        xrl log report out/a/run.mcap
+        xrl log report out/a/run.mcap -o report.html --open no
+        xrl log report out/a/run.mcap --from 1200 --to 1260   # a minute of an hour
         """,
     )
     parser.add_argument("file", type=Path, metavar="RUN", help=RUN_HELP)

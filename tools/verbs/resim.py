@@ -1,4 +1,4 @@
-"""`xrl resim`: runs a log's services again and compares their outputs with the recorded ones."""
+"""`xrl log resim`: runs a log's services again and compares their outputs with the recorded ones."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "resim",
         """
-        xrl resim out/a/run.mcap                              # planner and six services
-        xrl resim out/a/run.mcap --service knee_left --until-first-difference
-        xrl resim out/a/run.mcap --service planner --param law.K_p.x=2000
-        xrl resim out/a/run.mcap --service planner --controller mine.py   # what would it have sent?
-        xrl resim out/a/run.mcap --tolerance 1e-9             # of another machine class
-        xrl resim out/a                                       # a split run, all of its files
-        xrl resim out/a --from 1200 --to 1260                 # a minute of a long one
+        xrl log resim out/a/run.mcap                              # planner and six services
+        xrl log resim out/a/run.mcap --service knee_left --until-first-difference
+        xrl log resim out/a/run.mcap --service planner --param law.K_p.x=2000
+        xrl log resim out/a/run.mcap --service planner --controller mine.py   # what would it have sent?
+        xrl log resim out/a/run.mcap --tolerance 1e-9             # of another machine class
+        xrl log resim out/a                                       # a split run, all of its files
+        xrl log resim out/a --from 1200 --to 1260                 # a minute of a long one
         """,
     )
     parser.add_argument("log", type=Path, metavar="RUN", help=RUN_HELP)

@@ -116,7 +116,7 @@ def run(args: argparse.Namespace) -> int:
             )  # fmt: skip
         except KeyboardInterrupt:
             console.print(
-                f"interrupted; what was recorded until then is in {out}, and `xrl recover` "
+                f"interrupted; what was recorded until then is in {out}, and `xrl log recover` "
                 "finishes its file",
                 soft_wrap=True,
             )

@@ -1,4 +1,4 @@
-"""`xrl stiffness`: how stiff the body must be to balance (paper section IV)."""
+"""`xrl gains --stiffness`: how stiff the body must be to balance (paper section IV)."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "stiffness",
         """
-        xrl stiffness
-        xrl stiffness --config lab.toml
+        xrl gains --stiffness
+        xrl gains --stiffness --config lab.toml
         """,
     )
     add_config(parser)

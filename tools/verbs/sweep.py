@@ -1,4 +1,4 @@
-"""`xrl sweep`: studies over many random runs in virtual time. One module a study."""
+"""`xrl study sweep`: studies over many random runs in virtual time. One module a study."""
 
 from __future__ import annotations
 
@@ -107,4 +107,4 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _examples(name: str) -> str:
-    return "\n".join(f"  xrl sweep {name} {flags}".rstrip() for flags in STUDIES[name][1:])
+    return "\n".join(f"  xrl study sweep {name} {flags}".rstrip() for flags in STUDIES[name][1:])

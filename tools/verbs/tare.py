@@ -1,4 +1,4 @@
-"""`xrl tare`: a new zero for the harness sensor."""
+"""`xrl drive tare`: a new zero for the harness sensor."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "tare",
         """
-        xrl tare
-        xrl tare --anyway
+        xrl drive tare
+        xrl drive tare --anyway
         """,
     )
     add_run_dir(parser)
@@ -93,7 +93,7 @@ def tare(requests: TareClient, wrenches: Wrenches, *, anyway: bool) -> Wrench:
             f"the harness reads {describe(before)}: let go of it, and again; "
             "or --anyway, if nobody holds it and the sensor has drifted"
         )
-    source = f"xrl tare by {user_name()}"
+    source = f"xrl drive tare by {user_name()}"
     begun = False
     deadline = time.monotonic() + GIVE_UP_S
     seq = 0

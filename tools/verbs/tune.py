@@ -1,4 +1,4 @@
-"""`xrl tune`: how a direction of the body, or a module, answers; gains for a wanted answer."""
+"""`xrl drive tune`: how a direction of the body, or a module, answers; gains for a wanted answer."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "tune",
         """
-        xrl tune x                                    # the robot that is up: step and sines
-        xrl tune y --sim                              # in virtual time, on the realistic plant
-        xrl tune y --sim --plant drivetrain.stiffness=3000
-        xrl tune x --bandwidth 7 --damping 0.6        # proposes K_p and B_p
-        xrl tune ankle_left --axis theta              # hanging, the fleet down
-        xrl tune x --dry-run
+        xrl drive tune x                                    # the robot that is up: step and sines
+        xrl drive tune y --sim                              # in virtual time, on the realistic plant
+        xrl drive tune y --sim --plant drivetrain.stiffness=3000
+        xrl drive tune x --bandwidth 7 --damping 0.6        # proposes K_p and B_p
+        xrl drive tune ankle_left --axis theta              # hanging, the fleet down
+        xrl drive tune x --dry-run
         """,
     )
     parser.add_argument(
@@ -290,7 +290,7 @@ def _proposed(
     console.print(f"K_p = {K_p}\nB_p = {B_p}", highlight=False)
     console.print(
         "to try them: set the law's rows in a copy of the robot file, then `xrl gains`, which says "
-        "if a loop with them is stable, then `xrl tune` again"
+        "if a loop with them is stable, then `xrl drive tune` again"
     )
     changed = msgspec.structs.replace(law, K_p=tuple(K_p), B_p=tuple(B_p))
     return with_local_gains_kept(msgspec.structs.replace(robot, law=changed))

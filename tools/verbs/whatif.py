@@ -1,4 +1,4 @@
-"""`xrl whatif`: had something died at this moment of a recorded run, would it have stood?"""
+"""`xrl log whatif`: had something died at this moment of a recorded run, would it have stood?"""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "whatif",
         """
-        xrl whatif out/a/run.mcap --kill planner
-        xrl whatif out/a/run.mcap --kill planner --kill knee_left --every 0.5 --for 6
-        xrl whatif out/a/run.mcap --kill planner --from 5 --to 9
+        xrl log whatif out/a/run.mcap --kill planner
+        xrl log whatif out/a/run.mcap --kill planner --kill knee_left --every 0.5 --for 6
+        xrl log whatif out/a/run.mcap --kill planner --from 5 --to 9
         """,
     )
     parser.add_argument("log", type=Path, metavar="RUN", help=f"{RUN_HELP}; of a simulated robot")

@@ -1,4 +1,4 @@
-"""`xrl zero`: tell drives where their joints are."""
+"""`xrl drive zero`: tell drives where their joints are."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "zero",
         """
-        xrl zero knee_left --at 0,-0.5          # by a protractor: phi, theta in rad
-        xrl zero ankle_right --at -0.02,0.14
-        xrl zero --all --standing 1.188         # in the jig: soles flat, hips 1.188 m above ankles
-        xrl zero knee_left --by 0,-0.009        # corrects a zero, as `xrl identify body` tells
+        xrl drive zero knee_left --at 0,-0.5          # by a protractor: phi, theta in rad
+        xrl drive zero ankle_right --at -0.02,0.14
+        xrl drive zero --all --standing 1.188         # in the jig: soles flat, hips 1.188 m above ankles
+        xrl drive zero knee_left --by 0,-0.009        # corrects a zero, as `xrl drive identify body` tells
         """,
     )
     which = parser.add_mutually_exclusive_group(required=True)

@@ -1,6 +1,6 @@
 """Local gains and coupled torque at a reference pose (paper, section IV). Pure.
 
-The planner's tick and `xrl explain` (`tools.lab.design.torque_breakdown`) both call it.
+The planner's tick and `xrl log explain` (`tools.lab.design.torque_breakdown`) both call it.
 """
 
 from __future__ import annotations

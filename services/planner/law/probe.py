@@ -1,6 +1,6 @@
 """Small known offsets of one row of the pose's reference, to measure how the robot answers. Pure.
 
-`xrl tune` asks for them (`operator/intent`). The offset is added to the reference, within
+`xrl drive tune` asks for them (`operator/intent`). The offset is added to the reference, within
 `law.probe_max`, no faster than `PROBE_S` from the middle to the end of its range, and without a
 rate of its own: damping acts on the robot's motion alone. A probe ends when its intent is stale.
 

@@ -49,7 +49,7 @@ def in_one_line(error: RunError) -> None:
 
 
 def counted(path: Path) -> int | None:
-    """Return the messages that `xrl info` counts, or None for one clear line."""
+    """Return the messages that `xrl log info` counts, or None for one clear line."""
     survey = Survey()
     try:
         survey.add(path)

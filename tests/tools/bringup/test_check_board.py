@@ -96,7 +96,7 @@ def test_a_wrong_setting_has_both_values_the_command_and_the_reason(robot: Robot
     name = "controller.config.vel_limit"
     (row,) = [r for r in rows_of(robot, {f"axis0.{name}": 2.0}) if r.what == name]
     assert (row.found, row.wanted) == ("2", "60")
-    assert "xrl configure --apply --module knee_left" in row.fix
+    assert "xrl drive configure --apply --module knee_left" in row.fix
     assert "OVERSPEED" in row.why
 
 
@@ -166,7 +166,7 @@ def test_an_armed_axis_is_right_only_where_a_service_has_it(
 def test_a_motor_that_counts_from_power_up_has_no_zero_and_no_angle(robot: RobotConfig) -> None:
     (row,) = check_board.position_rows(MODULE, (64.0, 0.7), robot)
     assert (row.what, row.verdict) == ("zero", WRONG)
-    assert "xrl zero knee_left" in row.fix
+    assert "xrl drive zero knee_left" in row.fix
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ NOTED = warning("robot file", "assumed", "14 [assumed]", "none", "measure them")
 
 
 def trap(subject: str, what: str = "controller.config.vel_limit", wanted: str = "60") -> Finding:
-    fix = f"`xrl configure --apply --module {subject.partition('.')[0]}`"
+    fix = f"`xrl drive configure --apply --module {subject.partition('.')[0]}`"
     return wrong(subject, what, "2", wanted, fix, "it disarms")
 
 
@@ -102,7 +102,7 @@ def test_name_values_reason_and_command_are_printed_whatever_the_width(width: in
     text = printed({"drives": [TRAP, NOTED]}, width)
     for words in ("knee_left.axis0", "vel_limit", "it disarms", "wrong", "warning", "14 [assumed]"):
         assert words in text
-    assert "xrl configure" in text
+    assert "xrl drive configure" in text
 
 
 def test_verbose_prints_every_row() -> None:

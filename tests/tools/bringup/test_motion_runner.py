@@ -122,7 +122,7 @@ def test_a_drive_that_stays_armed_is_not_reported_idle(
 @pytest.mark.parametrize(
     ("status", "words"),
     [
-        (DriveStatus.UNZEROED, "does not know where the joint is; `xrl zero`"),
+        (DriveStatus.UNZEROED, "does not know where the joint is; `xrl drive zero`"),
         (DriveStatus.ARMED, "armed .closed loop. by somebody else"),
         (DriveStatus.LOST, "does not answer"),
     ],

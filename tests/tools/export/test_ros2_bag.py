@@ -1,4 +1,4 @@
-"""`xrl export --ros2bag`: a bag that other programs read, with what the log says."""
+"""`xrl log export --ros2bag`: a bag that other programs read, with what the log says."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`xrl export --csv` and `--parquet`: every number of the log, and nothing made up."""
+"""`xrl log export --csv` and `--parquet`: every number of the log, and nothing made up."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`xrl can`: the commands for real buses, and the emulated drives as they answer."""
+"""`xrl drive can`: the commands for real buses, and the emulated drives as they answer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`xrl configure` on emulated drives, from the command line to what the drives keep."""
+"""`xrl drive configure` on emulated drives, from the command line to what the drives keep."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_traps_are_taken_out_and_a_backup_brings_them_back(run_dir: Path, tmp_pa
     result = verb(run_dir, tmp_path, "--apply", *plants)
     assert result.returncode == 0, result.stdout + result.stderr
     assert "2 settings written" in result.stdout
-    assert "hip_right, knee_left; `xrl zero`" in result.stdout
+    assert "hip_right, knee_left; `xrl drive zero`" in result.stdout
     (file,) = tmp_path.glob("*.json")
     kept = {board["module"]: board for board in json.loads(file.read_text())["boards"]}
     assert list(kept) == list(MODULES)

@@ -163,7 +163,7 @@ def test_three_planted_traps_are_named_all_three(run_dir: Path) -> None:
     assert {(row["subject"], row["what"]): (row["found"], row["wanted"]) for row in wrong} == {
         (AXIS, name): values for name, values in TRAPS.items()
     }
-    assert {row["fix"] for row in wrong} == {"`xrl configure --apply --module knee_left`"}
+    assert {row["fix"] for row in wrong} == {"`xrl drive configure --apply --module knee_left`"}
     periods = [row for row in rows_of(result) if row["what"] == "encoder frames"]
     assert next(row for row in periods if row["subject"] == AXIS)["verdict"] == "warning"
 

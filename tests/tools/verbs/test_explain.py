@@ -1,4 +1,4 @@
-"""`xrl explain`: one tick of a run, or a pose, laid open."""
+"""`xrl log explain`: one tick of a run, or a pose, laid open."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`xrl identify`: on a record with planted errors, and what it refuses."""
+"""`xrl drive identify`: on a record with planted errors, and what it refuses."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_what_was_planted_is_found_within_its_interval_and_written(
     assert len(list(tmp_path.glob("lab.toml.*.bak"))) == 1
     assert (tmp_path / "fit" / "identify.png").stat().st_size > 10_000
     assert "xrl gains --config" in told
-    assert re.search(r"xrl zero knee_right --by -?0\.0\d+,0\.0(0[89]|1[012])", told)
+    assert re.search(r"xrl drive zero knee_right --by -?0\.0\d+,0\.0(0[89]|1[012])", told)
 
 
 def test_a_file_that_is_not_the_records_robot_is_not_written(

@@ -1,4 +1,4 @@
-"""`xrl info` on files whose contents are known."""
+"""`xrl log info` on files whose contents are known."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_an_unfinished_file_is_counted_and_names_how_to_recover(
     killed = runs.killed_file(tmp_path)
     output = as_text(capsys, killed.path)
     assert "not finished" in output
-    assert f"xrl recover {killed.path}" in output
+    assert f"xrl log recover {killed.path}" in output
     found = as_json(capsys, killed.path)
     assert found["messages"] == 1200
     assert not found["files"][0]["finished"]
@@ -92,7 +92,7 @@ def test_a_file_that_is_being_written_is_called_that(
         run.flush()
         output = as_text(capsys, run.path)
     assert "being written" in output
-    assert "xrl recover" not in output
+    assert "xrl log recover" not in output
 
 
 def test_a_cut_is_described_with_its_extent_and_end(

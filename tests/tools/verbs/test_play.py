@@ -1,4 +1,4 @@
-"""`xrl play` without a bus: what it refuses, and what it makes of its arguments."""
+"""`xrl log play` without a bus: what it refuses, and what it makes of its arguments."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_help_shows_the_keys_and_the_way_to_subscribe() -> None:
     )
     assert done.returncode == 0, done.stderr
     for words in (
-        "examples:\n  xrl play",
+        "examples:\n  xrl log play",
         "replay/xrl/<robot>/x",
         arguments.LISTEN,
         "space",

@@ -1,4 +1,4 @@
-"""`xrl recover`; what it can bring back is in tests/shared/mcap_log/test_recover.py."""
+"""`xrl log recover`; what it can bring back is in tests/shared/mcap_log/test_recover.py."""
 
 from __future__ import annotations
 

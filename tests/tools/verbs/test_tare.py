@@ -1,4 +1,4 @@
-"""`xrl tare` against a harness service that the test plays."""
+"""`xrl drive tare` against a harness service that the test plays."""
 
 from __future__ import annotations
 

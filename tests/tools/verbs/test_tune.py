@@ -1,4 +1,4 @@
-"""`xrl tune`: in virtual time, and what it refuses."""
+"""`xrl drive tune`: in virtual time, and what it refuses."""
 
 from __future__ import annotations
 

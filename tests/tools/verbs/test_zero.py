@@ -1,4 +1,4 @@
-"""`xrl zero`: against a drive that the test plays, and the verb on the emulated robot."""
+"""`xrl drive zero`: against a drive that the test plays, and the verb on the emulated robot."""
 
 from __future__ import annotations
 

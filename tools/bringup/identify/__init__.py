@@ -1,1 +1,1 @@
-"""What `xrl identify` measures: the body from a standing record, joints from small sines."""
+"""What `xrl drive identify` measures: the body from a standing record, joints from small sines."""

@@ -1,4 +1,4 @@
-"""`xrl identify joint`: moves the joints of a hanging leg one by one by small sines, and tells."""
+"""`xrl drive identify joint`: moves the joints of a hanging leg one by one by small sines, and tells."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def _measure(
         return moved
     fit = fit_sines(moved.samples, moved.plan)
     if fit is None:
-        return Stopped(f"{name}: too few samples for a fit; look at its bus (`xrl can test`)")
+        return Stopped(f"{name}: too few samples for a fit; look at its bus (`xrl drive can test`)")
     return JointResult(name, fit, hanging_joint(robot, moved.q, *joint).inertia)
 
 

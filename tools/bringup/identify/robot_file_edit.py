@@ -69,7 +69,7 @@ def refuse_running(path: Path) -> None:
         if manifest is not None and Path(manifest.config).resolve() == path.resolve():
             raise RunError(
                 f"{path}: the fleet in {place} runs with it; measure without --apply, `xrl down "
-                f"--run-dir {place}`, then --apply (`xrl identify body RECORD --apply`)"
+                f"--run-dir {place}`, then --apply (`xrl drive identify body RECORD --apply`)"
             )
 
 

@@ -1,4 +1,4 @@
-"""The arguments of `xrl play`, and its help."""
+"""The arguments of `xrl log play`, and its help."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ CLOCK_HZ_MAX: Final = 1000.0
 WAIT_S: Final = 1.0
 
 EXAMPLES: Final = """
-xrl play out/a/run.mcap
-xrl play out/a --rate 0.5 --loop --clock
-xrl play run.mcap run_1.mcap --start-offset 10 --duration 2.5
-xrl play run.mcap --topics 'joint/*/state' harness/wrench --start-paused
-xrl play run.mcap --exclude 'joint/*/trace' --remap harness/wrench=harness/before
+xrl log play out/a/run.mcap
+xrl log play out/a --rate 0.5 --loop --clock
+xrl log play run.mcap run_1.mcap --start-offset 10 --duration 2.5
+xrl log play run.mcap --topics 'joint/*/state' harness/wrench --start-paused
+xrl log play run.mcap --exclude 'joint/*/trace' --remap harness/wrench=harness/before
 """
 
 ABOUT: Final = f"""

@@ -223,7 +223,7 @@ def introduce(recording: Recording, paths: list[Path], note: str, console: Conso
         words = f"{path}: not finished; plays as far as it goes"
         console.print(words, style="yellow", soft_wrap=True)
     for path in recording.damaged:
-        words = f"{path}: parts of it cannot be read and are left out; see `xrl info`"
+        words = f"{path}: parts of it cannot be read and are left out; see `xrl log info`"
         console.print(words, style="yellow", soft_wrap=True)
     if len(paths) == 1 and (others := further_files(paths[0])):
         names = ", ".join(path.name for path in others)

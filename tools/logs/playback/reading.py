@@ -99,7 +99,7 @@ def files_named(given: Iterable[Path]) -> list[Path]:
     for path in given:
         found += files_in(path) if path.is_dir() else [path]
     if not found:
-        raise RunError("no FILE; write it first: xrl play FILE --topics 'joint/*/state'")
+        raise RunError("no FILE; write it first: xrl log play FILE --topics 'joint/*/state'")
     return found
 
 

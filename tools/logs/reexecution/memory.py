@@ -18,5 +18,5 @@ def memory_of(text: str, kind: type[M]) -> M:
     except (msgspec.DecodeError, RecursionError) as error:
         raise RunError(
             f"a service's memory in the log is no {kind.__name__}: {error}; execute it again with "
-            "the checkout that wrote it (`xrl info` tells its commit)"
+            "the checkout that wrote it (`xrl log info` tells its commit)"
         ) from None

@@ -1,4 +1,4 @@
-"""`xrl export --gif`: the robot of a run, drawn where it was."""
+"""`xrl log export --gif`: the robot of a run, drawn where it was."""
 
 from __future__ import annotations
 

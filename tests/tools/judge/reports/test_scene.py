@@ -1,4 +1,4 @@
-"""`xrl export`: the 3-D scene, compared with the models and the schemas."""
+"""`xrl log export`: the 3-D scene, compared with the models and the schemas."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The line by which `xrl resim` says why a run may have come out otherwise."""
+"""The line by which `xrl log resim` says why a run may have come out otherwise."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from tools.terminal import Console, marked
 
 RESULTS: Final = "results.json"
 JUNIT: Final = "junit.xml"
-SUITE: Final = "xrl crashtest"
+SUITE: Final = "xrl study crash"
 COLOUR: Final = {
     CrashVerdict.STOOD: "green",
     CrashVerdict.SANK: "yellow",

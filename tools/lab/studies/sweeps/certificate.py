@@ -1,4 +1,4 @@
-"""`xrl sweep certificate`: compares the sign of K_fail with falls in simulation."""
+"""`xrl study sweep certificate`: compares the sign of K_fail with falls in simulation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`xrl sweep dynamics`: does anything grow that the dynamic certificate says fades?"""
+"""`xrl study sweep dynamics`: does anything grow that the dynamic certificate says fades?"""
 
 from __future__ import annotations
 

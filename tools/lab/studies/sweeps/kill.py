@@ -1,4 +1,4 @@
-"""`xrl sweep kill`: the planner killed at random, in random postures and under pushes."""
+"""`xrl study sweep kill`: the planner killed at random, in random postures and under pushes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`xrl sweep latency`: three controls over networks from good to hopeless, under pushes."""
+"""`xrl study sweep latency`: three controls over networks from good to hopeless, under pushes."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ class Study(msgspec.Struct, Generic[C], frozen=True, kw_only=True):
     """What one study has of its own."""
 
     name: str
-    """After `xrl sweep`."""
+    """After `xrl study sweep`."""
     case: str = "case"
     """What a case is called."""
     table: str
@@ -278,7 +278,7 @@ def command_of(study: Study[Any], args: argparse.Namespace) -> str:
     """
     own = argparse.ArgumentParser()
     study.add_flags(own)
-    words = [f"xrl sweep {study.name} --seed {args.seed}"]
+    words = [f"xrl study sweep {study.name} --seed {args.seed}"]
     for name, default in vars(own.parse_args([])).items():
         value, flag = getattr(args, name), f"--{name.replace('_', '-')}"
         if value == default or name in HOW_MANY:

@@ -1,4 +1,4 @@
-"""`xrl crashtest`: how a case is run, and what is written of it."""
+"""`xrl study crash`: how a case is run, and what is written of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`xrl sweep`: what the one runner does for every study, and the verb around it."""
+"""`xrl study sweep`: what the one runner does for every study, and the verb around it."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ def test_a_fall_is_exit_code_1_with_the_command_that_shows_it(
     assert sweep(*KILL, *average, "--out", tmp_path) == 1
     output = " ".join(capsys.readouterr().out.split())
     assert "1 falls of 1" in output
-    command = f"xrl sweep kill --seed {seed} --split diagonal --jacobian average --only 0"
+    command = f"xrl study sweep kill --seed {seed} --split diagonal --jacobian average --only 0"
     assert command in output
     assert cli.main(command.split()[1:]) == 1
 
@@ -170,8 +170,8 @@ def test_a_study_and_the_verb_have_help_with_examples_that_are_right(
             cli.main(["sweep", *words, "--help"])
         assert left.value.code == 0
         shown = capsys.readouterr().out
-        assert f"\n  xrl sweep {study_name}\n" in shown.partition("examples:")[2]
-    for flag in re.findall(r"xrl sweep \w+ (--\w[\w-]*)", shown):
+        assert f"\n  xrl study sweep {study_name}\n" in shown.partition("examples:")[2]
+    for flag in re.findall(r"xrl study sweep \w+ (--\w[\w-]*)", shown):
         assert f"  {flag} " in shown.partition("examples:")[0]
 
 
@@ -231,7 +231,7 @@ def test_an_interrupted_study_prints_how_to_resume(
     out, address = tmp_path / "a b", "tcp://host:8786"
     flags = (*KILL, "--n", "2", "--push", "0.5", "--cluster", address, "--out", str(out))
     assert sweep(*flags) == (2 if isinstance(error, RunError) else 130)
-    again = f"xrl sweep kill --seed 1 --split diagonal --push 0.5 --n 2 --cluster {address}"
+    again = f"xrl study sweep kill --seed 1 --split diagonal --push 0.5 --n 2 --cluster {address}"
     words = f"1 cases are in {out}; resume with: {again} --out '{out}'\n"
     assert words in capsys.readouterr().out
     assert [row["number"] for row in rows_of(out / "cases.csv")] == ["0"]

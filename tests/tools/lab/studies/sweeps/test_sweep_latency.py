@@ -1,4 +1,4 @@
-"""`xrl sweep latency`: its grid, its trials, its figures, its words and its pictures."""
+"""`xrl study sweep latency`: its grid, its trials, its figures, its words and its pictures."""
 
 from __future__ import annotations
 
@@ -255,11 +255,11 @@ def test_falls_are_counted_where_they_were(capsys: pytest.CaptureFixture[str]) -
     assert latency_report.falls(latency_report.chosen(rows, "centralised")) == (4, 8)
     assert latency_report.falls(own).bounds[0] > 0.3
     assert {row["loss"] for row in latency_report.without_loss(rows)} == {"0"}
-    latency_report.show(rows, "xrl sweep latency", Console(width=120))
+    latency_report.show(rows, "xrl study sweep latency", Console(width=120))
     output = capsys.readouterr().out
     assert "centralised: 4 of 8 fell; most at 50 ms, 4 of 4" in output
     assert "distributed: none of 8 fell" in output
-    assert "xrl sweep latency --only 4" in output
+    assert "xrl study sweep latency --only 4" in output
 
 
 def test_each_delay_has_bounds_of_its_own_and_names_their_mix(
@@ -267,7 +267,7 @@ def test_each_delay_has_bounds_of_its_own_and_names_their_mix(
 ) -> None:
     """The worst of several delays is chosen: 95 % of it would be 83 %."""
     rows = made_up(lambda control, delay, _loss: control == "centralised" and delay == 50.0)
-    latency_report.show(rows, "xrl sweep latency", Console(width=80))
+    latency_report.show(rows, "xrl study sweep latency", Console(width=80))
     table, _, rest = capsys.readouterr().out.partition("Hand's peak force")
     assert "in this mix: 0, 50 % lost" in " ".join(table.split())
     assert [" ".join(line.split()) for line in table.splitlines() if " of 4" in line] == [
