@@ -115,7 +115,7 @@ def _copied(
     channels: list[NewChannel],
     messages: Iterable[NewMessage],
 ) -> LogCopy:
-    copy = LogCopy(file, reader.raw, "xrl log export")
+    copy = LogCopy(file, reader.raw, "xrl export")
     additions = _Additions(copy, channels)
     topics = {channel.topic for channel in channels}
     waiting: Iterator[NewMessage] = iter(messages)

@@ -36,7 +36,7 @@ class LogCopy:
     """Takes the records of a file in their order and writes what a finished file needs."""
 
     def __init__(
-        self, file: BinaryIO, raw: Callable[[int, int], bytes], library: str = "xrl log recover"
+        self, file: BinaryIO, raw: Callable[[int, int], bytes], library: str = "xrl recover"
     ) -> None:
         """Prepare.
 

@@ -6,7 +6,7 @@ import os
 import signal
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import Literal
 
 import pytest
 
@@ -196,7 +196,7 @@ def test_a_service_that_is_up_is_not_asked_for_anew_by_starting_it(
 
 
 @pytest.mark.parametrize(
-    ("signal", "after"),
+    ("name", "after"),
     [
         ("KILL", LastState.NOTHING),
         ("TERM", LastState.NOTHING),
@@ -208,14 +208,13 @@ def test_the_verb_that_ends_a_service_asks_for_the_next_and_one_that_suspends_it
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     left: RearmGuard,
-    signal: str,
+    name: Literal["KILL", "TERM", "STOP", "CONT"],
     after: LastState,
 ) -> None:
     calls = Calls({MODULE: PID}, suspended=False)
     fleet_of(tmp_path, monkeypatch, calls, (MODULE,))
-    args = SimpleNamespace(run_dir=tmp_path, service=MODULE, signal=signal)
-    assert kill.run(cast("kill.argparse.Namespace", args)) == 0
-    assert calls.made == [("kill", PID, kill.SIGNALS[signal])]
+    assert kill.run(kill.KillFlags(run_dir=tmp_path, service=MODULE, signal=name)) == 0
+    assert calls.made == [("kill", PID, signal.Signals[f"SIG{name}"])]
     assert left.read() is after
 
 
@@ -224,8 +223,7 @@ def test_a_service_without_a_drive_leaves_nothing_to_forget(
 ) -> None:
     calls = Calls({"planner": PID}, suspended=False)
     fleet_of(tmp_path, monkeypatch, calls, ("planner",))
-    args = SimpleNamespace(run_dir=tmp_path, service="planner", signal="KILL")
-    assert kill.run(cast("kill.argparse.Namespace", args)) == 0
+    assert kill.run(kill.KillFlags(run_dir=tmp_path, service="planner", signal="KILL")) == 0
     assert list(tmp_path.iterdir()) == []
 
 

@@ -21,7 +21,7 @@ FOLDERS = "xrl-crash-*"
 
 
 def command(out: Path, name: str) -> list[str]:
-    return [sys.executable, "-m", "tools.cli", "crashtest", "--only", name, "--out", str(out)]
+    return [sys.executable, "-m", "tools.cli", "study", "crash", "--only", name, "--out", str(out)]
 
 
 def crash_fleets() -> set[str]:

@@ -1,4 +1,4 @@
-"""`xrl drive identify` and `xrl drive tune` on a live fleet: asked for, led, measured, and left as it was."""
+"""`xrl drive identify` and `xrl drive tune` on a live fleet: asked, led, measured, left."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_live_robot_is_led_for_a_fit_and_probed_and_leads_on(
             assert moments.q[:, 5].max() - moments.q[:, 5].min() > 0.05, "the hips went down"
             stopped = motion.go(SHORT, lambda *_: None, lambda: True)
             assert stopped.ended == "stopped"
-            applied = xrl("identify", "body", *place, "--apply")
+            applied = xrl("drive", "identify", "body", *place, "--apply")
             assert applied.returncode == 2
             assert "runs with it" in applied.stderr, "and nothing was led"
         with open_session(robot, "tune", run_dir) as session:

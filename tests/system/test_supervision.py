@@ -445,14 +445,14 @@ def test_top_hz_and_echo_show_what_the_services_send(
 ) -> None:
     fleet = start({"ankle_right": JOINT, "planner": SLEEPER})
     place = ["--run-dir", str(run_dir)]
-    assert cli.main(["hz", "joint/ankle_right/state", "--for", "1", *place]) == 0
+    assert cli.main(["topic", "hz", "joint/ankle_right/state", "--for", "1", *place]) == 0
     row = next(line for line in capsys.readouterr().out.splitlines() if "ankle_right" in line)
     assert row.split()[1].endswith("/250"), "the rate, and the nominal one"
     assert 20 < float(row.split()[1].removesuffix("/250")) < 150
-    assert cli.main(["hz", "planner/status", "--for", "0.2", *place]) == 3, "nothing came"
+    assert cli.main(["topic", "hz", "planner/status", "--for", "0.2", *place]) == 3, "nothing came"
     capsys.readouterr()
 
-    words = ["echo", "joint/*/state", "--count", "2", "--field", "mode", "--field", "seq"]
+    words = ["topic", "echo", "joint/*/state", "--count", "2", "--field", "mode", "--field", "seq"]
     assert cli.main([*words, "--json", *place]) == 0
     first, second = map(json.loads, capsys.readouterr().out.splitlines())
     assert first["topic"] == "joint/ankle_right/state"
@@ -461,7 +461,7 @@ def test_top_hz_and_echo_show_what_the_services_send(
     assert cli.main([*words, *place]) == 0
     assert "mode: HOLD (1)" in capsys.readouterr().out
 
-    assert cli.main(["top", "--once", *place]) == 0
+    assert cli.main(["status", "--watch", "--traffic", "--once", *place]) == 0
     shown = capsys.readouterr().out
     assert str(fleet.pids()["ankle_right"]) in shown
     assert "joint/ankle_right/state" in shown

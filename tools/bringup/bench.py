@@ -10,7 +10,6 @@ import contextlib
 import os
 import sys
 import time
-from argparse import Namespace
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
@@ -21,6 +20,7 @@ from shared.config.robot_config import RobotConfig, expand
 from shared.exceptions import FleetError, XrlError
 from shared.joints import MODULES
 from tools.bringup import reach
+from tools.flags import FleetRobotFlags
 from tools.fleet import process_table, procfs
 from tools.fleet.run_dir import RunDir
 from tools.fleet.supervise import SupervisedFleet
@@ -33,20 +33,20 @@ GONE: Final = (
 )
 
 
-def robot_file(args: Namespace) -> Path:
+def robot_file(flags: FleetRobotFlags) -> Path:
     """Return the robot file: of the fleet that is up in `--run-dir`, else as `places.robot_file`.
 
     Raises:
         ConfigError: there is no fleet, and the file found may not be taken.
         FleetError: `--config` is not the fleet's.
     """
-    run = RunDir(args.run_dir)
+    run = RunDir(flags.run_dir)
     manifest = run.read_manifest()
     if manifest is None or not reach.is_up(run.path):
-        return Path(os.path.abspath(places.robot_file(args.config)))  # noqa: PTH100 - links stay
-    if args.config is None:
+        return Path(os.path.abspath(places.robot_file(flags.config)))  # noqa: PTH100 - links stay
+    if flags.config is None:
         return Path(manifest.config)
-    given = Path(os.path.abspath(args.config))  # noqa: PTH100 - as the manifest has it
+    given = Path(os.path.abspath(flags.config))  # noqa: PTH100 - as the manifest has it
     if given != Path(manifest.config):
         raise FleetError(
             f"the fleet in {run.path} runs with {manifest.config}, not with {given}; "

@@ -1,7 +1,7 @@
 """Restores a drive's own limits after a jog to those of the robot file.
 
 A drive keeps the small limits of a jog until a service arms it or it restarts. `xrl doctor` would
-find them wrong, and `xrl drive configure --apply` would restart the board for them, which loses its zero.
+find them wrong, and `xrl drive configure --apply` would restart the board: it loses its zero.
 """
 
 from __future__ import annotations

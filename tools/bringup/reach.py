@@ -1,20 +1,20 @@
 """The drives within reach of bring-up: real ones as they are, emulated ones by the same code.
 
-Where the drives are emulated, `xrl doctor` and `xrl drive configure` look at them by the same code as
-at real ones: over the emulated CAN buses, and with the genuine `odrive` package over the stand-in
-of libusb. A fleet that is up is looked at as it is; else the simulator runs alone for the while.
+Where the drives are emulated, `xrl doctor` and `xrl drive configure` look at them by the same code
+as at real ones: over the emulated CAN buses, and with the genuine `odrive` package over the
+stand-in of libusb. A fleet that is up is looked at as it is; else the simulator runs alone
+for the while.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import os
 import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 from services.simulator.drives.axis_settings import Settings, plant
 from services.simulator.fronts import usb_standin
@@ -24,6 +24,7 @@ from shared.exceptions import FleetError
 from shared.extras import require
 from tools.bringup.boards import FoundBoards
 from tools.bringup.can_monitor import listen
+from tools.flags import Arg, Flags
 from tools.fleet import procfs
 from tools.fleet.process_table import SIMULATED_CAN, is_simulated
 from tools.fleet.run_dir import RunDir
@@ -36,16 +37,12 @@ UP_S: Final = 3.0
 _POLL_S = 0.05
 
 
-def add_plant(parser: argparse.ArgumentParser) -> None:
-    """Add `--plant`: settings that the emulated drives have kept."""
-    parser.add_argument(
-        "--plant",
-        action="append",
-        default=[],
-        metavar="MODULE.NAME=VALUE",
-        help="emulated robot only: a setting that a drive has kept, as "
-        "knee_left.axis0.controller.config.vel_limit=2; may be given several times",
-    )
+class DriveSettingFlags(Flags):
+    """Settings that the emulated drives have kept."""
+
+    plant: Annotated[tuple[str, ...], Arg(metavar="MODULE.NAME=VALUE")] = ()
+    """emulated robot only: a setting that a drive has kept, as
+    knee_left.axis0.controller.config.vel_limit=2; may be given several times"""
 
 
 def check_plants(robot: RobotConfig, run_dir: Path, plants: Sequence[str]) -> None:

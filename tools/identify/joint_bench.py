@@ -1,13 +1,12 @@
-"""`xrl drive identify joint`: looks at a hanging leg, asks, moves its joints one by one, and tells."""
+"""`xrl drive identify joint`: looks at a hanging leg, asks, moves joints one by one, tells."""
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Final, Generic, NamedTuple, TypeVar
+from typing import Annotated, Final, Generic, NamedTuple, TypeVar
 
 from rich.live import Live
 from rich.text import Text
@@ -20,9 +19,11 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, DriveError
 from shared.extras import require
 from shared.joints import AXES, MODULES
+from shared.toml_file import Range
 from tools.bringup import bench, jog_drive, limits
 from tools.bringup.jogging import MotionPlan, Sample, outside
 from tools.bringup.stops import within_stops
+from tools.flags import FINITE_MAX, Arg, Folder, MotionFlags, positional
 from tools.identify import joint_drive, report
 from tools.identify.estimates import JointResult, of_joints
 from tools.identify.picture import draw_joints
@@ -54,23 +55,56 @@ class Stopped(NamedTuple):
     """The person said no."""
 
 
-def run(args: argparse.Namespace, console: Console) -> int:
+class JointFlags(MotionFlags):
+    """Which joints, and how hard they are moved."""
+
+    module: Annotated[tuple[str, ...], positional("MODULE", exclusive="which!")] = ()
+    """which; or --all"""
+    all: Annotated[bool, Arg(exclusive="which!")] = False
+    """all six, one joint after the other"""
+    axis: Annotated[str | None, Arg(choices=AXES)] = None
+    """only this one (default: both)"""
+    torque: Annotated[float, Range(1e-3, FINITE_MAX, "N m")] = 15.0
+    """of the sines; what holds a leg that is bent for it comes on top"""
+    apply: bool = False
+    """write what changes into the robot file, after a backup of it"""
+    out: Folder | None = None
+    """where the picture goes (out/identify-<time>)"""
+
+    def check(self) -> None:
+        """Refuse what is no module."""
+        super().check()
+        unknown = [name for name in self.module if name not in MODULES]
+        if unknown:
+            raise DriveError(f"{unknown[0][:40]}: one of {', '.join(MODULES)} is right")
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """The selected modules."""
+        return self.module or MODULES
+
+    @property
+    def axes(self) -> tuple[int, ...]:
+        """The selected axes."""
+        return (0, 1) if self.axis is None else (AXES.index(self.axis),)
+
+
+def run(flags: JointFlags, console: Console) -> int:
     """Measure the joints that are asked for; 0 if no motion was stopped."""
-    modules, axes = _asked(args)
-    if not args.dry_run:
+    if not flags.dry_run:
         require("plot")
-    path = bench.robot_file(args)
+    path = bench.robot_file(flags)
     robot = config_file.load_without_schedule(path)
-    if args.apply:
+    if flags.apply:
         report.refuse_running(path)
     results: list[JointResult] = []
     stopped: Stopped | None = None
     interrupts = jog_drive.Interrupts()
-    refuse_services(robot, modules, args.run_dir)
-    with bench.drives_to_ourselves(robot, path, args.run_dir, console.print, lifted=LIFTED):
-        for module, axis in ((module, axis) for module in modules for axis in axes):
+    refuse_services(robot, flags.modules, flags.run_dir)
+    with bench.drives_to_ourselves(robot, path, flags.run_dir, console.print, lifted=LIFTED):
+        for module, axis in ((module, axis) for module in flags.modules for axis in flags.axes):
             try:
-                found = _joint(args, robot, module, axis, interrupts, console)
+                found = _joint(flags, robot, module, axis, interrupts, console)
             except DriveError as error:
                 if not results:
                     raise
@@ -81,7 +115,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
             if found is not None:
                 results.append(found)
     if results:
-        _tell(args, robot, path, results, console)
+        _tell(flags, robot, path, results, console)
     code = 0 if stopped is None else tell_stopped(stopped, console)
     if interrupts.number:
         sys.exit(128 + interrupts.number)
@@ -99,23 +133,6 @@ def tell_stopped(stopped: Stopped, console: Console) -> int:
     return FAULT_EXIT_CODE
 
 
-def _asked(args: argparse.Namespace) -> tuple[Sequence[str], Sequence[int]]:
-    """Return modules and axes.
-
-    Raises:
-        DriveError: they name none, or no such module; or the torque is none.
-    """
-    unknown = [name for name in args.module if name not in MODULES]
-    if unknown:
-        raise DriveError(f"{unknown[0][:40]}: one of {', '.join(MODULES)} is right")
-    if bool(args.module) == args.all:
-        raise DriveError("name modules, or --all")
-    if not args.torque > 0.0:
-        raise DriveError(f"--torque {args.torque:g}: more than 0 N m is right")
-    axes = (0, 1) if args.axis is None else (AXES.index(args.axis),)
-    return (MODULES if args.all else args.module), axes
-
-
 def refuse_services(robot: RobotConfig, modules: Sequence[str], run_dir: Path) -> None:
     """Refuse if the leg of one of these modules has a joint service up.
 
@@ -128,7 +145,7 @@ def refuse_services(robot: RobotConfig, modules: Sequence[str], run_dir: Path) -
 
 
 def _joint(
-    args: argparse.Namespace,
+    flags: JointFlags,
     robot: RobotConfig,
     module: str,
     axis: int,
@@ -139,21 +156,21 @@ def _joint(
     joint = f"{module}_{AXES[axis]}"
 
     def plan_of(where: joint_drive.Hanging) -> SinePlan:
-        plan = joint_drive.plan_at(robot, module, axis, args.torque, where)
+        plan = joint_drive.plan_at(robot, module, axis, flags.torque, where)
         console.print(_described(joint, plan))
         return plan
 
-    moved = move_joint(args, robot, (module, axis), plan_of, interrupts, console)
+    moved = move_joint(flags, robot, (module, axis), plan_of, interrupts, console)
     if not isinstance(moved, Moved):
         return moved
     fit = fit_sines(moved.samples, moved.plan)
     if fit is None:
-        return Stopped(f"{joint}: too few samples for a fit; look at its bus (`xrl drive can test`)")
+        return Stopped(f"{joint}: too few samples for a fit; see its bus (`xrl drive can test`)")
     return JointResult(joint, fit, moved.where.inertia)
 
 
 def move_joint(
-    args: argparse.Namespace,
+    flags: MotionFlags,
     robot: RobotConfig,
     joint: tuple[str, int],
     plan_of: Callable[[joint_drive.Hanging], P],
@@ -163,7 +180,7 @@ def move_joint(
     """Look at a leg, ask, and move a joint; return how it ended, or None for a dry run.
 
     Args:
-        args: of the verb: `dry_run`, `yes`, `run_dir`.
+        flags: of the verb: `dry_run`, `yes`, `run_dir`.
         robot: its file.
         joint: module and axis.
         plan_of: returns the motion of a leg that hangs so, and tells of it.
@@ -178,7 +195,7 @@ def move_joint(
     name = f"{module}_{AXES[axis]}"
     leg = joint_drive.leg_of(module)
     with (
-        _open(robot, leg, args.run_dir) as drives,
+        _open(robot, leg, flags.run_dir) as drives,
         interrupts.kept(),
         console.status("waiting until the leg hangs still"),
     ):
@@ -190,14 +207,14 @@ def move_joint(
     limited = joint_drive.limited(robot, plan)
     if why := outside(within_stops(robot), module, plan, q[module]):
         raise DriveError(f"{module}: {why}")
-    if args.dry_run:
+    if flags.dry_run:
         return None
     question = "Does the leg hang free, the power switch at hand?"
-    if not bench.confirm(question, yes=args.yes):
+    if not bench.confirm(question, yes=flags.yes):
         return Stopped("nothing was moved", declined=True)
-    refuse_services(robot, [module], args.run_dir)
+    refuse_services(robot, [module], flags.run_dir)
     with (
-        _open(limited, leg, args.run_dir) as drives,
+        _open(limited, leg, flags.run_dir) as drives,
         interrupts.kept(),
         Live(console=console, refresh_per_second=4, transient=True) as shown,
     ):
@@ -213,7 +230,7 @@ def move_joint(
         )
     # only to drives that say that they are idle: full limits are nothing for an armed one
     idle = [one for one in leg if one not in result.not_idle]
-    _give_limits_back(robot, idle, args.run_dir, console)
+    _give_limits_back(robot, idle, flags.run_dir, console)
     if result.trouble or result.not_idle:
         return Stopped(f"{name}: {result.trouble or 'the motion ended'}", result.not_idle)
     return Moved(result.samples, plan, where)
@@ -255,15 +272,15 @@ def _line(sample: Sample, plan: MotionPlan, joint: str) -> Text:
 
 
 def _tell(
-    args: argparse.Namespace,
+    flags: JointFlags,
     robot: RobotConfig,
     path: Path,
     results: Sequence[JointResult],
     console: Console,
 ) -> None:
     estimates = of_joints(results, robot)
-    folder = make_folder(args.out, "identify")
+    folder = make_folder(flags.out, "identify")
     picture = folder / "joints.png"
     draw_joints(estimates, results, picture)
-    report.tell(estimates, robot, path if args.apply else None, console)
+    report.tell(estimates, robot, path if flags.apply else None, console)
     console.print(f"{picture}", style="dim")

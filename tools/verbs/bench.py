@@ -6,7 +6,6 @@ both in turn, or by the ratio of each figure to a yardstick that ran beside it.
 
 from __future__ import annotations
 
-import argparse
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
@@ -22,14 +21,13 @@ from shared.exceptions import FAULT_EXIT_CODE
 from shared.extras import require
 from shared.places import CHECKOUT
 from tools.lab.bench import bus_command, fleet_command, revisions, table
-from tools.lab.bench.flags import add_flags, write_rows
+from tools.lab.bench.flags import AgainstFlags, write_rows
 from tools.lab.bench.parts import LOCKSTEP, LOCKSTEP_RECORDED, PARTS
 from tools.lab.bench.revisions import Worker, its_config
 from tools.lab.bench.table import Row
 from tools.lab.bench.timing import ASLEEP_S, SWEPT_BYTES, YARDSTICK_CALLS
 from tools.lab.bench.worker import READY, Request
 from tools.terminal import Console, marked
-from tools.verb_table import Subparsers, add_config, add_verb
 
 WARM_CALLS: Final = 200
 COLD_CALLS: Final = 60
@@ -39,51 +37,26 @@ SPEEDS: Final = {LOCKSTEP: 10.0, LOCKSTEP_RECORDED: 7.0}
 """Targets of docs/results.md#targets, times real time."""
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(
-        subparsers,
-        "bench",
-        """
-        xrl bench
-        xrl bench --against HEAD~1
-        xrl bench --rounds 25 --json bench.json
-        xrl bench bus                                # the bus beside other transports
-        xrl bench fleet --against HEAD~1             # the whole fleet, live
-        """,
-    )
-    parser.set_defaults(bench=run_parts)
-    add_config(parser)
-    parser.add_argument(
-        "--against",
-        metavar="REV",
-        help="measure a git revision too, in turn with this tree, and print the ratios; both run "
-        "in this environment",
-    )
-    add_flags(parser, ROUNDS)
-    parser.add_argument(
-        "--strict",
-        action="store_true",
-        help=f"exit code {FAULT_EXIT_CODE} if a target is missed",
-    )
-    others = parser.add_subparsers(metavar="WHAT", title="something else to measure")
-    bus_command.add_parser(others)
-    fleet_command.add_parser(others)
+EXAMPLES: Final = """
+xrl bench
+xrl bench --against HEAD~1
+xrl bench --rounds 25 --json bench.json
+xrl bench bus                                # the bus beside other transports
+xrl bench bus --transport zenoh --transport datagrams --seconds 30
+xrl bench fleet                              # the whole fleet, live
+xrl bench fleet --against HEAD~1 --rounds 5 --json fleet.json
+"""
+
+bus, fleet = bus_command.run, fleet_command.run
 
 
-def run(args: argparse.Namespace) -> int:
-    """Measure and print."""
-    code: int = args.bench(args)
-    return code
-
-
-def run_parts(args: argparse.Namespace) -> int:
+def run(flags: AgainstFlags) -> int:
     """Measure the parts and print; with --strict a missed target is a fault."""
     require("sim")
-    gain_schedule.require(config_file.load(args.config), args.config)
+    gain_schedule.require(config_file.load(flags.config), flags.config)
     console = Console()
-    rows, missing = measure(args.config.resolve(), args.against, args.rounds or ROUNDS, console)
-    console.print(_table(rows, args.against))
+    rows, missing = measure(flags.config.resolve(), flags.against, flags.rounds or ROUNDS, console)
+    console.print(_table(rows, flags.against))
     for line in missing:
         console.print(marked("[yellow]{}[/]", line))
     console.print(
@@ -92,21 +65,14 @@ def run_parts(args: argparse.Namespace) -> int:
         f"Yardstick: {YARDSTICK_CALLS} solutions of a 12 x 12 system in NumPy.",
         style="dim",
     )
-    write_rows(args.json, [row._asdict() for row in rows])
-    return FAULT_EXIT_CODE if args.strict and not all(row.ok for row in rows) else 0
+    write_rows(flags.json, [row._asdict() for row in rows])
+    return FAULT_EXIT_CODE if flags.strict and not all(row.ok for row in rows) else 0
 
 
 def measure(
     config: Path, against: str | None, rounds: int, console: Console
 ) -> tuple[list[Row], list[str]]:
-    """Return the table's rows, and what could not be measured.
-
-    Args:
-        config: robot file; of one in this checkout the other revision takes its own version.
-        against: a git revision that measures in turn with this tree, or None.
-        rounds: turns of each.
-        console: for the progress.
-    """
+    """Return the table's rows, and what could not be measured."""
     with ExitStack() as stack:
         other = None if against is None else stack.enter_context(revisions.unpacked(against))
         workers = [stack.enter_context(Worker(CHECKOUT, config))]

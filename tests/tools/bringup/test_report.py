@@ -70,7 +70,9 @@ def test_all_six_boards_are_one_row_and_five_are_not() -> None:
 
 def test_values_wanted_of_one_axis_only_are_not_put_together() -> None:
     rows = [
-        wrong(f"{module}.{axis}", "config.can.node_id", "0", str(i), "`xrl drive configure --apply`")
+        wrong(
+            f"{module}.{axis}", "config.can.node_id", "0", str(i), "`xrl drive configure --apply`"
+        )
         for i, module in enumerate(MODULES)
         for axis in AXES
     ]

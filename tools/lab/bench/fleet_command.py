@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import argparse
 from contextlib import ExitStack
-from typing import Final
+from typing import Annotated, Final
 
 from rich import box
 from rich.progress import track
@@ -16,93 +15,62 @@ from shared.config import gain_schedule
 from shared.exceptions import FAULT_EXIT_CODE
 from shared.extras import require
 from shared.places import CHECKOUT
+from shared.toml_file import Range
+from tools.flags import Arg
 from tools.fleet.others import warn_of_others
-from tools.fleet.pace import check_pace
+from tools.fleet.pace import PACE_MIN
 from tools.judge.verdict_table import digits
 from tools.lab.bench import fleet
-from tools.lab.bench.flags import add_flags, write_rows
+from tools.lab.bench.flags import AgainstFlags, write_rows
 from tools.lab.bench.fleet import FleetRow, Turn
 from tools.lab.bench.revisions import its_config, unpacked
-from tools.number_arguments import finite
 from tools.terminal import Console, marked
-from tools.verb_table import Subparsers
 
 ROUNDS: Final = 3
 
 
-def add_parser(others: Subparsers) -> None:
-    """Add the command."""
-    parser = others.add_parser(
-        "fleet",
-        help="the whole fleet, led live through the paper's experiment",
-        description="Run `xrl demo`, half a minute a turn, and print what the fleet costs, how old "
-        "commands\nare when they are used, and what the hand meets. With --against another git "
-        "revision is\nrun in turn with this tree: a shared machine may be twice as slow from one "
-        "minute to the\nnext, so the ratio of two that ran side by side says more than a time.",
-        epilog="examples:\n  xrl bench fleet\n"
-        "  xrl bench fleet --against HEAD~1 --rounds 5 --json fleet.json",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument(
-        "--against",
-        default=argparse.SUPPRESS,
-        metavar="REV",
-        help="run a git revision too, in turn with this tree",
-    )
-    parser.add_argument(
-        "--scenario",
-        default="squat",
-        metavar="NAME|FILE",
-        help="what happens, as of `xrl demo` (squat, the paper's Fig. 7)",
-    )
-    parser.add_argument(
-        "--pace",
-        type=finite,
-        default=1.0,
-        metavar="X",
-        help="clock rate of the fleet (1); it is not lowered on full cores, and the targets are "
-        "those of 1",
-    )
-    add_flags(parser, ROUNDS, nested=True)
-    parser.add_argument(
-        "--strict",
-        action="store_true",
-        default=argparse.SUPPRESS,
-        help=f"exit code {FAULT_EXIT_CODE} if a target is missed",
-    )
-    parser.set_defaults(bench=run)
+class FleetFlags(AgainstFlags):
+    """What is led."""
+
+    scenario: Annotated[str, Arg(metavar="NAME|FILE")] = "squat"
+    """what happens, as of `xrl demo` (default: squat, the paper's Fig. 7)"""
+    pace: Annotated[float, Range(PACE_MIN, 1.0, ""), Arg(metavar="X")] = 1.0
+    """clock rate of the fleet; it is not lowered on full cores, and the targets are those of 1"""
 
 
-def run(args: argparse.Namespace) -> int:
-    """Lead each tree in turn and print the medians; with --strict a missed target is a fault."""
+def run(flags: FleetFlags) -> int:
+    """Lead each tree in turn and print the medians; with --strict a missed target is a fault.
+
+    A shared machine may be twice as slow from one minute to the next: the ratio of two trees that
+    ran side by side says more than a time.
+    """
     require("sim")
-    robot = config_file.load(args.config)
-    gain_schedule.require(robot, args.config)
-    check_pace(args.pace, simulated=True)
+    robot = config_file.load(flags.config)
+    gain_schedule.require(robot, flags.config)
     console = Console()
     warn_of_others(console)
-    config = args.config.resolve()
+    config = flags.config.resolve()
     turns: list[list[Turn]] = []
     with ExitStack() as stack:
         trees = [(CHECKOUT, config)]
-        if args.against is not None:
-            other = stack.enter_context(unpacked(args.against))
+        if flags.against is not None:
+            other = stack.enter_context(unpacked(flags.against))
             trees.append((other, its_config(config, other)))
-        runs = [tree for _ in range(args.rounds or ROUNDS) for tree in trees]
+        runs = [tree for _ in range(flags.rounds or ROUNDS) for tree in trees]
         found = [
-            fleet.measure(tree, its, args.scenario, args.pace)
+            fleet.measure(tree, its, flags.scenario, flags.pace)
             for tree, its in track(runs, "leading", console=console, transient=True)
         ]
         turns = [found[number :: len(trees)] for number in range(len(trees))]
-    rows = fleet.rows(turns[0], turns[1] if len(turns) > 1 else (), args.pace)
-    console.print(_table(rows, args.against))
+    rows = fleet.rows(turns[0], turns[1] if len(turns) > 1 else (), flags.pace)
+    console.print(_table(rows, flags.against))
     console.print(
         "Medians of the turns. CPU: in percent of one core. Late: later than two periods. "
         "Age: of a command, from the module's state that it answers to the cycle that takes it.",
         style="dim",
     )
-    write_rows(args.json, [row.as_dict() for row in rows])
-    return FAULT_EXIT_CODE if args.strict and not all(row.ok for row in rows) else 0
+    write_rows(flags.json, [row.as_dict() for row in rows])
+    return FAULT_EXIT_CODE if flags.strict and not all(row.ok for row in rows) else 0
 
 
 def _table(rows: list[FleetRow], against: str | None) -> Table:

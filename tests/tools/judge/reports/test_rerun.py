@@ -34,7 +34,7 @@ SIZES: dict[str, Callable[[pin.GeometryObject], list[float]]] = {
 @pytest.fixture(scope="module")
 def shown(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("rerun") / "shown.mcap"
-    assert cli.main(["export", str(made.path), "--scene", "-o", str(out)]) == 0
+    assert cli.main(["log", "export", str(made.path), "--scene", "-o", str(out)]) == 0
     return out
 
 

@@ -42,7 +42,7 @@ BODIES = {"hip": "thigh", "knee": "shin", "ankle": "foot"}
 @pytest.fixture(scope="module")
 def shown(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("shown") / "shown.mcap"
-    assert cli.main(["export", str(made.path), "--scene", "-o", str(out)]) == 0
+    assert cli.main(["log", "export", str(made.path), "--scene", "-o", str(out)]) == 0
     return out
 
 
@@ -293,7 +293,7 @@ def test_an_impossible_export_prints_one_line(
         ([half, "--scene", "-o", out], "no states of hip_left"),
         ([bare, "--scene", "-o", out], "holds no robot.toml"),
     ):
-        assert cli.main(["export", *map(str, arguments)]) == 2
+        assert cli.main(["log", "export", *map(str, arguments)]) == 2
         printed = capsys.readouterr().err
         assert words in printed
         assert printed.count("\n") == 1

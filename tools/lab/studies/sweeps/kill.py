@@ -143,7 +143,8 @@ def _run_task(task: Task) -> KillResult:
 
 
 def _name(task: Task) -> str:
-    return f"case {task[0].number} (xrl study sweep kill --seed {task[0].seed} --only {task[0].number})"
+    case = task[0]
+    return f"case {case.number} (xrl study sweep kill --seed {case.seed} --only {case.number})"
 
 
 def _rows(task: Task, outcome: KillResult) -> list[dict[str, object]]:

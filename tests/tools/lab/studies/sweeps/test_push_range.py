@@ -50,5 +50,5 @@ def test_what_is_drawn_reaches_the_limit_in_every_direction(pushes: PushRange) -
 def test_a_share_that_is_none_is_refused(
     study: str, share: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert exit_code(["sweep", study, "--n", "1", "--push", share]) == 2
+    assert exit_code(["study", "sweep", study, "--n", "1", "--push", share]) == 2
     assert "--push" in capsys.readouterr().err

@@ -29,7 +29,7 @@ from tools.lab.studies.sweeps.wilson import wilson
 
 def sweep(*flags: str) -> int:
     """Run the verb; the paper's split needs no gain schedule."""
-    return cli.main(["sweep", "kill", "--split", "diagonal", *flags])
+    return cli.main(["study", "sweep", "kill", "--split", "diagonal", *flags])
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
@@ -182,7 +182,7 @@ def test_a_fall_is_exit_code_1_with_the_command_that_shows_it(
 def test_a_number_that_makes_no_sense_is_refused(
     flags: tuple[str, str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert exit_code(["sweep", "kill", "--split", "diagonal", *flags]) == 2
+    assert exit_code(["study", "sweep", "kill", "--split", "diagonal", *flags]) == 2
     error = capsys.readouterr().err.splitlines()[-1]
     assert re.search(rf"{flags[0]}: '{flags[1]}': must be a whole number of at least \d", error)
 
@@ -212,7 +212,7 @@ def test_a_study_that_is_stopped_keeps_its_rows_and_leaves_no_process(
     tmp_path: Path, number: signal.Signals, code: int
 ) -> None:
     """Ctrl-C goes to every process of the terminal; SIGKILL here to the first only."""
-    command = [sys.executable, "-m", "tools.cli", "sweep", "kill", "--split", "diagonal"]
+    command = [sys.executable, "-m", "tools.cli", "study", "sweep", "kill", "--split", "diagonal"]
     process = subprocess.Popen(
         [*command, "--n", "200", "--workers", "2", "--out", str(tmp_path)],
         start_new_session=True,
@@ -237,7 +237,9 @@ def test_a_study_that_is_stopped_keeps_its_rows_and_leaves_no_process(
             os.kill(pid, signal.SIGKILL)
 
 
-@pytest.mark.parametrize("words", [("sweep",), ("sweep", "kill"), ("sweep", "certificate")])
+@pytest.mark.parametrize(
+    "words", [("sweep",), ("study", "sweep", "kill"), ("study", "sweep", "certificate")]
+)
 def test_the_verb_and_its_study_have_help_with_examples(
     words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:

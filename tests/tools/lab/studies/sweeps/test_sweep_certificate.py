@@ -14,7 +14,7 @@ FEW = ("--n", "2", "--seed", "1", "--rigid", "--workers", "1")
 
 
 def sweep(out: Path, *flags: str) -> int:
-    return cli.main(["sweep", "certificate", "--out", str(out), *flags])
+    return cli.main(["study", "sweep", "certificate", "--out", str(out), *flags])
 
 
 def test_a_study_is_tabled_drawn_and_gone_on_with(
@@ -42,5 +42,5 @@ def test_another_seed_is_refused_in_the_same_folder(
 
 
 def test_no_cases_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert exit_code(["sweep", "certificate", "--n", "0", "--out", tmp_path]) == 2
+    assert exit_code(["study", "sweep", "certificate", "--n", "0", "--out", tmp_path]) == 2
     assert "at least 1" in capsys.readouterr().err

@@ -29,7 +29,7 @@ def test_without_dask_the_extra_that_brings_it_is_named(
 ) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     flags = ("--cluster", "tcp://127.0.0.1:1", "--out", str(tmp_path))
-    assert cli.main(["sweep", "latency", "--trials", "1", *flags]) == 2
+    assert cli.main(["study", "sweep", "latency", "--trials", "1", *flags]) == 2
     output = capsys.readouterr().err
     assert "extra `cluster`" in output
     assert output.count("\n") == 1

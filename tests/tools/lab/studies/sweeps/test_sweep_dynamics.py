@@ -112,7 +112,10 @@ def test_a_study_is_tabled_drawn_and_counted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "dynamics"
-    assert cli.main(["sweep", "dynamics", "--n", "2", "--workers", "2", "--out", str(out)]) == 0
+    assert (
+        cli.main(["study", "sweep", "dynamics", "--n", "2", "--workers", "2", "--out", str(out)])
+        == 0
+    )
     with (out / dynamics.TABLE).open(encoding="utf-8") as file:
         assert [row["number"] for row in csv.DictReader(file)] == ["0", "1"]
     assert (out / dynamics.PICTURE).stat().st_size > 10_000

@@ -37,7 +37,7 @@ SOON_DOWN = (
 
 
 def sweep(*flags: str) -> int:
-    return cli.main(["sweep", "latency", *flags])
+    return cli.main(["study", "sweep", "latency", *flags])
 
 
 def grid(*flags: str) -> list[LatencyTrial]:
@@ -165,7 +165,7 @@ def test_the_command_is_of_this_study_whatever_its_numbers_are(robot: RobotConfi
     args = parser.parse_args(flags)
     command = latency._command(args)
     assert "--delay 0.00001,12345.67 --loss 0.1234567,0.1234568" in command
-    again = parser.parse_args(command.split()[3:])
+    again = parser.parse_args(command.split()[4:])
     assert latency.trials_of(again) == latency.trials_of(args)
     assert again.lead_easing == args.lead_easing
     assert latency._joined(args.loss) == "0.1234567,0.1234568"

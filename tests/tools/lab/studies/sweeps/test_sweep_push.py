@@ -45,7 +45,7 @@ def test_the_grid_has_every_pose_duration_angle_and_mode_once() -> None:
 
 
 def test_a_duration_of_nothing_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["sweep", "push", "--duration", "0"]) == 2
+    assert cli.main(["study", "sweep", "push", "--duration", "0"]) == 2
     assert "--duration 0" in capsys.readouterr().err
 
 
@@ -107,7 +107,7 @@ def test_a_table_is_drawn_with_both_modes_and_the_limits(tmp_path: Path) -> None
 
 
 def test_a_study_of_one_point_is_tabled_and_goes_on(tmp_path: Path) -> None:
-    words = ["sweep", "push", "--pose", "squat", "--angle", "90", "--duration", "0.3"]
+    words = ["study", "sweep", "push", "--pose", "squat", "--angle", "90", "--duration", "0.3"]
     out = tmp_path / "push"
     assert cli.main([*words, "--workers", "2", "--out", str(out)]) == 0
     with (out / push.TABLE).open(encoding="utf-8") as file:

@@ -86,7 +86,7 @@ def test_a_picture_is_drawn_and_falls_are_in_it(pushes: PushRange, tmp_path: Pat
 
 
 def test_an_impossible_width_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert exit_code(["sweep", "robust", "--n", "0"]) == 2
+    assert exit_code(["study", "sweep", "robust", "--n", "0"]) == 2
     assert "--n: '0'" in capsys.readouterr().err
 
 
@@ -108,7 +108,7 @@ def test_errors_are_reported_as_one_number_each() -> None:
 
 
 def test_an_impossible_slope_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["sweep", "robust", "--slope", "40"]) == 2
+    assert cli.main(["study", "sweep", "robust", "--slope", "40"]) == 2
     assert "--slope 40" in capsys.readouterr().err
 
 

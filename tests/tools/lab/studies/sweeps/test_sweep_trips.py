@@ -84,7 +84,17 @@ def test_what_is_to_trip_is_in_the_table_of_trips() -> None:
 def test_the_study_prints_its_matrix_and_goes_on_with_what_is_there(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    asked = ["sweep", "trips", "--trouble", "drops", "--on", "rigid", "--out", str(tmp_path)]
+    asked = [
+        "study",
+        "sweep",
+        "trips",
+        "--trouble",
+        "drops",
+        "--on",
+        "rigid",
+        "--out",
+        str(tmp_path),
+    ]
     assert cli.main([*asked, "--workers", "1"]) == 0
     first = capsys.readouterr().out
     assert "sagging" in first
@@ -102,5 +112,5 @@ def test_a_robot_on_which_nothing_trips_is_refused(
     assert 'split = "certified"' in shipped
     diagonal = tmp_path / "robot.toml"
     diagonal.write_text(shipped.replace('split = "certified"', 'split = "diagonal"'), "utf-8")
-    assert cli.main(["sweep", "trips", "--config", str(diagonal)]) == 2
+    assert cli.main(["study", "sweep", "trips", "--config", str(diagonal)]) == 2
     assert "only robots of the certified split have trips" in capsys.readouterr().err

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
-from typing import Final
+from typing import Annotated, Final
 
 from rich import box
 from rich.table import Table
@@ -16,12 +15,12 @@ from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, DriveError
 from shared.joints import AXES, MODULES
+from shared.toml_file import Range
 from tools.bringup import bench, limits
 from tools.bringup.jog_drive import NOT_IDLE, Interrupts, JogResult, first_reading, jog_drive
 from tools.bringup.jogging import JogPlan, Sample, gentle, judge, outside, what_to_see
-from tools.number_arguments import count, finite
+from tools.flags import Arg, FleetRobotFlags, Number, positional
 from tools.terminal import Console, marked
-from tools.verb_table import FLEET, Subparsers, add_config, add_run_dir, add_verb
 
 BY: Final = 0.05
 PERIOD_S: Final = 2.0
@@ -34,67 +33,59 @@ PERIOD_MIN_S: Final = 0.5
 CYCLES_MAX: Final = 100
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(
-        subparsers,
-        "jog",
-        """
-        xrl drive jog knee_left
-        xrl drive jog hip_right --axis phi --by -0.1 --period 4
-        xrl drive jog knee_left --torque-limit 30     # where its load needs more
-        """,
-    )
-    parser.add_argument("module", choices=MODULES, metavar="MODULE", help="which module")
-    parser.add_argument("--axis", choices=AXES, default="theta", help="default: %(default)s")
-    parser.add_argument(
-        "--by",
-        type=finite,
-        default=BY,
-        metavar="RAD",
-        help="how far, and back; positive theta leans forward (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--period",
-        type=finite,
-        default=PERIOD_S,
-        metavar="S",
-        help="time of one there and back (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--cycles", type=count, default=CYCLES, metavar="N", help="default: %(default)s"
-    )
-    parser.add_argument(
-        "--torque-limit",
-        type=finite,
-        default=TORQUE_LIMIT,
-        metavar="NM",
-        help="of both axes together at the joint; the drive's own current limit is set to it "
-        "(default: %(default)s)",
-    )
-    parser.add_argument("--yes", action="store_true", help="do not ask")
-    add_config(parser, before=FLEET)
-    add_run_dir(parser)
+EXAMPLES: Final = """
+xrl drive jog knee_left
+xrl drive jog hip_right --axis phi --by -0.1 --period 4
+xrl drive jog knee_left --torque-limit 30     # where its load needs more
+"""
 
 
-def run(args: argparse.Namespace) -> int:
+class JogFlags(FleetRobotFlags):
+    """Which joint, and how it moves."""
+
+    module: Annotated[str, positional("MODULE", choices=MODULES)]
+    """which module"""
+    axis: Annotated[str, Arg(choices=AXES)] = "theta"
+    by: Annotated[float, Range(-BY_MAX, BY_MAX, "rad")] = BY
+    """how far, and back; positive theta leans forward"""
+    period: Annotated[float, Range(PERIOD_MIN_S, 60.0, "s")] = PERIOD_S
+    """time of one there and back"""
+    cycles: Annotated[int, Range(1, CYCLES_MAX, "")] = CYCLES
+    torque_limit: Annotated[Number, Arg(metavar="NM")] = TORQUE_LIMIT
+    """of both axes together at the joint; the drive's own current limit is set to it"""
+    yes: bool = False
+    """do not ask"""
+
+    def check(self) -> None:
+        """Refuse a motion that is none."""
+        super().check()
+        if self.by == 0.0:
+            raise DriveError(f"--by 0: up to {BY_MAX:g} rad either way, and not 0, is right")
+
+    @property
+    def plan(self) -> JogPlan:
+        """The requested motion."""
+        return JogPlan(AXES.index(self.axis), self.by, self.period, self.cycles, self.torque_limit)
+
+
+def run(flags: JogFlags) -> int:
     """Look, ask, move, idle, judge."""
     console = Console()
-    plan = plan_of(args)
-    path = bench.robot_file(args)
-    module: str = args.module
+    plan = flags.plan
+    path = bench.robot_file(flags)
+    module = flags.module
     robot = config_file.load_without_schedule(path)
     limited = gentle(robot, plan)
-    bench.refuse_service(robot, args.module, args.run_dir)
+    bench.refuse_service(robot, flags.module, flags.run_dir)
     interrupts = Interrupts()
-    with bench.drives_to_ourselves(robot, path, args.run_dir, console.print) as started:
+    with bench.drives_to_ourselves(robot, path, flags.run_dir, console.print) as started:
         if started:
             console.print(f"its soles rest on the floor: a leg needs --torque-limit {EMULATED:g}")
-        outcome = confirm_and_move(args, console, limited, plan, interrupts)
+        outcome = confirm_and_move(flags, console, limited, plan, interrupts)
         if outcome is None:
             console.print("nothing was moved")
             return DECLINED_EXIT_CODE
-        why = limits.not_given_back(robot, args.module, args.run_dir) if outcome.is_idle else ""
+        why = limits.not_given_back(robot, flags.module, flags.run_dir) if outcome.is_idle else ""
         if why:
             console.print(marked("[yellow]{}[/]", why))
     code = report(outcome, module, plan, console)
@@ -104,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def confirm_and_move(
-    args: argparse.Namespace,
+    flags: JogFlags,
     console: Console,
     robot: RobotConfig,
     plan: JogPlan,
@@ -113,7 +104,7 @@ def confirm_and_move(
     """Open the drive, look at the joint, ask, and move it; None if the answer was no.
 
     Args:
-        args: of the verb.
+        flags: of the verb.
         console: to speak on.
         robot: as `gentle` made it.
         plan: what to do.
@@ -123,8 +114,8 @@ def confirm_and_move(
         DriveError: the drive does not answer, or the joint may not go there.
         FleetError: a joint service has the drive.
     """
-    module: str = args.module
-    drive = open_drive(robot, module, args.run_dir)
+    module = flags.module
+    drive = open_drive(robot, module, flags.run_dir)
     try:
         try:
             reading = first_reading(drive)
@@ -134,10 +125,10 @@ def confirm_and_move(
         if why := outside(robot, module, plan, q):
             raise DriveError(f"{module}: {why}")
         _introduce(robot, module, plan, console)
-        if not bench.confirm("Is the joint free, and the power switch at hand?", yes=args.yes):
+        if not bench.confirm("Is the joint free, and the power switch at hand?", yes=flags.yes):
             return None
         bench.refuse_service(
-            robot, args.module, args.run_dir
+            robot, flags.module, flags.run_dir
         )  # a person may take minutes to answer
         with interrupts.kept():
             return jog_drive(
@@ -151,21 +142,6 @@ def confirm_and_move(
             )
     finally:
         drive.close()
-
-
-def plan_of(args: argparse.Namespace) -> JogPlan:
-    """Return the requested motion.
-
-    Raises:
-        DriveError: it is out of range.
-    """
-    if not 0.0 < abs(args.by) <= BY_MAX:
-        raise DriveError(f"--by {args.by:g}: up to {BY_MAX:g} rad either way, and not 0, is right")
-    if not PERIOD_MIN_S <= args.period <= 60.0:
-        raise DriveError(f"--period {args.period:g}: {PERIOD_MIN_S:g} .. 60 s is right")
-    if not 1 <= args.cycles <= CYCLES_MAX:
-        raise DriveError(f"--cycles {args.cycles}: 1 .. {CYCLES_MAX} is right")
-    return JogPlan(AXES.index(args.axis), args.by, args.period, args.cycles, args.torque_limit)
 
 
 def progress(sample: Sample, plan: JogPlan) -> str:
