@@ -6,7 +6,9 @@ import argparse
 import contextlib
 import difflib
 import importlib.metadata
+import itertools
 import os
+import re
 import signal
 import sys
 import traceback
@@ -20,6 +22,7 @@ from tools.guarded_streams import guarded_streams
 from tools.verb_table import NOUNS, RENAMED, VERBS, Subparsers, Verb, add_declared, sentence
 
 INTERRUPTED = 128 + signal.SIGINT
+_NEGATIVE_LIST = re.compile(r"-\.?\d[^,]*,")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -53,13 +56,24 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(arguments: Sequence[str]) -> int:
     try:
-        args = _parser(arguments).parse_args(arguments)
+        args = _parser(arguments).parse_args(_with_values(arguments))
         code = int(args.run(args))
     except SystemExit:
         sys.stdout.flush()
         raise
     sys.stdout.flush()  # a full disk is told here; at the interpreter's end it would be a traceback
     return code
+
+
+def _with_values(arguments: Sequence[str]) -> list[str]:
+    """Join flags and lists of numbers that begin with a minus: argparse sees options in those."""
+    joined: list[str] = []
+    for word in arguments:
+        if joined and joined[-1].startswith("--") and _NEGATIVE_LIST.match(word):
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined
 
 
 def _drop_output() -> None:
@@ -73,6 +87,19 @@ def _drop_output() -> None:
             os.close(nowhere)
 
 
+class _TopParser(argparse.ArgumentParser):
+    """Its help is one screen: a line for each verb of every day, then for each noun."""
+
+    def format_help(self) -> str:
+        """Return it."""
+        daily = {verb.name: verb.help for verb in itertools.takewhile(lambda v: not v.noun, VERBS)}
+        others = {noun: text for noun, text in NOUNS.items() if " " not in noun}
+        others |= {v.name: v.help for v in VERBS if not v.noun and v.name not in daily}
+        lines = [f"  {name:<11}{text}" for name, text in daily.items()]
+        lines += ["", *(f"  {name:<11}{text}" for name, text in others.items())]
+        return "\n".join([f"{self.format_usage()}{self.description}", "", *lines, ""])
+
+
 def whole_parser() -> argparse.ArgumentParser:
     """Return the parser with every verb complete; takes a second or two."""
     return _parser([], whole=True)
@@ -80,27 +107,35 @@ def whole_parser() -> argparse.ArgumentParser:
 
 def _parser(arguments: Sequence[str], *, whole: bool = False) -> argparse.ArgumentParser:
     """Return the parser, complete for the verb in use and with one line for each other."""
-    parser = argparse.ArgumentParser(
+    parser = _TopParser(
         prog="xrl",
-        description="Runtime for Extra Robotic Legs: start, watch and break a fleet of services.",
-        epilog="`xrl help VERB` or `xrl VERB --help` shows a verb's arguments and examples.",
+        usage="xrl [--version] VERB ...",
+        description="Runtime for Extra Robotic Legs. `xrl VERB --help` shows flags and examples.",
     )
     parser.add_argument("--version", action=_Version, help="print version and commit, and end")
-    words = [word for word in arguments if not word.startswith("-")][:2]
-    _refuse_unknown(parser, words, arguments)
-    verbs = parser.add_subparsers(metavar="VERB", required=True)
-    nouns: dict[str, Subparsers] = {"": verbs}
+    asked = _asked(parser, arguments)
+    verbs = parser.add_subparsers(
+        prog="xrl", metavar="VERB", required=True, parser_class=argparse.ArgumentParser
+    )
+    below: dict[str, Subparsers] = {"": verbs}
     for verb in VERBS:
-        if verb.noun not in nouns:
-            text = NOUNS[verb.noun]
-            noun = verbs.add_parser(verb.noun, help=text, description=sentence(text))
-            nouns[verb.noun] = noun.add_subparsers(metavar="VERB", required=True)
-        among = nouns[verb.noun]
-        if whole or verb.name.split() == words[: len(verb.name.split())]:
+        among = below.get(verb.noun) or _below(verb.noun, below)
+        if whole or asked == verb.name or (asked == verb.noun != "" and asked not in NOUNS):
             _add(among, verb)
         else:
             among.add_parser(verb.word, help=verb.help)
     return parser
+
+
+def _below(noun: str, below: dict[str, Subparsers]) -> Subparsers:
+    """Return where the verbs of a noun are added; adds the noun, if no verb has its name."""
+    above, _, word = noun.rpartition(" ")
+    among = below.get(above) or _below(above, below)
+    parser = among.choices.get(word)
+    if parser is None:
+        parser = among.add_parser(word, help=NOUNS[noun], description=sentence(NOUNS[noun]))
+    below[noun] = parser.add_subparsers(metavar="VERB", required=noun in NOUNS)
+    return below[noun]
 
 
 def _add(among: Subparsers, verb: Verb) -> None:
@@ -108,25 +143,38 @@ def _add(among: Subparsers, verb: Verb) -> None:
         add_declared(among, verb)
         return
     verb.module.add_parser(among)  # not declared yet
-    among.choices[verb.name].set_defaults(run=verb.module.run)
+    among.choices[verb.word].set_defaults(run=verb.module.run)
 
 
-def _refuse_unknown(
-    parser: argparse.ArgumentParser, words: Sequence[str], arguments: Sequence[str]
-) -> None:
-    """Refuse a verb that is none, and say which one may be meant."""
-    known = [verb.name for verb in VERBS]
-    asked = " ".join(words if words[:1] and words[0] in NOUNS else words[:1])
-    if not asked or asked in known or asked in NOUNS:
-        return
-    if asked in RENAMED:
-        parser.exit(XrlError.exit_code, f"xrl: `xrl {asked}` is `xrl {RENAMED[asked]}` now\n")
-    near = difflib.get_close_matches(asked, [*known, *NOUNS, *RENAMED], n=3)
-    names = list(dict.fromkeys(RENAMED.get(name, name) for name in near))
-    hint = f"did you mean {' or '.join(names)}? " if near else ""
-    if arguments[0].startswith("-"):
-        hint = f"{arguments[0]} comes after the verb; "
-    where = f"xrl {words[0]} --help" if words[0] in NOUNS else "xrl --help"
+def _asked(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> str:
+    """Return the verb, or else the noun, that a command line begins with; "" for none.
+
+    A word that is neither is refused, with what may be meant.
+    """
+    names = {verb.name for verb in VERBS} | set(NOUNS)
+    first = [word for word in arguments if not word.startswith("-")][:1]
+    found = ""
+    for word in first + list(arguments[1:]):
+        longer = f"{found} {word}".lstrip()
+        if longer not in names:
+            if not word.startswith("-") and (not found or found in NOUNS):
+                _refuse(parser, found, word, arguments[0])
+            break
+        found = longer
+    return found
+
+
+def _refuse(parser: argparse.ArgumentParser, noun: str, word: str, begin: str) -> None:
+    if not noun and word in RENAMED:
+        parser.exit(XrlError.exit_code, f"xrl: `xrl {word}` is `xrl {RENAMED[word]}` now\n")
+    known = {verb.word: verb.name for verb in VERBS if verb.noun == noun}
+    if not noun:
+        known |= {name: name for name in NOUNS if " " not in name} | RENAMED
+    near = dict.fromkeys(known[name] for name in difflib.get_close_matches(word, known, n=3))
+    hint = f"did you mean {' or '.join(near)}? " if near else ""
+    if begin.startswith("-"):
+        hint = f"{begin} comes after the verb; "
+    asked, where = f"{noun} {word}".lstrip(), f"xrl {noun} --help".replace("  ", " ")
     parser.error(f"no verb {asked[:40]!r}; {hint}`{where}` lists them")
 
 

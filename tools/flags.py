@@ -18,7 +18,7 @@ import dataclasses
 import functools
 import math
 import types
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import (
     Annotated,
@@ -35,6 +35,7 @@ from typing import (
 )
 
 from shared import places
+from shared.joints import MODULES
 from shared.run_directory import default_run_dir, own_directory
 from shared.toml_file import Range
 from tools.field_docs import field_docs
@@ -73,9 +74,13 @@ class Arg(NamedTuple):
     names: tuple[str, ...] = ()
     """Of the flag; none: `--` and the field's name."""
     metavar: str = ""
+    choices: tuple[str, ...] = ()
+    """As of a `Literal`, where a table elsewhere has them."""
     parse: Callable[[str], Any] | None = None
     """Reads one value; raises ValueError or argparse.ArgumentTypeError that says what is right."""
     is_positional: bool = False
+    is_one: bool = False
+    """One word gives the whole tuple."""
     takes_many: bool = False
     """One flag takes several words, in place of a flag for each."""
     exclusive: str = ""
@@ -96,9 +101,60 @@ def positional(metavar: str, **more: Any) -> Arg:
     return Arg(metavar=metavar, is_positional=True, **more)
 
 
+Folder = Annotated[Path, Arg(metavar="DIR")]
+Module = Annotated[str, Arg(choices=MODULES, metavar="MODULE")]
+RUN_HELP: Final = "a run's record, finished or not; or its directory: all files of a split run"
+Run = Annotated[Path, positional("RUN", help=RUN_HELP)]
+
+
 def parsed(parse: Callable[[str], Any], metavar: str, **more: Any) -> Arg:
     """Return a flag whose value is read by a function."""
     return Arg(metavar=metavar, parse=parse, **more)
+
+
+def names_of(known: Collection[str] = ()) -> Callable[[str], tuple[str, ...]]:
+    """Return what reads names separated by commas, each once; without a table any names."""
+
+    def parse(text: str) -> tuple[str, ...]:
+        names = tuple(dict.fromkeys(word.strip() for word in text.split(",") if word.strip()))
+        for name in names:
+            if known and name not in known:
+                raise argparse.ArgumentTypeError(f"{name[:40]!r}: one of {', '.join(known)}")
+        return names
+
+    return parse
+
+
+def numbers(count: int, like: str) -> Callable[[str], tuple[float, ...]]:
+    """Return what reads so many numbers; `like` says what they are, and how they are written."""
+
+    def parse(text: str) -> tuple[float, ...]:
+        try:
+            return finite_numbers(text, count)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(f"{error}; {like}") from None
+
+    return parse
+
+
+def finite_numbers(text: str, count: int, largest: float = FINITE_MAX) -> tuple[float, ...]:
+    """Return so many numbers of a text, separated by commas or spaces, none beyond +-largest.
+
+    Raises:
+        ValueError: there are more or fewer, or one is none, not finite or too large; says which.
+    """
+    words = text.replace(",", " ").split()
+    if len(words) != count:
+        raise ValueError(f"{len(words)} numbers; {count} are right")
+    found = []
+    for place, word in enumerate(words, 1):
+        try:
+            found.append(float(word))
+        except ValueError:
+            found.append(math.nan)
+        if not abs(found[-1]) <= largest:
+            raise ValueError(f"number {place}, {word[:40]!r}: one within +-{largest:.4g} is right")
+    return tuple(found)
 
 
 class _Field(NamedTuple):
@@ -123,6 +179,7 @@ def fields_of(declaration: type[Flags]) -> Iterator[_Field]:
     for name in dict.fromkeys(names):
         field = by_name[name]
         kind, limits, arg, is_repeated = _taken_apart(hints[name])
+        is_repeated = is_repeated and not arg.is_one
         is_required = (
             field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         )
@@ -190,8 +247,8 @@ def _argument(field: _Field) -> dict[str, Any]:
         found |= {"dest": field.name, "required": field.is_required}
     if kind is bool:
         return found | {"action": "store_true"}
-    if get_origin(kind) is Literal and arg.parse is None:
-        found["choices"] = get_args(kind)
+    if arg.choices or get_origin(kind) is Literal:
+        found["choices"] = arg.choices or get_args(kind)
     else:
         found["type"] = arg.parse or _reader(kind, field.limits)
     metavar = arg.metavar or (_unit(field) if "choices" not in found else "")
@@ -204,7 +261,7 @@ def _argument(field: _Field) -> dict[str, Any]:
     elif field.is_repeated:
         found["action"] = "append"
     elif arg.is_positional and not field.is_required:
-        found["nargs"] = "?"
+        found |= {"nargs": "?", "default": None}  # argparse would read the text of SUPPRESS
     return found
 
 
@@ -296,3 +353,12 @@ class FleetRobotFlags(RunDirFlags):
     """Fleet and robot: the robot file is the fleet's, if there is a fleet."""
 
     config: Annotated[Path | None, robot_file_of("that of the fleet in --run-dir")] = None
+
+
+class MotionFlags(FleetRobotFlags):
+    """A motion of the robot that a person sees first, and agrees to."""
+
+    yes: bool = False
+    """do not ask"""
+    dry_run: bool = False
+    """show the motions, move nothing"""

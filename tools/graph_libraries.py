@@ -33,7 +33,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, RunError
 from shared.extras import is_installed
 from shared.robot.compiled_graph import FLAGS, FOLDER, Array, library_of
-from tools.verb_table import add_config
+from tools.flags import ConfigFlags, add_flags, read_flags
 
 SAMPLES: Final = 200
 """Drawn arguments on which library and graph must agree."""
@@ -142,9 +142,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    add_config(parser)
-    arguments = parser.parse_args(argv)
-    robot = config_file.load(arguments.config)
+    add_flags(parser, ConfigFlags)
+    flags = read_flags(ConfigFlags, parser.parse_args(argv))
+    robot = config_file.load(flags.config)
     if shutil.which("cc") is None:
         print(_NO_COMPILER, file=sys.stderr)
         return 0

@@ -38,6 +38,18 @@ def make_folder(out: Path | None, verb: str) -> Path:
     return out
 
 
+def refuse_taken(out: Path, record: Path, *, force: bool) -> None:
+    """Refuse an output that is the record itself or, without `--force`, that exists.
+
+    Raises:
+        RunError: saying which.
+    """
+    if out.exists() and record.exists() and out.samefile(record):
+        raise RunError(f"{out}: is the record itself, which stays as it is; give another name")
+    if out.exists() and not force:
+        raise RunError(f"{out}: exists already; remove it, give another name, or --force")
+
+
 def write_atomically(out: Path, content: bytes, *, private: bool = False) -> None:
     """Write a file whole or not at all."""
     if out.exists() and not out.is_file():

@@ -26,7 +26,7 @@ class MassConfig(Section, frozen=True):
     payload: Mass
     payload_max: Mass
     payload_com: tuple[PayloadPlace, PayloadPlace, PayloadPlace] = (0.0, 0.0, 0.0)
-    """Centre of the payload, m, torso axes, from the torso's origin; `xrl drive identify` measures it."""
+    """Centre of the payload, m, torso axes, from the torso's origin: `xrl drive identify`."""
 
 
 class GeometryConfig(Section, frozen=True):

@@ -1,8 +1,8 @@
 """Faults, and what then happens: one table (docs/reference/faults.md).
 
 Each row is a claim. `tests/lockstep/test_faults.py` brings about every fault of a drive and
-compares module, neighbours and drive with the row; `xrl study crash` does so live, with processes and
-recovery. `xrl faults` prints the table.
+compares module, neighbours and drive with the row; `xrl study crash` does so live, with processes
+and recovery. `xrl faults` prints the table.
 
 The rule behind the last column: a module that lost torque is never re-armed automatically. A person
 asks for it by restarting the module's service; a service that crashed and was started by the

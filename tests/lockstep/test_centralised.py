@@ -286,5 +286,5 @@ def test_a_run_of_it_is_marked_and_cannot_be_mistaken_for_the_services_own(
     assert cli.main(["sim", *flags, "--out", str(tmp_path)]) == 0
     log = str(tmp_path / "run.mcap")
     capsys.readouterr()
-    assert cli.main(["resim", log]) == 2
-    assert cli.main(["whatif", log, "--kill", "planner"]) == 2
+    assert cli.main(["log", "resim", log]) == 2
+    assert cli.main(["log", "whatif", log, "--kill", "planner"]) == 2

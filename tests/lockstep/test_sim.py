@@ -76,7 +76,7 @@ def test_a_lean_that_was_asked_for_is_not_judged_as_an_excursion_and_comes_out_a
     assert summary["alive_com_y_max_mm"] < 10.0
     statuses: list[PlannerStatus] = read_run(tmp_path / "run.mcap").messages(topics.PLANNER_STATUS)
     assert max(status.shift_requested[1] for status in statuses) == pytest.approx(0.04, abs=1e-4)
-    assert cli.main(["resim", str(tmp_path), "--service", "planner"]) == 0
+    assert cli.main(["log", "resim", str(tmp_path), "--service", "planner"]) == 0
 
 
 @pytest.mark.parametrize(

@@ -165,7 +165,7 @@ def test_sigkill_loses_less_than_a_second_and_the_next_recorder_recovers_the_res
     rig.stop(signal.SIGKILL)
     copy = rig.run_dir / "copy.mcap"
     copy.write_bytes(rig.path.read_bytes())
-    assert cli.main(["recover", str(copy), "-o", str(rig.run_dir / "by_hand.mcap")]) == 0
+    assert cli.main(["log", "recover", str(copy), "-o", str(rig.run_dir / "by_hand.mcap")]) == 0
     rig.start()
     wait_for(lambda: rig.hears("run-1.mcap"), doing=lambda: rig.send(1))
     wait_for(lambda: read_run(rig.path).complete)

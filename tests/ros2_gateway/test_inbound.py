@@ -61,7 +61,7 @@ def test_the_limits_themselves_are_accepted(robot: RobotConfig, force: float) ->
 
 
 @pytest.mark.parametrize(
-    ("by", "passes"), [("", True), (SCENARIO, True), (SOURCE, True), ("xrl assist by ann", False)]
+    ("by", "passes"), [("", True), (SCENARIO, True), (SOURCE, True), ("xrl lead by ann", False)]
 )
 def test_it_does_not_talk_another_operator_down(robot: RobotConfig, by: str, passes: bool) -> None:
     inbound = Inbound(robot)

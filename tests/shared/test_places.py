@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,15 +13,15 @@ from shared.exceptions import ConfigError, RunError
 from shared.places import DEFAULT_CONFIG
 from shared.process import service_parser
 from tests.tools.exit_codes import exit_code
-from tools import cli
 from tools.bringup import drive_access
 from tools.fleet.run_dir import RunDir
+from tools.verb_table import VERBS
 from tools.verbs import estop
 
 SAID = "config: ./robot.toml\n"
 DECIDE_LATER = {
-    ("configure",), ("doctor",), ("estop",), ("explain",), ("identify", "body"),
-    ("identify", "joint"), ("jog",), ("play",), ("tune",), ("view",), ("zero",),
+    "doctor", "drive configure", "drive identify body", "drive identify joint", "drive jog",
+    "drive tune", "drive zero", "estop", "log explain", "log play", "view",
 }  # fmt: skip
 """Verbs that take a running fleet's or a record's robot before they look for a file."""
 
@@ -31,14 +32,14 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "robot.toml"
 
 
-def options(parser: argparse.ArgumentParser, *words: str) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Yield the words of each command that takes `--config`, and its default."""
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            for name, inner in action.choices.items():
-                yield from options(inner, *words, name)
-        elif "--config" in action.option_strings:
-            yield words, action.default
+def own_defaults() -> Iterator[tuple[str, object]]:
+    """Yield each verb whose flags have `--config`, and what it is without the flag."""
+    for verb in VERBS:
+        if not hasattr(verb.module, "add_parser"):
+            for field in dataclasses.fields(verb.declaration):  # type: ignore[arg-type]
+                if field.name == "config":
+                    made = field.default_factory
+                    yield verb.name, field.default if made is dataclasses.MISSING else made
 
 
 def test_a_robot_file_of_the_working_directory_is_taken_and_named_but_one_that_is_named_wins(
@@ -81,15 +82,15 @@ def test_another_users_robot_file_is_not_taken_unasked(
 
 
 def test_every_verb_that_takes_a_robot_file_looks_for_one() -> None:
-    found = dict(options(cli.whole_parser()))
-    assert {words for words, default in found.items() if default is None} == DECIDE_LATER
-    assert {default for default in found.values() if default is not None} == {places.NOT_NAMED}
+    found = dict(own_defaults())
+    assert {name for name, default in found.items() if default is None} == DECIDE_LATER
+    assert {default for default in found.values() if default is not None} == {places.robot_file}
     assert len(found) > 2 * len(DECIDE_LATER)
 
 
 def test_an_empty_name_is_no_search(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     here.write_text("")
-    assert exit_code(["stiffness", "--config", ""]) == 2
+    assert exit_code(["gains", "--stiffness", "--config", ""]) == 2
     assert SAID not in capsys.readouterr().err
 
 
@@ -97,7 +98,7 @@ def test_a_file_of_another_kind_is_named_in_the_error(
     here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     here.write_text('[vacuum]\nname = "cleaner"\n')
-    assert exit_code(["stiffness"]) == 2
+    assert exit_code(["gains", "--stiffness"]) == 2
     told = capsys.readouterr().err
     assert told.startswith(f"{SAID}xrl: {here}: ")
     assert told.count("\n") == 2
@@ -124,11 +125,11 @@ def test_a_fleet_that_is_up_keeps_its_robot_file(
 
 
 def test_a_stop_from_afar_takes_the_robot_file_of_the_working_directory(here: Path) -> None:
-    args = argparse.Namespace(run_dir=here.parent, config=None)
+    flags = estop.EstopFlags(run_dir=here.parent)
     with pytest.raises(estop.FleetError, match="--config"):
-        estop._robot(args)
+        estop._robot(flags)
     here.write_bytes(DEFAULT_CONFIG.read_bytes())
-    assert estop._robot(args).name == "xrl"
+    assert estop._robot(flags).name == "xrl"
 
 
 def test_a_wheel_says_what_needs_a_checkout_and_its_files_are_not_written_to(

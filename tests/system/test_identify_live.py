@@ -1,4 +1,4 @@
-"""`xrl drive identify` and `xrl drive tune` on a live fleet: asked for, led, measured, and left as it was."""
+"""`xrl drive identify` and `xrl drive tune` on a live fleet: asked, led, measured, left."""
 
 from __future__ import annotations
 

@@ -163,7 +163,7 @@ def test_on_a_terminal_space_begins_right_steps_and_q_ends(
     pid, terminal = pty.fork()
     if pid == 0:
         os.chdir(ROOT)
-        os.execv(sys.executable, [sys.executable, "-m", "tools.cli", "play", *words])  # noqa: S606
+        os.execv(sys.executable, [sys.executable, "-m", "tools.cli", "log", "play", *words])  # noqa: S606
     screen = bytearray()
     over = threading.Event()
 

@@ -70,16 +70,16 @@ def test_emulated_drives_are_zeroed_by_a_protractor_and_by_the_stand(
         true = {m: eventually_look(robot, run_dir, m, zeroed=True).q for m in MODULES}
         lose_power(robot, run_dir, MODULE)
         eventually_look(robot, run_dir, MODULE, zeroed=False)
-        unasked = xrl("zero", MODULE, "--at", "0,-0.9", run_dir=run_dir)
+        unasked = xrl("drive", "zero", MODULE, "--at", "0,-0.9", run_dir=run_dir)
         assert unasked.returncode == 2
         assert "unzeroed" in unasked.stdout
         assert "--yes" in unasked.stderr
         assert not eventually_look(robot, run_dir, MODULE, zeroed=False).zeroed
-        done = xrl("zero", MODULE, "--at", "0.01,-0.9", "--yes", run_dir=run_dir)
+        done = xrl("drive", "zero", MODULE, "--at", "0.01,-0.9", "--yes", run_dir=run_dir)
         assert done.returncode == 0, done.stdout + done.stderr
         seen = eventually_look(robot, run_dir, MODULE, zeroed=True)
         assert seen.q == pytest.approx((0.01, -0.9), abs=zeroing.WITHIN)
-        done = xrl("zero", "--all", "--standing", str(height), "--yes", run_dir=run_dir)
+        done = xrl("drive", "zero", "--all", "--standing", str(height), "--yes", run_dir=run_dir)
         assert done.returncode == 0, done.stdout + done.stderr
         assert done.stdout.count(" zeroed") >= len(MODULES)
         for module in MODULES:
@@ -111,7 +111,7 @@ def test_beside_its_joint_service_a_module_is_zeroed_only_while_that_is_disarmed
 
 
 def test_a_leg_of_the_emulated_robot_follows_and_nothing_is_left_behind(run_dir: Path) -> None:
-    done = xrl("jog", *LEG, "--cycles", "1", run_dir=run_dir)
+    done = xrl("drive", "jog", *LEG, "--cycles", "1", run_dir=run_dir)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "FOLLOWED" in done.stdout
     assert "both axes are idle" in done.stdout
@@ -155,7 +155,7 @@ def test_on_the_emulated_robot_a_small_limit_an_interrupt_and_a_service_stop_it(
 
 
 def test_after_a_jog_the_doctor_finds_the_drive_as_it_was(run_dir: Path) -> None:
-    """Its limits too: `xrl drive configure --apply` would restart the board for them, zero and all."""
+    """Its limits too: `drive configure --apply` would restart the board for them, zero and all."""
     with started(run_dir, "simulator"):
         jogged = xrl("jog", MODULE, "--torque-limit", "4", "--yes", run_dir=run_dir)
         assert "both axes are idle" in jogged.stdout, jogged.stdout + jogged.stderr

@@ -21,23 +21,24 @@ from tools.output import write_atomically
 
 RUN = str(NEWEST)
 LONG = "x" * 5000
+READERS = ("info", "report", "explain", "resim", "play", "recover")
 NUMBERS = ("nan", "inf", "-inf", "1e300", "one", "")
 
 CASES: list[list[str]] = [
     *(["sim", f"--{name}", bad] for name in ("jitter", "delay", "loss", "duration")
       for bad in NUMBERS),
     *(["sim", "--seed", bad] for bad in ("-1", "1.5", "9" * 30, "")),
-    *(["explain", "--p", "0,0,0.87,0,0,0", "--assist", bad] for bad in NUMBERS),
-    *(["explain", RUN, "--at", bad] for bad in NUMBERS),
-    *(["report", RUN, flag, bad] for flag in ("--from", "--to") for bad in NUMBERS),
-    *(["whatif", RUN, "--kill", "planner", flag, bad] for flag in ("--every", "--for")
+    *(["log", "explain", "--p", "0,0,0.87,0,0,0", "--assist", bad] for bad in NUMBERS),
+    *(["log", "explain", RUN, "--at", bad] for bad in NUMBERS),
+    *(["log", "report", RUN, flag, bad] for flag in ("--from", "--to") for bad in NUMBERS),
+    *(["log", "whatif", RUN, "--kill", "planner", flag, bad] for flag in ("--every", "--for")
       for bad in NUMBERS),
-    *(["resim", RUN, "--tolerance", bad] for bad in NUMBERS),
-    *(["play", RUN, flag, bad] for flag in ("--rate", "--duration") for bad in NUMBERS),
-    *(["sweep", "kill", "--n", bad] for bad in ("99999999999", "-1", "0", "1.5")),
-    ["sweep", "kill", "--n", "1", "--seed", "-1"],
-    ["sweep", "kill", "--n", "1", "--workers", "-3"],
-    ["whatif", RUN, "--kill", "planner", "--workers", "0"],
+    *(["log", "resim", RUN, "--tolerance", bad] for bad in NUMBERS),
+    *(["log", "play", RUN, flag, bad] for flag in ("--rate", "--duration") for bad in NUMBERS),
+    *(["study", "sweep", "kill", "--n", bad] for bad in ("99999999999", "-1", "0", "1.5")),
+    ["study", "sweep", "kill", "--n", "1", "--seed", "-1"],
+    ["study", "sweep", "kill", "--n", "1", "--workers", "-3"],
+    ["log", "whatif", RUN, "--kill", "planner", "--workers", "0"],
     ["sim", "--push", "1:0.3:nan,0,0"],
     ["sim", "--push", "1:nan:1,1,1"],
     ["sim", "--kill", "planner@nan"],
@@ -45,17 +46,17 @@ CASES: list[list[str]] = [
     ["sim", "--inject", "all delay=nan"],
     ["sim", "--inject", "[/red] delay=3"],
     ["sim", "--scenario", "[/red]"],
-    *([verb, LONG] for verb in ("info", "report", "explain", "resim", "play", "recover", "export")),
-    *([verb, "/dev/zero"] for verb in ("info", "report", "explain", "resim", "play", "recover")),
+    *(["log", verb, bad] for bad in (LONG, "/dev/zero") for verb in READERS),
+    ["log", "export", LONG],
     *(["sim", flag, LONG] for flag in ("--config", "--scenario", "--plant", "--out")),
     *(["sim", flag, "/dev/zero"] for flag in ("--config", "--scenario")),
-    ["report", RUN, "-o", LONG, "--open", "no"],
-    ["export", RUN, "--gif", LONG],
-    ["export", RUN, "--scene", "-o", LONG],
-    ["stiffness", "--config", "/dev/zero"],
+    ["log", "report", RUN, "-o", LONG, "--open", "no"],
+    ["log", "export", RUN, "--gif", LONG],
+    ["log", "export", RUN, "--scene", "-o", LONG],
+    ["gains", "--stiffness", "--config", "/dev/zero"],
     ["status", "--run-dir", LONG],
     ["down", "--run-dir", LONG],
-    ["assist", "nan"],
+    ["lead", "--assist", "nan"],
 ]  # fmt: skip
 
 
@@ -82,12 +83,12 @@ def test_a_bad_command_line_is_refused_in_words(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("verb", ["info", "report", "explain", "resim", "play", "recover"])
+@pytest.mark.parametrize("verb", READERS)
 def test_a_pipe_is_not_waited_on(
     verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     os.mkfifo(tmp_path / "pipe")
-    assert "no ordinary file" in told([verb, str(tmp_path / "pipe")], capsys)
+    assert "no ordinary file" in told(["log", verb, str(tmp_path / "pipe")], capsys)
 
 
 @pytest.mark.parametrize(
@@ -103,7 +104,7 @@ def test_a_robot_file_that_is_none_is_refused(
 ) -> None:
     path = tmp_path / "robot.toml"
     path.write_bytes(content)
-    assert words in told(["stiffness", "--config", str(path)], capsys)
+    assert words in told(["gains", "--stiffness", "--config", str(path)], capsys)
 
 
 def test_a_device_is_never_replaced_by_an_output(tmp_path: Path) -> None:
@@ -152,14 +153,14 @@ def test_a_clock_that_no_machine_has_is_refused(
 ) -> None:
     path = made_up(tmp_path / "a.mcap", {"clock": {"offset_ns": "9" * digits}})
     for verb in ("report", "explain", "resim"):
-        assert "offset_ns" in told([verb, path], capsys)
+        assert "offset_ns" in told(["log", verb, path], capsys)
 
 
 def test_times_beyond_64_bits_are_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = made_up(tmp_path / "a.mcap", change=lambda _, t, data: (min(2**63 + t, 2**64 - 1), data))
-    assert "do not fit each other" in told(["report", path], capsys)
+    assert "do not fit each other" in told(["log", "report", path], capsys)
 
 
 @pytest.mark.parametrize("content", [b"\xff\xfe", b"a = " + b"[" * 9000, b"a = 1"])
@@ -168,7 +169,7 @@ def test_a_robot_file_in_a_log_that_is_none_is_refused(
 ) -> None:
     path = made_up(tmp_path / "a.mcap", attachments={"robot.toml": content})
     for verb in ("explain", "resim"):
-        assert "robot.toml" in told([verb, path], capsys)
+        assert "robot.toml" in told(["log", verb, path], capsys)
 
 
 @pytest.mark.parametrize("content", [b"{}", b"\xff", b"["])
@@ -176,7 +177,7 @@ def test_gains_in_a_log_that_are_none_are_refused(
     content: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = made_up(tmp_path / "a.mcap", attachments={"robot.gains.json": content})
-    assert "no gain schedule" in told(["resim", path], capsys)
+    assert "no gain schedule" in told(["log", "resim", path], capsys)
 
 
 def test_the_memory_of_another_version_is_refused_with_what_to_do(
@@ -186,7 +187,7 @@ def test_the_memory_of_another_version_is_refused_with_what_to_do(
         return t_ns, re.sub(rb'"snapshot":"(?:[^"\\]|\\.)+"', b'"snapshot":"{\\\\"a\\\\":1}"', data)
 
     path = made_up(tmp_path / "a.mcap", change=foreign)
-    assert "with the checkout that wrote it" in told(["resim", path], capsys)
+    assert "with the checkout that wrote it" in told(["log", "resim", path], capsys)
 
 
 def test_a_small_file_that_expands_to_gigabytes_is_refused(
@@ -205,7 +206,7 @@ def test_a_small_file_that_expands_to_gigabytes_is_refused(
         writer.finish()
     assert path.stat().st_size < 100_000
     for verb in ("report", "resim", "play"):
-        assert "expand to over" in told([verb, str(path)], capsys)
+        assert "expand to over" in told(["log", verb, str(path)], capsys)
 
 
 def test_a_million_false_marks_of_chunks_are_passed_in_time(
@@ -215,7 +216,7 @@ def test_a_million_false_marks_of_chunks_are_passed_in_time(
     mark = b"\x06" + struct.pack("<Q", 50 << 20) + b"\0" * 28 + b"\x04\0\0\0zstd"
     path = tmp_path / "marks.mcap"
     path.write_bytes(NEWEST.read_bytes()[:20_000] + mark * 1_000_000)
-    assert cli.main(["info", str(path)]) == 0
+    assert cli.main(["log", "info", str(path)]) == 0
     assert "not finished" in capsys.readouterr().out
 
 
@@ -242,4 +243,4 @@ def test_no_damage_ends_a_reader_without_words(
         ["resim", "--service", "knee_left", "--until-first-difference"],
     ):
         expected = (0, 1, 2) if verb == "resim" else (0, 2)  # 1: another output than recorded
-        assert cli.main([verb, str(path), *words]) in expected
+        assert cli.main(["log", verb, str(path), *words]) in expected

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import errno
 import importlib.metadata
+import itertools
 import re
+import shlex
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,12 +17,12 @@ import pytest
 from shared import revision
 from shared.exceptions import BUG_EXIT_CODE, RunError
 from shared.process import run_service
+from tests.tools.exit_codes import exit_code
 from tools import cli
+from tools.flags import read_flags
 from tools.lab.studies.sweeps import pool
-from tools.verb_table import VERBS
+from tools.verb_table import NOUNS, RENAMED, VERBS, Verb
 from tools.verbs import faults
-
-MINE = ("up", "status", "kill", "tare", "down")
 
 
 def xrl(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -39,11 +42,52 @@ def assert_one_line_error(done: subprocess.CompletedProcess[str], code: int = 2)
     assert done.stdout == ""
 
 
-def test_help_lists_every_verb() -> None:
+def test_help_is_a_screen_that_lists_every_verb_or_its_noun() -> None:
     done = xrl("--help")
     assert done.returncode == 0
     for verb in VERBS:
-        assert re.search(rf"^    {verb.name.split()[0]}\b", done.stdout, re.MULTILINE)
+        assert re.search(rf"^  {verb.name.split()[0]} ", done.stdout, re.MULTILINE)
+    lines = done.stdout.splitlines()
+    assert len(lines) <= 30
+    assert max(map(len, lines)) <= 80
+
+
+@pytest.mark.parametrize("old", RENAMED)
+def test_an_old_name_answers_with_the_new_one_in_a_line(
+    old: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert exit_code([old, "--anything", "3"]) == 2
+    said = capsys.readouterr().err
+    assert said == f"xrl: `xrl {old}` is `xrl {RENAMED[old]}` now\n"
+    noun = RENAMED[old].partition(" --")[0]
+    assert noun in {verb.name for verb in VERBS} | set(NOUNS)
+
+
+def commands(example: str) -> Iterator[list[str]]:
+    """Yield what stands behind each `xrl` of a line."""
+    words = shlex.split(example, comments=True)
+    for is_joint, part in itertools.groupby(words, lambda word: word in ("|", ">", "&&")):
+        command = [word for word in part if word != "sudo"]
+        if not is_joint and command[0] == "xrl":
+            yield command[1:]
+
+
+@pytest.mark.parametrize("verb", VERBS, ids=lambda verb: verb.name)
+def test_every_example_of_every_help_is_read_and_its_flags_fit_each_other(
+    verb: Verb, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert exit_code([*verb.name.split(), "--help"]) == 0
+    _, _, shown = capsys.readouterr().out.rpartition("examples:\n")
+    by_name = {one.name: one for one in VERBS}
+    own = 0
+    for words in itertools.chain.from_iterable(map(commands, shown.splitlines())):
+        parser = cli._parser(words)
+        asked = by_name[cli._asked(parser, words)]
+        found = parser.parse_args(cli._with_values(words))
+        own += asked is verb
+        if not hasattr(asked.module, "add_parser"):
+            read_flags(asked.declaration, found)
+    assert own
 
 
 def test_help_imports_no_verb() -> None:
@@ -54,13 +98,6 @@ def test_help_imports_no_verb() -> None:
         "assert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=60)
-
-
-@pytest.mark.parametrize("verb", MINE)
-def test_each_verb_has_help_with_examples(verb: str) -> None:
-    done = xrl(verb, "--help")
-    assert done.returncode == 0, done.stderr
-    assert f"examples:\n  xrl {verb}" in done.stdout
 
 
 def test_an_unknown_verb_is_refused() -> None:
@@ -77,7 +114,7 @@ def test_a_misspelt_verb_is_told_what_it_is_like() -> None:
 
 
 def test_no_fleet_is_one_line(tmp_path: Path) -> None:
-    for verb in (("status",), ("kill", "planner"), ("tare",)):
+    for verb in (("status",), ("kill", "planner"), ("drive", "tare")):
         assert_one_line_error(xrl(*verb, "--run-dir", str(tmp_path)))
 
 
@@ -101,12 +138,12 @@ def test_an_unknown_scenario_is_one_line_that_lists_the_known(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    "words", [["stiffness"], ["faults"], ["--help"], ["help", "sim"], ["completion", "bash"]]
+    "line", ["gains --stiffness", "faults", "--help", "help sim", "completion bash"]
 )
-def test_an_output_that_takes_nothing_is_one_line_and_no_fall(words: list[str]) -> None:
+def test_an_output_that_takes_nothing_is_one_line_and_no_fall(line: str) -> None:
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
-            [sys.executable, "-m", "tools.cli", *words],
+            [sys.executable, "-m", "tools.cli", *line.split()],
             stdout=full, stderr=subprocess.PIPE, text=True, timeout=60, check=False,
         )  # fmt: skip
     assert done.returncode == 2
@@ -145,7 +182,10 @@ def test_workers_without_shared_memory_are_told(monkeypatch: pytest.MonkeyPatch)
 def test_a_bug_is_a_traceback_and_neither_a_fall_nor_bad_input(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(faults, "run", lambda args: args.none)
+    def broken(flags: faults.FaultsFlags) -> int:
+        return flags.none  # type: ignore[attr-defined,no-any-return]
+
+    monkeypatch.setattr(faults, "run", broken)
     assert cli.main(["faults"]) == BUG_EXIT_CODE
     told = capsys.readouterr().err
     assert "AttributeError" in told

@@ -39,7 +39,7 @@ printf '%s\\n' "${{COMPREPLY[@]}}"
 
 def test_every_verb_is_offered(script: Path, tmp_path: Path) -> None:
     assert offered(script, "xrl ", tmp_path) >= {verb.name.split()[0] for verb in VERBS}
-    assert offered(script, "xrl re", tmp_path) == {"report", "recover", "resim"}
+    assert offered(script, "xrl log re", tmp_path) == {"report", "recover", "resim"}
 
 
 def test_a_verbs_options_and_actions_are_offered(script: Path, tmp_path: Path) -> None:

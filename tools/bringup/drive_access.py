@@ -10,7 +10,6 @@ else the simulator runs alone for the while.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import os
 import sys
@@ -18,7 +17,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 from services.simulator.drives.axis_settings import Settings, preset
 from services.simulator.fronts import usb_standin
@@ -30,6 +29,7 @@ from shared.extras import require
 from shared.joints import MODULES
 from tools.bringup.boards import FoundBoards
 from tools.bringup.can_monitor import bus_config, listen
+from tools.flags import Arg, Flags, FleetRobotFlags
 from tools.fleet import procfs
 from tools.fleet.process_table import SIMULATED_CAN, FleetOptions, is_simulated
 from tools.fleet.run_dir import RunDir
@@ -48,20 +48,20 @@ GONE: Final = (
 _POLL_S = 0.05
 
 
-def robot_file(args: argparse.Namespace) -> Path:
+def robot_file(flags: FleetRobotFlags) -> Path:
     """Return the robot file: of the fleet that is up in `--run-dir`, else as `places.robot_file`.
 
     Raises:
         ConfigError: there is no fleet, and the file found may not be taken.
         FleetError: `--config` is not the fleet's.
     """
-    run = RunDir(args.run_dir)
+    run = RunDir(flags.run_dir)
     manifest = run.read_manifest()
     if manifest is None or not is_up(run.path):
-        return Path(os.path.abspath(places.robot_file(args.config)))  # noqa: PTH100 - links stay
-    if args.config is None:
+        return Path(os.path.abspath(places.robot_file(flags.config)))  # noqa: PTH100 - links stay
+    if flags.config is None:
         return Path(manifest.config)
-    given = Path(os.path.abspath(args.config))  # noqa: PTH100 - as the manifest has it
+    given = Path(os.path.abspath(flags.config))  # noqa: PTH100 - as the manifest has it
     if given != Path(manifest.config):
         raise FleetError(
             f"the fleet in {run.path} runs with {manifest.config}, not with {given}; "
@@ -122,13 +122,12 @@ def confirm(question: str, *, yes: bool) -> bool:
     return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
 
 
-def add_plant(parser: argparse.ArgumentParser) -> None:
-    """Add `--plant`: settings that the emulated drives have kept."""
-    parser.add_argument(
-        "--plant", action="append", default=[], metavar="MODULE.NAME=VALUE",
-        help="emulated robot only: a setting that a drive has kept, as "
-        "knee_left.axis0.controller.config.vel_limit=2; may be given several times",
-    )  # fmt: skip
+class DriveSettingFlags(Flags):
+    """Settings that the emulated drives have kept."""
+
+    plant: Annotated[tuple[str, ...], Arg(metavar="MODULE.NAME=VALUE")] = ()
+    """emulated robot only: a setting that a drive has kept, as
+    knee_left.axis0.controller.config.vel_limit=2; may be given several times"""
 
 
 def check_plants(robot: RobotConfig, run_dir: Path, plants: Sequence[str]) -> None:

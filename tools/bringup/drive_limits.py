@@ -1,7 +1,7 @@
 """Restores a drive's own limits after a motion to those of the robot file.
 
 A drive keeps a motion's small limits until a service arms it or it restarts. `xrl doctor` would
-find them wrong, and `xrl drive configure --apply` would restart the board for them, which loses its zero.
+find them wrong, and `xrl drive configure --apply` would restart the board: it loses its zero.
 """
 
 from __future__ import annotations

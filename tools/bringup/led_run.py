@@ -1,4 +1,4 @@
-"""A live robot that is asked for something for a while: by `xrl drive identify body`, by `xrl drive tune`."""
+"""A live robot that is asked for something for a while: by `identify body` and `tune`."""
 
 from __future__ import annotations
 

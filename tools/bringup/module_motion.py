@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -31,6 +30,7 @@ from tools.bringup.motion import (
     within_stops,
 )
 from tools.bringup.motion_runner import NOT_IDLE, Interrupts, look_at, run_motion
+from tools.flags import MotionFlags
 from tools.terminal import Console, marked
 
 LIFTED: Final = 0.2
@@ -80,7 +80,7 @@ def refuse_services(robot: RobotConfig, modules: Sequence[str], run_dir: Path) -
 
 
 def look_ask_and_move(
-    args: argparse.Namespace,
+    flags: MotionFlags,
     robot: RobotConfig,
     joint: tuple[str, int],
     plan_of: Callable[[Mapping[str, Pair]], MotionPlan[C]],
@@ -92,7 +92,7 @@ def look_ask_and_move(
     """Look at a leg, ask, and move a joint; return how it ended, or None for a dry run.
 
     Args:
-        args: of the verb: `yes`, `run_dir`, and `dry_run` if it has one.
+        flags: of the verb.
         robot: its file.
         joint: module and axis.
         plan_of: returns the motion of modules that are there, (phi, theta), rad, and tells of it.
@@ -104,7 +104,7 @@ def look_ask_and_move(
     module, axis = joint
     modules = (module,) if alone else leg_of(module)
     with (
-        _open(robot, modules, args.run_dir) as drives,
+        _open(robot, modules, flags.run_dir) as drives,
         interrupts.kept(),
         console.status("looking" if alone else "waiting until the leg hangs still"),
     ):
@@ -116,23 +116,23 @@ def look_ask_and_move(
     limited = limit_drives(bounded, plan)
     if why := why_out_of_reach(bounded, module, plan, q[module]):
         raise DriveError(f"{module}: {why}")
-    if vars(args).get("dry_run"):
+    if flags.dry_run:
         return None
     what = "Is the joint free, and" if alone else "Does the leg hang free,"
-    if not confirm(f"{what} the power switch at hand?", yes=args.yes):
+    if not confirm(f"{what} the power switch at hand?", yes=flags.yes):
         return Stopped("nothing was moved", declined=True)
     for name in modules:  # a person may take minutes to answer
-        refuse_service(robot, name, args.run_dir)
+        refuse_service(robot, name, flags.run_dir)
     name = f"{module}_{AXES[axis]}"
     shown = contextlib.nullcontext(console.print) if alone else _in_place(console)
-    with _open(limited, modules, args.run_dir) as drives, interrupts.kept(), shown as show:
+    with _open(limited, modules, flags.run_dir) as drives, interrupts.kept(), shown as show:
         result = run_motion(
             drives, limited, module, plan, q_seen=q[module], interrupts=interrupts,
             progress=lambda sample: show(_line(sample, plan, name)),
         )  # fmt: skip
     for one in modules:
         # only to drives that say that they are idle: full limits are nothing for an armed one
-        if one not in result.not_idle and (why := not_given_back(robot, one, args.run_dir)):
+        if one not in result.not_idle and (why := not_given_back(robot, one, flags.run_dir)):
             console.print(marked("[yellow]{}: {}[/]", one, why))
     if result.trouble or result.not_idle:
         return Stopped(f"{name}: {result.trouble or 'the motion ended'}", result.not_idle)

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 import time
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Annotated, Final, TypeVar
 
 from shared.exceptions import FleetError
-from tools.number_arguments import finite
+from shared.toml_file import Range
+from tools.flags import Arg, Flags
 
 T = TypeVar("T")
 
@@ -30,16 +30,19 @@ class CoresFullError(FleetError):
     """The fleet does not come to track, and the cores have no time left."""
 
 
-def add_pace(parser: argparse.ArgumentParser) -> None:
-    """Add `--pace`."""
-    parser.add_argument(
-        "--pace",
-        type=finite,
-        metavar="X",
-        help="clock rate of a simulated fleet: 0.5 is slow motion at half speed, as on a machine "
-        f"twice as fast (default: ${PACE_VARIABLE}, else 1; `demo` and `crashtest` lower it by "
-        f"{SLOWER:g} while the cores are full)",
-    )
+class PaceFlags(Flags):
+    """How fast the clock of a simulated fleet goes."""
+
+    pace: Annotated[
+        float | None,
+        Range(PACE_MIN, 1.0, ""),
+        Arg(
+            metavar="X",
+            help="clock rate of a simulated fleet: 0.5 is slow motion at half speed, as on a "
+            f"machine twice as fast (default: ${PACE_VARIABLE}, else 1; `demo` and `study crash` "
+            f"lower it by {SLOWER:g} while the cores are full)",
+        ),
+    ] = None
 
 
 def usual_pace() -> float:

@@ -2,37 +2,40 @@
 
 from __future__ import annotations
 
-import argparse
 import math
-from typing import Final
+from typing import Annotated, Final
 
 from shared.exceptions import RunError
+from tools.flags import Flags, Number, option
 from tools.judge import verdict
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import RunLog, RunPart, parts_of, read_part
-from tools.number_arguments import finite
 
 _LOOK_S: Final = 20.0
 """Length of the parts in which the scenario's start is looked for."""
 
 
-def add_part(parser: argparse.ArgumentParser, what: str = "of the part to read") -> None:
-    """Add `--from` and `--to`."""
-    for flag, name, default in (("--from", "begin", -math.inf), ("--to", "end", math.inf)):
-        parser.add_argument(
-            flag,
-            dest=f"{name}_s",
-            type=finite,
-            default=default,
-            metavar="S",
-            help=f"{name} {what} (default: the run's): scenario time, or time since "
-            "the log begins if it has no scenario; as in the report",
-        )
+class PartFlags(Flags):
+    """Part of a run: the whole of it if none is given."""
+
+    begin_s: Annotated[Number, option("--from", metavar="S")] = -math.inf
+    """begin of the part (default: the run's): scenario time, or time since the log begins if it has
+    no scenario; as in the report"""
+    end_s: Annotated[Number, option("--to", metavar="S")] = math.inf
+    """end of the part (default: the run's)"""
+
+    def check(self) -> None:
+        """Refuse an empty part."""
+        super().check()
+        if not self.begin_s < self.end_s:
+            raise RunError(
+                f"--from {self.begin_s:g} --to {self.end_s:g}: the first is to be the smaller one"
+            )
 
 
-def part_of(args: argparse.Namespace, index: RunIndex) -> RunPart:
+def part_of(flags: PartFlags, index: RunIndex) -> RunPart:
     """Return the part that a command line asks for."""
-    begin_s, end_s = args.begin_s, args.end_s
+    begin_s, end_s = flags.begin_s, flags.end_s
     if math.isinf(begin_s) and math.isinf(end_s):
         return RunPart()
     if not begin_s < end_s:
@@ -47,9 +50,9 @@ def part_of(args: argparse.Namespace, index: RunIndex) -> RunPart:
     return RunPart(max(0.0, begin_s + offset_s), end_s + offset_s)
 
 
-def read_asked(args: argparse.Namespace, index: RunIndex, *, as_sent: bool = False) -> RunLog:
+def read_asked(flags: PartFlags, index: RunIndex, *, as_sent: bool = False) -> RunLog:
     """Read the part that a command line asks for, at once; `as_sent` as for `RunLog`."""
-    return read_part(index, part_of(args, index), as_sent=as_sent)
+    return read_part(index, part_of(flags, index), as_sent=as_sent)
 
 
 def zero_ns(index: RunIndex) -> int:

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Final, get_args, get_type_hints
+from typing import Annotated, Any, Final, get_args, get_type_hints
 
 import msgspec
 
@@ -20,17 +20,25 @@ from shared.config import checks as config_check
 from shared.config import files as config_file
 from shared.config import gain_schedule, scenarios
 from shared.config.robot_config import SERVICES, RobotConfig
-from shared.config.scenarios import FAULT_KINDS, SIGNALS, Fault, Kill, Push, Restart, Scenario
+from shared.config.scenarios import (
+    FAULT_KINDS,
+    SIGNALS,
+    Fault,
+    Inject,
+    Kill,
+    Push,
+    Restart,
+    Scenario,
+)
 from shared.config.sections import LawConfig
 from shared.exceptions import FleetError, RunError
 from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG, SCENARIOS
+from tools.flags import Arg, ConfigFlags, Duration, Flags, Natural, add_flags, parsed
 from tools.guarded_streams import printable
 from tools.live.describe_inject import in_words_of, parse_inject
-from tools.number_arguments import finite, natural
 from tools.output import make_folder
 from tools.terminal import Console, marked
-from tools.verb_table import add_config
 
 PLANT_FILE = "plant.toml"
 """Name of the plant among a run's results and in its log."""
@@ -46,74 +54,46 @@ def choices(field: str) -> tuple[str, ...]:
     return get_args(get_type_hints(LawConfig)[field])
 
 
-def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags that shape an experiment."""
-    add_config(parser)
-    parser.add_argument(
-        "--scenario",
-        default="squat",
-        metavar="NAME|FILE",
-        help="what happens: a name (of a file in scenarios/ beside the robot file, or one that is "
-        "shipped), or a file (default: squat, the paper's Fig. 7)",
-    )
-    parser.add_argument("--duration", type=finite, metavar="S", help="scenario time to run, s")
-    for field, (parse, metavar, words) in _ROWS.items():
-        parser.add_argument(
-            f"--{field}",
-            action="append",
-            type=parse,
-            metavar=metavar,
-            help=f"{words}; may be repeated",
-        )
-    add_plant(parser)
-    add_controller(parser)
-    add_imu(parser)
-    parser.add_argument("--split", choices=choices("split"), help="gain split of the law")
-    parser.add_argument(
-        "--jacobian",
-        choices=choices("jacobian"),
-        help="how the legs share the load; average comes with the diagonal split: no gains "
-        "certify it",
-    )
-    parser.add_argument(
-        "--seed",
-        type=natural,
-        default=0,
-        help="of the sensors' noise, and of what the network loses and how late it is",
-    )
+class PlantFlags(Flags):
+    """How the simulated robot differs from its robot file."""
+
+    plant: Annotated[
+        tuple[str, ...],
+        Arg(
+            metavar="NAME|FILE|KEY=VALUE",
+            help=f"the true robot: {', '.join(NAMED)} (default: realistic), a TOML file, or one "
+            "value such as drivetrain.stiffness=5000 or floor.slope=[0.03,0.0]; may be repeated, "
+            "each laid over those before; no controller sees it (deploy/plants/README.md)",
+        ),
+    ] = ()
+
+
+class ControllerFlags(Flags):
+    """A controller of somebody's own in the place of the law."""
+
+    controller: Annotated[str | None, Arg(metavar="FILE.py[:NAME]")] = None
+    """a controller of your own in the place of the law, behind the same certificate, age rule and
+    limits (docs/own-controller.md, examples/lqr_controller.py)"""
+
+
+class ImuFlags(Flags):
+    """An IMU, whatever the robot file says."""
+
+    imu: bool = False
+    """with an IMU on the torso, and its service: the robot stands on slopes (imu.fitted of the
+    robot file)"""
 
 
 def add_imu(parser: argparse.ArgumentParser) -> None:
-    """Add the flag that fits an IMU."""
-    parser.add_argument(
-        "--imu",
-        action="store_true",
-        help="with an IMU on the torso, and its service: the robot stands on slopes "
-        "(imu.fitted of the robot file)",
-    )
-
-
-def add_controller(parser: argparse.ArgumentParser) -> None:
-    """Add the flag that puts a controller of somebody's own in the place of the law."""
-    parser.add_argument(
-        "--controller",
-        metavar="FILE.py[:NAME]",
-        help="a controller of your own in the place of the law, behind the same certificate, age "
-        "rule and limits (docs/own-controller.md, examples/lqr_controller.py)",
-    )
+    """Add `--imu` to the parser of a study."""
+    add_flags(parser, ImuFlags)
+    parser.set_defaults(imu=False)
 
 
 def add_plant(parser: argparse.ArgumentParser) -> None:
-    """Add the flag that says how the simulated robot differs from its robot file."""
-    parser.add_argument(
-        "--plant",
-        action="append",
-        default=[],
-        metavar="NAME|FILE|KEY=VALUE",
-        help=f"the true robot: {', '.join(NAMED)} (default: realistic), a TOML file, or one value "
-        "such as drivetrain.stiffness=5000 or floor.slope=[0.03,0.0]; may be repeated, each laid "
-        "over those before; no controller sees it (deploy/plants/README.md)",
-    )
+    """Add `--plant` to the parser of a study."""
+    add_flags(parser, PlantFlags)
+    parser.set_defaults(plant=[])
 
 
 def _refused(text: str, form: str, **known: Iterable[str]) -> argparse.ArgumentTypeError:
@@ -166,45 +146,55 @@ def parse_fault(text: str) -> Fault:
     return msgspec.convert({**row, "axis": axis, "duration": duration}, Fault)
 
 
-_ROWS: Final[dict[str, tuple[Callable[[str], object], str, str]]] = {
-    "kill": (
-        parse_kill,
-        "SERVICE@T[:SIGNAL]",
-        (
-            f"send a signal ({', '.join(SIGNALS)}; default KILL) at scenario time T; "
-            "replaces the scenario's kills"
+class ExperimentFlags(ConfigFlags, PlantFlags, ControllerFlags, ImuFlags):
+    """What shapes an experiment."""
+
+    scenario: Annotated[str, Arg(metavar="NAME|FILE")] = "squat"
+    """what happens: a name (of a file in scenarios/ beside the robot file, or one that is shipped),
+    or a file (default: squat, the paper's Fig. 7)"""
+    duration: Duration | None = None
+    """scenario time to run, s"""
+    kill: Annotated[
+        tuple[Kill, ...] | None,
+        parsed(
+            parse_kill,
+            "SERVICE@T[:SIGNAL]",
+            help=f"send a signal ({', '.join(SIGNALS)}; default KILL) at scenario time T; "
+            "replaces the scenario's kills; may be repeated",
         ),
-    ),
-    "restart": (
-        parse_restart,
-        "SERVICE@T",
-        "start a killed service again, or continue a stopped one",
-    ),
-    "push": (
-        parse_push,
-        "T:DUR:FX,FY,FZ",
-        "push the torso by a force in N from T for DUR s; replaces the scenario's pushes",
-    ),
-    "fault": (
-        parse_fault,
-        "MODULE:KIND@T",
-        (
-            f"a fault of a module's drive ({', '.join(FAULT_KINDS)}) at scenario time T; "
-            "MODULE.1 is its second axis, @T:DUR lasts DUR s; replaces the scenario's faults"
+    ] = None
+    restart: Annotated[tuple[Restart, ...] | None, parsed(parse_restart, "SERVICE@T")] = None
+    """start a killed service again, or continue a stopped one; may be repeated"""
+    push: Annotated[tuple[Push, ...] | None, parsed(parse_push, "T:DUR:FX,FY,FZ")] = None
+    """push the torso by a force in N from T for DUR s; replaces the scenario's pushes; may be
+    repeated"""
+    fault: Annotated[
+        tuple[Fault, ...] | None,
+        parsed(
+            parse_fault,
+            "MODULE:KIND@T",
+            help=f"a fault of a module's drive ({', '.join(FAULT_KINDS)}) at scenario time T; "
+            "MODULE.1 is its second axis, @T:DUR lasts DUR s; replaces the scenario's faults; "
+            "may be repeated",
         ),
-    ),
-    "inject": (
-        parse_inject,
-        "'LINK KEY=VALUE ...'",
-        (
-            "what the network does to a link, such as 'planner->joints delay=30 jitter=10 at=3 "
-            "for=4' (ms and s), 'all loss=20%% burst=5', 'planner->left partition at=3'; at is "
-            "scenario time; `xrl inject --help` explains each word, and which of several counts; "
-            "replaces the scenario's"
-        ),
-    ),
-}
-"""Rows of a scenario that flags of the same name give: parser, form, help."""
+    ] = None
+    inject: Annotated[tuple[Inject, ...] | None, parsed(parse_inject, "'LINK KEY=VALUE ...'")] = (
+        None
+    )
+    """what the network does to a link, such as 'planner->joints delay=30 jitter=10 at=3 for=4' (ms
+    and s), 'all loss=20% burst=5', 'planner->left partition at=3'; at is scenario time; `xrl inject
+    --help` explains each word, and which of several counts; replaces the scenario's; may be
+    repeated"""
+    split: Annotated[str | None, Arg(choices=choices("split"))] = None
+    """gain split of the law"""
+    jacobian: Annotated[str | None, Arg(choices=choices("jacobian"))] = None
+    """how the legs share the load; average comes with the diagonal split: no gains certify it"""
+    seed: Natural = 0
+    """of the sensors' noise, and of what the network loses and how late it is"""
+
+
+ROW_FIELDS: Final = ("kill", "restart", "push", "fault", "inject")
+"""Rows of a scenario that flags of the same name give."""
 
 
 def scenario_file(name: str, config: Path = DEFAULT_CONFIG) -> Path:
@@ -221,25 +211,24 @@ def scenario_file(name: str, config: Path = DEFAULT_CONFIG) -> Path:
     raise FleetError(f"no scenario {name!r}; one of {known}, or the path of a .toml file")
 
 
-def make_scenario(args: argparse.Namespace) -> Scenario:
+def make_scenario(flags: ExperimentFlags) -> Scenario:
     """Return the scenario with the flags applied.
 
     A shorter duration drops the file's rows beyond it; a flag that names a time beyond it is
     refused.
     """
-    path = scenario_file(args.scenario, args.config)
+    path = scenario_file(flags.scenario, flags.config)
     scenario = scenarios.load(path)
-    duration = args.duration if args.duration is not None else scenario.duration
-    if duration <= 0.0:
-        raise RunError(f"--duration {duration:g}: must be more than 0 s")
+    duration = flags.duration if flags.duration is not None else scenario.duration
     rows: dict[str, tuple[Any, ...]] = {}
-    for field in _ROWS:
-        given = getattr(args, field)
-        own = () if field == "restart" and args.kill else getattr(scenario, field)
+    for field in ROW_FIELDS:
+        given = getattr(flags, field)
+        own = () if field == "restart" and flags.kill else getattr(scenario, field)
         rows[field] = tuple(given or (row for row in own if row.at < duration))
     scenario = msgspec.structs.replace(scenario, duration=duration, **rows)
-    flags = (args.duration, *(getattr(args, field) for field in _ROWS))
-    by_flags = " with the flags of this command" if any(flag is not None for flag in flags) else ""
+    given_flags = (flags.duration, *(getattr(flags, field) for field in ROW_FIELDS))
+    has_flags = any(flag is not None for flag in given_flags)
+    by_flags = " with the flags of this command" if has_flags else ""
     scenarios.check(f"{path}{by_flags}", scenario)
     return scenario
 
@@ -260,13 +249,13 @@ def introduce(scenario: Scenario, console: Console) -> None:
     console.print(marked("[bold]{}[/]: {}", scenario.name, about))
 
 
-def make_robot(args: argparse.Namespace) -> RobotConfig:
+def make_robot(flags: ExperimentFlags | argparse.Namespace) -> RobotConfig:
     """Return the robot with the flags laid over it."""
-    flags = (("split", args.split), ("jacobian", args.jacobian))
-    changes = {key: value for key, value in flags if value is not None}
+    law = (("split", flags.split), ("jacobian", flags.jacobian))
+    changes = {key: value for key, value in law if value is not None}
     if changes.get("jacobian") == "average" and "split" not in changes:
         changes["split"] = "diagonal"  # no local gains certify it, so there is no schedule
-    return load_robot(args.config, imu=args.imu, **changes)
+    return load_robot(flags.config, imu=flags.imu, **changes)
 
 
 def load_robot(path: Path, *, imu: bool = False, **law: str) -> RobotConfig:

@@ -6,7 +6,6 @@ both in turn, or by the ratio of each figure to a yardstick that ran beside it.
 
 from __future__ import annotations
 
-import argparse
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
@@ -19,14 +18,15 @@ from shared.config import gain_schedule
 from shared.exceptions import FAULT_EXIT_CODE
 from shared.extras import require
 from shared.places import CHECKOUT
-from tools.lab.bench import bus, fleet, revisions
+from tools.lab.bench import bus as bus_bench
+from tools.lab.bench import fleet as fleet_bench
+from tools.lab.bench import revisions
 from tools.lab.bench.parts import LOCKSTEP, LOCKSTEP_RECORDED, PARTS
 from tools.lab.bench.revisions import Worker, its_config
-from tools.lab.bench.table import add_flags, print_table, ratio_cell, write_rows
+from tools.lab.bench.table import AgainstFlags, print_table, ratio_cell, write_rows
 from tools.lab.bench.timing import ASLEEP_S, SWEPT_BYTES, YARDSTICK_CALLS
 from tools.lab.bench.worker import READY, PartRow, Request, row_of
 from tools.terminal import Console, marked
-from tools.verb_table import Subparsers, add_config, add_verb
 
 WARM_CALLS: Final = 200
 COLD_CALLS: Final = 60
@@ -36,52 +36,38 @@ SPEEDS: Final = {LOCKSTEP: 10.0, LOCKSTEP_RECORDED: 7.0}
 """Targets of docs/results.md#targets, times real time."""
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(
-        subparsers,
-        "bench",
-        """
-        xrl bench
-        xrl bench --against HEAD~1
-        xrl bench --rounds 25 --json bench.json
-        xrl bench bus                                # the bus beside other transports
-        xrl bench fleet --against HEAD~1             # the whole fleet, live
-        """,
-    )
-    parser.set_defaults(bench=run_parts)
-    add_config(parser)
-    add_flags(parser, ROUNDS)
-    others = parser.add_subparsers(metavar="WHAT", title="something else to measure")
-    bus.add_parser(others)
-    fleet.add_parser(others)
+EXAMPLES: Final = """
+xrl bench
+xrl bench --against HEAD~1
+xrl bench --rounds 25 --json bench.json
+xrl bench bus                                # the bus beside other transports
+xrl bench bus --transport zenoh --transport datagrams --seconds 30
+xrl bench fleet                              # the whole fleet, live
+xrl bench fleet --against HEAD~1 --rounds 5 --json fleet.json
+"""
+
+bus, fleet = bus_bench.run, fleet_bench.run
 
 
-def run(args: argparse.Namespace) -> int:
-    """Measure and print."""
-    code: int = args.bench(args)
-    return code
-
-
-def run_parts(args: argparse.Namespace) -> int:
+def run(flags: AgainstFlags) -> int:
     """Measure the parts and print; with --strict a missed target is a fault."""
     require("sim")
-    gain_schedule.require(config_file.load(args.config), args.config)
+    gain_schedule.require(config_file.load(flags.config), flags.config)
     console = Console()
-    rows, missing = measure(args.config.resolve(), args.against, args.rounds or ROUNDS, console)
-    compare = ("wall", "/ yard") if args.against is None else (args.against, "ratio")
+    rows, missing = measure(flags.config.resolve(), flags.against, flags.rounds or ROUNDS, console)
+    compare = ("wall", "/ yard") if flags.against is None else (flags.against, "ratio")
     print_table(
         console,
         ("", "CPU", *compare, "target"),
-        [_cells(row, args.against) for row in rows],
+        [_cells(row, flags.against) for row in rows],
         "Medians of the rounds' medians, us; CPU is the calling thread's. "
         f"Cold: {SWEPT_BYTES >> 20} MiB are swept and {1e3 * ASLEEP_S:g} ms slept before a call. "
         f"Yardstick: {YARDSTICK_CALLS} solutions of a 12 x 12 system in NumPy.",
     )
     for line in missing:
         console.print(marked("[yellow]{}[/]", line))
-    write_rows(args.json, [row.as_dict() for row in rows])
-    return FAULT_EXIT_CODE if args.strict and not all(part.row.ok for part in rows) else 0
+    write_rows(flags.json, [row.as_dict() for row in rows])
+    return FAULT_EXIT_CODE if flags.strict and not all(part.row.ok for part in rows) else 0
 
 
 def measure(

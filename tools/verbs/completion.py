@@ -4,31 +4,31 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Annotated, Final
 
 import shtab
 
 from tools.cli import whole_parser
-from tools.verb_table import Subparsers, add_verb
+from tools.flags import Flags, positional
+
+EXAMPLES: Final = """
+xrl completion bash > ~/.local/share/bash-completion/completions/xrl
+xrl completion zsh > "${fpath[1]}/_xrl"
+"""
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(
-        subparsers,
-        "completion",
-        """
-        xrl completion bash > ~/.local/share/bash-completion/completions/xrl
-        xrl completion zsh > "${fpath[1]}/_xrl"
-        """,
-    )
-    parser.add_argument("shell", choices=shtab.SUPPORTED_SHELLS, help="print it for this shell")
+class CompletionFlags(Flags):
+    """Which shell."""
+
+    shell: Annotated[str, positional("SHELL", choices=tuple(shtab.SUPPORTED_SHELLS))]
+    """print it for this shell"""
 
 
-def run(args: argparse.Namespace) -> int:
+def run(flags: CompletionFlags) -> int:
     """Print the script."""
     parser = whole_parser()
     _complete_paths(parser)
-    print(shtab.complete(parser, shell=args.shell))
+    print(shtab.complete(parser, shell=flags.shell))
     return 0
 
 

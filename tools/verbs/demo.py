@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
+import dataclasses
 import signal
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
+from typing import Annotated, Final
 
 from services.planner.controller_file import controller_maker
 from services.simulator.physics.plant import plant_from
@@ -18,7 +19,8 @@ from shared.bus.session import Session
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Scenario
 from shared.extras import require
-from tools.fleet.pace import add_pace
+from tools.flags import Arg, Folder
+from tools.fleet.pace import PaceFlags
 from tools.fleet.status_table import warn_of_others
 from tools.fleet.supervise import SupervisedFleet
 from tools.judge import verdict, verdict_table
@@ -28,68 +30,60 @@ from tools.live.live import run_live
 from tools.live.live_view import LiveView
 from tools.live.scenario_runner import EndOfRun, ScenarioRunner
 from tools.terminal import Console, marked
-from tools.verb_table import Subparsers, add_verb
-from tools.view.serving import add_port, served_beside
+from tools.view.serving import PortFlags, served_beside
 
 VIEW_S = 3600.0
 """Longest run that a page leads, s of scenario time."""
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(
-        subparsers,
-        "demo",
-        """
-        xrl demo
-        xrl demo --out out/b --kill planner@6.2 --restart planner@9
-        xrl demo --kill planner@3.1:STOP --restart planner@7
-        xrl demo --view                        # lead, push and stop it by hand, in a browser
-        xrl demo --scenario crawl --kill planner@8
-        xrl demo --jacobian average
-        xrl demo --controller examples/lqr_controller.py
-        xrl demo --plant drivetrain.stiffness=3000
-        xrl demo --duration 8 --push 4:0.3:40,0,0
-        xrl demo --pace 0.5
-        """,
-    )
-    experiment.add_flags(parser)
-    add_pace(parser)
-    parser.add_argument(
-        "--no-restart",
-        action="store_true",
-        help="services that end by themselves stay down; without it the supervisor restarts "
-        "them. What --kill kills stays down until its --restart either way",
-    )
-    parser.add_argument(
-        "--view",
-        action="store_true",
-        help="show it in a browser, and let a page act on it; without --scenario and --duration it "
-        "stands until Ctrl-C, and is judged then",
-    )
-    add_port(parser)
-    parser.set_defaults(scenario=None)
-    parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="where results go (default: out/demo-<time>)"
-    )
+EXAMPLES: Final = """
+xrl demo
+xrl demo --out out/b --kill planner@6.2 --restart planner@9
+xrl demo --kill planner@3.1:STOP --restart planner@7
+xrl demo --view                        # lead, push and stop it by hand, in a browser
+xrl demo --scenario crawl --kill planner@8
+xrl demo --jacobian average
+xrl demo --controller examples/lqr_controller.py
+xrl demo --plant drivetrain.stiffness=3000
+xrl demo --duration 8 --push 4:0.3:40,0,0
+xrl demo --pace 0.5
+"""
 
 
-def run(args: argparse.Namespace) -> int:
+class DemoFlags(experiment.ExperimentFlags, PaceFlags, PortFlags):
+    """An experiment, and how the fleet runs it."""
+
+    scenario: Annotated[str, Arg(metavar="NAME|FILE")] = ""
+    """what happens: a name (of a file in scenarios/ beside the robot file, or one that is shipped),
+    or a file (default: squat, the paper's Fig. 7; with --view stand)"""
+    no_restart: bool = False
+    """services that end by themselves stay down; without it the supervisor restarts them. What
+    --kill kills stays down until its --restart either way"""
+    view: bool = False
+    """show it in a browser, and let a page act on it; without --scenario and --duration it stands
+    until Ctrl-C, and is judged then"""
+    out: Folder | None = None
+    """where results go (default: out/demo-<time>)"""
+
+
+def run(flags: DemoFlags) -> int:
     """Run the experiment; 0 only if the robot stood to the end."""
     require("sim")
-    if args.view:
+    if flags.view:
         require("view", "leave --view")
     console = Console()
-    args.scenario = args.scenario or ("stand" if args.view else "squat")
-    if args.view and args.duration is None:
-        args.duration = VIEW_S
-    robot, scenario = experiment.make_robot(args), experiment.make_scenario(args)
-    plant_from(args.plant)  # refused before anything is started
-    out = experiment.make_out(args.out, "demo")
+    flags = dataclasses.replace(
+        flags,
+        scenario=flags.scenario or ("stand" if flags.view else "squat"),
+        duration=VIEW_S if flags.view and flags.duration is None else flags.duration,
+    )
+    robot, scenario = experiment.make_robot(flags), experiment.make_scenario(flags)
+    plant_from(flags.plant)  # refused before anything is started
+    out = experiment.make_out(flags.out, "demo")
     experiment.introduce(scenario, console)
     warn_of_others(console)
     try:
-        ended = lead_run(args, robot, scenario, out, console)
+        ended = lead_run(flags, robot, scenario, out, console)
     except KeyboardInterrupt:
         console.print(f"interrupted; what was recorded until then is in {out}")
         raise
@@ -97,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def lead_run(
-    args: argparse.Namespace, robot: RobotConfig, scenario: Scenario, out: Path, console: Console
+    flags: DemoFlags, robot: RobotConfig, scenario: Scenario, out: Path, console: Console
 ) -> EndOfRun:
     """Run the scenario on a fleet of its own, and show it."""
     console.print(
@@ -113,30 +107,30 @@ def lead_run(
         planner = session.latest(topics.PLANNER_STATUS, PlannerStatus)
         with contextlib.ExitStack() as stack:
             ended = threading.Event()
-            if args.view:
-                address = stack.enter_context(served_beside(fleet.run.path, args.port))
+            if flags.view:
+                address = stack.enter_context(served_beside(fleet.run.path, flags.port))
                 console.print(f"{address}  (Ctrl-C ends the run)", soft_wrap=True)
                 stack.enter_context(_interrupts_set(ended))
             view = stack.enter_context(LiveView(console, scenario.inject, planner))
             runner = ScenarioRunner(fleet, session, scenario, view.show, tell=tell_of_machine)
             return runner.run(ended.is_set)
 
-    if args.controller is not None:
-        controller_maker(args.controller, robot)  # refused before anything is started
+    if flags.controller is not None:
+        controller_maker(flags.controller, robot)  # refused before anything is started
     return run_live(
         out,
         robot,
         scenario,
         lead,
         verb="demo",
-        seed=args.seed,
-        true_plant=plant_from(args.plant),
-        pace=args.pace,
-        controller=args.controller,
+        seed=flags.seed,
+        true_plant=plant_from(flags.plant),
+        pace=flags.pace,
+        controller=flags.controller,
         tell=lambda text: console.print(
             marked("[yellow]{}[/]", text), highlight=False, soft_wrap=True
         ),
-        no_restart=robot.services if args.no_restart else {kill.service for kill in scenario.kill},
+        no_restart=robot.services if flags.no_restart else {kill.service for kill in scenario.kill},
     )
 
 

@@ -2,38 +2,32 @@
 
 from __future__ import annotations
 
-import argparse
+from typing import Final
 
+from tools.flags import RunDirFlags
 from tools.fleet import procfs
 from tools.fleet.supervise import SupervisedFleet
-from tools.verb_table import Subparsers, add_run_dir, add_verb
+
+EXAMPLES: Final = """
+xrl down
+xrl down --run-dir /tmp/bench
+xrl down --keep-stops      # from a systemd unit
+"""
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(
-        subparsers,
-        "down",
-        """
-        xrl down
-        xrl down --run-dir /tmp/bench
-        xrl down --keep-stops      # from a systemd unit
-        """,
-    )
-    add_run_dir(parser)
-    parser.add_argument(
-        "--keep-stops",
-        action="store_true",
-        help="an emergency stop holds on in the next `xrl up --disarmed`",
-    )
+class DownFlags(RunDirFlags):
+    """Which fleet."""
+
+    keep_stops: bool = False
+    """an emergency stop holds on in the next `xrl up --disarmed`"""
 
 
-def run(args: argparse.Namespace) -> int:
+def run(flags: DownFlags) -> int:
     """Stop every service, also of a fleet whose supervisor is dead; keep the logs."""
-    fleet = SupervisedFleet(args.run_dir)
+    fleet = SupervisedFleet(flags.run_dir)
     was_up = fleet.run.is_marked and fleet.run.read_manifest() is not None
     was_up |= bool(procfs.fleet_pids(fleet.run.path))  # its directory may have been removed
-    fleet.stop(keep_logs=True, keep_stops=args.keep_stops)
+    fleet.stop(keep_logs=True, keep_stops=flags.keep_stops)
     if was_up:
         print(f"the fleet in {fleet.run.path} is down; its logs stay in {fleet.run.logs}")
     else:

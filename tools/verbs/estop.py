@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
+import dataclasses
 import sys
 import time
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 from shared import places
 from shared.bus.credentials import require_operator
@@ -17,125 +17,109 @@ from shared.exceptions import FleetError, XrlError
 from shared.joints import MODULES
 from shared.places import ROBOT_FILE
 from shared.process import StopFlag
+from shared.run_directory import default_run_dir
+from tools.flags import Arg, Flags, names_of, parsed
 from tools.fleet.emergency_stop import GIVE_UP_S, BusStop, request_here, stop_all, wait_here
 from tools.fleet.run_dir import RunDir
 from tools.keyboard import typed_line
 from tools.terminal import Console
-from tools.verb_table import Subparsers, add_run_dir, add_verb
 
 EVERY_S: Final = 0.02
 LINKS_S: Final = 2.0
 """Time that the links may take to come up before a silent module is told, s."""
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(
-        subparsers,
-        "estop",
-        """
-        xrl estop
-        xrl estop --run-dir /tmp/lab
-        xrl estop --local                       # on the robot's own host: needs no bus
-        xrl estop --config lab.toml             # from another computer, with an operator's key
-        xrl estop --config lab.toml --wait      # open the links now; Enter or Ctrl-C is the stop
-        """,
-    )
-    add_run_dir(parser, Path)  # whoever can reach the robot may stop it
-    parser.add_argument(
-        "--local",
-        action="store_true",
-        help="only by shared memory, to the joint services on this host (default: both ways)",
-    )
-    parser.add_argument(
-        "--partly",
-        type=_modules,
-        metavar="MODULE,...",
-        help="with --local: only these have to stop, the others are on other hosts (default: all)",
-    )
-    parser.add_argument(
-        "--wait",
-        action="store_true",
-        help="open the links now, say whether all six modules are heard, and stop at Enter, Ctrl-C "
-        "or the terminal's end; q and Enter leaves without a stop",
-    )
-    parser.add_argument(
-        "--config",
-        type=Path,
-        metavar="FILE",
-        help=f"robot file (default: that of the fleet in the run directory, else {ROBOT_FILE} of "
-        "the working directory)",
-    )
+EXAMPLES: Final = """
+xrl estop
+xrl estop --run-dir /tmp/lab
+xrl estop --local                       # on the robot's own host: needs no bus
+xrl estop --config lab.toml             # from another computer, with an operator's key
+xrl estop --config lab.toml --wait      # open the links now; Enter or Ctrl-C is the stop
+"""
 
 
-def run(args: argparse.Namespace) -> int:
+class EstopFlags(Flags):
+    """Which robot, and by which way."""
+
+    run_dir: Annotated[Path, parsed(Path, "DIR")] = dataclasses.field(
+        default_factory=default_run_dir  # of any user: whoever can reach the robot may stop it
+    )
+    """directory of the fleet's sockets and logs (default: $XRL_RUN_DIR, else /tmp/xrl-UID of the
+    user)"""
+    local: bool = False
+    """only by shared memory, to the joint services on this host (default: both ways)"""
+    partly: Annotated[
+        tuple[str, ...] | None, parsed(names_of(MODULES), "MODULE,...", is_one=True)
+    ] = None
+    """with --local: only these have to stop, the others are on other hosts (default: all)"""
+    wait: bool = False
+    """open the links now, say whether all six modules are heard, and stop at Enter, Ctrl-C or the
+    terminal's end; q and Enter leaves without a stop"""
+    config: Annotated[
+        Path | None,
+        Arg(
+            help="robot file (default: that of the fleet in the run directory, else "
+            f"{ROBOT_FILE} of the working directory)"
+        ),
+    ] = None
+
+    def check(self) -> None:
+        """Refuse what goes with one way only."""
+        super().check()
+        if self.partly and not self.local:
+            raise FleetError("--partly goes with --local: over the bus all six have to stop")
+        if self.wait and self.local:
+            raise FleetError("--wait is for the bus; `xrl pendant` waits by shared memory")
+
+
+def run(flags: EstopFlags) -> int:
     """Repeat the stop until every module has stopped; only a restart leaves DAMP."""
-    run_dir: Path = args.run_dir
-    if args.partly and not args.local:
-        raise FleetError("--partly goes with --local: over the bus all six have to stop")
-    if args.wait and args.local:
-        raise FleetError("--wait is for the bus; `xrl pendant` waits by shared memory")
-    is_here = _is_here(args)
-    if args.wait:
-        return _wait(_robot(args), run_dir, here=is_here)
+    run_dir = flags.run_dir
+    is_here = _is_here(flags)
+    if flags.wait:
+        return _wait(_robot(flags), run_dir, here=is_here)
     here, errors = request_here(run_dir) if is_here else ([], [])  # first: it needs no bus
     for line in errors:
         print(f"xrl: {line}", file=sys.stderr)
-    wanted = args.partly or MODULES
-    if args.local:
+    wanted = flags.partly or MODULES
+    if flags.local:
         if not here:
             raise FleetError(f"{run_dir}: no joint service of this robot is on this host")
         going = wait_here(run_dir, here, wanted)
     else:
         try:
-            going = stop_all(_robot(args), run_dir, here=is_here)
+            going = stop_all(_robot(flags), run_dir, here=is_here)
         except XrlError as error:
             if not here:
                 raise
             print(f"xrl: not over the bus: {error}", file=sys.stderr)
             going = wait_here(run_dir, here)
-    _conclude(going, ", ".join(args.partly) if args.partly else "all six modules")
+    _conclude(going, ", ".join(flags.partly) if flags.partly else "all six modules")
     return 0
 
 
-def _is_here(args: argparse.Namespace) -> bool:
+def _is_here(flags: EstopFlags) -> bool:
     """Return True if the run directory is of the robot that is meant: any, if none was named."""
-    if args.config is None:
+    if flags.config is None:
         return True
-    manifest = RunDir(args.run_dir).read_manifest()
-    return manifest is not None and Path(manifest.config).resolve() == args.config.resolve()
+    manifest = RunDir(flags.run_dir).read_manifest()
+    return manifest is not None and Path(manifest.config).resolve() == flags.config.resolve()
 
 
-def _modules(text: str) -> tuple[str, ...]:
-    names = tuple(dict.fromkeys(word.strip() for word in text.split(",") if word.strip()))
-    for name in names:
-        if name not in MODULES:
-            raise argparse.ArgumentTypeError(f"{name!r}: one of {', '.join(MODULES)}")
-    return names
-
-
-def _robot(args: argparse.Namespace) -> RobotConfig:
-    """Return the robot that is asked for, or whose fleet is up.
-
-    Raises:
-        ConfigError, FleetError: there is none.
-    """
-    if args.config is not None:
-        return load(args.config)
-    manifest = RunDir(args.run_dir).read_manifest()  # whether or not its supervisor lives
+def _robot(flags: EstopFlags) -> RobotConfig:
+    """Return the robot that is asked for, or whose fleet is up."""
+    if flags.config is not None:
+        return load(flags.config)
+    manifest = RunDir(flags.run_dir).read_manifest()  # whether or not its supervisor lives
     if manifest is not None:
         return load(Path(manifest.config))
     if places.robot_file_here() is None:  # a stop of the shipped robot would be heard by nobody
-        raise FleetError(f"no fleet is up in {args.run_dir}; name its robot file with --config")
+        raise FleetError(f"no fleet is up in {flags.run_dir}; name its robot file with --config")
     return load(places.robot_file())
 
 
 def _wait(robot: RobotConfig, run_dir: Path, *, here: bool) -> int:
-    """Keep the links open until a person asks for the stop, or leaves.
-
-    Raises:
-        FleetError: this host's key stops nobody: a person is not to rely on it.
-    """
+    """Keep the links open until a person asks for the stop, or leaves."""
     require_operator(robot, "estop")
     console, asked = Console(), StopFlag()
     with open_session(robot, "estop", run_dir) as session:
@@ -162,11 +146,7 @@ def _wait(robot: RobotConfig, run_dir: Path, *, here: bool) -> int:
 
 
 def _conclude(going: list[str], which: str) -> None:
-    """Say how it ended.
-
-    Raises:
-        FleetError: a module has not stopped.
-    """
+    """Say how it ended."""
     if going:
         raise FleetError(f"not stopped after {GIVE_UP_S:g} s: {', '.join(going)}; cut the power")
     Console().print(

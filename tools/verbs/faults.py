@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import argparse
+from typing import Final
 
 import msgspec
 from rich.table import Table
@@ -12,35 +12,34 @@ from shared.config.scenarios import FAULT_KINDS
 from shared.config.sections import TripLimit
 from shared.robot.fault_table import DRIVE_FAULTS, LOSSES
 from shared.robot.trip_table import JOINT_TRIPS, PLANNER_TRIPS, TripRow
+from tools.flags import ConfigFlags
 from tools.terminal import Console, marked
-from tools.verb_table import Subparsers, add_config, add_verb
 
 _LABEL_WIDTH = 12
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(
-        subparsers,
-        "faults",
-        """
-        xrl faults
-        xrl faults --json
-        xrl sim --fault knee_left:encoder@4     # to see one
-        """,
-    )
-    add_config(parser)
-    parser.add_argument("--json", action="store_true", help="print the table as JSON")
+EXAMPLES: Final = """
+xrl faults
+xrl faults --json
+xrl sim --fault knee_left:encoder@4     # to see one
+"""
 
 
-def run(args: argparse.Namespace) -> int:
+class FaultsFlags(ConfigFlags):
+    """Whose limits, and in which form."""
+
+    json: bool = False
+    """print the table as JSON"""
+
+
+def run(flags: FaultsFlags) -> int:
     """Print the table."""
-    limits = load(args.config).trips
+    limits = load(flags.config).trips
     trips = {
         trip.name: (row, getattr(limits, row.key))
         for trip, row in (*JOINT_TRIPS.items(), *PLANNER_TRIPS.items())
     }
-    if args.json:
+    if flags.json:
         rows = {
             "drive": {kind: row._asdict() for kind, row in DRIVE_FAULTS.items()},
             "fleet": {name: row._asdict() for name, row in LOSSES.items()},

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 from pathlib import Path
+from typing import Annotated, Final
 
 import msgspec
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -17,11 +17,12 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, ConfigError
 from shared.extras import require
 from shared.places import refuse_shipped
+from tools.flags import Arg, ConfigFlags, option
 from tools.lab.design import damping_picture, split_program
+from tools.lab.design.body_stiffness import BodyStiffness, for_robot
 from tools.lab.design.dynamic_certificate import DynamicCertificate
 from tools.lab.design.push_limit import DIRECTIONS, equivalent_slope
 from tools.terminal import Console
-from tools.verb_table import Subparsers, add_config, add_verb
 
 ROOM_EVERY = 5
 """Every n-th pose gets its printed margins."""
@@ -32,72 +33,66 @@ SHOWN = 6
 """Heights in the printed table."""
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(
-        subparsers,
-        "gains",
-        """
-        xrl gains
-        xrl gains --config lab.toml
-        xrl gains --config lab.toml --damping-of deploy/robot.gains.json
-        xrl gains --picture damping.png
-        xrl gains --check
-        """,
-    )
-    add_config(parser)
-    parser.add_argument(
-        "--damping-of",
-        type=Path,
-        metavar="FILE",
-        help="take damping and coupling from another schedule, such as deploy/robot.gains.json, "
-        "and hold them to the dynamic certificate; without it they are searched for (two minutes)",
-    )
-    parser.add_argument(
-        "--picture",
-        type=Path,
-        metavar="FILE.png",
-        help="draw how each motion decays, over the drivetrain's stiffness",
-    )
-    parser.add_argument(
-        "--check", action="store_true", help="only say whether the schedule fits the robot"
-    )
+STIFFNESS_ROWS = (
+    ("theta_max", "rad", "largest lean the ankles' torque can hold"),
+    ("theta_edge", "rad", "lean with the COM over the sole's edge"),
+    ("tau_edge", "N m", "each ankle's torque there"),
+    ("K_ank_min", "N m/rad", "least stiffness of each ankle"),
+    ("K_min", "N/m", "least stiffness of the body"),
+    ("K_tau_max", "N/m", "stiffness that gives tau_max at the edge"),
+)
+
+EXAMPLES: Final = """
+xrl gains
+xrl gains --config lab.toml
+xrl gains --config lab.toml --damping-of deploy/robot.gains.json
+xrl gains --picture damping.png
+xrl gains --check
+xrl gains --stiffness
+"""
 
 
-def run(args: argparse.Namespace) -> int:
+class GainsFlags(ConfigFlags):
+    """Whose schedule, and what is done with it."""
+
+    damping_of: Path | None = None
+    """take damping and coupling from another schedule, such as deploy/robot.gains.json, and hold
+    them to the dynamic certificate; without it they are searched for (two minutes)"""
+    picture: Annotated[Path | None, Arg(metavar="FILE.png")] = None
+    """draw how each motion decays, over the drivetrain's stiffness"""
+    check_only: Annotated[bool, option("--check", exclusive="only")] = False
+    """only say whether the schedule fits the robot"""
+    stiffness: Annotated[bool, Arg(exclusive="only")] = False
+    """only print how stiff the body must be to balance (paper section IV)"""
+
+
+def run(flags: GainsFlags) -> int:
     """Write the schedule beside the robot file; with --check only say if it would have to be."""
-    path = gain_schedule.path_beside(args.config)
+    robot = config_file.load_without_schedule(flags.config)
+    if flags.stiffness:
+        return _show_stiffness(robot)
+    path = gain_schedule.path_beside(flags.config)
     console = Console()
-    if args.check:
-        stale = gain_schedule.why_stale(config_file.load(args.config))
+    if flags.check_only:
+        stale = gain_schedule.why_stale(config_file.load(flags.config))
         console.print(f"{path}: {stale or 'fits the robot'}", soft_wrap=True)
         return FAULT_EXIT_CODE if stale else 0
     refuse_shipped(path)
     require("design")
-    if args.picture is not None:
+    if flags.picture is not None:
         require("plot")
-    robot = config_file.load_without_schedule(args.config)
-    schedule = compute(robot, console, args.damping_of)
+    schedule = compute(robot, console, flags.damping_of)
     gain_schedule.write(path, schedule)
     _show(robot, schedule, console)
-    if args.picture is not None:
-        draw_damping(robot, schedule, args.picture)
-        console.print(f"drawn to {args.picture}", style="dim", soft_wrap=True)
+    if flags.picture is not None:
+        draw_damping(robot, schedule, flags.picture)
+        console.print(f"drawn to {flags.picture}", style="dim", soft_wrap=True)
     console.print(f"written to {path}", style="dim", soft_wrap=True)
     return 0
 
 
 def compute(robot: RobotConfig, console: Console, damping_of: Path | None = None) -> GainSchedule:
-    """Solve the schedule with a progress bar.
-
-    Args:
-        robot: the robot.
-        console: to print on.
-        damping_of: schedule to take damping and coupling from; None: they are searched for.
-
-    Raises:
-        RunError: no local gains meet the certificate somewhere.
-    """
+    """Solve the schedule; damping and coupling are searched for, or taken from another."""
     design = None
     if damping_of is not None:
         other = gain_schedule.read(damping_of)
@@ -199,3 +194,38 @@ def draw_damping(robot: RobotConfig, schedule: GainSchedule, path: Path) -> None
 
 def _decibels(factor: float) -> str:
     return "none" if factor == 0.0 else f">= {20.0 * math.log10(factor):.0f} dB"
+
+
+def _show_stiffness(robot: RobotConfig) -> int:
+    """Print the design of the body for x and y."""
+    design = for_robot(robot)
+    table = Table(title="Body stiffness, legs straight (paper section IV)", title_justify="left")
+    table.add_column("")
+    for direction in design:
+        table.add_column(direction, justify="right", no_wrap=True)
+    table.add_column("unit")
+    table.add_column("what")
+    for key, unit, what in STIFFNESS_ROWS:
+        table.add_row(key, *(_stiffness(key, row) for row in design.values()), unit, what)
+    console = Console()
+    console.print(table)
+    edge = math.degrees(design["y"].theta_edge)
+    console.print(
+        f"theta_edge along y: {edge:.2f} deg. The paper's numbers are the column y: its "
+        "theta_edge is that of w_foot / 2, though its formula prints l_foot.",
+        style="dim",
+    )
+    for direction, stiffness in zip(design, robot.law.K_p, strict=False):
+        least = design[direction].K_min
+        word = "above" if stiffness > least else "BELOW"
+        console.print(f"law.K_p along {direction}: {stiffness:g} N/m, {word} {least:.0f} N/m")
+    return 0
+
+
+def _stiffness(key: str, row: BodyStiffness) -> str:
+    value: float = getattr(row, key)
+    if math.isnan(value):
+        return "any"
+    if key.startswith("theta"):
+        return f"{value:.4f}"
+    return f"{value:.2f}" if value < 1000 else f"{value:.0f}"

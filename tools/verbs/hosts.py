@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Annotated, Final, NamedTuple
 
 from rich import box
 from rich.table import Table
@@ -15,6 +14,7 @@ from shared.config import files as config_file
 from shared.config import gain_schedule
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, FleetError, RunError
+from tools.flags import ConfigFlags, Folder, option, positional
 from tools.fleet.status_table import tables
 from tools.hosts import hosts_file, installation, records, running
 from tools.hosts.hosts_file import Hosts
@@ -24,10 +24,9 @@ from tools.keys import authority as authorities
 from tools.keys.authority import Authority
 from tools.output import write_atomically
 from tools.terminal import Console, marked
-from tools.verb_table import Subparsers, add_config, add_verb
 
 DEFAULT_HOSTS: Final = Path("hosts.toml")
-_EXAMPLES = """
+EXAMPLES: Final = """
 xrl hosts files -o out/hosts               # write what each host will have, and look at it
 xrl keys make --hosts hosts.toml           # once: the authority, and a certificate for each service
 xrl hosts update                           # bring it there, over ssh
@@ -40,27 +39,59 @@ xrl hosts down
 """
 
 
-_WHILE_UP: Final = {
-    "update": "although services are running: one that crashes starts with the new files",
-    "records": "although services are running: what leads shares the network with the records",
-}
+class HostsFlags(ConfigFlags):
+    """Which hosts."""
+
+    names: Annotated[tuple[str, ...], positional("HOST")] = ()
+    """these only (default: all)"""
+    hosts: Path = DEFAULT_HOSTS
+    """which host runs what"""
+    authority: Folder | None = None
+    """folder of the authority (default: ~/.config/xrl/ROBOT/authority)"""
+
+
+class FilesFlags(HostsFlags):
+    """Where they go."""
+
+    out: Annotated[Path, option("-o", "--out", metavar="DIR")]
+    """folder"""
+
+
+class UpdateFlags(HostsFlags):
+    """And when."""
+
+    while_up: bool = False
+    """although services are running: one that crashes starts with the new files"""
+
+
+class RecordsFlags(FilesFlags):
+    """And when."""
+
+    while_up: bool = False
+    """although services are running: what leads shares the network with the records"""
+
+
+class HostsUpFlags(HostsFlags):
+    """How they start."""
+
+    disarmed: bool = False
+    """leave drives that do not hold idle"""
 
 
 class _Given(NamedTuple):
-    """What every order works with."""
+    """What every order works with.
 
-    args: argparse.Namespace
+    Only what an order needs is read: a stop must not fail for want of a gain schedule.
+    """
+
+    flags: HostsFlags
     hosts: Hosts
     robot: RobotConfig
     remotes: list[Remote]
 
     def files(self) -> dict[str, list[HostFile]]:
-        """Return the files of each host by its name; without an authority all but the keys.
-
-        Raises:
-            ConfigError, RunError, BusError: the gain schedule or the authority cannot be used.
-        """
-        config: Path = self.args.config
+        """Return the files of each host by its name; without an authority all but the keys."""
+        config = self.flags.config
         gain_schedule.require(self.robot, config)
         try:
             schedule = gain_schedule.path_beside(config).read_bytes()
@@ -75,70 +106,21 @@ class _Given(NamedTuple):
         }
 
     def authority(self) -> Authority | None:
-        """Return the authority of this robot's keys; None if there is none yet.
-
-        Raises:
-            BusError: its folder cannot be used.
-        """
-        folder = self.args.authority or authorities.default_folder(self.robot)
+        """Return the authority of this robot's keys; None if there is none yet."""
+        folder = self.flags.authority or authorities.default_folder(self.robot)
         return Authority(folder) if folder.is_dir() else None
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb and its orders."""
-    parser = add_verb(subparsers, "hosts", _EXAMPLES)
-    orders = parser.add_subparsers(metavar="WHAT", required=True)
-    words = {
-        "files": (_files, "write each host's files into a folder, and bring nothing anywhere"),
-        "update": (_update, "bring each host its files: robot file, keys, unit"),
-        "check": (_check, "look whether the hosts are as they should be; 0: they are"),
-        "up": (_up, "start the services on all hosts, and arm the drives"),
-        "status": (_status, "show the services of all hosts in one table"),
-        "records": (_records, "bring the newest records here, and join them into one run"),
-        "estop": (_estop, "every module to DAMP, by each host's own shared memory"),
-        "down": (_down, "stop the services on all hosts"),
-    }
-    for name, (order, text) in words.items():
-        one = orders.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
-        one.add_argument("names", nargs="*", metavar="HOST", help="these only (default: all)")
-        one.add_argument(
-            "--hosts",
-            type=Path,
-            default=DEFAULT_HOSTS,
-            metavar="FILE",
-            help="which host runs what (default: %(default)s)",
-        )
-        add_config(one)
-        one.add_argument(
-            "--authority",
-            type=Path,
-            metavar="DIR",
-            help="folder of the authority (default: ~/.config/xrl/ROBOT/authority)",
-        )
-        if name in ("files", "records"):
-            one.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="folder")
-        if name in _WHILE_UP:
-            one.add_argument("--while-up", action="store_true", help=_WHILE_UP[name])
-        if name == "up":
-            one.add_argument(
-                "--disarmed", action="store_true", help="leave drives that do not hold idle"
-            )
-        one.set_defaults(order=order)
+def _given(flags: HostsFlags) -> _Given:
+    robot = config_file.load(flags.config)
+    hosts = hosts_file.load(flags.hosts, robot)
+    return _Given(flags, hosts, robot, [Remote(hosts, host) for host in hosts.named(flags.names)])
 
 
-def run(args: argparse.Namespace) -> int:
-    """Do what was asked for, on all hosts at a time.
-
-    Only what an order needs is read: a stop must not fail for want of a gain schedule.
-    """
-    robot = config_file.load(args.config)
-    hosts = hosts_file.load(args.hosts, robot)
-    remotes = [Remote(hosts, host) for host in hosts.named(tuple(args.names))]
-    return int(args.order(_Given(args, hosts, robot, remotes)))
-
-
-def _files(given: _Given) -> int:
-    out: Path = given.args.out
+def files(flags: FilesFlags) -> int:
+    """Write them into a folder."""
+    given = _given(flags)
+    out = flags.out
     for remote in given.remotes:
         for file in given.files()[remote.host.name]:
             path = out / remote.host.name / file.path.lstrip("/")
@@ -153,22 +135,25 @@ def _files(given: _Given) -> int:
     return 0
 
 
-def _update(given: _Given) -> int:
+def update(flags: UpdateFlags) -> int:
+    """Bring each host its files."""
+    given = _given(flags)
     if given.authority() is None:
         raise RunError("there is no authority yet; `xrl keys make --hosts FILE` makes one")
     files = given.files()
 
     def one(remote: Remote) -> str:
         mine = files[remote.host.name]
-        return installation.update(given.hosts, remote, mine, while_up=given.args.while_up)
+        return installation.update(given.hosts, remote, mine, while_up=flags.while_up)
 
     return _each(given, one)
 
 
-def _up(given: _Given) -> int:
+def up(flags: HostsUpFlags) -> int:
     """Start all, look at all, and only then arm: an emergency stop on one host is one for all."""
+    given = _given(flags)
     failed_to_start = _each(given, running.start)
-    if failed_to_start or given.args.disarmed:
+    if failed_to_start or flags.disarmed:
         return failed_to_start
     found = on_all(given.remotes, lambda remote: running.heard(given.hosts, remote))
     failed = [one for one in found.values() if isinstance(one, FleetError)]
@@ -185,18 +170,24 @@ def _up(given: _Given) -> int:
     return _each(given, lambda r: running.arm(given.hosts, r, statuses[r.host.name]))
 
 
-def _estop(given: _Given) -> int:
+def estop(flags: HostsFlags) -> int:
+    """Stop every module, on all hosts."""
+    given = _given(flags)
     failed = _each(given, lambda remote: running.estop(given.hosts, remote))
     if failed:
         Console().print(marked("[bold red]not all have stopped: cut the power[/]"))
     return failed
 
 
-def _down(given: _Given) -> int:
+def down(flags: HostsFlags) -> int:
+    """Stop all services."""
+    given = _given(flags)
     return _each(given, lambda remote: running.down(given.hosts, remote))
 
 
-def _status(given: _Given) -> int:
+def status(flags: HostsFlags) -> int:
+    """Show one table."""
+    given = _given(flags)
     found = on_all(given.remotes, lambda remote: running.status(given.hosts, remote))
     good = {name: one for name, one in found.items() if not isinstance(one, FleetError)}
     if good:
@@ -207,16 +198,17 @@ def _status(given: _Given) -> int:
     return 0 if len(good) == len(found) else FAULT_EXIT_CODE
 
 
-def _records(given: _Given) -> int:
+def bring(flags: RecordsFlags) -> int:
     """Bring the fleet's newest record and what other hosts have recorded since it began."""
-    out: Path = given.args.out
+    given = _given(flags)
+    out = flags.out
     if out.exists() and any(out.iterdir()):
         raise RunError(f"{out}: is not empty; give another folder")
     fleets = [remote for remote in given.remotes if records.is_fleets(remote)]
     if not fleets:
         raise RunError("the recorder's host is not among those named: its record comes first")
     (body,) = fleets
-    if not given.args.while_up:
+    if not flags.while_up:
         installation.refuse_up(body, "what leads over the same network would wait")
     base = records.fetch(body, records.newest(body), out / body.host.name)
     _tell(body.host.name, str(base))
@@ -239,7 +231,9 @@ def _records(given: _Given) -> int:
     return FAULT_EXIT_CODE if failed or left_out else 0
 
 
-def _check(given: _Given) -> int:
+def check(flags: HostsFlags) -> int:
+    """Look; a fault if one is not as it should be."""
+    given = _given(flags)
     files = given.files()
     found = on_all(
         given.remotes,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from typing import Final
+from typing import Annotated, Final
 
 from rich import box
 from rich.table import Table
@@ -13,6 +13,7 @@ from shared.config.scenarios import Inject
 from shared.exceptions import ConfigError, RunError
 from shared.links import GROUPS
 from shared.network.proxy_protocol import RequestedImpairment
+from tools.flags import Arg, RunDirFlags, positional
 from tools.fleet.proxy_client import ProxyClient
 from tools.live.describe_inject import (
     DISTRIBUTION,
@@ -23,98 +24,106 @@ from tools.live.describe_inject import (
     parse_inject,
 )
 from tools.terminal import Console
-from tools.verb_table import Subparsers, add_run_dir, add_verb
 
 ALL: Final = "all"
 WORDS: Final = "'LINK KEY=VALUE ...'"
 RULE: Final = "of several on one link, a partition counts first, else what began last"
 
+_WHAT: Final = f"""what is done to every message of it
+A message is a batch of Zenoh's here: what is sent at once travels, and is lost, as one.
+TIME: 30, 30ms, 0.03s or 500us. SHARE: a probability, 0.2 or 20%.
+{RULE[0].upper()}{RULE[1:]};
+when that is over, the others count again."""
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(
-        subparsers,
-        "inject",
-        """
-        xrl up --injectable                                       # first
-        xrl inject --link 'planner->joints' --delay 30ms --jitter 10ms --for 4
-        xrl inject --link all --loss 20% --burst 5
-        xrl inject --link 'planner->left' --partition --ordered --at 2 --for 1
-        xrl inject 'planner->joints delay=30 jitter=10 for=4'     # as --inject of demo and sim
-        xrl inject --list
-        xrl inject --clear
-        """,
-    )
-    parser.add_argument(
-        "words",
-        nargs="?",
-        metavar=WORDS,
-        help="all of it in words, in place of flags: as --inject of demo and sim, but `at` is from "
-        "now",
-    )
-    parser.add_argument(
-        "--link",
-        help=f"{', '.join(GROUPS)}, or one direction, such as 'planner->ankle_left', "
-        f"'knee_right->planner', 'harness->planner' (default: {ALL})",
-    )
-    what = parser.add_argument_group(
-        "what is done to every message of it",
-        "A message is a batch of Zenoh's here: what is sent at once travels, and is lost, as one.\n"
-        "TIME: 30, 30ms, 0.03s or 500us. SHARE: a probability, 0.2 or 20%.\n"
-        f"{RULE[0].upper()}{RULE[1:]};\nwhen that is over, the others count again.",
-    )
-    what.add_argument("--delay", metavar="TIME", help="delay of each message")
-    what.add_argument(
-        "--jitter",
-        metavar="TIME",
-        help="half the width if uniform, else the standard deviation; a message that this would "
-        "deliver before it is sent has no delay",
-    )
-    what.add_argument(
-        "--distribution", metavar="KIND", help="of the jitter: uniform (default), normal, pareto"
-    )
-    what.add_argument("--loss", metavar="SHARE", help="messages lost; 1 is all, and not 1%%")
-    what.add_argument("--burst", metavar="N", help="mean number of losses in a row (1)")
-    what.add_argument("--duplicate", metavar="SHARE", help="messages that arrive twice")
-    what.add_argument("--reorder", metavar="SHARE", help="messages without delay")
-    what.add_argument("--rate", metavar="BYTES", help="bytes (not bits) a second on the line")
-    what.add_argument("--partition", action="store_true", help="nothing passes")
-    what.add_argument(
-        "--ordered",
-        action="store_true",
-        help="as on a stream: a late message delays those behind it, and a partition holds all "
-        "back until its end; --loss still loses messages, nothing is sent again. Without it, as "
-        "datagrams: an overtaken message, or one in a partition, is lost",
-    )
-    when = parser.add_argument_group("when")
-    when.add_argument("--at", metavar="T", help="start in T seconds from now (default: 0)")
-    when.add_argument(
-        "--for",
-        metavar="T",
-        help="duration in seconds (default: until --clear, or the fleet's end)",
-    )
-    other = parser.add_argument_group("in place of that").add_mutually_exclusive_group()
-    other.add_argument("--list", action="store_true", help="list active and planned impairments")
-    other.add_argument(
-        "--clear",
-        action="store_true",
-        help="end what touches the link: wholly, on its other directions too",
-    )
-    add_run_dir(parser)
+EXAMPLES: Final = """
+xrl up --injectable                                       # first
+xrl inject --link 'planner->joints' --delay 30ms --jitter 10ms --for 4
+xrl inject --link all --loss 20% --burst 5
+xrl inject --link 'planner->left' --partition --ordered --at 2 --for 1
+xrl inject 'planner->joints delay=30 jitter=10 for=4'     # as --inject of demo and sim
+xrl inject --list
+xrl inject --clear
+"""
 
 
-def run(args: argparse.Namespace) -> int:
+class InjectFlags(RunDirFlags):
+    """A link, and what is done to it; each value is read as in the words of a scenario."""
+
+    words: Annotated[str | None, positional(WORDS)] = None
+    """all of it in words, in place of flags: as --inject of demo and sim, but `at` is from now"""
+    link: Annotated[
+        str | None,
+        Arg(
+            metavar="LINK",
+            help=f"{', '.join(GROUPS)}, or one direction, such as 'planner->ankle_left', "
+            f"'knee_right->planner', 'harness->planner' (default: {ALL})",
+        ),
+    ] = None
+    delay: Annotated[str | None, Arg(metavar="TIME", group=_WHAT)] = None
+    """delay of each message"""
+    jitter: Annotated[str | None, Arg(metavar="TIME", group=_WHAT)] = None
+    """half the width if uniform, else the standard deviation; a message that this would deliver
+    before it is sent has no delay"""
+    distribution: Annotated[str | None, Arg(metavar="KIND", group=_WHAT)] = None
+    """of the jitter: uniform (default), normal, pareto"""
+    loss: Annotated[str | None, Arg(metavar="SHARE", group=_WHAT)] = None
+    """messages lost; 1 is all, and not 1%"""
+    burst: Annotated[str | None, Arg(metavar="N", group=_WHAT)] = None
+    """mean number of losses in a row (1)"""
+    duplicate: Annotated[str | None, Arg(metavar="SHARE", group=_WHAT)] = None
+    """messages that arrive twice"""
+    reorder: Annotated[str | None, Arg(metavar="SHARE", group=_WHAT)] = None
+    """messages without delay"""
+    rate: Annotated[str | None, Arg(metavar="BYTES", group=_WHAT)] = None
+    """bytes (not bits) a second on the line"""
+    partition: Annotated[bool, Arg(group=_WHAT)] = False
+    """nothing passes"""
+    ordered: Annotated[bool, Arg(group=_WHAT)] = False
+    """as on a stream: a late message delays those behind it, and a partition holds all back until
+    its end; --loss still loses messages, nothing is sent again. Without it, as datagrams: an
+    overtaken message, or one in a partition, is lost"""
+    at: Annotated[str | None, Arg(metavar="T", group="when")] = None
+    """start in T seconds from now (default: 0)"""
+    for_: Annotated[str | None, Arg(metavar="T", group="when")] = None
+    """duration in seconds (default: until --clear, or the fleet's end)"""
+    list: Annotated[bool, Arg(group="in place of that", exclusive="other")] = False
+    """list active and planned impairments"""
+    clear: Annotated[bool, Arg(group="in place of that", exclusive="other")] = False
+    """end what touches the link: wholly, on its other directions too"""
+
+    @property
+    def given(self) -> dict[str, str]:
+        """The words of what is done, with their values."""
+        names = (*NUMBERS, DISTRIBUTION, *SWITCHES)
+        found = {name: getattr(self, "for_" if name == "for" else name) for name in names}
+        return {name: value for name, value in found.items() if value not in (None, False)}
+
+    def check(self) -> None:
+        """Refuse flags that would have no effect."""
+        super().check()
+        one = "--list" if self.list else "--clear" if self.clear else WORDS if self.words else ""
+        if not one:
+            return
+        without = [f"--{word}" for word in self.given]
+        if self.link is not None and one != "--clear":
+            without.append("--link")
+        if self.words is not None and one != WORDS:
+            without.append(WORDS)
+        if without:
+            names = ", ".join(without)
+            raise RunError(f"{one} with {names}: without effect; leave one of them out")
+
+
+def run(flags: InjectFlags) -> int:
     """Start or end an impairment, and show those that are active."""
     console = Console()
-    client = ProxyClient(args.run_dir)
-    if args.list:
-        _refuse(args, "--list", "link", "words")
+    client = ProxyClient(flags.run_dir)
+    if flags.list:
         show(client.list(), console)
-    elif args.clear:
-        _refuse(args, "--clear", "words")
-        _clear(client, args.link or ALL, console)
+    elif flags.clear:
+        _clear(client, flags.link or ALL, console)
     else:
-        inject = inject_of(args)
+        inject = inject_of(flags)
         show(client.begin(inject, inject.at), console)
     return 0
 
@@ -135,43 +144,17 @@ def _clear(client: ProxyClient, link: str, console: Console) -> None:
     show(left, console)
 
 
-def inject_of(args: argparse.Namespace) -> Inject:
-    """Return the requested impairment; its `at` counts from now.
-
-    Raises:
-        RunError: a flag is malformed or out of its range, or two contradict each other.
-    """
-    if args.words is not None:
-        _refuse(args, WORDS, "link")
+def inject_of(flags: InjectFlags) -> Inject:
+    """Return the requested impairment; its `at` counts from now."""
+    if flags.words is not None:
         try:
-            return parse_inject(args.words)
+            return parse_inject(flags.words)
         except argparse.ArgumentTypeError as error:
             raise RunError(str(error)) from None
     try:
-        return make(args.link or ALL, _given(args), dash="--")
+        return make(flags.link or ALL, flags.given, dash="--")
     except ConfigError as error:
         raise RunError(f"{error.key}: {error.found}; {error.expected}") from None
-
-
-def _given(args: argparse.Namespace) -> dict[str, str]:
-    """Return the words that were given, with their values."""
-    given = {word: getattr(args, word) for word in (*NUMBERS, DISTRIBUTION, *SWITCHES)}
-    return {word: value for word, value in given.items() if value not in (None, False)}
-
-
-def _refuse(args: argparse.Namespace, flag: str, *others: str) -> None:
-    """Refuse flags that would have no effect.
-
-    Raises:
-        RunError: such a flag was given.
-    """
-    given = [f"--{word}" for word in _given(args)]
-    given += [
-        "--link" if word == "link" else WORDS for word in others if getattr(args, word) is not None
-    ]
-    if given:
-        words = ", ".join(given)
-        raise RunError(f"{flag} with {words}: without effect; leave one of them out")
 
 
 def show(asked: Sequence[RequestedImpairment], console: Console) -> None:

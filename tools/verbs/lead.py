@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 import time
 from collections.abc import Sequence
 from enum import Enum
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 from rich.live import Live
 from rich.text import Text
 
 from shared.bus import topics
 from shared.bus.credentials import require_operator
-from shared.bus.messages import HandLead, OperatorIntent, PlannerStatus, SimTruth
+from shared.bus.messages import STRAIGHT, HandLead, OperatorIntent, PlannerStatus, SimTruth
 from shared.bus.session import Session, open_session
 from shared.clock import now_ns
 from shared.config.files import load
@@ -24,16 +23,17 @@ from shared.config.scenarios import SCENARIO
 from shared.exceptions import FleetError
 from shared.process import StopFlag
 from shared.user import user_name
+from tools.flags import Arg, Duration, Number, RunDirFlags, numbers, option, parsed
 from tools.fleet.emergency_stop import BusStop, request_here
 from tools.fleet.supervise import SupervisedFleet
 from tools.keyboard import Keyboard
+from tools.live.assist_request import ask, refuse_beyond_limits
 from tools.pads.calibration import calibrate, keep
 from tools.pads.controls import BUTTONS
 from tools.pads.gamepad import Gamepad, open_pad, open_pads
 from tools.pads.mappings import mapping_of
 from tools.pads.pilot import Deflection, Led, Pilot
 from tools.terminal import Console
-from tools.verb_table import Subparsers, add_run_dir, add_verb
 
 PERIOD_S: Final = 0.05
 """Repeats each request: an intent fades out, and a push ends, once nobody repeats it."""
@@ -64,47 +64,61 @@ KEYS: Final = {
 }  # fmt: skip
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(
-        subparsers,
-        "lead",
-        """
-        xrl lead                 # the first gamepad: hold the right shoulder and move the sticks
-        xrl lead --keys          # arrows: height and pitch; + and -: assist; space: stop
-        xrl lead --pad /dev/input/event7 --hold leftshoulder --stop x
-        xrl lead --calibrate     # a pad that is not known: asks for each stick, trigger and button
-        """,
-    )
-    add_run_dir(parser)
-    which = parser.add_mutually_exclusive_group()
-    which.add_argument("--keys", action="store_true", help="keys of this terminal, no gamepad")
-    which.add_argument("--pad", metavar="DEVICE", help="event device (default: the first gamepad)")
-    parser.add_argument(
-        "--hold", choices=BUTTONS, default="rightshoulder", help="dead man's button (rightshoulder)"
-    )
-    parser.add_argument("--stop", choices=BUTTONS, default="b", help="emergency stop (b)")
-    parser.add_argument(
-        "--calibrate", action="store_true",
-        help="learn what the pad's axes and buttons mean, and keep it; needs no robot",
-    )  # fmt: skip
+EXAMPLES: Final = """
+xrl lead                 # the first gamepad: hold the right shoulder and move the sticks
+xrl lead --keys          # arrows: height and pitch; + and -: assist; space: stop
+xrl lead --pad /dev/input/event7 --hold leftshoulder --stop x
+xrl lead --assist 80 --for 60             # no pad: N for a minute, then it fades out
+xrl lead --assist 0 --shift 0.02,0,0,0    # lean the COM 2 cm forwards
+xrl lead --calibrate     # a pad that is not known: asks for each stick, trigger and button
+"""
 
 
-def run(args: argparse.Namespace) -> int:
-    """Lead until q, Ctrl-C, the stop, or the loss of the pad.
+class LeadFlags(RunDirFlags):
+    """By what the robot is led."""
 
-    Raises:
-        FleetError: there is no pad, no terminal or no key that may act, the robot is silent, or the
-            pad is lost.
-    """
-    if args.calibrate:
-        return _calibrate(args)
-    fleet = SupervisedFleet.attach(args.run_dir)
+    keys: Annotated[bool, Arg(exclusive="by")] = False
+    """keys of this terminal, no gamepad"""
+    pad: Annotated[str | None, Arg(metavar="DEVICE", exclusive="by")] = None
+    """event device (default: the first gamepad)"""
+    assist: Annotated[Number | None, Arg(metavar="N", exclusive="by")] = None
+    """nothing is led: ask the robot to carry so much of the person, N, until Ctrl-C; then it fades
+    out"""
+    shift: Annotated[
+        tuple[float, ...] | None,
+        parsed(numbers(4, "such as 0.02,0,0,0"), "X,Y,ROLL,YAW", is_one=True),
+    ] = None
+    """with --assist: where COM (m) and torso (rad) are to be off a straight stand (0,0,0,0)"""
+    for_s: Annotated[Duration | None, option("--for")] = None
+    """with --assist: so long"""
+    hold: Annotated[str, Arg(choices=BUTTONS)] = "rightshoulder"
+    """dead man's button"""
+    stop: Annotated[str, Arg(choices=BUTTONS)] = "b"
+    """emergency stop"""
+    calibrate: bool = False
+    """learn what the pad's axes and buttons mean, and keep it; needs no robot"""
+
+    def check(self) -> None:
+        """Refuse what goes with another way of leading."""
+        super().check()
+        if self.hold == self.stop:
+            raise FleetError(f"--hold and --stop are both {self.hold}: two buttons are right")
+        if self.calibrate and (self.keys or self.assist is not None):
+            raise FleetError("--calibrate is for a pad: leave out --keys or --assist")
+        if self.assist is None and (self.shift is not None or self.for_s is not None):
+            raise FleetError("--shift and --for go with --assist N; --assist 0 only shifts")
+
+
+def run(flags: LeadFlags) -> int:
+    """Lead until q, Ctrl-C, the stop, or the loss of the pad."""
+    if flags.calibrate:
+        return _calibrate(flags)
+    fleet = SupervisedFleet.attach(flags.run_dir)
     robot = load(Path(fleet.manifest.config))
+    if flags.assist is not None:
+        return _ask(robot, fleet.run.path, flags.assist, flags)
     require_operator(robot, "lead")
-    if args.hold == args.stop:
-        raise FleetError(f"--hold and --stop are both {args.hold}: two buttons are right")
-    pad = None if args.keys else _opened(args)
+    pad = None if flags.keys else _opened(flags)
     console = Console()
     with open_session(robot, "lead", fleet.run.path) as session:
         leader = Leader(robot, session, simulated="simulator" in fleet.manifest.services)
@@ -122,15 +136,35 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _opened(args: argparse.Namespace) -> Gamepad:
-    device = open_pad(args.pad)
-    return Gamepad(device, mapping_of(device), hold=args.hold, stop=args.stop)
+def _ask(robot: RobotConfig, run_dir: Path, assist_n: float, flags: LeadFlags) -> int:
+    """Publish a request for assist until stopped."""
+    x, y, roll, yaw = flags.shift or STRAIGHT
+    request = OperatorIntent(
+        t_ns=now_ns(), seq=0, assist_n=assist_n, shift=(x, y, roll, yaw), source=_source()
+    )
+    refuse_beyond_limits(robot, request.assist_n, request.shift)
+    stop = StopFlag()
+    with open_session(robot, "lead", run_dir) as session:
+        intents = session.publisher(topics.OPERATOR_INTENT, OperatorIntent)
+        statuses = session.latest(topics.PLANNER_STATUS, PlannerStatus)
+        with Live(console=Console(), refresh_per_second=4, transient=True) as shown:
+            given = ask(intents, statuses, request, lambda: bool(stop), shown, for_s=flags.for_s)
+    fade_s = robot.assist.fade_s
+    Console().print(f"request ended: {given:.0f} N were given; they fade out in {fade_s:g} s")
+    return 0
 
 
-def _calibrate(args: argparse.Namespace) -> int:
-    if args.keys:
-        raise FleetError("--calibrate --keys: keys need no calibration; one of the two is right")
-    device = open_pads(args.pad)[0]
+def _source() -> str:
+    return f"xrl lead by {user_name()} ({os.getpid()})"
+
+
+def _opened(flags: LeadFlags) -> Gamepad:
+    device = open_pad(flags.pad)
+    return Gamepad(device, mapping_of(device), hold=flags.hold, stop=flags.stop)
+
+
+def _calibrate(flags: LeadFlags) -> int:
+    device = open_pads(flags.pad)[0]
     print(f"{device.name}; another one: --pad DEVICE")
     mapping = calibrate(device, print)
     print(f"{device.name}: kept in {keep(device, mapping)}; `xrl lead` uses it from now on")
@@ -141,11 +175,7 @@ class Leader:
     """Sends where a person leads."""
 
     def __init__(self, robot: RobotConfig, session: Session, *, simulated: bool) -> None:
-        """Begin where the robot is.
-
-        Raises:
-            FleetError: it is silent.
-        """
+        """Begin where the robot is."""
         self._hand = session.publisher(topics.OPERATOR_HAND, HandLead) if simulated else None
         self._intents = session.publisher(topics.OPERATOR_INTENT, OperatorIntent)
         self._statuses = session.latest(topics.PLANNER_STATUS, PlannerStatus)
@@ -160,7 +190,7 @@ class Leader:
             time.sleep(0.01)
         height, pitch = (truth.torso[2], truth.angles[1]) if truth is not None else (1.0, 0.0)
         self.pilot = Pilot(height, pitch, robot.assist.force_max)
-        self._source = f"xrl lead by {user_name()} ({os.getpid()})"
+        self._source = _source()
         self._sent = 0
 
     def take_hold(self) -> None:

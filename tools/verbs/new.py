@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import argparse
 import shlex
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 from services.simulator.physics import plant
 from shared.exceptions import RunError
 from shared.places import FILES, ROBOT_FILE, SCENARIOS
 from tools import graph_libraries
-from tools.verb_table import Subparsers, add_verb
+from tools.flags import Flags, positional
 
 HOSTS_FILE: Final = "hosts.example.toml"
 _ABOUT_PLANTS: Final = (
@@ -24,30 +23,27 @@ _ABOUT_PLANTS: Final = (
 )
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(
-        subparsers,
-        "new",
-        """
-        xrl new lab                     # then: cd lab; every verb finds robot.toml there
-        xrl new .                       # here, if nothing is here
-        """,
-    )
-    parser.add_argument(
-        "directory", type=Path, metavar="DIR", help="made if it is absent; else it must be empty"
-    )
+EXAMPLES: Final = """
+xrl new lab                     # then: cd lab; every verb finds robot.toml there
+xrl new .                       # here, if nothing is here
+"""
 
 
-def run(args: argparse.Namespace) -> int:
+class NewFlags(Flags):
+    """Where."""
+
+    directory: Annotated[Path, positional("DIR")]
+    """made if it is absent; else it must be empty"""
+
+
+def run(flags: NewFlags) -> int:
     """Copy the shipped files out, all or none, and say what comes next."""
-    directory: Path = args.directory
-    with _filled(directory) as scratch:
+    with _filled(flags.directory) as scratch:
         for name, content in contents().items():
             path = scratch / name
             path.parent.mkdir(exist_ok=True)
             path.write_bytes(content)
-    print(_what_next(directory))
+    print(_what_next(flags.directory))
     return 0
 
 
@@ -67,9 +63,6 @@ def _filled(directory: Path) -> Iterator[Path]:
     """Yield a folder whose contents become the directory's if the block ends well.
 
     Otherwise the directory is left as it was found: empty, or absent.
-
-    Raises:
-        RunError: it is not empty, no directory, or in none.
     """
     made = _made(directory)
     moved: list[Path] = []

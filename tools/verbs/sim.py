@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 import time
 from pathlib import Path
+from typing import Annotated, Final
 
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -15,88 +15,68 @@ from shared.bus.messages import SimTruth
 from shared.config.impairment import Impairment
 from shared.exceptions import RunError
 from shared.extras import require
+from shared.toml_file import Range
+from tools.flags import Arg, Folder
 from tools.judge import verdict, verdict_table
 from tools.live import experiment
 from tools.logs.hand_path import HandRow, hand_path
 from tools.logs.run_log import read_run
-from tools.number_arguments import finite
 from tools.sim import recorded_lockstep
 from tools.sim.centralised.fleet import CONTROLS, SHIPPED
 from tools.terminal import Console
-from tools.verb_table import Subparsers, add_verb
+
+Milliseconds = Annotated[float, Range(0.0, 1e12, "ms")]
+
+EXAMPLES: Final = """
+xrl sim
+xrl sim --delay 10 --out out/slow
+xrl sim --delay 5 --jitter 5 --loss 0.1 --seed 3
+xrl sim --scenario crawl --kill planner@8
+xrl sim --delay 50 --control centralised
+xrl sim --plant drivetrain.stiffness=3000 --plant drivetrain.play=0.01
+xrl sim --plant ideal
+xrl sim --controller examples/lqr_controller.py
+xrl sim --scenario stand --hand out/view/run.mcap     # as a person led it there
+xrl sim --inject 'planner->joints delay=30 jitter=10 at=3 for=4'
+xrl sim --inject 'all partition at=3 for=2' --inject 'planner->left loss=0.5 at=6'
+"""
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(
-        subparsers,
-        "sim",
-        """
-        xrl sim
-        xrl sim --delay 10 --out out/slow
-        xrl sim --delay 5 --jitter 5 --loss 0.1 --seed 3
-        xrl sim --scenario crawl --kill planner@8
-        xrl sim --delay 50 --control centralised
-        xrl sim --plant drivetrain.stiffness=3000 --plant drivetrain.play=0.01
-        xrl sim --plant ideal
-        xrl sim --controller examples/lqr_controller.py
-        xrl sim --scenario stand --hand out/view/run.mcap     # as a person led it there
-        xrl sim --inject 'planner->joints delay=30 jitter=10 at=3 for=4'
-        xrl sim --inject 'all partition at=3 for=2' --inject 'planner->left loss=0.5 at=6'
-        """,
-    )
-    experiment.add_flags(parser)
-    parser.add_argument(
-        "--delay", type=finite, default=1.0, metavar="MS", help="of every link, each way (1)"
-    )
-    parser.add_argument(
-        "--jitter",
-        type=finite,
-        default=0.0,
-        metavar="MS",
-        help="half the width of a uniform spread (0)",
-    )
-    parser.add_argument(
-        "--loss",
-        type=finite,
-        default=0.0,
-        metavar="P",
-        help="probability that a message is lost, 0 to 1 (0)",
-    )
-    parser.add_argument(
-        "--control",
-        choices=CONTROLS,
-        default=SHIPPED,
-        help="who computes the torques; centralised: the planner all of them, a baseline to "
-        "compare with (default: distributed)",
-    )
-    parser.add_argument(
-        "--hand",
-        type=Path,
-        metavar="RUN",
-        help="lead and push as somebody did in this record (`operator/hand`), in place of the "
-        "scenario's path",
-    )
-    parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="where results go (default: out/sim-<time>)"
-    )
+class SimFlags(experiment.ExperimentFlags):
+    """An experiment, the network it runs over, and who computes the torques."""
+
+    delay: Milliseconds = 1.0
+    """of every link, each way"""
+    jitter: Milliseconds = 0.0
+    """half the width of a uniform spread"""
+    loss: Annotated[float, Range(0.0, 1.0, ""), Arg(metavar="P")] = 0.0
+    """probability that a message is lost"""
+    control: Annotated[str, Arg(choices=CONTROLS)] = SHIPPED
+    """who computes the torques; centralised: the planner all of them, a baseline to compare with"""
+    hand: Annotated[Path | None, Arg(metavar="RUN")] = None
+    """lead and push as somebody did in this record (`operator/hand`), in place of the scenario's
+    path"""
+    out: Folder | None = None
+    """where results go (default: out/sim-<time>)"""
+
+    def check(self) -> None:
+        """Refuse two controllers."""
+        super().check()
+        if self.controller is not None and self.control != SHIPPED:
+            raise RunError("--controller and --control: one of them says who computes the torques")
 
 
-def run(args: argparse.Namespace) -> int:
+def run(flags: SimFlags) -> int:
     """Run the experiment; 0 only if the robot stood to the end."""
     require("sim")
-    if args.delay < 0.0 or args.jitter < 0.0 or not 0.0 <= args.loss <= 1.0:
-        raise RunError("--delay and --jitter must be at least 0 ms, --loss from 0 to 1")
     console = Console()
-    robot, scenario = experiment.make_robot(args), experiment.make_scenario(args)
-    true_plant = plant_from(args.plant)
-    hand = _path_of(args.hand) if args.hand is not None else ()
-    if args.controller is not None and args.control != SHIPPED:
-        raise RunError("--controller and --control: one of them says who computes the torques")
-    if args.controller is not None:
-        controller_maker(args.controller, robot)  # refused before anything is written
-    network = Impairment(delay_ms=args.delay, jitter_ms=args.jitter, loss=args.loss)
-    out = experiment.make_out(args.out, "sim")
+    robot, scenario = experiment.make_robot(flags), experiment.make_scenario(flags)
+    true_plant = plant_from(flags.plant)
+    hand = _path_of(flags.hand) if flags.hand is not None else ()
+    if flags.controller is not None:
+        controller_maker(flags.controller, robot)  # refused before anything is written
+    network = Impairment(delay_ms=flags.delay, jitter_ms=flags.jitter, loss=flags.loss)
+    out = experiment.make_out(flags.out, "sim")
     experiment.introduce(scenario, console)
     bar = Progress(
         BarColumn(), TextColumn("{task.completed:5.1f} of {task.total:g} s"),
@@ -111,8 +91,8 @@ def run(args: argparse.Namespace) -> int:
 
         try:
             simulated_s = recorded_lockstep.simulate(
-                robot, scenario, network, args.seed, out, watch, args.control, true_plant, hand,
-                args.controller,
+                robot, scenario, network, flags.seed, out, watch, flags.control, true_plant, hand,
+                flags.controller,
             )  # fmt: skip
         except KeyboardInterrupt:
             console.print(
@@ -129,11 +109,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _path_of(record: Path) -> tuple[HandRow, ...]:
-    """Return how the hand was led in a record.
-
-    Raises:
-        RunError: it cannot be read, or nobody led it there.
-    """
+    """Return how the hand was led in a record."""
     log = read_run(record)
     path = hand_path(log)
     if not path and log.messages(topics.OPERATOR_HAND):

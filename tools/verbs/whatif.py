@@ -17,7 +17,8 @@ from shared.exceptions import FELL_EXIT_CODE, RunError
 from shared.extras import require
 from shared.joints import MODULES
 from shared.toml_file import parse_toml
-from tools.judge.run_parts import add_part, read_asked
+from tools.flags import RUN_HELP, add_flags, read_flags
+from tools.judge.run_parts import PartFlags, read_asked
 from tools.lab.studies.counterfactual.moments import moments_of
 from tools.lab.studies.counterfactual.run import Counterfactual, Task, counterfactual_of, draw
 from tools.lab.studies.sweeps.pool import cores, results
@@ -28,7 +29,7 @@ from tools.logs.run_index import RunIndex
 from tools.logs.run_log import RunLog, refuse_own_controller, robot_of, text_of
 from tools.number_arguments import count, finite
 from tools.terminal import Console, marked
-from tools.verb_table import RUN_HELP, Subparsers, add_verb
+from tools.verb_table import Subparsers, add_verb
 
 KILLABLE: Final = ("planner", *MODULES)
 WIDTH: Final = 72
@@ -55,7 +56,7 @@ def add_parser(subparsers: Subparsers) -> None:
         metavar="SERVICE",
         help=f"dies at the moment: {', '.join(KILLABLE)}; may be given several times",
     )
-    add_part(parser)
+    add_flags(parser, PartFlags)
     parser.add_argument(
         "--every", type=finite, default=0.1, metavar="S", help="between two moments (0.1 s)"
     )
@@ -79,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
     if not (args.every >= 0.1 - 1e-9 and args.for_s > 0.0):
         raise RunError("--every from 0.1 s on (so often is the state recorded), --for over 0 s")
     console = Console()
-    log = read_asked(args, RunIndex(args.log), as_sent=True)
+    log = read_asked(read_flags(PartFlags, args), RunIndex(args.log), as_sent=True)
     refuse_own_controller(log)
     robot, scenario = robot_of(log), scenario_of(log)
     kill = tuple(dict.fromkeys(args.kill))

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import contextlib
 import os
@@ -14,28 +13,27 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Annotated
 
 from shared.config.endpoints import PORT_MAX
 from shared.exceptions import FleetError
 from shared.extras import require
 from shared.run_directory import private_files
+from shared.toml_file import Range
+from tools.flags import Arg, Flags
 from tools.fleet.parent_death import die_with_parent
-from tools.number_arguments import whole
 from tools.terminal import Console
 from tools.view.source import HOST, PORT, Source
 
 _END_S = 5.0
 
 
-def add_port(parser: argparse.ArgumentParser) -> None:
-    """Add `--port`."""
-    parser.add_argument(
-        "--port", type=_port, default=PORT, metavar="N", help=f"of {HOST} (default: {PORT}); 0: any"
-    )
+class PortFlags(Flags):
+    """Where a page is served."""
 
-
-def _port(text: str) -> int:
-    return whole(text, 0, PORT_MAX)
+    port: Annotated[
+        int, Range(0, PORT_MAX, ""), Arg(help=f"of {HOST} (default: {PORT}); 0: any")
+    ] = PORT
 
 
 def serve(source: Source, port: int) -> None:

@@ -1,10 +1,10 @@
 """A module's drive as the joint sees it: zero, motor signs, and read-only access.
 
 The encoders sit on the motors and count turns; a power cycle loses what a count means at the
-joint. So `xrl drive zero` writes the joint's position plus `mark_turns` to the drive: a motor at q = 0
-reads `mark_turns`. After a power cycle the drive reads near 0 instead, so a lost zero is detected
-within one cycle: the drive is `UNZEROED`, it is never armed, and a drive that was armed faults. A
-failed encoder goes on reporting its last position; the drive's error shows that one.
+joint. So `xrl drive zero` writes the joint's position plus `mark_turns` to the drive: a motor at
+q = 0 reads `mark_turns`. After a power cycle the drive reads near 0 instead, so a lost zero is
+detected within one cycle: the drive is `UNZEROED`, it is never armed, and a drive that was armed
+faults. A failed encoder goes on reporting its last position; the drive's error shows that one.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ def make(log: RunLog, out: Path) -> dict[str, Path]:
     cut.write_bytes(run.path.read_bytes()[: run.path.stat().st_size * 2 // 3])
     recover.recover(cut, out / "recovered.mcap")
     with contextlib.redirect_stdout(io.StringIO()):
-        words = ["export", str(run.path), "--scene", "-o", str(out / "exported.mcap")]
+        words = ["log", "export", str(run.path), "--scene", "-o", str(out / "exported.mcap")]
         assert cli.main(words) == 0
     return {
         "recorded": log.path,

@@ -22,7 +22,7 @@ from tests.shared.mcap_log.runs import STATE_KEY, Killed
 from tools import cli
 from tools.logs.run_log import read_run
 from tools.logs.survey import Survey
-from tools.verbs.info import as_json
+from tools.verbs.log.info import as_json
 
 CUTS = 1000
 CUTS_BY_VERB = 40
@@ -164,7 +164,7 @@ def test_the_verbs_answer_a_cut_file_with_a_good_end_or_one_line(
         path.write_bytes(data[:size])
         for verb in ("info", "recover"):
             flags = ["--force"] if verb == "recover" else []
-            code = cli.main([verb, str(path), *flags])
+            code = cli.main(["log", verb, str(path), *flags])
             output = capsys.readouterr()
             assert code in (0, 2)
             assert len(output.err.splitlines()) == (1 if code else 0)
@@ -198,12 +198,12 @@ def test_another_version_and_a_foreign_file_are_shown_recovered_and_refused_in_o
 ) -> None:
     path = tmp_path / "x.mcap"
     make(path)
-    assert cli.main(["info", str(path)]) == 0
+    assert cli.main(["log", "info", str(path)]) == 0
     output = capsys.readouterr().out
     assert ("0; this code writes" in output) == (make is old_version)
     assert ("foreign" in output) == (make is foreign)
     assert "\x1b" not in output
-    assert cli.main(["recover", str(path), "-o", str(tmp_path / "y.mcap")]) == 0
+    assert cli.main(["log", "recover", str(path), "-o", str(tmp_path / "y.mcap")]) == 0
     with pytest.raises(RunError) as caught:
         read_run(path).messages(topics.JOINT_STATE, "knee_right")
     assert "\n" not in str(caught.value)
@@ -225,7 +225,7 @@ def test_what_is_no_log_is_one_line_and_exit_code_2(
     elif kind == "pipe":
         os.mkfifo(path)
     there = sorted(tmp_path.iterdir())
-    assert cli.main([verb, str(path)]) == 2
+    assert cli.main(["log", verb, str(path)]) == 2
     output = capsys.readouterr()
     assert len(output.err.splitlines()) == 1
     assert str(path) in output.err

@@ -22,7 +22,7 @@ def test_a_folder_that_is_ended_half_way_is_not_there_and_is_written_the_next_ti
     run_file: Path, tmp_path: Path, flag: str, number: signal.Signals
 ) -> None:
     out = tmp_path / "out"
-    words = ["export", str(run_file), flag, str(out)]
+    words = ["log", "export", str(run_file), flag, str(out)]
     process = subprocess.Popen(
         [sys.executable, "-m", "tools.cli", *words],
         cwd=Path(__file__).parents[3],
@@ -63,6 +63,6 @@ def test_a_file_that_is_ended_half_way_leaves_the_one_that_was_there(
     out = tmp_path / words[-1]
     out.write_bytes(b"old")
     monkeypatch.setattr(within, interrupted)
-    assert cli.main(["export", str(run_file), *words, "--force"]) == 130
+    assert cli.main(["log", "export", str(run_file), *words, "--force"]) == 130
     assert out.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [out]

@@ -25,7 +25,7 @@ KNOWN = topics_of("")
 @pytest.fixture(scope="module")
 def bag(run_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("bag") / "bag"
-    assert cli.main(["export", str(run_file), "--ros2bag", str(out), "--rate", "50"]) == 0
+    assert cli.main(["log", "export", str(run_file), "--ros2bag", str(out), "--rate", "50"]) == 0
     return out
 
 
@@ -102,8 +102,8 @@ def test_a_run_after_2038_is_refused_as_a_bag_and_has_its_other_exports(
     path = tmp_path / "late.mcap"
     rewritten.write(log, path, {}, {})
     bag = tmp_path / "bag"
-    assert cli.main(["export", str(path), "--ros2bag", str(bag)]) == 2
+    assert cli.main(["log", "export", str(path), "--ros2bag", str(bag)]) == 2
     assert "are beyond those of ROS 2, which end on 2038-01-19" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == [path]
     words = ["--scene", "--csv", str(tmp_path / "tables")]
-    assert cli.main(["export", str(path), *words]) == 0
+    assert cli.main(["log", "export", str(path), *words]) == 0

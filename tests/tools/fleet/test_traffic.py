@@ -11,10 +11,9 @@ from shared.bus.codec import encode
 from shared.bus.messages import Estop
 from shared.clock import NS_PER_MS
 from shared.exceptions import RunError
-from tests.tools.exit_codes import exit_code
 from tools.fleet.traffic import KeyTraffic, rate_hz
 from tools.topic_keys import TopicKey, every_key, keys_named
-from tools.verbs.echo import as_text
+from tools.verbs.topic.echo import as_text
 
 STATE = TopicKey(topics.WRENCH, "")
 
@@ -75,15 +74,3 @@ def test_keys_are_named_by_patterns_and_a_wrong_one_says_what_there_is() -> None
 def test_a_message_of_another_type_is_told_and_not_a_traceback() -> None:
     text = as_text(STATE, message(1, 0.0), [], as_json=False)
     assert text.endswith("bytes that are no Wrench")
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["hz", "foo"], ["echo", "foo"], ["echo"], ["hz", "estop", "--for", "0"],
-        ["echo", "estop", "--field", "mode"], ["echo", "estop", "--count", "0"],
-        ["echo", "estop", "--hz", "0"],
-    ],
-)  # fmt: skip
-def test_what_cannot_be_is_refused(words: list[str]) -> None:
-    assert exit_code(words) == 2

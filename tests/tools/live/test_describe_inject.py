@@ -19,6 +19,7 @@ from shared.config.scenarios import Inject
 from shared.exceptions import ConfigError
 from shared.links import DIRECTIONS
 from tests.lockstep.runs import still
+from tools.flags import add_flags, read_flags
 from tools.judge import verdict
 from tools.live import describe_inject, experiment
 from tools.logs.run_log import RunLog, read_run
@@ -27,10 +28,10 @@ from tools.sim.network import BASE
 from tools.sim.recorded_lockstep import simulate
 
 
-def parse(*words: str) -> argparse.Namespace:
+def parse(*words: str) -> experiment.ExperimentFlags:
     parser = argparse.ArgumentParser()
-    experiment.add_flags(parser)
-    return parser.parse_args(words)
+    add_flags(parser, experiment.ExperimentFlags)
+    return read_flags(experiment.ExperimentFlags, parser.parse_args(words))
 
 
 @pytest.mark.parametrize(

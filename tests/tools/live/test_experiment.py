@@ -12,13 +12,14 @@ from shared.config.gain_schedule import path_beside
 from shared.config.scenarios import FAULT_KINDS, Fault
 from shared.exceptions import ConfigError, FleetError
 from shared.places import DEFAULT_CONFIG, SCENARIOS
+from tools.flags import add_flags, read_flags
 from tools.live import experiment
 
 
-def parse(*arguments: str) -> argparse.Namespace:
+def parse(*arguments: str) -> experiment.ExperimentFlags:
     parser = argparse.ArgumentParser()
-    experiment.add_flags(parser)
-    return parser.parse_args(arguments)
+    add_flags(parser, experiment.ExperimentFlags)
+    return read_flags(experiment.ExperimentFlags, parser.parse_args(arguments))
 
 
 @pytest.mark.parametrize(

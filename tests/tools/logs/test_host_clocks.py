@@ -131,19 +131,21 @@ def test_times_of_all_hosts_are_the_recorders_and_as_sent_they_are_their_own(rec
 def test_its_services_are_executed_again_bit_for_bit(
     record: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert exit_code(["resim", record, "--service", "planner", "--service", "knee_left"]) == 0
+    assert (
+        exit_code(["log", "resim", record, "--service", "planner", "--service", "knee_left"]) == 0
+    )
     assert "all equal" in capsys.readouterr().out
 
 
 def test_info_tells_the_clocks(record: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert exit_code(["info", record]) == 0
+    assert exit_code(["log", "info", record]) == 0
     told = capsys.readouterr().out
     assert f"{BODY}: the recorder's (planner" in told
     for host, offset_s in ((RIGHT, 259_200.5), (LEFT, 252_000.0)):
         found = re.search(rf"{host}: ([+-][\d.]+) s to the recorder's, within ([\d.]+) ms", told)
         assert found is not None
         assert float(found[1]) == pytest.approx(offset_s, abs=0.01)
-    assert exit_code(["info", record, "--json"]) == 0
+    assert exit_code(["log", "info", record, "--json"]) == 0
     left = json.loads(capsys.readouterr().out)["clocks"][LEFT]
     assert left["services"] == ["ankle_left", "knee_left", "hip_left"]
     assert left["clocks"][0]["offset_s"] == pytest.approx(252_000.0, abs=0.01)
@@ -180,12 +182,12 @@ def test_a_host_that_starts_again_has_two_clocks_and_all_its_times_are_right(
     late = late_ns(log, "knee_left")
     assert len(late) == 790 + 900
     assert max(map(abs, late)) < 3 * NS_PER_MS
-    assert exit_code(["info", path]) == 0
+    assert exit_code(["log", "info", path]) == 0
     assert "then it started again" in " ".join(capsys.readouterr().out.split())
     for number, those in enumerate((sent[:790], sent[790:])):
         clock = (CLOCKS[LEFT], again)[number]
         own = write_record(tmp_path / f"own{number}", robot, those, LEFT, of=LEG, clock=clock)
-        assert exit_code(["join", path, own, "--out", tmp_path / f"joined{number}"]) == 0
+        assert exit_code(["log", "join", path, own, "--out", tmp_path / f"joined{number}"]) == 0
         assert ": 0 messages" in capsys.readouterr().out
 
 

@@ -121,7 +121,7 @@ def test_the_index_that_a_file_lacks_is_made_by_recover(
     path = rewrite(recorded, tmp_path / "run.mcap", **WAYS[way])
     lacks = way.startswith("without")
     assert recover.is_whole(path) != lacks
-    assert cli.main(["recover", str(path)]) == 0
+    assert cli.main(["log", "recover", str(path)]) == 0
     copy = tmp_path / "run.recovered.mcap"
     assert copy.exists() == lacks
     if lacks:

@@ -12,7 +12,7 @@ from shared.config.robot_config import RobotConfig
 from shared.config.sections import CanConfig
 from tests.tools.exit_codes import exit_code
 from tools.bringup import check_socketcan
-from tools.verbs import can
+from tools.verbs.drive import can
 
 
 @pytest.fixture
@@ -31,7 +31,7 @@ def test_setup_prints_what_brings_each_used_interface_up_and_runs_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     monkeypatch.setattr(can, "_ran", None)
-    assert exit_code(["can", "setup", "--config", real_file]) == 0
+    assert exit_code(["drive", "can", "setup", "--config", real_file]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 3 * len(robot.buses) + 1
     assert lines[1] == "ip link set can0 up type can bitrate 1000000 restart-ms 100"
@@ -42,7 +42,7 @@ def test_setup_ends_at_the_first_command_that_fails(
     real_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """There is no can0 here, or no right to it."""
-    assert exit_code(["can", "setup", "--config", real_file, "--apply"]) in (2, 3)
+    assert exit_code(["drive", "can", "setup", "--config", real_file, "--apply"]) in (2, 3)
     told = capsys.readouterr()
     assert told.out.splitlines()[0] == "ip link set can0 down"
     assert len(told.out.splitlines()) == 1
@@ -50,7 +50,7 @@ def test_setup_ends_at_the_first_command_that_fails(
 
 
 def test_an_emulated_robot_has_nothing_to_set_up(capsys: pytest.CaptureFixture[str]) -> None:
-    assert exit_code(["can", "setup"]) == 0
+    assert exit_code(["drive", "can", "setup"]) == 0
     assert "nothing to bring up" in capsys.readouterr().out
 
 
@@ -59,9 +59,9 @@ def test_a_bus_that_is_none_or_not_there_is_one_line(
     action: str, real_file: Path, run_dir: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     place = ["--run-dir", run_dir, "--config", real_file]
-    assert exit_code(["can", action, "--bus", "foot", *place]) == 2
+    assert exit_code(["drive", "can", action, "--bus", "foot", *place]) == 2
     assert "--bus foot: the robot has " in capsys.readouterr().err
-    assert exit_code(["can", action, *place]) in (2, 3)
+    assert exit_code(["drive", "can", action, *place]) in (2, 3)
     told = capsys.readouterr()
     assert "Traceback" not in told.err
     assert "can0" in told.out + told.err
@@ -71,14 +71,14 @@ def test_a_bus_that_is_none_or_not_there_is_one_line(
 def test_every_emulated_axis_is_heard_and_answers(
     run_dir: Path, robot: RobotConfig, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert exit_code(["can", "test", "--run-dir", run_dir]) == 0
+    assert exit_code(["drive", "can", "test", "--run-dir", run_dir]) == 0
     shown = capsys.readouterr().out
     for module in robot.module:
         assert f"{module.name}.axis0" in shown
         assert f"{module.name}.axis1" in shown
     assert "load cells: " in shown
     assert "silent" not in shown
-    assert exit_code(["can", "latency", "--count", "5", "--run-dir", run_dir]) == 0
+    assert exit_code(["drive", "can", "latency", "--count", "5", "--run-dir", run_dir]) == 0
     rows = [line.split() for line in capsys.readouterr().out.splitlines() if line.count(".") == 3]
     assert len(rows) == 2 * len(robot.module)
     assert all(0.0 < float(row[2]) <= float(row[4]) < 100.0 for row in rows)

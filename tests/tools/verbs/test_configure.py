@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import argparse
+import dataclasses
 import json
 import os
 import signal
@@ -30,7 +30,7 @@ from tools.bringup.motion_runner import Interrupts
 from tools.fleet import procfs
 from tools.fleet.run_dir import RunDir
 from tools.terminal import Console
-from tools.verbs import configure
+from tools.verbs.drive import configure
 
 VEL_LIMIT = "axis0.controller.config.vel_limit"
 REGEN = "config.dc_max_negative_current"
@@ -57,7 +57,7 @@ def run_dir() -> Iterator[Path]:
 
 
 def verb(run_dir: Path, out: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "tools.cli", "configure", "--run-dir", str(run_dir)]
+    command = [sys.executable, "-m", "tools.cli", "drive", "configure", "--run-dir", str(run_dir)]
     command += ["--out", str(out), *arguments]
     environment = {**os.environ, "COLUMNS": "120"}
     return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
@@ -105,8 +105,8 @@ def test_traps_are_taken_out_and_a_backup_brings_them_back(run_dir: Path, tmp_pa
 
 
 @pytest.fixture
-def arguments(tmp_path: Path) -> argparse.Namespace:
-    return argparse.Namespace(restore=tmp_path / "b.json", module=None)
+def flags(tmp_path: Path) -> configure.ConfigureFlags:
+    return configure.ConfigureFlags(restore=tmp_path / "b.json")
 
 
 def saved_as(serial: str, firmware: str = "0.5.6", **settings: Value) -> backup.Backup:
@@ -115,20 +115,20 @@ def saved_as(serial: str, firmware: str = "0.5.6", **settings: Value) -> backup.
 
 
 def test_a_backup_is_for_the_modules_that_it_has(
-    robot: RobotConfig, arguments: argparse.Namespace
+    robot: RobotConfig, flags: configure.ConfigureFlags
 ) -> None:
-    assert configure.modules_of(arguments, robot, saved_as(SERIAL.lower())) == (MODULE,)
-    assert configure.modules_of(arguments, robot, None) == MODULES
-    arguments.module = ["hip_left"]
+    assert configure.modules_of(flags, robot, saved_as(SERIAL.lower())) == (MODULE,)
+    assert configure.modules_of(flags, robot, None) == MODULES
+    other = dataclasses.replace(flags, module=("hip_left",))
     with pytest.raises(DriveError, match="no hip_left; it has knee_left"):
-        configure.modules_of(arguments, robot, saved_as(SERIAL))
+        configure.modules_of(other, robot, saved_as(SERIAL))
 
 
 def test_a_backup_of_another_board_is_refused(
-    robot: RobotConfig, arguments: argparse.Namespace
+    robot: RobotConfig, flags: configure.ConfigureFlags
 ) -> None:
     with pytest.raises(DriveError, match=f"3A00000000FF there and {SERIAL}"):
-        configure.modules_of(arguments, robot, saved_as("3A00000000FF"))
+        configure.modules_of(flags, robot, saved_as("3A00000000FF"))
 
 
 def test_a_backup_of_another_firmware_is_refused(robot: RobotConfig) -> None:
@@ -222,6 +222,6 @@ def test_the_backup_is_written_before_anything_else_and_under_its_time(
 
 def test_help_states_that_it_changes_nothing_by_itself(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as left:
-        cli.main(["configure", "--help"])
+        cli.main(["drive", "configure", "--help"])
     assert left.value.code == 0
     assert "without --apply" in " ".join(capsys.readouterr().out.split())

@@ -71,18 +71,3 @@ def test_a_viewers_key_stands_by_for_nothing(
     file.write_text(config_file.to_toml(secured), encoding="utf-8")
     assert exit_code(["estop", "--wait", "--config", file, "--run-dir", run_dir]) == 2
     assert "to act takes an operator's" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--partly", "knee_left"], "--partly goes with --local"),
-        (["--local", "--partly", "elbow"], "'elbow': one of"),
-        (["--local", "--wait"], "--wait is for the bus"),
-    ],
-)
-def test_what_does_not_go_together_is_refused(
-    words: list[str], said: str, run_dir: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert exit_code(["estop", *words, "--run-dir", run_dir]) == 2
-    assert said in capsys.readouterr().err

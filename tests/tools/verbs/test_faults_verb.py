@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from argparse import Namespace
 
 import pytest
 
@@ -17,12 +16,12 @@ def test_every_row_is_printed_for_people_and_for_machines(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     trips = {trip.name for trip in (*JOINT_TRIPS, *PLANNER_TRIPS)}
-    assert faults.run(Namespace(json=False, config=DEFAULT_CONFIG)) == 0
+    assert faults.run(faults.FaultsFlags(config=DEFAULT_CONFIG)) == 0
     text = capsys.readouterr().out
     assert all(name in text for name in (*DRIVE_FAULTS, *LOSSES, *trips))
     assert "above 15 N m (trips.shaking)" in text
     assert "[robustness]" in text, "a key of the robot file is no colour"
-    assert faults.run(Namespace(json=True, config=DEFAULT_CONFIG)) == 0
+    assert faults.run(faults.FaultsFlags(json=True, config=DEFAULT_CONFIG)) == 0
     table = json.loads(capsys.readouterr().out)
     assert set(table["drive"]) == set(DRIVE_FAULTS)
     assert set(table["fleet"]) == set(LOSSES)

@@ -44,7 +44,17 @@ def test_what_was_planted_is_found_within_its_interval_and_written(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     before = config_file.load_without_schedule(lab)
-    words = ["identify", "body", record, "--config", lab, "--apply", "--out", tmp_path / "fit"]
+    words = [
+        "drive",
+        "identify",
+        "body",
+        record,
+        "--config",
+        lab,
+        "--apply",
+        "--out",
+        tmp_path / "fit",
+    ]
     assert exit_code(words) == 0
     told = capsys.readouterr().out
     rows = {
@@ -87,7 +97,17 @@ def test_a_file_that_is_not_the_records_robot_is_not_written(
 ) -> None:
     text = lab.read_text(encoding="utf-8").replace("payload = 20.4", "payload = 15.0", 1)
     lab.write_text(text, encoding="utf-8")
-    words = ["identify", "body", record, "--config", lab, "--apply", "--out", tmp_path / "fit"]
+    words = [
+        "drive",
+        "identify",
+        "body",
+        record,
+        "--config",
+        lab,
+        "--apply",
+        "--out",
+        tmp_path / "fit",
+    ]
     assert exit_code(words) == 2
     assert "mass.payload is 15.0, and was 20.4" in capsys.readouterr().err
     assert lab.read_text(encoding="utf-8") == text
@@ -96,30 +116,10 @@ def test_a_file_that_is_not_the_records_robot_is_not_written(
 def test_a_dry_run_shows_the_motions_and_needs_no_robot(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert exit_code(["identify", "body", "--dry-run"]) == 0
+    assert exit_code(["drive", "identify", "body", "--dry-run"]) == 0
     told = capsys.readouterr().out
     assert "law.shift_max" in told
     assert "1.188" in told
-
-
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (["body", "--level", "0"], "--level"),
-        (["body", "--added", "1", "--added", "2"], "2 for 1"),
-        (["body", "--added", "-1"], "from 0 to 100"),
-        (["body", "/nowhere/run.mcap"], "/nowhere"),
-        (["joint"], "name modules, or --all"),
-        (["joint", "--all", "knee_left"], "name modules, or --all"),
-        (["joint", "shin_left"], "shin_left: one of ankle_right"),
-        (["joint", "knee_left", "--torque", "-1"], "--torque -1"),
-    ],
-)
-def test_bad_words_are_refused_in_a_line(
-    words: list[str], told: str, capsys: pytest.CaptureFixture[str], run_dir: Path
-) -> None:
-    assert exit_code(["identify", *words, "--run-dir", run_dir]) == 2
-    assert told in capsys.readouterr().err
 
 
 def test_a_record_without_slow_motion_is_refused(
@@ -127,10 +127,10 @@ def test_a_record_without_slow_motion_is_refused(
 ) -> None:
     out = tmp_path / "short"
     assert exit_code(["sim", "--scenario", "stand", "--duration", "3", "--out", out]) == 0
-    assert exit_code(["identify", "body", out]) == 2
+    assert exit_code(["drive", "identify", "body", out]) == 2
     assert "quasi-static moments" in capsys.readouterr().err
 
 
 def test_no_fleet_is_said_so(capsys: pytest.CaptureFixture[str], run_dir: Path) -> None:
-    assert exit_code(["identify", "body", "--run-dir", run_dir]) == 2
+    assert exit_code(["drive", "identify", "body", "--run-dir", run_dir]) == 2
     assert "no fleet" in capsys.readouterr().err

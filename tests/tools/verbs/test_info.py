@@ -30,13 +30,13 @@ def wrench(seq: int, t_ms: int) -> tuple[str, bytes, int]:
 
 
 def as_json(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, Any]:
-    assert cli.main(["info", *map(str, words), "--json"]) == 0
+    assert cli.main(["log", "info", *map(str, words), "--json"]) == 0
     found: dict[str, Any] = json.loads(capsys.readouterr().out)
     return found
 
 
 def as_text(capsys: pytest.CaptureFixture[str], *words: object) -> str:
-    assert cli.main(["info", *map(str, words)]) == 0
+    assert cli.main(["log", "info", *map(str, words)]) == 0
     return capsys.readouterr().out
 
 
@@ -200,7 +200,7 @@ def test_a_large_finished_file_is_told_from_its_index_like_the_messages_tell_it(
     del items[2000:2060]
     path = runs.write(tmp_path, items)
     read = as_json(capsys, path)
-    monkeypatch.setattr("tools.verbs.info.LARGE", 1)
+    monkeypatch.setattr("tools.verbs.log.info.LARGE", 1)
     found = as_json(capsys, path)
     full = as_json(capsys, path, "--full")
     assert full == read
@@ -219,7 +219,7 @@ def test_a_large_file_that_was_cut_off_is_read_through(
 ) -> None:
     path = runs.write(tmp_path, [state(seq, 4 * seq) for seq in range(3000)])
     path.write_bytes(path.read_bytes()[:-200])
-    monkeypatch.setattr("tools.verbs.info.LARGE", 1)
+    monkeypatch.setattr("tools.verbs.log.info.LARGE", 1)
     found = as_json(capsys, path)
     assert not found["files"][0]["finished"]
     assert found["topics"][STATE_KEY]["bytes"] > 0

@@ -127,12 +127,3 @@ def test_a_time_lays_it_down_by_itself(
     assert cli.main(["pendant", "--for", "0.1", "--run-dir", str(tmp_path)]) == 0
     assert "laid down" in capsys.readouterr().out
     assert files[3].beats == 0
-
-
-def test_a_pendant_without_a_joint_service_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.main(["pendant", "--run-dir", str(tmp_path)]) == 2
-    assert "no joint service" in capsys.readouterr().err
-    assert cli.main(["pendant", "--for", "0", "--run-dir", str(tmp_path)]) == 2
-    assert "--for 0" in capsys.readouterr().err

@@ -16,9 +16,9 @@ from shared.places import DEFAULT_CONFIG
 from tests.certified import certified, opened
 from tests.shared.mcap_log import runs
 from tests.shared.mcap_log.runs import item, write
-from tools import cli
+from tools.flags import add_flags, read_flags
 from tools.logs.playback import arguments, reading
-from tools.verbs import play
+from tools.verbs.log import play
 
 LENGTH = 40
 """Messages, a millisecond apart."""
@@ -29,57 +29,9 @@ def log(tmp_path: Path) -> Path:
     return write(tmp_path, [item(n) for n in range(LENGTH)])
 
 
-def refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:
-    """Return the one line that a command line is refused with."""
-    assert cli.main(["play", *words]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("xrl: ")
-    assert error.count("\n") == 1, error
-    return error
-
-
-@pytest.mark.parametrize(
-    ("words", "right"),
-    [
-        (("--rate", "0"), "0.001 .. 1000 is right"),
-        (("--rate", "-1"), "0.001 .. 1000 is right"),
-        (("--start-offset", "-0.1"), "--start-offset -0.1"),
-        (("--start-offset", "9"), "the log is 0.04 s long"),
-        (("--duration", "0"), "--duration 0"),
-        (("--clock-hz", "0"), "--clock-hz 0"),
-        (("--topics", "joint/*/sate"), "the nearest is joint/*/state"),
-        (("--topics", "estop"), "nothing is left to play; the log holds joint/*/state"),
-        (("--exclude", "wrenchh"), "the nearest is harness/wrench"),
-        (("--remap", "joint/knee_right/state"), "OLD=NEW is right"),
-        (("--prefix", "xrl/lab"), "--prefix"),
-        (("--config", "nowhere.toml"), "nowhere.toml"),
-    ],
-)
-def test_a_meaningless_request_is_refused_in_one_line_with_what_would_be_right(
-    log: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], right: str
-) -> None:
-    error = refused(capsys, str(log), "--run-dir", str(log.parent / "r"), *words)
-    assert right in error
-    assert not (log.parent / "r").exists()
-
-
-def test_a_file_behind_a_list_of_names_is_asked_for(
-    log: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert "write it first" in refused(capsys, "--topics", "joint/*/state", str(log))
-
-
-def test_a_playback_without_a_start_is_refused(
-    log: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ("--start-paused", "--listen", "none", "--run-dir", str(log.parent / "r"))
-    assert "a terminal is needed" in refused(capsys, str(log), *words)
-    assert not (log.parent / "r").exists()
-
-
 def test_help_shows_the_keys_and_the_way_to_subscribe() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "tools.cli", "play", "--help"],
+        [sys.executable, "-m", "tools.cli", "log", "play", "--help"],
         capture_output=True,
         text=True,
         timeout=60,
@@ -96,8 +48,10 @@ def test_help_shows_the_keys_and_the_way_to_subscribe() -> None:
         assert words in done.stdout
 
 
-def arguments_of(log: Path, *words: str) -> argparse.Namespace:
-    return cli._parser(["play"]).parse_args(["play", str(log), *words])
+def arguments_of(log: Path, *words: str) -> arguments.PlayFlags:
+    parser = argparse.ArgumentParser()
+    add_flags(parser, arguments.PlayFlags)
+    return read_flags(arguments.PlayFlags, parser.parse_args([str(log), *words]))
 
 
 def test_the_bus_is_that_of_the_robot_file_given_else_of_the_log_else_as_shipped(

@@ -17,7 +17,7 @@ def test_the_copy_goes_beside_the_original_which_is_not_touched(
 ) -> None:
     killed = runs.killed_file(tmp_path)
     before = killed.path.read_bytes()
-    assert cli.main(["recover", str(killed.path)]) == 0
+    assert cli.main(["log", "recover", str(killed.path)]) == 0
     log = read_run(tmp_path / "killed.recovered.mcap")
     assert (log.complete, log.count(STATE_KEY)) == (True, 1200)
     assert killed.path.read_bytes() == before
@@ -30,7 +30,7 @@ def test_a_finished_file_is_left_and_nothing_is_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = runs.write(tmp_path, [item(0)])
-    assert cli.main(["recover", str(path)]) == 0
+    assert cli.main(["log", "recover", str(path)]) == 0
     assert "nothing to recover" in capsys.readouterr().out
     assert list(tmp_path.iterdir()) == [path]
 
@@ -40,13 +40,13 @@ def test_a_finished_file_with_damage_is_recovered(tmp_path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[data.index(b"zstd") + 100] ^= 1
     path.write_bytes(data)
-    assert cli.main(["recover", str(path)]) == 0
+    assert cli.main(["log", "recover", str(path)]) == 0
     assert 0 < read_run(tmp_path / "run.recovered.mcap").count(STATE_KEY) < 1000
 
 
 def test_with_an_output_a_finished_file_is_copied_too(tmp_path: Path) -> None:
     path = runs.write(tmp_path, [item(0)])
-    assert cli.main(["recover", str(path), "-o", str(tmp_path / "copy.mcap")]) == 0
+    assert cli.main(["log", "recover", str(path), "-o", str(tmp_path / "copy.mcap")]) == 0
     assert read_run(tmp_path / "copy.mcap").count(STATE_KEY) == 1
 
 
@@ -56,10 +56,10 @@ def test_an_existing_output_is_replaced_only_by_force(
     killed = runs.killed_file(tmp_path)
     out = tmp_path / "out.mcap"
     out.write_text("mine")
-    assert cli.main(["recover", str(killed.path), "-o", str(out)]) == 2
+    assert cli.main(["log", "recover", str(killed.path), "-o", str(out)]) == 2
     assert "exists already" in capsys.readouterr().err
     assert out.read_text() == "mine"
-    assert cli.main(["recover", str(killed.path), "-o", str(out), "--force"]) == 0
+    assert cli.main(["log", "recover", str(killed.path), "-o", str(out), "--force"]) == 0
     assert read_run(out).complete
 
 
@@ -68,9 +68,9 @@ def test_the_file_itself_is_no_output_even_by_force(
 ) -> None:
     killed = runs.killed_file(tmp_path)
     before = killed.path.read_bytes()
-    words = ["recover", str(killed.path), "-o", str(killed.path), "--force"]
+    words = ["log", "recover", str(killed.path), "-o", str(killed.path), "--force"]
     assert cli.main(words) == 2
-    assert "is the file itself" in capsys.readouterr().err
+    assert "is the record itself" in capsys.readouterr().err
     assert killed.path.read_bytes() == before
 
 
@@ -78,7 +78,9 @@ def test_an_output_that_cannot_be_written_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     killed = runs.killed_file(tmp_path)
-    assert cli.main(["recover", str(killed.path), "-o", str(tmp_path / "no" / "x.mcap")]) == 2
+    assert (
+        cli.main(["log", "recover", str(killed.path), "-o", str(tmp_path / "no" / "x.mcap")]) == 2
+    )
     output = capsys.readouterr().err
     assert "cannot be written: No such file or directory" in output
     assert len(output.splitlines()) == 1
@@ -90,7 +92,7 @@ def test_a_file_that_is_being_written_is_recovered_so_far(
     with runs.writer(tmp_path) as run:
         run.take_from(Queue([item(0), item(1)]), 10)
         run.flush()
-        assert cli.main(["recover", str(run.path), "-o", str(tmp_path / "so_far.mcap")]) == 0
+        assert cli.main(["log", "recover", str(run.path), "-o", str(tmp_path / "so_far.mcap")]) == 0
         assert "is writing this file" in capsys.readouterr().out
     assert read_run(tmp_path / "so_far.mcap").count(STATE_KEY) == 2
     assert read_run(run.path).complete

@@ -15,7 +15,7 @@ def record(tmp_path: Path) -> Path:
 
 
 def report(*arguments: object) -> int:
-    return cli.main(["report", *map(str, arguments)])
+    return cli.main(["log", "report", *map(str, arguments)])
 
 
 def test_the_page_is_written_beside_the_log(
@@ -34,13 +34,6 @@ def test_an_old_page_is_replaced_and_no_other_file_remains(record: Path, tmp_pat
     assert report(record, "-o", out, "--open", "no") == 0
     assert out.stat().st_size > 10_000
     assert sorted(path.name for path in tmp_path.iterdir()) == ["report.html", "run.mcap"]
-
-
-def test_the_log_is_never_overwritten(record: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    before = record.read_bytes()
-    assert report(record, "-o", record) == 2
-    assert record.read_bytes() == before
-    assert "is the log itself" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("out", ["", "absent/report.html"])

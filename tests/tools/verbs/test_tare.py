@@ -8,7 +8,7 @@ import pytest
 
 from shared.bus.messages import Tare, TareRequest, Wrench
 from shared.exceptions import FleetError
-from tools.verbs import tare
+from tools.verbs.drive import tare
 
 
 def wrench(up: float = 0.0, state: Tare = Tare.DONE, *, saturated: bool = False) -> Wrench:

@@ -15,17 +15,27 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from tests.conftest import ROBOT_FILE
 from tests.tools.exit_codes import exit_code
-from tools.bringup.tune import excitation
-from tools.bringup.tune.excitation import Excitation
+from tools.bringup.tune.excitation import Excitation, excitation
 from tools.bringup.tune.pose_probe import ProbeCourse
-from tools.verbs import tune
+from tools.verbs.drive import tune
 
 
 def test_a_direction_is_measured_beside_the_model_and_gains_are_proposed_that_do_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(excitation, "FREQUENCIES_HZ", (0.4, 0.6, 0.9, 1.2))
-    words = ["tune", "x", "--sim", "--bandwidth", "7", "--damping", "0.6", "--out", tmp_path]
+    words = [
+        "drive",
+        "tune",
+        "x",
+        "--sim",
+        "--bandwidth",
+        "7",
+        "--damping",
+        "0.6",
+        "--out",
+        tmp_path,
+    ]
     assert exit_code(words) == 0
     told = capsys.readouterr().out
     rows = {
@@ -42,31 +52,6 @@ def test_a_direction_is_measured_beside_the_model_and_gains_are_proposed_that_do
     assert (tmp_path / "tune.png").stat().st_size > 10_000
 
 
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (["up"], "up: one of x, y, z"),
-        (["x", "--bandwidth", "7"], "both, or none"),
-        (["x", "--bandwidth", "0", "--damping", "0.5"], "0.1 to 500"),
-        (["x", "--bandwidth", "7", "--damping", "9"], "0.05 to 3"),
-        (["x", "--size", "0.5", "--sim"], "law.probe_max"),
-        (["x", "--size", "0", "--sim"], "law.probe_max"),
-        (["x"], "no fleet"),
-        (["knee_left", "--sim"], "--sim: for a direction"),
-        (["knee_left", "--size", "0.01", "--plant", "ideal"], "--plant, --size: for a direction"),
-        (["x", "--sim", "--torque", "10"], "--torque: for a module"),
-        (["x", "--sim", "--axis", "phi"], "--axis: for a module"),
-        (["x", "--plant", "ideal"], "(--sim)"),
-        (["knee_left", "--torque", "0"], "more than 0"),
-    ],
-)
-def test_bad_words_are_refused_in_a_line(
-    words: list[str], told: str, capsys: pytest.CaptureFixture[str], run_dir: Path
-) -> None:
-    assert exit_code(["tune", *words, "--run-dir", run_dir]) == 2
-    assert told in capsys.readouterr().err
-
-
 def test_a_robot_file_may_forbid_probes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = ROBOT_FILE.read_text(encoding="utf-8")
     probes = list(config_file.load_without_schedule(ROBOT_FILE).law.probe_max)
@@ -74,12 +59,12 @@ def test_a_robot_file_may_forbid_probes(tmp_path: Path, capsys: pytest.CaptureFi
     path.write_text(text.replace(f"probe_max = {probes}", "probe_max = [0, 0, 0, 0, 0, 0]"))
     schedule = ROBOT_FILE.with_suffix(".gains.json").read_bytes()
     path.with_suffix(".gains.json").write_bytes(schedule)
-    assert exit_code(["tune", "x", "--dry-run", "--config", path]) == 2
+    assert exit_code(["drive", "tune", "x", "--dry-run", "--config", path]) == 2
     assert "forbids it" in capsys.readouterr().err
 
 
 def test_a_dry_run_tells_the_motion_and_moves_nothing(capsys: pytest.CaptureFixture[str]) -> None:
-    assert exit_code(["tune", "roll", "--dry-run"]) == 0
+    assert exit_code(["drive", "tune", "roll", "--dry-run"]) == 0
     assert "0.016 rad" in capsys.readouterr().out
 
 
@@ -97,7 +82,7 @@ def test_a_simulation_that_fails_leaves_what_was_measured(
         return ProbeCourse(t, r, np.asarray(y), "")
 
     monkeypatch.setattr(tune, "in_lockstep", falls)
-    assert exit_code(["tune", "roll", "--sim", "--out", tmp_path]) == 0
+    assert exit_code(["drive", "tune", "roll", "--sim", "--out", tmp_path]) == 0
     told = capsys.readouterr().out
     assert "predicted: the robot fell in lockstep" in told
     assert "natural frequency" in told

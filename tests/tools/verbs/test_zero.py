@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import io
 import math
 import re
@@ -23,8 +22,7 @@ from tools.bringup import drive_access, motion_runner, zeroing
 from tools.bringup.stand_angles import stand_angles
 from tools.bringup.zeroing import Back, DriveLook, is_right, look, refusal, why_outside, zero
 from tools.fleet.supervise import SupervisedFleet
-from tools.terminal import Console
-from tools.verbs import zero as verb
+from tools.verbs.drive import zero as verb
 
 MODULE = "knee_left"
 MARK = 64.0
@@ -201,44 +199,6 @@ def test_angles_outside_of_the_limits_are_refused(
     robot: RobotConfig, q: Pair, inside: bool
 ) -> None:
     assert (why_outside(robot, MODULE, q) == "") == inside
-
-
-def asked(**changes: object) -> argparse.Namespace:
-    fields = {"module": MODULE, "all": False, "at": None, "standing": None}
-    return argparse.Namespace(**{"by": None, **fields, **changes})
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ({"at": "0.1"}, "phi and theta in rad"),
-        ({"at": "a,b"}, "phi and theta in rad"),
-        ({"at": "0,0,0"}, "phi and theta in rad"),
-        ({"at": "0,0"}, r"knee_left: theta 0 rad is outside of -3 \.\. -0\.2"),
-        ({"at": "nan,-0.5"}, "number 1, .nan.: one within"),
-        ({"at": "0,-0.5", "all": True, "module": None}, "for one module"),
-        ({"at": "0,-28"}, r"outside .*if these are degrees: --at 0,-0\.4887$"),
-        ({"at": "0,-3.1"}, "leg could then not be bent by lifting alone$"),
-        ({"standing": 1.5}, "between 0 and"),
-        ({"standing": 1188.0}, r"if these are mm: --standing 1\.188"),
-        ({"standing": math.nan}, "between 0 and"),
-        ({"standing": 0.4}, "cannot be reached"),
-    ],
-)
-def test_what_cannot_be_is_refused_before_any_drive_is_touched(
-    robot: RobotConfig, arguments: dict[str, object], words: str
-) -> None:
-    with pytest.raises(XrlError, match=words):
-        verb.angles_of(asked(**arguments), robot, Console(quiet=True))
-
-
-@pytest.mark.parametrize("words", [["--at", "-0.02,0.14"], ["--at=-.02,0.14"], ["--at", "-1,-1"]])
-def test_angles_that_begin_with_a_minus_are_angles(words: list[str]) -> None:
-    parser = argparse.ArgumentParser()
-    verb.add_parser(parser.add_subparsers())
-    args = parser.parse_args(["zero", "ankle_right", *words])
-    assert args.at.startswith("-")
-    assert args.module == "ankle_right"
 
 
 @pytest.mark.parametrize("height", [0.9, 1.188])

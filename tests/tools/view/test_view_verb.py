@@ -7,14 +7,11 @@ import signal
 import subprocess
 import sys
 import urllib.request
-from pathlib import Path
 
 import pytest
 
 from shared.places import CHECKOUT
-from tests.tools.exit_codes import exit_code
 from tests.tools.view.test_record_source import LOG
-from tools import cli
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -34,28 +31,3 @@ def test_a_record_is_served_until_it_is_interrupted(number: signal.Signals) -> N
         finally:
             process.kill()
     assert (process.returncode, error) == (0, "")
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["no-such-file.mcap"], "no-such-file.mcap"),
-        (["--port", "70000", "--sim"], "at most 65535"),
-        ([str(LOG), "--sim"], "do not go together"),
-        ([str(LOG), "--act"], "--act is for the fleet that is up"),
-        (["--html", "run.html"], "--html is for a record"),
-        (["--sim", "--act"], "--act is for the fleet that is up"),
-    ],
-)
-def test_what_cannot_be_shown_is_one_line(
-    words: list[str], said: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    assert exit_code(["view", *words, "--run-dir", str(tmp_path / "r")]) == 2
-    assert said in capsys.readouterr().err.splitlines()[-1]
-
-
-def test_without_a_fleet_it_says_how_to_start_one(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    assert cli.main(["view", "--run-dir", str(tmp_path / "r")]) == 2
-    assert "`xrl up` starts one" in capsys.readouterr().err

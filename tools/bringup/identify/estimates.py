@@ -240,7 +240,7 @@ def measured(estimates: list[ParameterEstimate]) -> set[str]:
 
 
 def zero_corrections(estimates: list[ParameterEstimate]) -> dict[str, tuple[float, float]]:
-    """Return what `xrl drive zero MODULE --by` is to be given: (phi, theta), rad, of each module."""
+    """Return what `xrl drive zero MODULE --by` takes: (phi, theta), rad, of each module."""
     by_joint = {
         row.what.removeprefix("zero ").split()[0]: -row.value
         for row in estimates

@@ -1,1 +1,1 @@
-"""What `xrl drive tune` does: offsets a reference by known amounts, and tells how the robot answers."""
+"""What `xrl drive tune` does: offsets a reference by known amounts; how the robot answers."""

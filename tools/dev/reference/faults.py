@@ -18,8 +18,8 @@ _INTRODUCTION: Final = """\
 # Faults
 
 `xrl faults` prints this page's tables. Lockstep tests hold the robot to each row of the first two
-tables, and `xrl study crash` does so live. A module that lost torque is never re-armed automatically,
-even if its service restarts: a person mends the cause, then restarts the service.
+tables, and `xrl study crash` does so live. A module that lost torque is never re-armed
+automatically, even if its service restarts: a person mends the cause, then restarts the service.
 
 ## A fault of a drive
 

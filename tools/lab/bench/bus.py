@@ -5,14 +5,13 @@ Six modules and a planner, each a process of its own (`bus_process.py`).
 
 from __future__ import annotations
 
-import argparse
 import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
-from typing import Final, NamedTuple
+from typing import Annotated, Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -22,12 +21,11 @@ from shared.exceptions import RunError
 from shared.extras import missing_package
 from shared.joints import MODULES
 from shared.places import CHECKOUT
+from tools.flags import Arg, Duration
 from tools.lab.bench.bus_process import PLANNER, WARM_UP_S, BusReport
-from tools.lab.bench.table import add_flags, print_table, write_rows
+from tools.lab.bench.table import BenchFlags, print_table, write_rows
 from tools.lab.bench.transports import TRANSPORTS, installed
-from tools.number_arguments import finite
 from tools.terminal import Console
-from tools.verb_table import Subparsers
 
 ROUNDS: Final = 3
 PATIENCE_S: Final = 20.0
@@ -108,44 +106,29 @@ def _report(transport: str, process: subprocess.Popen[str], seconds: float) -> B
     return msgspec.json.decode(out.strip().splitlines()[-1], type=BusReport)
 
 
-def add_parser(others: Subparsers) -> None:
-    """Add the command."""
-    parser = others.add_parser(
-        "bus",
-        help="the fleet's pattern of messages over Zenoh and over other transports",
-        description="Run six modules at 500 Hz and a planner at 250 Hz, as processes that only "
-        "send and\nreceive, over each transport that is installed. Those beyond Zenoh and "
-        "datagrams come with\nthe extra `bench`.",
-        epilog="examples:\n  xrl bench bus\n"
-        "  xrl bench bus --transport zenoh --transport datagrams --seconds 30",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument(
-        "--transport",
-        action="append",
-        choices=[row.name for row in TRANSPORTS],
-        help="one of them; repeat it for several (default: all that are installed)",
-    )
-    parser.add_argument(
-        "--seconds", type=finite, default=10.0, metavar="S", help="of each run, s (10)"
-    )
-    add_flags(parser, ROUNDS, nested=True, compares=False)
-    parser.set_defaults(bench=run)
+class BusFlags(BenchFlags):
+    """Which transports, and how long."""
+
+    transport: Annotated[
+        tuple[str, ...], Arg(choices=tuple(row.name for row in TRANSPORTS), metavar="NAME")
+    ] = ()
+    """one of them; repeat it for several (default: all that are installed; those beyond Zenoh and
+    datagrams come with the extra `bench`)"""
+    seconds: Duration = 10.0
+    """of each run"""
 
 
-def run(args: argparse.Namespace) -> int:
+def run(flags: BusFlags) -> int:
     """Measure the transports in turn and print their medians."""
-    if not args.seconds > 0.0:
-        raise RunError(f"--seconds {args.seconds:g}: above 0")
     present = installed()
-    names = args.transport or list(present)
+    names = flags.transport or list(present)
     for name in names:
         if name not in present:
             raise missing_package("bench", [name])
     console = Console()
     rounds = [
-        [measure(name, args.seconds) for name in names]
-        for _ in track(range(args.rounds or ROUNDS), "measuring", console=console, transient=True)
+        [measure(name, flags.seconds) for name in names]
+        for _ in track(range(flags.rounds or ROUNDS), "measuring", console=console, transient=True)
     ]
     rows = [median_of(column) for column in zip(*rounds, strict=True)]
     print_table(
@@ -164,5 +147,5 @@ def run(args: argparse.Namespace) -> int:
         "Missed: a command came a cycle later than it could have. CPU: of all seven processes, in "
         "percent of one core.",
     )
-    write_rows(args.json, [row._asdict() for row in rows])
+    write_rows(flags.json, [row._asdict() for row in rows])
     return 0

@@ -5,7 +5,6 @@ Its record tells what it costs and achieves.
 
 from __future__ import annotations
 
-import argparse
 import signal
 import subprocess
 import sys
@@ -13,7 +12,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Annotated, Any, Final, NamedTuple, TypeAlias
 
 import msgspec
 import numpy as np
@@ -31,22 +30,22 @@ from shared.exceptions import FAULT_EXIT_CODE, RunError
 from shared.extras import require
 from shared.joints import MODULES
 from shared.places import CHECKOUT
-from tools.fleet.pace import check_pace
+from shared.toml_file import Range
+from tools.flags import Arg
+from tools.fleet.pace import PACE_MIN
 from tools.fleet.status_table import warn_of_others
 from tools.judge.verdict_table import digits
 from tools.lab.bench.revisions import environment, its_config, unpacked
 from tools.lab.bench.table import (
+    AgainstFlags,
     Row,
-    add_flags,
     compared,
     print_table,
     ratio_cell,
     write_rows,
 )
 from tools.logs.run_log import RunLog, read_run
-from tools.number_arguments import finite
 from tools.terminal import Console
-from tools.verb_table import Subparsers
 
 Array = NDArray[np.float64]
 
@@ -178,69 +177,46 @@ def rows(here: Sequence[Turn], there: Sequence[Turn], pace: float) -> list[Row]:
     ]
 
 
-def add_parser(others: Subparsers) -> None:
-    """Add the command."""
-    parser = others.add_parser(
-        "fleet",
-        help="the whole fleet, led live through the paper's experiment",
-        description="Run `xrl demo`, half a minute a turn, and print what the fleet costs, how old "
-        "commands\nare when they are used, and what the hand meets. With --against another git "
-        "revision is\nrun in turn with this tree: a shared machine may be twice as slow from one "
-        "minute to the\nnext, so the ratio of two that ran side by side says more than a time.",
-        epilog="examples:\n  xrl bench fleet\n"
-        "  xrl bench fleet --against HEAD~1 --rounds 5 --json fleet.json",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument(
-        "--scenario",
-        default="squat",
-        metavar="NAME|FILE",
-        help="what happens, as of `xrl demo` (squat, the paper's Fig. 7)",
-    )
-    parser.add_argument(
-        "--pace",
-        type=finite,
-        default=1.0,
-        metavar="X",
-        help="clock rate of the fleet (1); it is not lowered on full cores, and the targets are "
-        "those of 1",
-    )
-    add_flags(parser, ROUNDS, nested=True)
-    parser.set_defaults(bench=run)
+class FleetFlags(AgainstFlags):
+    """What is led."""
+
+    scenario: Annotated[str, Arg(metavar="NAME|FILE")] = "squat"
+    """what happens, as of `xrl demo` (default: squat, the paper's Fig. 7)"""
+    pace: Annotated[float, Range(PACE_MIN, 1.0, ""), Arg(metavar="X")] = 1.0
+    """clock rate of the fleet; it is not lowered on full cores, and the targets are those of 1"""
 
 
-def run(args: argparse.Namespace) -> int:
+def run(flags: FleetFlags) -> int:
     """Lead each tree in turn and print the medians; with --strict a missed target is a fault."""
     require("sim")
-    robot = config_file.load(args.config)
-    gain_schedule.require(robot, args.config)
-    check_pace(args.pace, simulated=True)
+    robot = config_file.load(flags.config)
+    gain_schedule.require(robot, flags.config)
     console = Console()
     warn_of_others(console)
-    config = args.config.resolve()
+    config = flags.config.resolve()
     turns: list[list[Turn]] = []
     with ExitStack() as stack:
         trees = [(CHECKOUT, config)]
-        if args.against is not None:
-            other = stack.enter_context(unpacked(args.against))
+        if flags.against is not None:
+            other = stack.enter_context(unpacked(flags.against))
             trees.append((other, its_config(config, other)))
-        runs = [tree for _ in range(args.rounds or ROUNDS) for tree in trees]
+        runs = [tree for _ in range(flags.rounds or ROUNDS) for tree in trees]
         led = [
-            measure(tree, its, args.scenario, args.pace)
+            measure(tree, its, flags.scenario, flags.pace)
             for tree, its in track(runs, "leading", console=console, transient=True)
         ]
         turns = [led[number :: len(trees)] for number in range(len(trees))]
-    found = rows(turns[0], turns[1] if len(turns) > 1 else (), args.pace)
-    compare = ("least .. most",) if args.against is None else (args.against, "ratio")
+    found = rows(turns[0], turns[1] if len(turns) > 1 else (), flags.pace)
+    compare = ("least .. most",) if flags.against is None else (flags.against, "ratio")
     print_table(
         console,
         ("", "here", *compare, "target"),
-        [_cells(row, args.against) for row in found],
+        [_cells(row, flags.against) for row in found],
         "Medians of the turns. CPU: in percent of one core. Late: later than two periods. "
         "Age: of a command, from the module's state that it answers to the cycle that takes it.",
     )
-    write_rows(args.json, [{**row._asdict(), "figure": row.what} for row in found])
-    return FAULT_EXIT_CODE if args.strict and not all(row.ok for row in found) else 0
+    write_rows(flags.json, [{**row._asdict(), "figure": row.what} for row in found])
+    return FAULT_EXIT_CODE if flags.strict and not all(row.ok for row in found) else 0
 
 
 def _cells(row: Row, against: str | None) -> list[Text | str]:

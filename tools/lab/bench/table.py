@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from statistics import median
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 from rich import box
 from rich.table import Table
@@ -15,7 +15,7 @@ from rich.text import Text
 
 from shared.atomic_file import replace_file
 from shared.exceptions import FAULT_EXIT_CODE
-from tools.number_arguments import count
+from tools.flags import Arg, ConfigFlags, Count, Flags, parsed
 from tools.terminal import Console, marked
 
 
@@ -91,53 +91,33 @@ def ratio_cell(row: Row) -> str:
     return "" if row.ratio is None else f"{row.ratio:.2f}"
 
 
-def add_flags(
-    parser: argparse.ArgumentParser, rounds: int, *, nested: bool = False, compares: bool = True
-) -> None:
-    """Add the flags of every command.
-
-    Args:
-        parser: of the verb, or of a command below it.
-        rounds: what the help calls the default; without the flag the argument is None.
-        nested: the command is below the verb, whose flags may stand before it too.
-        compares: it has targets, and compares this tree with another revision.
-    """
-    default = argparse.SUPPRESS if nested else None
-    if compares:
-        parser.add_argument(
-            "--against",
-            default=default,
-            metavar="REV",
-            help="measure a git revision too, in turn with this tree, and print the ratios; both "
-            "run in this environment",
-        )
-        parser.add_argument(
-            "--strict",
-            action="store_true",
-            default=argparse.SUPPRESS if nested else False,
-            help=f"exit code {FAULT_EXIT_CODE} if a target is missed",
-        )
-    parser.add_argument(
-        "--rounds", type=count, default=default, metavar="N", help=f"turns of each ({rounds})"
-    )
-    parser.add_argument(
-        "--json",
-        type=_writable,
-        default=default,
-        metavar="FILE",
-        help="write the figures there too",
-    )
-
-
-def write_rows(file: Path | None, rows: Sequence[Mapping[str, object]]) -> None:
-    """Write a table's rows to the file of `--json`, if there is one."""
-    if file is not None:
-        replace_file(file, json.dumps(rows, indent=2).encode() + b"\n")
-
-
 def _writable(text: str) -> Path:
     """Return a file's path; refused before minutes of measuring are lost to it."""
     file = Path(text)
     if file.is_dir() or not file.parent.is_dir():
         raise argparse.ArgumentTypeError(f"{text[:200]!r}: name a file in a folder that exists")
     return file
+
+
+class BenchFlags(Flags):
+    """How often, and where the figures go."""
+
+    rounds: Annotated[Count | None, Arg(metavar="N")] = None
+    """turns of each (default: 9 for the parts, 3 else)"""
+    json: Annotated[Path | None, parsed(_writable, "FILE")] = None
+    """write the figures there too"""
+
+
+class AgainstFlags(BenchFlags, ConfigFlags):
+    """A tree, and one to compare it with."""
+
+    against: Annotated[str | None, Arg(metavar="REV")] = None
+    """measure a git revision too, in turn with this tree, and print the ratios; both run in this
+    environment"""
+    strict: Annotated[bool, Arg(help=f"exit code {FAULT_EXIT_CODE} if a target is missed")] = False
+
+
+def write_rows(file: Path | None, rows: Sequence[Mapping[str, object]]) -> None:
+    """Write a table's rows to the file of `--json`, if there is one."""
+    if file is not None:
+        replace_file(file, json.dumps(rows, indent=2).encode() + b"\n")

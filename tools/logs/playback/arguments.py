@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
-import math
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
-from shared.exceptions import RunError
+from shared.toml_file import Range
+from tools.flags import FINITE_MAX, Arg, RunDirFlags, Seconds, option, positional
 from tools.logs.playback.schedule import RATE_MAX, RATE_MIN
 from tools.logs.playback.selection import CLOCK
-from tools.number_arguments import finite
-from tools.verb_table import add_run_dir
 
 PREFIX: Final = "replay"
 LISTEN: Final = "unixsock-stream/{run}/play.zenoh"
@@ -19,14 +16,6 @@ NOWHERE: Final = "none"
 CLOCK_HZ: Final = 100.0
 CLOCK_HZ_MAX: Final = 1000.0
 WAIT_S: Final = 1.0
-
-EXAMPLES: Final = """
-xrl log play out/a/run.mcap
-xrl log play out/a --rate 0.5 --loop --clock
-xrl log play run.mcap run_1.mcap --start-offset 10 --duration 2.5
-xrl log play run.mcap --topics 'joint/*/state' harness/wrench --start-paused
-xrl log play run.mcap --exclude 'joint/*/trace' --remap harness/wrench=harness/before
-"""
 
 ABOUT: Final = f"""
 Messages go out in the order and at the times at which the recorder had them, byte for byte:
@@ -55,107 +44,47 @@ summary says how many messages nobody heard.
 """
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Add every argument, with the warnings for a person."""
-    parser.description = f"{parser.description}\n{ABOUT.rstrip()}"
-    parser.add_argument(
-        "files",
-        nargs="*",
-        type=Path,
-        metavar="FILE",
-        help="files of a run in any order, finished or not, or its directory; write it first",
-    )
-    _add_what(parser)
-    _add_when(parser)
-    parser.add_argument(
-        "--listen",
-        default=LISTEN,
-        metavar="ENDPOINT",
-        help=f"where subscribers dial (default {LISTEN}); {NOWHERE}: nowhere",
-    )
-    parser.add_argument(
-        "--config",
-        type=Path,
-        metavar="FILE",
-        help="robot file with the bus's endpoints (default: that of the fleet in --run-dir, else "
-        "as shipped: never a log's)",
-    )
-    add_run_dir(parser)
+class PlayFlags(RunDirFlags):
+    """What of a log is put, when, and under which keys."""
 
-
-def _add_what(parser: argparse.ArgumentParser) -> None:
-    for flag, words in (("--topics", "play these only"), ("--exclude", "leave these out")):
-        parser.add_argument(
-            flag,
-            nargs="+",
-            action="extend",
-            default=[],
-            metavar="NAME",
-            help=f"{words}: names below xrl/<robot>/, or globs as joint/*/state",
-        )
-    parser.add_argument(
-        "--remap",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="OLD=NEW",
-        help="play OLD under the name NEW, both below xrl/<robot>/; * stands for the same in both",
+    files: Annotated[tuple[Path, ...], positional("FILE")] = ()
+    """files of a run in any order, finished or not, or its directory; write it first"""
+    topics: Annotated[tuple[str, ...], Arg(metavar="NAME", takes_many=True)] = ()
+    """play these only: names below xrl/<robot>/, or globs as joint/*/state"""
+    exclude: Annotated[tuple[str, ...], Arg(metavar="NAME", takes_many=True)] = ()
+    """leave these out: names below xrl/<robot>/, or globs as joint/*/state"""
+    remap: Annotated[tuple[str, ...], Arg(metavar="OLD=NEW", takes_many=True)] = ()
+    """play OLD under the name NEW, both below xrl/<robot>/; * stands for the same in both"""
+    prefix: Annotated[str, Arg(metavar="WORD")] = PREFIX
+    """what stands before each key (default: replay); empty: the live keys"""
+    force: bool = False
+    """on the live keys beside a live drive: also what it acts on, but for what moves it"""
+    rate: Annotated[float, Range(RATE_MIN, RATE_MAX, ""), option("--rate", "-r", metavar="R")] = 1.0
+    """recorded seconds for each second"""
+    start_offset: Annotated[Seconds, option("--start-offset", "-s")] = 0.0
+    """start S seconds after the first message of the log"""
+    duration: Annotated[float | None, Range(1e-9, FINITE_MAX, "s"), option("--duration", "-d")] = (
+        None
     )
-    parser.add_argument(
-        "--prefix",
-        default=PREFIX,
-        metavar="WORD",
-        help="what stands before each key (default: %(default)s); empty: the live keys",
-    )
-    parser.add_argument(
-        "--force",
-        action="store_true",
-        help="on the live keys beside a live drive: also what it acts on, but for what moves it",
-    )
-
-
-def _add_when(parser: argparse.ArgumentParser) -> None:
-    numbers = (
-        ("--rate", "-r", 1.0, "R", "recorded seconds for each second (default: %(default)g)"),
-        ("--start-offset", "-s", 0.0, "S", "start S seconds after the first message of the log"),
-        ("--duration", "-d", None, "S", "length of the part to play, in recorded seconds"),
-    )
-    for flag, short, default, metavar, words in numbers:
-        parser.add_argument(flag, short, type=finite, default=default, metavar=metavar, help=words)
-    parser.add_argument("--loop", "-l", action="store_true", help="again and again, until Ctrl-C")
-    parser.add_argument(
-        "--start-paused", "-p", action="store_true", help="until space is pressed; on a terminal"
-    )
-    parser.add_argument(
-        "--clock",
-        action="store_true",
-        help=f"publish the recorded time on PREFIX/{CLOCK}, as {{t_ns, seq}}",
-    )
-    parser.add_argument(
-        "--clock-hz",
-        type=finite,
-        default=CLOCK_HZ,
-        metavar="HZ",
-        help="its rate, in real time (default: %(default)g)",
-    )
-    parser.add_argument(
-        "--wait",
-        type=finite,
-        default=WAIT_S,
-        metavar="S",
-        help="longest wait for the first subscriber, seconds (default: %(default)g)",
-    )
-
-
-def check(args: argparse.Namespace) -> None:
-    """Refuse numbers that cannot be meant."""
-    for name, value, least, most in (
-        ("--rate", args.rate, RATE_MIN, RATE_MAX),
-        ("--start-offset", args.start_offset, 0.0, math.inf),
-        ("--duration", args.duration, 1e-9, math.inf),
-        ("--clock-hz", args.clock_hz, RATE_MIN, CLOCK_HZ_MAX),
-        ("--wait", args.wait, 0.0, math.inf),
-    ):
-        if value is not None and not (least <= value <= most and math.isfinite(value)):
-            limit = f"{least:g} .. {most:g}" if most < math.inf else f"a number from {least:g} on"
-            raise RunError(f"{name} {value:g}: {limit} is right")
+    """length of the part to play, in recorded seconds"""
+    loop: Annotated[bool, option("--loop", "-l")] = False
+    """again and again, until Ctrl-C"""
+    start_paused: Annotated[bool, option("--start-paused", "-p")] = False
+    """until space is pressed; on a terminal"""
+    clock: Annotated[
+        bool, Arg(help=f"publish the recorded time on PREFIX/{CLOCK}, as {{t_ns, seq}}")
+    ] = False
+    clock_hz: Annotated[float, Range(RATE_MIN, CLOCK_HZ_MAX, "Hz")] = CLOCK_HZ
+    """its rate, in real time"""
+    wait: Seconds = WAIT_S
+    """longest wait for the first subscriber"""
+    listen: Annotated[
+        str,
+        Arg(
+            metavar="ENDPOINT",
+            help=f"where subscribers dial (default {LISTEN}); {NOWHERE}: nowhere",
+        ),
+    ] = LISTEN
+    config: Path | None = None
+    """robot file with the bus's endpoints (default: that of the fleet in --run-dir, else as
+    shipped: never a log's)"""

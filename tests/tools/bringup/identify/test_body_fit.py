@@ -146,7 +146,9 @@ def test_the_findings_name_the_lines_to_write_and_the_zeros_to_correct(
     assert isinstance(constant, float)
     assert values["joint.tau_module_max"] == pytest.approx(most * constant, abs=0.1)
     assert "drive.torque_constant" in measured(estimates)
-    assert any("xrl drive configure" in remark for remark in remarks(estimates, robot)), "drives copy it"
+    assert any("xrl drive configure" in remark for remark in remarks(estimates, robot)), (
+        "drives copy it"
+    )
     corrections = zero_corrections(estimates)
     assert corrections["knee_right"][1] == pytest.approx(0.01, abs=5e-3)
     assert corrections["hip_left"][1] == pytest.approx(-0.012, abs=6e-3)

@@ -20,7 +20,7 @@ from tests.tools.judge.reports.layout_types import FIELD, PANELS, TOPIC, Layout,
 from tests.tools.judge.reports.runs import Made
 from tools import cli
 from tools.judge.reports import scene
-from tools.verbs.export import LAYOUT, layout_for
+from tools.verbs.log.export import LAYOUT, layout_for
 
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 
@@ -161,7 +161,7 @@ def test_panels_of_modes_list_the_names_of_their_numbers(panels: dict[str, Any])
 
 def test_a_layout_is_written_for_the_robot_of_the_log(made: Made, tmp_path: Path) -> None:
     out = tmp_path / "layout.json"
-    assert cli.main(["export", str(made.path), "--layout", str(out)]) == 0
+    assert cli.main(["log", "export", str(made.path), "--layout", str(out)]) == 0
     assert json.loads(out.read_text(encoding="utf-8")) == layout_for("xrl")
     text = json.dumps(layout_for("lab-2"))
     assert "xrl/xrl/" not in text

@@ -30,7 +30,7 @@ from tools.logs.run_log import RunLog
 @pytest.fixture(scope="module")
 def drawn(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("gif") / "run.gif"
-    assert cli.main(["export", str(made.path), "--gif", str(out)]) == 0
+    assert cli.main(["log", "export", str(made.path), "--gif", str(out)]) == 0
     return out
 
 
@@ -51,7 +51,7 @@ def test_the_picture_is_as_long_as_the_scenario(drawn: Path) -> None:
 def test_curves_grow_beside_it_until_they_are_whole(made: Made, tmp_path: Path) -> None:
     """The height's curve has ink farther right in each later frame, up to its panel's end."""
     out = tmp_path / "fig7.gif"
-    assert cli.main(["export", str(made.path), "--gif", str(out), "--curves"]) == 0
+    assert cli.main(["log", "export", str(made.path), "--gif", str(out), "--curves"]) == 0
     ends = []
     with Image.open(out) as picture:
         assert picture.size == (SIZE[0] + WIDTH, SIZE[1])
@@ -67,7 +67,7 @@ def test_curves_grow_beside_it_until_they_are_whole(made: Made, tmp_path: Path) 
 def test_curves_without_a_picture_are_refused(
     made: Made, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli.main(["export", str(made.path), "--scene", "--curves"]) == 2
+    assert cli.main(["log", "export", str(made.path), "--scene", "--curves"]) == 2
     assert "name it with --gif FILE" in capsys.readouterr().err
 
 
@@ -85,5 +85,5 @@ def test_modules_change_their_colour_from_track_to_hold_when_the_planner_dies(dr
 def test_a_picture_that_exists_is_not_replaced_unasked(
     drawn: Path, made: Made, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli.main(["export", str(made.path), "--gif", str(drawn)]) == 2
+    assert cli.main(["log", "export", str(made.path), "--gif", str(drawn)]) == 2
     assert "exists already" in capsys.readouterr().err

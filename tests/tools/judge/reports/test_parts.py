@@ -126,7 +126,7 @@ def test_a_part_of_a_run_has_the_time_of_the_whole_and_all_events(
 ) -> None:
     out = tmp_path / "part.html"
     words = ["--from", "1", "--to", "2", "-o", str(out), "--open", "no"]
-    assert cli.main(["report", str(made.path), *words]) == 0
+    assert cli.main(["log", "report", str(made.path), *words]) == 0
     assert 'id="verdict">A part of a run, and its figures: no verdict<' in out.read_text()
     data = runs.data_of(out.read_text())
     assert data["span"] == pytest.approx([1.0, 2.0], abs=1e-6)
@@ -147,7 +147,7 @@ def test_a_part_of_a_run_has_the_time_of_the_whole_and_all_events(
 def test_a_part_that_is_not_there_is_told_with_what_is(
     made: Made, words: tuple[str, ...], told: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli.main(["report", str(made.path), *words, "--open", "no"]) == 2
+    assert cli.main(["log", "report", str(made.path), *words, "--open", "no"]) == 2
     assert told in capsys.readouterr().err
 
 

@@ -286,7 +286,7 @@ def test_an_impossible_export_prints_one_line(
         ([half, "--scene", "-o", out], "no states of hip_left"),
         ([bare, "--scene", "-o", out], "holds no robot.toml"),
     ):
-        assert cli.main(["export", *map(str, arguments)]) == 2
+        assert cli.main(["log", "export", *map(str, arguments)]) == 2
         printed = capsys.readouterr().err
         assert words in printed
         assert printed.count("\n") == 1

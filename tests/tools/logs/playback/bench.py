@@ -74,7 +74,7 @@ def write(
 
 @contextlib.contextmanager
 def playing(run_dir: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
-    command = [sys.executable, "-m", "tools.cli", "play", *words, "--run-dir", str(run_dir)]
+    command = [sys.executable, "-m", "tools.cli", "log", "play", *words, "--run-dir", str(run_dir)]
     process = subprocess.Popen(
         command,
         cwd=ROOT,

@@ -29,7 +29,7 @@ from tools.logs.reexecution.params import with_params
 from tools.logs.reexecution.ranges import execute_range, merged, ranges_of
 from tools.logs.run_log import WHOLE, RunLog, RunPart, parts_of, read_run
 from tools.sim.recorded_lockstep import simulate
-from tools.verbs import resim
+from tools.verbs.log import resim
 
 
 @pytest.fixture(scope="module")
@@ -204,7 +204,7 @@ def test_a_difference_is_told_with_its_likely_reason_and_none_without(
 ) -> None:
     versions = provenance.packages()
     reason = f"numpy {versions['numpy']}, here 0.1"
-    words = ["resim", str(recorded), "--service", "planner", "--until-first-difference"]
+    words = ["log", "resim", str(recorded), "--service", "planner", "--until-first-difference"]
     monkeypatch.setattr(provenance, "packages", lambda: versions | {"numpy": "0.1"})
     assert exit_code(words) == 0
     assert reason not in capsys.readouterr().out
@@ -220,14 +220,14 @@ def test_a_changed_gain_changes_what_comes_out_from_the_first_tick_with_an_error
     out = tmp_path / "changed.mcap"
     changed_gain = ["--param", "gains.k_p_x=2000"]
     code = cli.main(
-        ["resim", str(recorded), "--service", "planner", *changed_gain, "--out", str(out)]
+        ["log", "resim", str(recorded), "--service", "planner", *changed_gain, "--out", str(out)]
     )
     assert code == 0
     text = capsys.readouterr().out
     assert "planner, first at" in text
     assert "largest changes" in text
     new = read_run(out)
-    assert new.metadata["resim"]["params"] == "gains.k_p_x=2000"
+    assert new.metadata["log", "resim"]["params"] == "gains.k_p_x=2000"
     assert new.count(topics.SIM_TRUTH.key(log.robot)) == log.count(topics.SIM_TRUTH.key(log.robot))
     old_commands = log.messages(topics.JOINT_COMMAND, "ankle_left")
     new_commands = new.messages(topics.JOINT_COMMAND, "ankle_left")

@@ -1,4 +1,4 @@
-"""`xrl study sweep push`: the hardest push by direction, duration, pose and mode, beside the limits."""
+"""`xrl study sweep push`: the hardest push by direction, duration, pose and mode."""
 
 from __future__ import annotations
 

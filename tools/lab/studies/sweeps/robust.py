@@ -1,4 +1,4 @@
-"""`xrl study sweep robust`: every error of the plant drawn at once: who falls, what takes the margin."""
+"""`xrl study sweep robust`: every error of the plant drawn at once: who falls, and why."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`xrl study sweep trips`: does each trip come where it is to, on each plant, and none where not?"""
+"""`xrl study sweep trips`: does each trip come where it is to, and none where not?"""
 
 from __future__ import annotations
 

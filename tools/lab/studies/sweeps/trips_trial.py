@@ -1,6 +1,6 @@
 """One trial of the trips: something that is to trip, or is not, on a plant, with trips and without.
 
-Pushes are not here: one that tips a sole is stood, or is beyond what soles bear (`xrl study sweep push`).
+Pushes are not here: one that tips a sole is stood, or beyond what soles bear.
 """
 
 from __future__ import annotations

@@ -193,7 +193,7 @@ def test_cases_are_chosen_by_name_pattern_and_length() -> None:
 
 
 def test_a_name_that_fits_no_case_is_one_line_with_those_it_may_mean(tmp_path: Path) -> None:
-    done = xrl("crashtest", "--only", "kill-kne_left", "--out", str(tmp_path / "out"))
+    done = xrl("study", "crash", "--only", "kill-kne_left", "--out", str(tmp_path / "out"))
     assert_one_line_error(done)
     assert "kill-knee_left" in done.stderr
     assert "--list" in done.stderr
@@ -201,7 +201,7 @@ def test_a_name_that_fits_no_case_is_one_line_with_those_it_may_mean(tmp_path: P
 
 
 def test_list_runs_nothing_and_names_every_case(tmp_path: Path) -> None:
-    done = xrl("crashtest", "--list", "--out", str(tmp_path / "out"))
+    done = xrl("study", "crash", "--list", "--out", str(tmp_path / "out"))
     assert done.returncode == 0, done.stderr
     assert all(case.name in done.stdout for case in CASES)
     assert not (tmp_path / "out").exists()
@@ -209,7 +209,7 @@ def test_list_runs_nothing_and_names_every_case(tmp_path: Path) -> None:
 
 def test_results_that_are_there_are_left_alone(tmp_path: Path) -> None:
     (tmp_path / report.RESULTS).write_text("kept")
-    assert_one_line_error(xrl("crashtest", "--quick", "--out", str(tmp_path)))
+    assert_one_line_error(xrl("study", "crash", "--quick", "--out", str(tmp_path)))
     assert (tmp_path / report.RESULTS).read_text() == "kept"
 
 

@@ -1,31 +1,18 @@
-"""`xrl assist`: ask the robot to carry some of the person, for as long as the verb runs."""
+"""A request for assist, repeated for as long as it is meant, and what the planner makes of it."""
 
 from __future__ import annotations
 
-import argparse
-import os
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Final, Protocol
 
-from rich.live import Live
 from rich.text import Text
 
-from shared.bus import topics
-from shared.bus.messages import STRAIGHT, OperatorIntent, PlannerMode, PlannerStatus, Vector4
-from shared.bus.session import open_session
+from shared.bus.messages import OperatorIntent, PlannerMode, PlannerStatus, Vector4
 from shared.clock import now_ns
-from shared.config.files import load
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import SCENARIO
 from shared.exceptions import FleetError
-from shared.process import StopFlag
-from shared.user import user_name
-from tools.fleet.supervise import SupervisedFleet
-from tools.number_arguments import finite, finite_numbers
-from tools.terminal import Console
-from tools.verb_table import Subparsers, add_run_dir, add_verb
 
 REPEAT_S: Final = 0.02
 HEARD_S: Final = 3.0
@@ -55,53 +42,6 @@ class Shown(Protocol):
 
     def update(self, renderable: Text) -> None:
         """Show a line in place of the last."""
-
-
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(
-        subparsers,
-        "assist",
-        """
-        xrl assist 80                     # N, until Ctrl-C; then it fades out
-        xrl assist 80 --for 60            # for a minute
-        xrl assist 0 --shift 0.02,0,0,0   # lean the COM 2 cm forwards
-        """,
-    )
-    add_run_dir(parser)
-    parser.add_argument("assist", type=finite, metavar="N", help="upward force on the person, N")
-    parser.add_argument(
-        "--shift",
-        type=_shift,
-        default=STRAIGHT,
-        metavar="X,Y,ROLL,YAW",
-        help="where COM (m) and torso (rad) are to be off a straight stand (0,0,0,0)",
-    )
-    parser.add_argument(
-        "--for", dest="for_s", type=finite, metavar="S", help="seconds (default: until Ctrl-C)"
-    )
-
-
-def run(args: argparse.Namespace) -> int:
-    """Publish the request until stopped."""
-    fleet = SupervisedFleet.attach(args.run_dir)
-    robot = load(Path(fleet.manifest.config))
-    refuse_beyond_limits(robot, args.assist, args.shift)
-    if args.for_s is not None and not args.for_s > 0.0:
-        raise FleetError(f"--for {args.for_s:g}: a time is right, such as 60")
-    stop = StopFlag()
-    source = f"xrl assist by {user_name()} ({os.getpid()})"
-    with open_session(robot, "assist", args.run_dir) as session:
-        intents = session.publisher(topics.OPERATOR_INTENT, OperatorIntent)
-        statuses = session.latest(topics.PLANNER_STATUS, PlannerStatus)
-        with Live(console=Console(), refresh_per_second=4, transient=True) as shown:
-            request = OperatorIntent(
-                t_ns=now_ns(), seq=0, assist_n=args.assist, shift=args.shift, source=source
-            )
-            given = ask(intents, statuses, request, lambda: bool(stop), shown, for_s=args.for_s)
-    fade_s = robot.assist.fade_s
-    Console().print(f"request ended: {given:.0f} N were given; they fade out in {fade_s:g} s")
-    return 0
 
 
 def refuse_beyond_limits(robot: RobotConfig, assist: float, shift: Vector4) -> None:
@@ -198,11 +138,3 @@ def _first(statuses: Statuses, stop: Stop) -> PlannerStatus | None:
             raise FleetError("the planner is silent; see `xrl status`")
         time.sleep(REPEAT_S)
     return None
-
-
-def _shift(text: str) -> Vector4:
-    try:
-        x, y, roll, yaw = finite_numbers(text, 4)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"{error}; such as 0.02,0,0,0") from None
-    return x, y, roll, yaw

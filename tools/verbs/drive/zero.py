@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import math
-import re
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import msgspec
 from rich import box
@@ -28,82 +26,87 @@ from shared.joints import MODULES
 from tools.bringup import drive_access
 from tools.bringup.motion import within_stops
 from tools.bringup.zeroing import DriveLook, is_right, look, refusal, why_outside, zero
+from tools.flags import (
+    Arg,
+    FleetRobotFlags,
+    Number,
+    numbers,
+    parsed,
+    positional,
+)
 from tools.fleet.supervise import SupervisedFleet
-from tools.number_arguments import finite, finite_numbers
 from tools.terminal import Console, marked
-from tools.verb_table import FLEET, Subparsers, add_config, add_run_dir, add_verb
 
 DEGREES_FROM: Final = 7.0
 """No joint has an angle of so many rad: more than a turn."""
 CORRECTION_MAX: Final = 0.1
 """rad; more is no error of a protractor."""
-_NEGATIVE = re.compile(r"-\.?\d")
 
 HEARD_S: Final = 2.0
 """Longest wait for the states of joint services that are up."""
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(
-        subparsers,
-        "zero",
-        """
-        xrl drive zero knee_left --at 0,-0.5          # by a protractor: phi, theta in rad
-        xrl drive zero ankle_right --at -0.02,0.14
-        xrl drive zero --all --standing 1.188         # in the jig: soles flat, hips 1.188 m above ankles
-        xrl drive zero knee_left --by 0,-0.009        # corrects a zero, as `xrl drive identify body` tells
-        """,
-    )
-    which = parser.add_mutually_exclusive_group(required=True)
-    which.add_argument("module", nargs="?", choices=MODULES, metavar="MODULE", help="one module")
-    which.add_argument("--all", action="store_true", help="all six")
-    where = parser.add_mutually_exclusive_group(required=True)
-    where.add_argument(
-        "--at",
-        metavar="PHI,THETA",
-        help="the joint is at these angles now, rad, as 0,-0.5",
-    )
-    # "-0.02,0.14" is a value and no option, as a single negative number is to argparse
-    parser._negative_number_matcher = _NEGATIVE  # noqa: SLF001 - no public way
-    where.add_argument(
-        "--by",
-        metavar="PHI,THETA",
-        help="the joint is this much farther, rad, than its present zero says",
-    )
-    where.add_argument(
-        "--standing",
-        type=finite,
-        metavar="HEIGHT",
-        help="the robot stands or hangs as if it stood: both soles flat and level, at their "
-        "distance (geometry.w_base), torso upright, COM over the ankles, the hips' axis so many "
-        "m above the ankles'; the angles then follow from the lengths in the robot file",
-    )
-    parser.add_argument("--yes", action="store_true", help="do not ask")
-    add_config(parser, before=FLEET)
-    add_run_dir(parser)
+EXAMPLES: Final = """
+xrl drive zero knee_left --at 0,-0.5          # by a protractor: phi, theta in rad
+xrl drive zero ankle_right --at -0.02,0.14
+xrl drive zero --all --standing 1.188         # in the jig: soles flat, hips 1.188 m above ankles
+xrl drive zero knee_left --by 0,-0.009        # corrects a zero, as `xrl drive identify body` tells
+"""
 
 
-def run(args: argparse.Namespace) -> int:
+_PAIR: Final = numbers(2, "phi and theta in rad, such as 0,-0.5")
+
+
+class ZeroFlags(FleetRobotFlags):
+    """Which modules, and where their joints are."""
+
+    module: Annotated[str | None, positional("MODULE", choices=MODULES, exclusive="which!")] = None
+    """one module"""
+    all: Annotated[bool, Arg(exclusive="which!")] = False
+    """all six"""
+    at: Annotated[Pair | None, parsed(_PAIR, "PHI,THETA", exclusive="where!")] = None
+    """the joint is at these angles now, rad, as 0,-0.5"""
+    by: Annotated[Pair | None, parsed(_PAIR, "PHI,THETA", exclusive="where!")] = None
+    """the joint is this much farther, rad, than its present zero says"""
+    standing: Annotated[Number | None, Arg(metavar="HEIGHT", exclusive="where!")] = None
+    """the robot stands or hangs as if it stood: both soles flat and level, at their distance
+    (geometry.w_base), torso upright, COM over the ankles, the hips' axis so many m above the
+    ankles'; the angles then follow from the lengths in the robot file"""
+    yes: bool = False
+    """do not ask"""
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """The selected modules."""
+        return MODULES if self.module is None else (self.module,)
+
+    def check(self) -> None:
+        """Refuse one module's angles for all."""
+        super().check()
+        if self.all and self.standing is None:
+            raise DriveError("--at and --by are for one module; for all give --standing HEIGHT")
+
+
+def run(flags: ZeroFlags) -> int:
     """Look, ask, set, read back."""
     console = Console()
-    path = drive_access.robot_file(args)
+    path = drive_access.robot_file(flags)
     robot = config_file.load_without_schedule(path)
-    wanted = angles_of(args, robot, console)
-    by = None if args.by is None else _pair("--by", args.by)
-    modules = tuple(wanted) or (args.module,)
-    holders = {module: drive_access.service_on(robot, module, args.run_dir) for module in modules}
-    with drive_access.drives_to_ourselves(robot, path, args.run_dir, console.print) as started:
+    wanted = angles_of(flags, robot, console)
+    by = flags.by
+    modules = tuple(wanted) or flags.modules
+    holders = {module: drive_access.service_on(robot, module, flags.run_dir) for module in modules}
+    with drive_access.drives_to_ourselves(robot, path, flags.run_dir, console.print) as started:
         refuse_services(robot, holders)
         with contextlib.ExitStack() as stack:
-            drives = {module: _open(robot, module, args.run_dir, stack) for module in modules}
+            drives = {module: _open(robot, module, flags.run_dir, stack) for module in modules}
             before = _look_all(robot, drives)
             if by is not None:
                 wanted = corrected(before, by, robot)
             console.print(plan_table(wanted, before))
             _warn(wanted, holders, console)
             question = "Are the joints at these angles now?" if by is None else "Correct the zero?"
-            if not drive_access.confirm(question, yes=args.yes):
+            if not drive_access.confirm(question, yes=flags.yes):
                 console.print("nothing was changed")
                 return DECLINED_EXIT_CODE
             refuse_services(robot, holders)  # a person may take minutes to answer
@@ -116,30 +119,26 @@ def run(args: argparse.Namespace) -> int:
     return code
 
 
-def angles_of(args: argparse.Namespace, robot: RobotConfig, console: Console) -> dict[str, Pair]:
+def angles_of(flags: ZeroFlags, robot: RobotConfig, console: Console) -> dict[str, Pair]:
     """Return the position (phi, theta), rad, of each selected module; none yet for `--by`.
 
     Raises:
-        DriveError: the value is not two angles, or one is outside the limits.
+        DriveError: an angle is outside the limits.
         RunError: there is no such stand.
     """
-    modules = MODULES if args.all else (args.module,)
-    if args.all and args.standing is None:
-        raise DriveError("--at and --by are for one module; for all give --standing HEIGHT")
-    if args.by is not None:
-        return {}
-    if args.at is not None:
-        wanted = {args.module: _pair("--at", args.at)}
-    else:
+    wanted: dict[str, Pair] = {}
+    if flags.at is not None:
+        wanted = dict.fromkeys(flags.modules, flags.at)
+    elif flags.standing is not None:
         from tools.bringup.stand_angles import stand_angles  # noqa: PLC0415 - takes a second
 
-        stand = stand_angles(robot, args.standing)
+        stand = stand_angles(robot, flags.standing)
         console.print(
-            f"a stand with the hips {args.standing:g} m above the ankles and "
+            f"a stand with the hips {flags.standing:g} m above the ankles and "
             f"{abs(stand.hips_forward):.3f} m {'before' if stand.hips_forward > 0 else 'behind'} "
             "them, torso upright, soles flat"
         )
-        wanted = {module: stand.q[module] for module in modules}
+        wanted = {module: stand.q[module] for module in flags.modules}
     for module, q in wanted.items():
         if fault := why_outside(robot, module, q):
             raise DriveError(f"{module}: {fault}{_if_degrees(q)}")
@@ -306,14 +305,6 @@ def _way_out(module: str, mode: Mode) -> str:
         f"its joint service is in {mode.name}; hang the robot and `xrl kill {module}` "
         "(a restart leaves it), or `xrl down` first"
     )
-
-
-def _pair(option: str, text: str) -> Pair:
-    try:
-        phi, theta = finite_numbers(text, 2)
-    except ValueError as error:
-        raise DriveError(f"{option}: {error}; phi and theta in rad, such as 0,-0.5") from None
-    return phi, theta
 
 
 def _angles(q: Pair) -> str:

@@ -1,11 +1,10 @@
-"""`xrl drive tune`: how a direction of the body, or a module, answers; gains for a wanted answer."""
+"""`xrl drive tune`: how a direction of the body, or a module, answers; gains for it."""
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import msgspec
 import numpy as np
@@ -21,6 +20,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, RunError
 from shared.extras import require
 from shared.joints import AXES, MODULES
+from shared.toml_file import Range
 from tools.bringup import drive_access, module_motion
 from tools.bringup.hanging_leg import hanging_joint
 from tools.bringup.motion_runner import Interrupts
@@ -35,12 +35,11 @@ from tools.bringup.tune.pose_probe import (
 )
 from tools.bringup.tune.report import answer_table, draw
 from tools.bringup.tune.response import ResponseFit, answer_of, propose
+from tools.flags import FINITE_MAX, Arg, Folder, MotionFlags, Number, positional
 from tools.fleet.supervise import SupervisedFleet
 from tools.live import experiment
-from tools.number_arguments import finite
 from tools.output import make_folder, progress_along
 from tools.terminal import Console, marked
-from tools.verb_table import FLEET, Subparsers, add_config, add_run_dir, add_verb
 
 SIZE_SHARE: Final = 0.8
 """Of `law.probe_max`."""
@@ -49,110 +48,98 @@ STATUSES_MIN: Final = 1000
 UNITS: Final = ("N/m", "N/m", "N/m", "N m/rad", "N m/rad", "N m/rad")
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(
-        subparsers,
-        "tune",
+EXAMPLES: Final = """
+xrl drive tune x                                    # the robot that is up: step and sines
+xrl drive tune y --sim                              # in virtual time, on the realistic plant
+xrl drive tune y --sim --plant drivetrain.stiffness=3000
+xrl drive tune x --bandwidth 7 --damping 0.6        # proposes K_p and B_p
+xrl drive tune ankle_left --axis theta              # hanging, the fleet down
+xrl drive tune x --dry-run
+"""
+
+
+class TuneFlags(MotionFlags, experiment.PlantFlags):
+    """What is probed, how strongly, and which answer is wanted."""
+
+    what: Annotated[
+        str,
+        positional(
+            "WHAT",
+            choices=(*DIRECTIONS, *MODULES),
+            help=f"one of {', '.join(DIRECTIONS)}; or a module, hanging",
+        ),
+    ]
+    size: Annotated[Number | None, Arg(metavar="S")] = None
+    """of a direction's step and sines, m or rad"""
+    axis: Annotated[str | None, Arg(choices=AXES)] = None
+    """of a module (theta)"""
+    torque: Annotated[float | None, Range(1e-3, FINITE_MAX, "N m")] = None
+    """of a module's step and sines (15; 60 for legs)"""
+    bandwidth: Annotated[float | None, Range(0.1, 500.0, "rad/s")] = None
+    """wanted natural frequency"""
+    damping: Annotated[float | None, Range(0.05, 3.0, ""), Arg(metavar="RATIO")] = None
+    """wanted damping ratio"""
+    sim: bool = False
+    """a robot in virtual time, no fleet"""
+    out: Folder | None = None
+    """for the picture (out/tune-<time>)"""
+
+    @property
+    def wanted(self) -> tuple[float, float] | None:
+        """Natural frequency, rad/s, and damping ratio of the wanted answer."""
+        if self.bandwidth is None or self.damping is None:
+            return None
+        return self.bandwidth, self.damping
+
+    def check(self) -> None:
+        """Refuse half a wish, and flags of the other kind.
+
+        Who asks for virtual time must not move a real module.
         """
-        xrl drive tune x                                    # the robot that is up: step and sines
-        xrl drive tune y --sim                              # in virtual time, on the realistic plant
-        xrl drive tune y --sim --plant drivetrain.stiffness=3000
-        xrl drive tune x --bandwidth 7 --damping 0.6        # proposes K_p and B_p
-        xrl drive tune ankle_left --axis theta              # hanging, the fleet down
-        xrl drive tune x --dry-run
-        """,
-    )
-    parser.add_argument(
-        "what", metavar="WHAT", help=f"one of {', '.join(DIRECTIONS)}; or a module, hanging"
-    )
-    parser.add_argument(
-        "--size", type=finite, metavar="S", help="of a direction's step and sines, m or rad"
-    )
-    parser.add_argument("--axis", choices=AXES, help="of a module (theta)")
-    parser.add_argument(
-        "--torque", type=finite, metavar="NM", help="of a module's step and sines (15; 60 for legs)"
-    )
-    parser.add_argument(
-        "--bandwidth", type=finite, metavar="RAD/S", help="wanted natural frequency"
-    )
-    parser.add_argument("--damping", type=finite, metavar="RATIO", help="wanted damping ratio")
-    parser.add_argument("--sim", action="store_true", help="a robot in virtual time, no fleet")
-    parser.add_argument("--dry-run", action="store_true", help="show the motions, move nothing")
-    parser.add_argument("--yes", action="store_true", help="do not ask")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="for the picture (out/tune-<time>)")
-    experiment.add_plant(parser)
-    add_config(parser, before=FLEET)
-    add_run_dir(parser)
+        super().check()
+        if (self.bandwidth is None) != (self.damping is None):
+            raise RunError("--bandwidth and --damping: both, or none")
+        of_directions = {"--sim": self.sim, "--plant": self.plant, "--size": self.size is not None}
+        of_modules = {"--axis": self.axis is not None, "--torque": self.torque is not None}
+        is_module = self.what in MODULES
+        others = of_directions if is_module else of_modules
+        wrong = [name for name, given in others.items() if given]
+        if wrong:
+            kind = "a direction" if is_module else "a module"
+            raise RunError(f"{', '.join(wrong)}: for {kind}, and {self.what} is none")
+        if self.plant and not self.sim:
+            raise RunError("--plant: for a robot in virtual time (--sim)")
 
 
-def run(args: argparse.Namespace) -> int:
+def run(flags: TuneFlags) -> int:
     """Measure, compare with what the model predicts, and propose; 0 if it was not stopped."""
     console = Console()
-    if args.what not in (*DIRECTIONS, *MODULES):
-        raise RunError(f"{args.what[:40]}: one of {', '.join((*DIRECTIONS, *MODULES))} is right")
-    _check_wanted(args)
-    _refuse_mixed(args)
-    if not args.dry_run:
-        require("sim" if args.sim else "plot")
-    if args.what in MODULES:
-        return _tune_module(args, console)
-    return _tune_direction(args, console)
+    if not flags.dry_run:
+        require("sim" if flags.sim else "plot")
+    if flags.what in MODULES:
+        return _tune_module(flags, console)
+    return _tune_direction(flags, console)
 
 
-def _check_wanted(args: argparse.Namespace) -> None:
-    """Refuse half a wish, or one that no loop can have.
-
-    Raises:
-        RunError: saying what would be right.
-    """
-    wanted = (args.bandwidth, args.damping)
-    if (wanted[0] is None) != (wanted[1] is None):
-        raise RunError("--bandwidth and --damping: both, or none")
-    if wanted[0] is not None and not 0.1 <= wanted[0] <= 500.0:
-        raise RunError(f"--bandwidth {wanted[0]:g}: 0.1 to 500 rad/s is right")
-    if wanted[1] is not None and not 0.05 <= wanted[1] <= 3.0:
-        raise RunError(f"--damping {wanted[1]:g}: 0.05 to 3 is right")
-
-
-def _refuse_mixed(args: argparse.Namespace) -> None:
-    """Refuse options of the other kind: who asks for virtual time must not move a real module.
-
-    Raises:
-        RunError: naming them.
-    """
-    of_directions = {"--sim": args.sim, "--plant": args.plant, "--size": args.size is not None}
-    of_modules = {"--axis": args.axis is not None, "--torque": args.torque is not None}
-    is_module = args.what in MODULES
-    wrong = [name for name, given in (of_directions if is_module else of_modules).items() if given]
-    if wrong:
-        kind = "a direction" if is_module else "a module"
-        raise RunError(f"{', '.join(wrong)}: for {kind}, and {args.what} is none")
-    if args.plant and not args.sim:
-        raise RunError("--plant: for a robot in virtual time (--sim)")
-    if args.torque is not None and not args.torque > 0.0:
-        raise RunError(f"--torque {args.torque:g}: more than 0 N m is right")
-
-
-def _tune_direction(args: argparse.Namespace, console: Console) -> int:
-    row = DIRECTIONS.index(args.what)
-    fleet = None if args.sim or args.dry_run else SupervisedFleet.attach(args.run_dir)
-    path = places.robot_file(args.config) if fleet is None else Path(fleet.manifest.config)
+def _tune_direction(flags: TuneFlags, console: Console) -> int:
+    row = DIRECTIONS.index(flags.what)
+    fleet = None if flags.sim or flags.dry_run else SupervisedFleet.attach(flags.run_dir)
+    path = places.robot_file(flags.config) if fleet is None else Path(fleet.manifest.config)
     robot = experiment.load_robot(path)
-    plan = excitation(_size(args, robot, row))
+    plan = excitation(_size(flags, robot, row))
     sines = ", ".join(f"{sine.frequency_hz:g}" for sine in plan.sines)
     unit = "m" if row < 3 else "rad"
     console.print(
-        f"{args.what}: a step of {plan.size:g} {unit} there and back, then sines of it at {sines} "
+        f"{flags.what}: a step of {plan.size:g} {unit} there and back, then sines of it at {sines} "
         f"Hz: {plan.duration_s:.0f} s. The planner limits it (law.probe_max), and all trips stay"
     )
-    if args.dry_run:
+    if flags.dry_run:
         return 0
     if fleet is None:
         with progress_along("simulated", plan.duration_s) as progress:
-            course = in_lockstep(robot, row, plan, plant_from(args.plant), progress)
+            course = in_lockstep(robot, row, plan, plant_from(flags.plant), progress)
     else:
-        live = _live(args, robot, fleet, row, plan, console)
+        live = _live(flags, robot, fleet, row, plan, console)
         if live is None:
             console.print("nothing was moved")
             return DECLINED_EXIT_CODE
@@ -164,13 +151,13 @@ def _tune_direction(args: argparse.Namespace, console: Console) -> int:
     courses, answers = {"measured": course}, {"measured": answer}
     _simulate("predicted", robot, row, plan, IDEAL, courses, answers, console)
     closed = not robot.law.S[row]
-    if args.bandwidth is not None and closed:
-        proposed = _proposed(args, robot, row, answer, console)
+    if flags.wanted is not None and closed:
+        proposed = _proposed(flags.wanted, robot, row, answer, console)
         if proposed is not None:
             # on the plant that was measured, where it is known
-            plant = plant_from(args.plant) if args.sim else IDEAL
+            plant = plant_from(flags.plant) if flags.sim else IDEAL
             _simulate("proposed", proposed, row, plan, plant, courses, answers, console)
-    _tell(args, courses, answers, console, closed=closed)
+    _tell(flags, courses, answers, console, closed=closed)
     if not closed:
         console.print(
             "the person leads this direction: it was held on local gains while it was probed, with "
@@ -200,7 +187,7 @@ def _simulate(
 
 
 def _live(
-    args: argparse.Namespace,
+    flags: TuneFlags,
     robot: RobotConfig,
     fleet: SupervisedFleet,
     row: int,
@@ -212,7 +199,7 @@ def _live(
     console.print("leave the robot alone but for the hand that holds its height")
     question = "Does it stand, with room around it, and the stop at hand?"
     simulated = "simulator" in fleet.manifest.services
-    if not simulated and not drive_access.confirm(question, yes=args.yes):
+    if not simulated and not drive_access.confirm(question, yes=flags.yes):
         return None
     interrupts = Interrupts()
     with open_session(robot, "tune", fleet.run.path) as session:
@@ -225,7 +212,7 @@ def _live(
     return course
 
 
-def _size(args: argparse.Namespace, robot: RobotConfig, row: int) -> float:
+def _size(flags: TuneFlags, robot: RobotConfig, row: int) -> float:
     """Return the size of step and sines, m or rad.
 
     Raises:
@@ -234,10 +221,10 @@ def _size(args: argparse.Namespace, robot: RobotConfig, row: int) -> float:
     most = robot.law.probe_max[row]
     if most == 0.0:
         raise RunError(
-            f"{args.what}: law.probe_max of the robot file forbids it; set it there, and start the "
-            "planner again"
+            f"{flags.what}: law.probe_max of the robot file forbids it; set it there, and start "
+            "the planner again"
         )
-    size: float = SIZE_SHARE * most if args.size is None else args.size
+    size: float = SIZE_SHARE * most if flags.size is None else flags.size
     if not 0.0 < size <= most:
         raise RunError(f"--size {size:g}: more than 0 and at most {most:g} (law.probe_max)")
     return size
@@ -261,7 +248,11 @@ def _answer(course: ProbeCourse, plan: Excitation) -> ResponseFit:
 
 
 def _proposed(
-    args: argparse.Namespace, robot: RobotConfig, row: int, answer: ResponseFit, console: Console
+    wanted: tuple[float, float],
+    robot: RobotConfig,
+    row: int,
+    answer: ResponseFit,
+    console: Console,
 ) -> RobotConfig | None:
     """Tell gains for the wanted answer; return the robot with them, None if there are none."""
     if not answer.is_second_order:
@@ -270,7 +261,7 @@ def _proposed(
     law = robot.law
     k, b = propose(
         answer.model, (law.K_p[row], law.B_p[row]), inertia_along(robot, row),
-        bandwidth=args.bandwidth, damping_ratio=args.damping,
+        bandwidth=wanted[0], damping_ratio=wanted[1],
     )  # fmt: skip
     if k <= 0.0 or b <= 0.0:
         console.print(
@@ -284,9 +275,7 @@ def _proposed(
         return None
     K_p, B_p = list(law.K_p), list(law.B_p)
     K_p[row], B_p[row] = float(f"{k:.3g}"), float(f"{b:.3g}")
-    console.print(
-        f"for {args.bandwidth:g} rad/s and a damping ratio of {args.damping:g}, in {UNITS[row]}:"
-    )
+    console.print(f"for {wanted[0]:g} rad/s and a damping ratio of {wanted[1]:g}, in {UNITS[row]}:")
     console.print(f"K_p = {K_p}\nB_p = {B_p}", highlight=False)
     console.print(
         "to try them: set the law's rows in a copy of the robot file, then `xrl gains`, which says "
@@ -306,17 +295,17 @@ def with_local_gains_kept(robot: RobotConfig) -> RobotConfig:
     return msgspec.structs.replace(robot, gain_schedule=kept)
 
 
-def _tune_module(args: argparse.Namespace, console: Console) -> int:
-    module, axis = joint = args.what, AXES.index(args.axis or "theta")
-    path = drive_access.robot_file(args)
+def _tune_module(flags: TuneFlags, console: Console) -> int:
+    module, axis = joint = flags.what, AXES.index(flags.axis or "theta")
+    path = drive_access.robot_file(flags)
     robot = config_file.load_without_schedule(path)
-    module_motion.refuse_services(robot, [module], args.run_dir)
+    module_motion.refuse_services(robot, [module], flags.run_dir)
     interrupts = Interrupts()
     k_p, k_d = module_probe.axis_gains(robot, module, axis)
 
     def plan_of(q: Mapping[str, Pair]) -> module_probe.ProbePlan:
         hung = hanging_joint(robot, q, module, axis)
-        plan = module_probe.probe_plan(robot, module, axis, args.torque, hung)
+        plan = module_probe.probe_plan(robot, module, axis, flags.torque, hung)
         console.print(
             f"{module} {AXES[axis]}: a step of {1e3 * plan.course.size:.1f} mrad there and "
             f"back, then sines of it, {plan.duration_s:.0f} s, at most {plan.torque_limit:.0f} N "
@@ -325,9 +314,9 @@ def _tune_module(args: argparse.Namespace, console: Console) -> int:
         return plan
 
     with drive_access.drives_to_ourselves(
-        robot, path, args.run_dir, console.print, lifted=module_motion.LIFTED
+        robot, path, flags.run_dir, console.print, lifted=module_motion.LIFTED
     ):
-        moved = module_motion.look_ask_and_move(args, robot, joint, plan_of, interrupts, console)
+        moved = module_motion.look_ask_and_move(flags, robot, joint, plan_of, interrupts, console)
     if moved is None:
         return 0
     if isinstance(moved, module_motion.Stopped):
@@ -338,7 +327,7 @@ def _tune_module(args: argparse.Namespace, console: Console) -> int:
     course = module_probe.course_of_samples(moved.samples, plan)
     answer = _answer(course, plan.course)
     model = module_probe.predicted(robot, module, axis, hung)
-    _tell(args, {"measured": course}, {"measured": answer}, console, closed=False)
+    _tell(flags, {"measured": course}, {"measured": answer}, console, closed=False)
     console.print(
         f"predicted, rotor and leg rigid: natural frequency {model.natural_frequency:.1f} rad/s, "
         f"damping ratio {model.damping_ratio:.2f}"
@@ -348,28 +337,29 @@ def _tune_module(args: argparse.Namespace, console: Console) -> int:
             "the encoder is at the motor: behind play and a soft drivetrain this leg is no "
             "second-order system; compare step and picture with another leg's"
         )
-    elif args.bandwidth is not None:
+    elif flags.wanted is not None:
+        bandwidth, damping = flags.wanted
         # k_p below 0: gravity alone is stiffer than what is wanted
         inertia = k_p / answer.model.b_0
-        k_p = inertia * args.bandwidth**2 - hung.gravity
-        k_d = 2.0 * args.damping * args.bandwidth * inertia
+        k_p = inertia * bandwidth**2 - hung.gravity
+        k_d = 2.0 * damping * bandwidth * inertia
         console.print(
-            f"for {args.bandwidth:g} rad/s and a damping ratio of {args.damping:g}: k_p = "
+            f"for {bandwidth:g} rad/s and a damping ratio of {damping:g}: k_p = "
             f"{k_p:.0f} N m/rad, k_d = {k_d:.1f} N m s/rad (stand.*, then `xrl gains`)"
         )
     return 0
 
 
 def _tell(
-    args: argparse.Namespace,
+    flags: TuneFlags,
     courses: dict[str, ProbeCourse],
     answers: dict[str, ResponseFit],
     console: Console,
     *,
     closed: bool,
 ) -> None:
-    out = make_folder(args.out, "tune")
+    out = make_folder(flags.out, "tune")
     console.print(answer_table(answers, closed=closed))
-    title = args.what if args.what in DIRECTIONS else f"{args.what} {args.axis or 'theta'}"
+    title = flags.what if flags.what in DIRECTIONS else f"{flags.what} {flags.axis or 'theta'}"
     draw(title, courses, answers, out / "tune.png")
     console.print(f"{out}/tune.png", style="dim")

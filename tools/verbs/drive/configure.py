@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 from shared.can import drive_settings
 from shared.config import files as config_file
@@ -20,76 +19,66 @@ from tools.bringup.boards import FIRMWARE, Board, FoundBoards, describe_firmware
 from tools.bringup.changes import ChangeResult, SettingChange
 from tools.bringup.check_robot import joint_services, services_up
 from tools.bringup.drive_access import (
-    add_plant,
+    DriveSettingFlags,
     boards_on_usb,
     check_plants,
     drives_within_reach,
     no_fleet_meanwhile,
 )
 from tools.bringup.motion_runner import Interrupts
+from tools.flags import Arg, FleetRobotFlags, Folder, Module
 from tools.fleet.process_table import is_simulated
 from tools.terminal import Console, marked
-from tools.verb_table import FLEET, Subparsers, add_config, add_run_dir, add_verb
 
 BACKUPS: Final = Path("out") / "drive-backups"
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(
-        subparsers,
-        "configure",
-        """
-        xrl drive configure                          # what would be changed, and nothing else
-        xrl drive configure --apply
-        xrl drive configure --apply --module knee_left
-        xrl drive configure --restore out/drive-backups/20260301-101500.json --apply
-        """,
-    )
-    what = parser.add_mutually_exclusive_group()
-    what.add_argument(
-        "--dry-run",
-        action="store_true",
-        help="show the difference only, as without --apply; "
-        f"exit code {FAULT_EXIT_CODE} if there is one",
-    )
-    what.add_argument("--apply", action="store_true", help="write and save it; the boards restart")
-    parser.add_argument(
-        "--module", action="append", choices=MODULES, metavar="MODULE",
-        help="this one only; may be given several times (default: all six)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--restore",
-        type=Path,
-        metavar="BACKUP.json",
-        help="what a backup has, instead of what the robot file wants",
-    )
-    parser.add_argument(
-        "--out", type=Path, default=BACKUPS, metavar="DIR",
-        help=f"where the backup is written (default {BACKUPS})",
-    )  # fmt: skip
-    add_config(parser, before=FLEET)
-    add_run_dir(parser)
-    add_plant(parser)
+EXAMPLES: Final = """
+xrl drive configure                          # what would be changed, and nothing else
+xrl drive configure --apply
+xrl drive configure --apply --module knee_left
+xrl drive configure --restore out/drive-backups/20260301-101500.json --apply
+"""
 
 
-def run(args: argparse.Namespace) -> int:
+class ConfigureFlags(FleetRobotFlags, DriveSettingFlags):
+    """Which drives, what is written, and where the backup goes."""
+
+    dry_run: Annotated[
+        bool,
+        Arg(
+            exclusive="what",
+            help="show the difference only, as without --apply; "
+            f"exit code {FAULT_EXIT_CODE} if there is one",
+        ),
+    ] = False
+    apply: Annotated[bool, Arg(exclusive="what")] = False
+    """write and save it; the boards restart"""
+    module: tuple[Module, ...] = ()
+    """this one only; may be given several times (default: all six)"""
+    restore: Annotated[Path | None, Arg(metavar="BACKUP.json")] = None
+    """what a backup has, instead of what the robot file wants"""
+    out: Folder = BACKUPS
+    """where the backup is written"""
+
+
+def run(flags: ConfigureFlags) -> int:
     """Show the differences, and write them if told to; return 0 if the drives are as wanted."""
     console = Console()
-    path = drive_access.robot_file(args)
+    path = drive_access.robot_file(flags)
     robot = config_file.load_without_schedule(path)
-    saved = backup.read(args.restore) if args.restore else None
-    modules = modules_of(args, robot, saved)
-    check_plants(robot, args.run_dir, args.plant)
+    saved = backup.read(flags.restore) if flags.restore else None
+    modules = modules_of(flags, robot, saved)
+    check_plants(robot, flags.run_dir, flags.plant)
     with contextlib.ExitStack() as stack:
-        if args.apply:
-            stack.enter_context(no_fleet_meanwhile(robot, args.run_dir))
-            refuse_services(robot, args.run_dir, modules)
-        return look_and_write(args, console, robot, path, modules, saved)
+        if flags.apply:
+            stack.enter_context(no_fleet_meanwhile(robot, flags.run_dir))
+            refuse_services(robot, flags.run_dir, modules)
+        return look_and_write(flags, console, robot, path, modules, saved)
 
 
 def look_and_write(
-    args: argparse.Namespace,
+    flags: ConfigureFlags,
     console: Console,
     robot: RobotConfig,
     path: Path,
@@ -98,20 +87,21 @@ def look_and_write(
 ) -> int:
     """Show what differs; with `--apply` keep a backup, write it and read it back."""
     with (
-        drives_within_reach(robot, path, args.run_dir, args.plant) as started,
-        boards_on_usb(robot, args.run_dir, modules) as found,
+        drives_within_reach(robot, path, flags.run_dir, flags.plant) as started,
+        boards_on_usb(robot, flags.run_dir, modules) as found,
     ):
         boards = boards_of(robot, modules, found)
         difference = differences(robot, boards, saved)
         console.print(changes.difference_table(difference) if difference else "nothing to change")
-        if not args.apply or not difference:
+        if not flags.apply or not difference:
             if difference:
                 console.print("\nnothing was written; `--apply` writes it")
             return FAULT_EXIT_CODE if difference else 0
         for module, board in boards.items():
             changes.refuse_armed(module, board)
-        kept = keep(args.out, boards, path)
-        console.print(f"\nwhat the boards had: {kept}; `xrl drive configure --restore {kept}` shows it")
+        kept = keep(flags.out, boards, path)
+        restore = f"`xrl drive configure --restore {kept}`"
+        console.print(f"\nwhat the boards had: {kept}; {restore} shows it")
         interrupts = Interrupts()
         with interrupts.kept():
             outcomes = apply(console, boards, difference, interrupts)
@@ -125,7 +115,7 @@ def look_and_write(
 
 
 def modules_of(
-    args: argparse.Namespace, robot: RobotConfig, saved: backup.Backup | None
+    flags: ConfigureFlags, robot: RobotConfig, saved: backup.Backup | None
 ) -> tuple[str, ...]:
     """Return the modules that are meant: those that were named, or of the backup, or all.
 
@@ -133,17 +123,17 @@ def modules_of(
         DriveError: the backup does not have one of them, or has it with another board.
     """
     if saved is None:
-        return tuple(args.module or MODULES)
+        return tuple(flags.module or MODULES)
     by_module = {board.module: board for board in saved.boards}
-    modules = tuple(args.module or by_module)
+    modules = tuple(flags.module or by_module)
     for module in modules:
         if module not in by_module:
-            raise DriveError(f"{args.restore}: it has no {module}; it has {', '.join(by_module)}")
+            raise DriveError(f"{flags.restore}: it has no {module}; it has {', '.join(by_module)}")
         serial = robot.module_named(module).serial_number.upper() if module in MODULES else ""
         other = by_module[module].serial_number.upper()
         if serial != other:
             raise DriveError(
-                f"{args.restore}: {module} is ODrive {other} there and {serial or 'unnamed'} in "
+                f"{flags.restore}: {module} is ODrive {other} there and {serial or 'unnamed'} in "
                 "the robot file; a backup is for the board that it was made of"
             )
     return modules

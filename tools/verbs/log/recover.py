@@ -2,54 +2,47 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
+from typing import Annotated, Final
 
 from shared.exceptions import RunError
 from shared.mcap_log import recover
 from shared.mcap_log.files import in_use, recovered_name
+from tools.flags import Flags, option, positional
 from tools.guarded_streams import printable
 from tools.logs.run_index import MetadataByName, head_of
+from tools.output import refuse_taken
 from tools.terminal import Console, marked
-from tools.verb_table import Subparsers, add_verb
+
+EXAMPLES: Final = """
+xrl log recover out/a/run.mcap
+xrl log recover out/a/run.mcap -o rescued.mcap
+"""
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(
-        subparsers,
-        "recover",
-        """
-        xrl log recover out/a/run.mcap
-        xrl log recover out/a/run.mcap -o rescued.mcap
-        """,
-    )
-    parser.add_argument("file", type=Path, metavar="FILE", help="an MCAP file; it is not touched")
-    parser.add_argument(
-        "-o",
-        "--out",
-        type=Path,
-        metavar="OUT",
-        help="where the recovered file goes (default: NAME.recovered.mcap beside it)",
-    )
-    parser.add_argument("--force", action="store_true", help="replace OUT if it exists")
+class RecoverFlags(Flags):
+    """Which log, and where the copy goes."""
+
+    file: Annotated[Path, positional("FILE")]
+    """an MCAP file; it is not touched"""
+    out: Annotated[Path | None, option("-o", "--out", metavar="OUT")] = None
+    """where the recovered file goes (default: NAME.recovered.mcap beside it)"""
+    force: bool = False
+    """replace OUT if it exists"""
 
 
-def run(args: argparse.Namespace) -> int:
+def run(flags: RecoverFlags) -> int:
     """Recover it; 0 also if it lacks nothing."""
     console = Console()
-    path: Path = args.file
-    if args.out is None and recover.is_whole(path):
+    path = flags.file
+    if flags.out is None and recover.is_whole(path):
         console.print(
             f"{printable(str(path))}: finished, whole and indexed; nothing to recover",
             soft_wrap=True,
         )
         return 0
-    out: Path = args.out or recovered_name(path)
-    if out.exists() and path.exists() and out.samefile(path):
-        raise RunError(f"{out}: is the file itself, which stays as it is; give another -o")
-    if out.exists() and not args.force:
-        raise RunError(f"{out}: exists already; remove it, give another with -o, or --force")
+    out = flags.out or recovered_name(path)
+    refuse_taken(out, path, force=flags.force)
     if _in_use(path):
         console.print("a recorder is writing this file: what follows is not in the copy")
     outcome = recover.recover(path, out)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
+from collections.abc import Sequence
 from enum import IntEnum
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import msgspec
 
@@ -17,61 +17,58 @@ from shared.config.files import load
 from shared.exceptions import FAULT_EXIT_CODE, RunError
 from shared.mcap_log.schema import ENUMERATIONS
 from shared.process import StopFlag
+from tools.flags import Arg, Count, Rate, RunDirFlags, Seconds, option, positional
 from tools.fleet.supervise import SupervisedFleet
-from tools.number_arguments import count, finite, rate
 from tools.topic_keys import TopicKey, keys_named
-from tools.verb_table import Subparsers, add_run_dir, add_verb
 
 POLL_S: Final = 0.002
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(
-        subparsers,
-        "echo",
-        """
-        xrl topic echo planner/status --count 1
-        xrl topic echo 'joint/*/state' --field q --hz 5
-        xrl topic echo joint/knee_left/event              # each change of mode
-        xrl topic echo harness/wrench --json | jq .force
-        """,
-    )
-    add_run_dir(parser)
-    parser.add_argument("topic", nargs="+", metavar="TOPIC", help="such as 'joint/*/state'")
-    parser.add_argument(
-        "--field", action="append", default=[], metavar="NAME", help="only these; may be repeated"
-    )
-    parser.add_argument(
-        "--hz", type=rate, metavar="HZ", help="at most so many of each topic a second"
-    )
-    parser.add_argument("--count", type=count, metavar="N", help="end after N messages")
-    parser.add_argument("--for", dest="for_s", type=finite, metavar="S", help="end after S seconds")
-    parser.add_argument(
-        "--json", action="store_true", help="a line of JSON for each message, as on the bus"
-    )
+EXAMPLES: Final = """
+xrl topic echo planner/status --count 1
+xrl topic echo 'joint/*/state' --field q --hz 5
+xrl topic echo joint/knee_left/event              # each change of mode
+xrl topic echo harness/wrench --json | jq .force
+"""
 
 
-def run(args: argparse.Namespace) -> int:
+class EchoFlags(RunDirFlags):
+    """Which topics, and how much of them."""
+
+    topic: Annotated[tuple[str, ...], positional("TOPIC")]
+    """such as 'joint/*/state'"""
+    field: Annotated[tuple[str, ...], Arg(metavar="NAME")] = ()
+    """only these; may be repeated"""
+    hz: Annotated[Rate | None, Arg(metavar="HZ")] = None
+    """at most so many of each topic a second"""
+    count: Annotated[Count | None, Arg(metavar="N")] = None
+    """end after N messages"""
+    for_s: Annotated[Seconds | None, option("--for")] = None
+    """end after S seconds"""
+    json: bool = False
+    """a line of JSON for each message, as on the bus"""
+
+
+def run(flags: EchoFlags) -> int:
     """Print until the end that was asked for; 0 if anything came."""
-    keys = keys_named(args.topic)
-    for name in args.field:
+    keys = keys_named(flags.topic)
+    for name in flags.field:
         without = [key.name for key in keys if name not in key.topic.type.__struct_fields__]
         if len(without) == len(keys):
             fields = ", ".join(keys[0].topic.type.__struct_fields__)
             raise RunError(f"--field {name}: {keys[0].name} has no such field; it has {fields}")
-    fleet = SupervisedFleet.attach(args.run_dir)
+    fleet = SupervisedFleet.attach(flags.run_dir)
     robot = load(Path(fleet.manifest.config))
     with open_session(robot, "echo", fleet.run.path) as session:
-        return 0 if _print(session, keys, args) else FAULT_EXIT_CODE
+        return 0 if _print(session, keys, flags) else FAULT_EXIT_CODE
 
 
-def _print(session: Session, keys: list[TopicKey], args: argparse.Namespace) -> int:
+def _print(session: Session, keys: list[TopicKey], flags: EchoFlags) -> int:
     """Print the messages; return how many."""
     by_key = {key.topic.key(session.robot, key.module): key for key in keys}
     stream = session.stream(list(by_key))
     stop, printed = StopFlag(), 0
-    deadline = None if args.for_s is None else time.monotonic() + args.for_s
+    deadline = None if flags.for_s is None else time.monotonic() + flags.for_s
     due: dict[str, float] = {}
     while not stop and (deadline is None or time.monotonic() < deadline):
         sample = stream.take()
@@ -80,20 +77,20 @@ def _print(session: Session, keys: list[TopicKey], args: argparse.Namespace) -> 
             continue
         name, payload, _ = sample
         now = time.monotonic()
-        if args.hz is not None and now < due.get(name, 0.0):
+        if flags.hz is not None and now < due.get(name, 0.0):
             continue
-        due[name] = now + (0.0 if args.hz is None else 1.0 / args.hz)
-        text = as_text(by_key[name], payload, args.field, as_json=args.json)
+        due[name] = now + (0.0 if flags.hz is None else 1.0 / flags.hz)
+        text = as_text(by_key[name], payload, flags.field, as_json=flags.json)
         if text:
             print(text)
             sys.stdout.flush()
             printed += 1
-        if args.count is not None and printed >= args.count:
+        if flags.count is not None and printed >= flags.count:
             break
     return printed
 
 
-def as_text(key: TopicKey, payload: bytes, fields: list[str], *, as_json: bool) -> str:
+def as_text(key: TopicKey, payload: bytes, fields: Sequence[str], *, as_json: bool) -> str:
     """Return a message as text; "" if it has none of the fields, or is no message of its type."""
     try:
         message = msgspec.json.decode(payload, type=key.topic.type)

@@ -1,4 +1,4 @@
-"""`xrl assist` against a planner that the test plays."""
+"""A request for assist against a planner that the test plays."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from shared.bus.messages import STRAIGHT, OperatorIntent, PlannerMode, PlannerSt
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import SCENARIO
 from shared.exceptions import FleetError
-from tools.verbs import assist
+from tools.live import assist_request as assist
 
 WISH = OperatorIntent(t_ns=1, seq=0, assist_n=80.0, shift=(0.02, 0.0, 0.0, 0.0), source="me")
 
@@ -76,8 +76,8 @@ def test_it_ends_by_itself_after_the_time_it_was_given(robot: RobotConfig) -> No
 
 
 def test_one_who_asks_already_goes_on(robot: RobotConfig) -> None:
-    planner = FakePlanner(lambda _: status(robot, "xrl assist by ada (7)"))
-    with pytest.raises(FleetError, match=r"xrl assist by ada \(7\) asks already"):
+    planner = FakePlanner(lambda _: status(robot, "xrl lead by ada (7)"))
+    with pytest.raises(FleetError, match=r"xrl lead by ada \(7\) asks already"):
         assist.ask(planner, planner, WISH, lambda: False, planner)
     assert not planner.heard
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 import bisect
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,15 +35,14 @@ from shared.exceptions import RunError
 from shared.joints import JOINTS, MODULES, N_JOINTS
 from shared.robot.robot_model import stand_pose
 from shared.text_file import read_text
+from tools.flags import Arg, Flags, Number, Run, finite_numbers, robot_file_of
 from tools.judge.run_parts import zero_ns
 from tools.lab.design.push_limit import PushLimits
 from tools.lab.design.torque_breakdown import TorqueBreakdown, torque_breakdown
 from tools.logs import snapshot_text
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import RunLog, RunPart, refuse_own_controller, robot_of
-from tools.number_arguments import finite, finite_numbers
 from tools.terminal import Console, marked
-from tools.verb_table import RUN_HELP, Subparsers, add_config, add_verb
 
 Array = NDArray[np.float64]
 
@@ -73,63 +71,63 @@ class Tick(NamedTuple):
     """The states the tick was made from."""
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(
-        subparsers,
-        "explain",
-        """
-        xrl log explain out/a/run.mcap --at 2.5
-        xrl log explain --q 0,0.139,0,-1.015,0,0.876,0,0.139,0,-1.015,0,0.876
-        xrl log explain --q stand.txt --assist 200 --config lab.toml
-        xrl log explain --p 0,0,0.75,0,0.6,0
-        """,
-    )
-    parser.add_argument("log", nargs="?", type=Path, metavar="RUN", help=RUN_HELP)
-    parser.add_argument(
-        "--at", type=finite, metavar="T", help="scenario time, s (default: the end)"
-    )
-    parser.add_argument(
-        "--q",
-        metavar="ANGLES|FILE",
-        help=f"explain a robot at rest at twelve joint angles in rad, separated by commas: "
-        f"{', '.join(JOINTS[:4])}, ...; or a file that holds them",
-    )
-    parser.add_argument(
-        "--p",
-        metavar="POSE",
-        help="explain a robot at rest at p: COM x, y, z in m and torso roll, pitch, yaw in rad, "
-        "separated by commas; write --p=-0.01,... if it begins with a minus",
-    )
-    parser.add_argument(
-        "--assist", type=finite, default=0.0, metavar="N", help="with --q and --p (0 N)"
-    )
-    add_config(parser, before="that in the log")
+EXAMPLES: Final = """
+xrl log explain out/a/run.mcap --at 2.5
+xrl log explain --q 0,0.139,0,-1.015,0,0.876,0,0.139,0,-1.015,0,0.876
+xrl log explain --q stand.txt --assist 200 --config lab.toml
+xrl log explain --p 0,0,0.75,0,0.6,0
+"""
 
 
-def run(args: argparse.Namespace) -> int:
+class ExplainFlags(Flags):
+    """Which tick: one of a run, or that of a pose at rest."""
+
+    log: Run | None = None
+    at: Annotated[Number | None, Arg(metavar="T")] = None
+    """scenario time, s (default: the end)"""
+    q: Annotated[
+        str | None,
+        Arg(
+            metavar="ANGLES|FILE",
+            help="explain a robot at rest at twelve joint angles in rad, separated by commas: "
+            f"{', '.join(JOINTS[:4])}, ...; or a file that holds them",
+        ),
+    ] = None
+    p: Annotated[str | None, Arg(metavar="POSE")] = None
+    """explain a robot at rest at p: COM x, y, z in m and torso roll, pitch, yaw in rad, separated
+    by commas"""
+    assist: Annotated[Number, Arg(metavar="N")] = 0.0
+    """with --q and --p"""
+    config: Annotated[Path | None, robot_file_of("that in the log")] = None
+
+    def check(self) -> None:
+        """Refuse none, and several."""
+        super().check()
+        if sum(given is not None for given in (self.log, self.q, self.p)) != 1:
+            raise RunError("give a run's log, --q ANGLES or --p POSE; one of them")
+
+
+def run(flags: ExplainFlags) -> int:
     """Print the account of one tick."""
     console = Console()
-    if sum(given is not None for given in (args.log, args.q, args.p)) != 1:
-        raise RunError("give a run's log, --q ANGLES or --p POSE; one of them")
-    if args.log is None:
-        path = places.robot_file(args.config)
+    if flags.log is None:
+        path = places.robot_file(flags.config)
         robot = config_file.load(path)
         gain_schedule.require(robot, path)
-        if args.q is None:
-            q = at_pose(robot, args.p)
+        if flags.q is not None:
+            q = parse("--q", flags.q, N_JOINTS, 2 * np.pi, "rad")
         else:
-            q = parse("--q", args.q, N_JOINTS, 2 * np.pi, "rad")
+            q = at_pose(robot, flags.p or "")
         still = np.zeros(N_JOINTS)
-        show(robot, torque_breakdown(robot, q, still, q, still, args.assist), console)
+        show(robot, torque_breakdown(robot, q, still, q, still, flags.assist), console)
         return 0
-    index = RunIndex(args.log)
+    index = RunIndex(flags.log)
     zero = zero_ns(index)
-    log = read_around(index, zero, args.at)
+    log = read_around(index, zero, flags.at)
     refuse_own_controller(log)
     robot = robot_of(log)
-    tick = tick_at(log, args.at, zero)
-    _introduce(log, tick, args.at, zero, console)
+    tick = tick_at(log, flags.at, zero)
+    _introduce(log, tick, flags.at, zero, console)
     q, v = (_joined(tick.states, name) for name in ("q", "v"))
     q_ref, v_ref = (_joined(tick.commands, name) for name in ("q_ref", "v_ref"))
     found = torque_breakdown(
@@ -148,11 +146,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def parse(flag: str, text: str, count: int, largest: float, unit: str) -> Array:
-    """Read so many numbers from a text, or from the file that it names.
-
-    Raises:
-        RunError: it is something else.
-    """
+    """Read so many numbers from a text, or from the file that it names."""
     try:
         return np.array(finite_numbers(_content(text), count, largest))
     except OSError as error:
@@ -171,11 +165,7 @@ def _content(text: str) -> str:
 
 
 def at_pose(robot: RobotConfig, text: str) -> Array:
-    """Return the joint angles (12,), rad, at a pose p given as text.
-
-    Raises:
-        RunError: the text is no pose, or the robot cannot reach it; says why.
-    """
+    """Return the joint angles (12,), rad, at a pose p given as text."""
     p_ref = parse("--p", text, 6, POSE_MAX, "m and rad")
     limits = np.array(robot.joint_limits())
     ik = InverseKinematics(Kinematics(robot), limits)
@@ -187,13 +177,7 @@ def at_pose(robot: RobotConfig, text: str) -> Array:
 
 
 def read_around(index: RunIndex, zero: int, at_s: float | None) -> RunLog:
-    """Read a run; of a long one what is around a time, or its end.
-
-    Args:
-        index: of the run.
-        zero: monotonic stamp of time 0.
-        at_s: time on the axis of the report; None: the end.
-    """
+    """Read a run; of a long one what is around a time, or its end."""
     if index.length_s <= LONG_S:
         return RunLog(index)
     at_s = (
@@ -204,11 +188,7 @@ def read_around(index: RunIndex, zero: int, at_s: float | None) -> RunLog:
 
 
 def tick_at(log: RunLog, at_s: float | None, zero_ns: int) -> Tick:
-    """Return the planner's last tick at or before a time; by default the last.
-
-    Raises:
-        RunError: the planner did not tick there, or the log lacks its inputs.
-    """
+    """Return the planner's last tick at or before a time; by default the last."""
     statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
     led = [row for row in statuses if row.mode != PlannerMode.WAITING]
     if not led:

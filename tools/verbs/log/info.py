@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 from rich import box
 from rich.table import Table
@@ -17,6 +16,7 @@ from shared.exceptions import XrlError
 from shared.mcap_log.reader import LostBytes
 from shared.mcap_log.recover import clock_time, describe_lost, describe_passed_over
 from shared.mcap_log.writer import SCHEMA_VERSION
+from tools.flags import Arg, Flags, option, positional
 from tools.guarded_streams import printable
 from tools.judge.run_parts import zero_ns
 from tools.logs.host_clocks import HostClocks
@@ -25,7 +25,6 @@ from tools.logs.run_index import RunIndex, files_in, files_of_run
 from tools.logs.run_log import NOTHING, RunLog, clocks_of
 from tools.logs.survey import FileFacts, Survey, TopicFacts
 from tools.terminal import Console, marked
-from tools.verb_table import Subparsers, add_verb
 
 SLOW: Final = 0.9
 """Fraction of a topic's nominal rate below which it is marked."""
@@ -36,49 +35,42 @@ INJECTED_MAX: Final = 12
 """Impairments with a line of their own."""
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(
-        subparsers,
-        "info",
-        """
-        xrl log info out/a/run.mcap
-        xrl log info out/a/run.mcap --run
-        xrl log info out/a/run.mcap --json | jq '.topics | map_values(.lost)'
-        """,
-    )
-    parser.add_argument(
-        "file",
-        type=Path,
-        metavar="FILE",
-        help="an MCAP file, finished or not; of a directory its run's first",
-    )
-    parser.add_argument(
-        "--run",
-        dest="whole_run",
-        action="store_true",
-        help="all files of the run that it belongs to, counted together",
-    )
-    parser.add_argument(
-        "--full",
-        action="store_true",
-        help=f"read every message of a finished file over {LARGE >> 20} MiB too: sizes, longest "
-        "gaps and damage; else what its recorder counted is shown",
-    )
-    parser.add_argument("--json", action="store_true", help="print JSON, in SI units")
+EXAMPLES: Final = """
+xrl log info out/a/run.mcap
+xrl log info out/a/run.mcap --run
+xrl log info out/a/run.mcap --json | jq '.topics | map_values(.lost)'
+"""
 
 
-def run(args: argparse.Namespace) -> int:
+class InfoFlags(Flags):
+    """Which log, and in which form."""
+
+    file: Annotated[Path, positional("FILE")]
+    """an MCAP file, finished or not; of a directory its run's first"""
+    whole_run: Annotated[bool, option("--run")] = False
+    """all files of the run that it belongs to, counted together"""
+    full: Annotated[
+        bool,
+        Arg(
+            help=f"read every message of a finished file over {LARGE >> 20} MiB too: sizes, "
+            "longest gaps and damage; else what its recorder counted is shown"
+        ),
+    ] = False
+    json: bool = False
+    """print JSON, in SI units"""
+
+
+def run(flags: InfoFlags) -> int:
     """Print it; 0 if the file can be read."""
     survey = Survey()
-    file = files_in(args.file)[0] if args.file.is_dir() else args.file
-    first = _add(survey, file, full=args.full)
+    file = files_in(flags.file)[0] if flags.file.is_dir() else flags.file
+    first = _add(survey, file, full=flags.full)
     run_files = files_of_run(file, first.metadata)
-    if args.whole_run and len(run_files) > 1:
+    if flags.whole_run and len(run_files) > 1:
         survey = Survey()
         for path in run_files:
-            _add(survey, path, full=args.full)
-    if args.json:
+            _add(survey, path, full=flags.full)
+    if flags.json:
         print(json.dumps(as_json(survey, run_files), indent=2))
     else:
         show(survey, run_files, Console())
@@ -260,13 +252,7 @@ def _zero(index: RunIndex) -> tuple[int, str]:
 
 
 def _table(found: dict[str, TopicFacts], prefix: str, *, events: bool) -> Table:
-    """Return a row for each topic.
-
-    Args:
-        found: topics with at least one message each.
-        prefix: left out of their names.
-        events: a topic without a rate is one of events: its mean rate means nothing.
-    """
+    """Return a row for each topic."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("topic", overflow="fold")
     for name in ("count", "Hz", "of Hz", "gap ms", "lost", "restarts"):

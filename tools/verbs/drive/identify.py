@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 from rich import box
 from rich.live import Live
@@ -23,27 +22,27 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Lead, Scenario
 from shared.exceptions import DECLINED_EXIT_CODE, RunError
 from shared.extras import require
-from shared.joints import AXES, MODULES
+from shared.joints import MODULES
+from shared.toml_file import Range
 from tools.bringup.drive_access import confirm
 from tools.bringup.identify import joints, report
 from tools.bringup.identify.body_fit import Record, fit
 from tools.bringup.identify.body_lead import BodyLead
 from tools.bringup.identify.estimates import of_body, zero_corrections
+from tools.bringup.identify.joints import JointFlags
 from tools.bringup.identify.quasi_static import Moments, TimedRows, moments_of
 from tools.bringup.identify.robot_file_edit import refuse_running
 from tools.bringup.module_motion import exit_if_interrupted
 from tools.bringup.motion_runner import Interrupts
+from tools.flags import Arg, Folder, MotionFlags, positional
 from tools.fleet.supervise import SupervisedFleet
 from tools.live import experiment
 from tools.logs.run_log import RunLog, read_run, robot_of
-from tools.number_arguments import finite
 from tools.output import make_folder
 from tools.terminal import Console
-from tools.verb_table import FLEET, Subparsers, add_config, add_run_dir, add_verb
 
 LEVEL_SD: Final = 0.003
 """rad: a floor that a spirit level calls level."""
-TORQUE: Final = 15.0
 LEVEL_MAX: Final = 0.1
 WEIGHED_SD: Final = 0.1
 """kg: a payload that was on a scale."""
@@ -51,109 +50,90 @@ MOTIONS: Final = "identify"
 """The scenario whose path is led."""
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(
-        subparsers,
-        "identify",
-        """
-        xrl drive identify body --dry-run                      # the motions, and nothing else
-        xrl drive identify body                                # lead the robot that is up, and fit
-        xrl drive identify body out/a/run.mcap                 # from a record of slow motions
-        xrl drive identify body run.mcap loaded.mcap --added 0 --added 10   # 10 kg more on the torso
-        xrl drive identify body run.mcap --weighed --config lab.toml --apply
-        xrl drive identify joint ankle_left --dry-run          # hanging, the fleet down
-        xrl drive identify joint ankle_left ankle_right --apply
-        xrl drive identify joint --all --axis theta
-        """,
-    )
-    actions = parser.add_subparsers(metavar="WHAT", required=True, dest="what")
-    body = actions.add_parser(
-        "body",
-        help="standing: payload and its centre, harness point, torque constant, encoder zeros",
-    )
-    body.add_argument(
-        "record", nargs="*", type=Path, metavar="RUN",
-        help="records of this robot, standing and led slowly; without one the robot that is up is "
-        "led through deploy/scenarios/identify.toml",
-    )  # fmt: skip
-    body.add_argument(
-        "--added", action="append", type=finite, metavar="KG",
-        help="mass on the torso beyond the robot file's, known by a scale; once for each record",
-    )  # fmt: skip
-    body.add_argument(
-        "--weighed", action="store_true",
-        help=f"the robot file's payload was on a scale, within {WEIGHED_SD:g} kg",
-    )  # fmt: skip
-    body.add_argument(
-        "--level", type=finite, default=LEVEL_SD, metavar="RAD",
-        help="how level the floor is, as a standard deviation (default: %(default)s)",
-    )  # fmt: skip
-    joint = actions.add_parser(
-        "joint",
-        help="hanging, its services down: dry and viscous friction, reflected inertia",
-    )
-    joint.add_argument("module", nargs="*", metavar="MODULE", help="which; or --all")
-    joint.add_argument("--all", action="store_true", help="all six, one joint after the other")
-    joint.add_argument("--axis", choices=AXES, help="only this one (default: both)")
-    joint.add_argument(
-        "--torque", type=finite, default=TORQUE, metavar="NM",
-        help="of the sines; what holds a leg that is bent for it comes on top (default: "
-        "%(default)s)",
-    )  # fmt: skip
-    for one in (body, joint):
-        one.add_argument("--yes", action="store_true", help="do not ask")
-        one.add_argument("--dry-run", action="store_true", help="show the motions, move nothing")
-        one.add_argument(
-            "--apply", action="store_true",
-            help="write what changes into the robot file, after a backup of it",
-        )  # fmt: skip
-        one.add_argument(
-            "--out", type=Path, metavar="DIR", help="where the picture goes (out/identify-<time>)"
-        )
-        add_config(one, before=FLEET)
-        add_run_dir(one)
+EXAMPLES: Final = """
+xrl drive identify body --dry-run                      # the motions, and nothing else
+xrl drive identify body                                # lead the robot that is up, and fit
+xrl drive identify body out/a/run.mcap                 # from a record of slow motions
+xrl drive identify body run.mcap loaded.mcap --added 0 --added 10   # 10 kg more on the torso
+xrl drive identify body run.mcap --weighed --config lab.toml --apply
+xrl drive identify joint ankle_left --dry-run          # hanging, the fleet down
+xrl drive identify joint ankle_left ankle_right --apply
+xrl drive identify joint --all --axis theta
+"""
 
 
-def run(args: argparse.Namespace) -> int:
+class BodyFlags(MotionFlags):
+    """From which motions."""
+
+    record: Annotated[tuple[Path, ...], positional("RUN")] = ()
+    """records of this robot, standing and led slowly; without one the robot that is up is led
+    through deploy/scenarios/identify.toml"""
+    added: tuple[Annotated[float, Range(0.0, 100.0, "kg")], ...] = ()
+    """mass on the torso beyond the robot file's, known by a scale; once for each record"""
+    weighed: Annotated[
+        bool, Arg(help=f"the robot file's payload was on a scale, within {WEIGHED_SD:g} kg")
+    ] = False
+    level: Annotated[float, Range(1e-6, LEVEL_MAX, "rad")] = LEVEL_SD
+    """how level the floor is, as a standard deviation"""
+    apply: bool = False
+    """write what changes into the robot file, after a backup of it"""
+    out: Folder | None = None
+    """where the picture goes (out/identify-<time>)"""
+
+    @property
+    def masses(self) -> tuple[float, ...]:
+        """The added mass of each record, kg."""
+        return self.added or (0.0,) * max(1, len(self.record))
+
+    def check(self) -> None:
+        """Refuse another number of masses than of records."""
+        super().check()
+        if len(self.masses) != max(1, len(self.record)):
+            raise RunError(
+                f"--added: {len(self.added)} for {max(1, len(self.record))} records; once for each "
+                "is right"
+            )
+
+
+def joint(flags: JointFlags) -> int:
+    """Measure, fit, tell, and write if it is asked for."""
+    return joints.run(flags, Console())
+
+
+def body(flags: BodyFlags) -> int:
     """Measure, fit, tell, and write if it is asked for."""
     console = Console()
-    if args.what == "joint":
-        return joints.run(args, console)
-    if not 0.0 < args.level <= LEVEL_MAX:
-        raise RunError(f"--level {args.level:g}: more than 0 and at most {LEVEL_MAX:g} is right")
     scenario = scenarios.load(experiment.scenario_file(MOTIONS))
-    if args.dry_run:
+    if flags.dry_run:
         _show_motions(
-            scenario, config_file.load_without_schedule(places.robot_file(args.config)), console
+            scenario, config_file.load_without_schedule(places.robot_file(flags.config)), console
         )
         return 0
     require("plot")
-    added = _added(args.added, max(1, len(args.record)))
-    if args.record:
-        logs = [read_run(path) for path in args.record]
-        robot, path = _same_robot(logs), places.robot_file(args.config)
-        if args.apply:
+    if flags.record:
+        logs = [read_run(path) for path in flags.record]
+        robot, path = _same_robot(logs), places.robot_file(flags.config)
+        if flags.apply:
             refuse_running(path)
         moments = [_moments_in(log) for log in logs]
     else:
-        fleet = SupervisedFleet.attach(args.run_dir)
+        fleet = SupervisedFleet.attach(flags.run_dir)
         path = Path(fleet.manifest.config)
-        if args.apply:
+        if flags.apply:
             refuse_running(path)
         robot = config_file.load(path)
-        led = _led(robot, fleet, scenario, args, console)
+        led = _led(robot, fleet, scenario, flags, console)
         if led is None:
             console.print("nothing was moved")
             return DECLINED_EXIT_CODE
         moments = [led]
-    records = [Record(part, kg) for part, kg in zip(moments, added, strict=True)]
-    payload_sd = WEIGHED_SD if args.weighed else None
-    result = fit(robot, records, level_sd=args.level, payload_sd=payload_sd)
+    records = [Record(part, kg) for part, kg in zip(moments, flags.masses, strict=True)]
+    payload_sd = WEIGHED_SD if flags.weighed else None
+    result = fit(robot, records, level_sd=flags.level, payload_sd=payload_sd)
     estimates = of_body(result, robot)
-    picture = make_folder(args.out, "identify") / "identify.png"
+    picture = make_folder(flags.out, "identify") / "identify.png"
     report.draw_body(estimates, result, picture)
-    report.tell(estimates, robot, path if args.apply else None, console)
+    report.tell(estimates, robot, path if flags.apply else None, console)
     corrections = zero_corrections(estimates)
     if corrections:
         console.print("zeros, with the robot hung and its services DISARMED or down:")
@@ -181,20 +161,6 @@ def _same_robot(logs: Sequence[RunLog]) -> RobotConfig:
     return first
 
 
-def _added(given: list[float] | None, records: int) -> list[float]:
-    """Return the added mass of each record, kg.
-
-    Raises:
-        RunError: the number of values is another, or one is no mass.
-    """
-    added = given if given is not None else [0.0] * records
-    if len(added) != records:
-        raise RunError(f"--added: {len(added)} for {records} records; once for each is right")
-    if any(not 0.0 <= kg <= 100.0 for kg in added):
-        raise RunError("--added: from 0 to 100 kg is right")
-    return added
-
-
 def _moments_in(log: RunLog) -> Moments:
     states = [
         TimedRows(log.received_ns(topics.JOINT_STATE, name), log.messages(topics.JOINT_STATE, name))
@@ -208,7 +174,7 @@ def _led(
     robot: RobotConfig,
     fleet: SupervisedFleet,
     scenario: Scenario,
-    args: argparse.Namespace,
+    flags: BodyFlags,
     console: Console,
 ) -> Moments | None:
     """Lead the robot that is up; return its moments, None if the person does not want it.
@@ -225,7 +191,7 @@ def _led(
             "are shown, and rest on the harness with the assist that is shown; nobody else touches "
             "it"
         )
-        if not confirm("Does it stand, with room around it, and the stop at hand?", yes=args.yes):
+        if not confirm("Does it stand, with room around it, and the stop at hand?", yes=flags.yes):
             return None
     interrupts = Interrupts()
     with open_session(robot, "identify", fleet.run.path) as session:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Annotated, Final, Protocol
 
 from shared.bus import topics
 from shared.bus.messages import Tare, TareRequest, Wrench
@@ -15,9 +14,9 @@ from shared.clock import now_ns
 from shared.config.files import load
 from shared.exceptions import FleetError
 from shared.user import user_name
+from tools.flags import Arg, RunDirFlags
 from tools.fleet.supervise import SupervisedFleet
 from tools.terminal import Console
-from tools.verb_table import Subparsers, add_run_dir, add_verb
 
 LOADED_N: Final = 30.0
 """A harness that reads more is taken for one that is held; drift is less."""
@@ -42,51 +41,36 @@ class Wrenches(Protocol):
         """Return the newest wrench since the last call, or None."""
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(
-        subparsers,
-        "tare",
-        """
-        xrl drive tare
-        xrl drive tare --anyway
-        """,
-    )
-    add_run_dir(parser)
-    parser.add_argument(
-        "--anyway",
-        action="store_true",
-        help=f"even if it reads more than {LOADED_N:g} N: the sensor has drifted so far",
-    )
+EXAMPLES: Final = """
+xrl drive tare
+xrl drive tare --anyway
+"""
 
 
-def run(args: argparse.Namespace) -> int:
+class TareFlags(RunDirFlags):
+    """Whether it may be loaded."""
+
+    anyway: Annotated[
+        bool,
+        Arg(help=f"even if it reads more than {LOADED_N:g} N: the sensor has drifted so far"),
+    ] = False
+
+
+def run(flags: TareFlags) -> int:
     """Ask for it, and wait until the wrench is valid again."""
-    fleet = SupervisedFleet.attach(args.run_dir)
+    fleet = SupervisedFleet.attach(flags.run_dir)
     robot = load(Path(fleet.manifest.config))
-    with open_session(robot, "tare", args.run_dir) as session:
+    with open_session(robot, "tare", flags.run_dir) as session:
         requests = session.publisher(topics.HARNESS_TARE, TareRequest)
         wrenches = session.latest(topics.WRENCH, Wrench)
-        before = tare(requests, wrenches, anyway=args.anyway)
+        before = tare(requests, wrenches, anyway=flags.anyway)
     read = describe(before) if before.valid else "nothing valid"
     Console().print(f"the harness is tared: what it reads now is zero; before it read {read}")
     return 0
 
 
 def tare(requests: TareClient, wrenches: Wrenches, *, anyway: bool) -> Wrench:
-    """Request the tare until it has started, and wait until it is done.
-
-    Args:
-        requests: to the harness service.
-        wrenches: from it.
-        anyway: also if the harness seems to be held.
-
-    Returns:
-        The harness's reading before.
-
-    Raises:
-        FleetError: the harness is silent, is held, or finds no zero.
-    """
+    """Request the tare until it has started, wait until it is done; return the reading before."""
     before = newest = _first(wrenches)
     if before.valid and math.hypot(*before.force) > LOADED_N and not anyway:
         raise FleetError(

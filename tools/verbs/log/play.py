@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import gc
 import math
@@ -24,11 +23,11 @@ from tools.cli import INTERRUPTED
 from tools.fleet.supervise import SupervisedFleet
 from tools.keyboard import Keyboard
 from tools.logs.playback import arguments, guard, reading, selection
+from tools.logs.playback.arguments import PlayFlags
 from tools.logs.playback.player import PRESSES, Display, Player, Press, introduce, summary, where
 from tools.logs.playback.reading import Recording
 from tools.logs.playback.schedule import Entry, EntryStream, Playhead, Schedule, Window, window
 from tools.terminal import Console
-from tools.verb_table import Subparsers, add_verb
 
 _POLL_S: Final = 0.01
 _SETTLED_S: Final = 0.1
@@ -44,80 +43,77 @@ class Bus(NamedTuple):
     """A note for the person on how the bus was chosen; else empty."""
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(subparsers, "play", arguments.EXAMPLES)
-    arguments.add(parser)
+EXAMPLES: Final = """
+xrl log play out/a/run.mcap
+xrl log play out/a --rate 0.5 --loop --clock
+xrl log play run.mcap run_1.mcap --start-offset 10 --duration 2.5
+xrl log play run.mcap --topics 'joint/*/state' harness/wrench --start-paused
+xrl log play run.mcap --exclude 'joint/*/trace' --remap harness/wrench=harness/before
+"""
 
 
-def run(args: argparse.Namespace) -> int:
+ABOUT: Final = arguments.ABOUT
+
+
+def run(flags: PlayFlags) -> int:
     """Play until the end, q or Ctrl-C."""
     console = Console()
-    arguments.check(args)
-    prefix = selection.check_prefix(args.prefix)
-    paths = reading.files_named(args.files)
+    prefix = selection.check_prefix(flags.prefix)
+    paths = reading.files_named(flags.files)
     recording = reading.read(paths)
-    chosen = selection.choose(recording.keys, args.topics, args.exclude)
-    targets = selection.targets(chosen, prefix, args.remap, recording.robot)
-    part = part_of(recording, args)
-    bus = bus_of(recording, args)
+    chosen = selection.choose(recording.keys, flags.topics, flags.exclude)
+    targets = selection.targets(chosen, prefix, flags.remap, recording.robot)
+    part = part_of(recording, flags)
+    bus = bus_of(recording, flags)
     introduce(recording, paths, bus.note, console)
     with contextlib.ExitStack() as stack:
-        stack.callback(_leave_no_directory, args.run_dir, made=not args.run_dir.exists())
+        stack.callback(_leave_no_directory, flags.run_dir, made=not flags.run_dir.exists())
         acting = [] if prefix else guard.those_of(guard.ACTED_ON, targets.values())
-        watch = guard.LiveRobotWatch(bus.robot, args.run_dir) if acting else None
+        watch = guard.LiveRobotWatch(bus.robot, flags.run_dir) if acting else None
         if watch is not None:
             stack.callback(watch.close)
-            targets = _permitted(targets, watch, console, force=args.force)
+            targets = _permitted(targets, watch, console, force=flags.force)
         executor = stack.enter_context(ThreadPoolExecutor(1, "read ahead"))
-        schedule = schedule_of(recording, targets, part, executor, loop=args.loop)
-        listen = [] if args.listen == arguments.NOWHERE else [args.listen]
-        session = stack.enter_context(open_session(bus.robot, "play", args.run_dir, listen=listen))
-        listening = expand(args.listen, args.run_dir) if listen else ""
+        schedule = schedule_of(recording, targets, part, executor, loop=flags.loop)
+        listen = [] if flags.listen == arguments.NOWHERE else [flags.listen]
+        session = stack.enter_context(open_session(bus.robot, "play", flags.run_dir, listen=listen))
+        listening = expand(flags.listen, flags.run_dir) if listen else ""
         words = where(list(targets.values()), recording.robot, part, listening)
         console.print(words, markup=False, soft_wrap=True)
         keyboard = stack.enter_context(Keyboard(PRESSES))
-        if args.start_paused and not keyboard.present:
+        if flags.start_paused and not keyboard.present:
             raise RunError("--start-paused: nobody could press space here; a terminal is needed")
-        return _play(args, schedule, targets, session, keyboard, _alarm(watch, targets, args))
+        return _play(flags, schedule, targets, session, keyboard, _alarm(watch, targets, flags))
 
 
-def part_of(recording: Recording, args: argparse.Namespace) -> Window:
-    """Return what of the log is to be played.
-
-    Raises:
-        RunError: it begins behind the log's end.
-    """
+def part_of(recording: Recording, flags: PlayFlags) -> Window:
+    """Return what of the log is to be played."""
     part = window(
         recording.began_ns,
         recording.ended_ns,
-        round(args.start_offset * NS_PER_S),
-        None if args.duration is None else math.ceil(args.duration * NS_PER_S),
+        round(flags.start_offset * NS_PER_S),
+        None if flags.duration is None else math.ceil(flags.duration * NS_PER_S),
     )
     if part.start_ns > recording.ended_ns:
         length_s = (recording.ended_ns - recording.began_ns) / NS_PER_S
-        raise RunError(f"--start-offset {args.start_offset:g}: the log is {length_s:.2f} s long")
+        raise RunError(f"--start-offset {flags.start_offset:g}: the log is {length_s:.2f} s long")
     return part
 
 
-def bus_of(recording: Recording, args: argparse.Namespace) -> Bus:
+def bus_of(recording: Recording, flags: PlayFlags) -> Bus:
     """Return the robot whose bus to join: as given, of the fleet that is up, or of the log.
 
     Endpoints are never taken from a log, which may be a stranger's: the player would dial them.
-
-    Raises:
-        ConfigError: the file given cannot be used.
-        RunError: nobody may put another's keys on that bus.
     """
-    file: Path | None = args.config
+    file = flags.config
     with contextlib.suppress(FleetError):
-        file = file or Path(SupervisedFleet.attach(args.run_dir).manifest.config)
+        file = file or Path(SupervisedFleet.attach(flags.run_dir).manifest.config)
     shipped = config_file.load_without_schedule(DEFAULT_CONFIG)
     if file is not None:
         robot = config_file.load_without_schedule(file)
         if robot.bus.security.mode != "mtls":
             return Bus(robot, "")
-        if not args.prefix.strip("/"):
+        if not flags.prefix.strip("/"):
             right = "leave --prefix as it is: subscribers dial the player"
             raise RunError(f"{file}: under mtls nobody may put another's keys; {right}")
         note = "the fleet's bus is mtls, where nobody may put another's keys: on a bus of its own"
@@ -141,11 +137,7 @@ def schedule_of(
     *,
     loop: bool,
 ) -> Schedule:
-    """Return the messages to be put, numbered by the keys of `targets`.
-
-    Raises:
-        RunError: there is none.
-    """
+    """Return the messages to be put, numbered by the keys of `targets`."""
     keys = list(targets)
 
     def read(begin_ns: int, end_ns: int) -> list[Entry]:
@@ -170,10 +162,10 @@ def _permitted(
 
 
 def _alarm(
-    watch: guard.LiveRobotWatch | None, targets: dict[str, str], args: argparse.Namespace
+    watch: guard.LiveRobotWatch | None, targets: dict[str, str], flags: PlayFlags
 ) -> Callable[[], None]:
     """Return what ends a play onto live keys when a joint service comes up meanwhile."""
-    rows = guard.IN_THE_LOOP if args.force else guard.ACTED_ON
+    rows = guard.IN_THE_LOOP if flags.force else guard.ACTED_ON
     refused = guard.those_of(rows, targets.values())
 
     def look() -> None:
@@ -184,7 +176,7 @@ def _alarm(
 
 
 def _play(
-    args: argparse.Namespace,
+    flags: PlayFlags,
     schedule: Schedule,
     targets: dict[str, str],
     session: Session,
@@ -192,14 +184,14 @@ def _play(
     alarm: Callable[[], None],
 ) -> int:
     """Play, and say at the end how it went."""
-    patient = bool(args.prefix.strip("/"))  # nobody on the live keys is to be waited for
+    patient = bool(flags.prefix.strip("/"))  # nobody on the live keys is to be waited for
     ports = [session.raw_publisher(key, patient=patient) for key in targets.values()]
     clock = None
-    if args.clock:
-        key = selection.clock_key(selection.check_prefix(args.prefix))
+    if flags.clock:
+        key = selection.clock_key(selection.check_prefix(flags.prefix))
         clock = session.raw_publisher(key, patient=patient)
-    if not args.start_paused:
-        _await_subscriber(ports, args.wait, keyboard)
+    if not flags.start_paused:
+        _await_subscriber(ports, flags.wait, keyboard)
     display = Display(ports)
 
     def show() -> None:
@@ -209,14 +201,14 @@ def _play(
     gc.freeze()  # the log is not garbage: a collector that walks it makes messages late
     player = Player(
         schedule,
-        Playhead(now_ns(), args.rate, paused=args.start_paused),
+        Playhead(now_ns(), flags.rate, paused=flags.start_paused),
         ports,
         keyboard,
         now_ns=now_ns,
         show=show,
         listening=lambda: any(port.matched for port in ports),
         clock=clock,
-        clock_hz=args.clock_hz,
+        clock_hz=flags.clock_hz,
     )
     began_ns = now_ns()
     try:

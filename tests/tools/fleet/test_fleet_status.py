@@ -76,7 +76,8 @@ def test_a_way_out_is_given_only_where_a_person_must_act(
     assert bool(status.way_out) is helpless
     if mode is Mode.FAULT:
         assert "xrl kill" in status.way_out
-        assert ("xrl drive zero" in status.way_out) is (cause in (Cause.DRIVE_LOST, Cause.POSITION_LOST))
+        is_zeroed = cause not in (Cause.DRIVE_LOST, Cause.POSITION_LOST)
+        assert ("xrl drive zero" in status.way_out) is not is_zeroed
 
 
 @pytest.mark.parametrize("drive", DriveStatus)

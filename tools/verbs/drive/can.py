@@ -1,12 +1,11 @@
-"""`xrl drive can`: bring the CAN buses up, listen to them, measure how long drives take to answer."""
+"""`xrl drive can`: bring the CAN buses up, listen to them, measure how fast drives answer."""
 
 from __future__ import annotations
 
-import argparse
 import shlex
 import subprocess
 from collections.abc import Mapping
-from typing import Final
+from typing import Annotated, Final
 
 from rich import box
 from rich.table import Table
@@ -31,55 +30,69 @@ from tools.bringup.can_monitor import (
 )
 from tools.bringup.check_socketcan import setup_commands
 from tools.bringup.drive_access import drives_within_reach
-from tools.number_arguments import count, finite
+from tools.flags import Arg, ConfigFlags, Count, Duration, RunDirFlags, option
 from tools.terminal import Console, marked
-from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
 
 COMMAND_S: Final = 10.0
 REQUESTS: Final = 200
 SILENT: Final = Text("silent", "red")
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(
-        subparsers,
-        "can",
-        """
-        xrl drive can setup --config lab.toml             # prints the commands
-        sudo xrl drive can setup --config lab.toml --apply
-        xrl drive can test --config lab.toml --for 5      # listens, sends nothing
-        xrl drive can latency --config lab.toml           # asks each axis 200 times; the fleet is down
-        """,
-    )
-    actions = parser.add_subparsers(metavar="ACTION", required=True, dest="action")
-    setup = actions.add_parser("setup", help="bring the kernel's CAN interfaces up")
-    add_config(setup)
-    setup.add_argument(
-        "--apply", action="store_true", help="run the commands, as root; else they are printed"
-    )
-    test = actions.add_parser("test", help="listen: which drives and sensors send how often")
-    latency = actions.add_parser("latency", help="how long each axis takes to answer")
-    for looks in (test, latency):
-        add_config(looks)
-        add_run_dir(looks)
-        looks.add_argument("--bus", metavar="NAME", help="only this one of the robot file")
-    test.add_argument("--for", dest="for_s", type=finite, metavar="S", help="listen so long")
-    latency.add_argument(
-        "--count", type=count, default=REQUESTS, metavar="N", help=f"requests an axis ({REQUESTS})"
-    )
+EXAMPLES: Final = """
+xrl drive can setup --config lab.toml             # prints the commands
+sudo xrl drive can setup --config lab.toml --apply
+xrl drive can test --config lab.toml --for 5      # listens, sends nothing
+xrl drive can latency --config lab.toml           # asks each axis 200 times; the fleet is down
+"""
 
 
-def run(args: argparse.Namespace) -> int:
-    """Do it; a drive or sensor that is missing, or a command that failed, is a fault."""
-    robot = load(args.config)
-    if args.action == "setup":
-        return _set_up(robot, apply=args.apply)
-    buses = _buses(robot, args.bus)
-    with drives_within_reach(robot, args.config, args.run_dir, ()):
-        if args.action == "latency":
-            return _measure(robot, args, buses)
-        return _listen(robot, args, buses)
+class CanFlags(ConfigFlags, RunDirFlags):
+    """Which buses."""
+
+    bus: Annotated[str | None, Arg(metavar="NAME")] = None
+    """only this one of the robot file"""
+
+
+class SetUpFlags(ConfigFlags):
+    """Whether it is done."""
+
+    apply: bool = False
+    """run the commands, as root; else they are printed"""
+
+
+class TestFlags(CanFlags):
+    """How long."""
+
+    for_s: Annotated[Duration | None, option("--for")] = None
+    """listen so long"""
+
+
+class LatencyFlags(CanFlags):
+    """How often."""
+
+    count: Annotated[Count, Arg(metavar="N")] = REQUESTS
+    """requests an axis"""
+
+
+def set_up(flags: SetUpFlags) -> int:
+    """Print the commands, or run them; a fault if one failed."""
+    return _set_up(load(flags.config), apply=flags.apply)
+
+
+def test(flags: TestFlags) -> int:
+    """Listen; a drive or sensor that is missing is a fault."""
+    robot = load(flags.config)
+    buses = _buses(robot, flags.bus)
+    with drives_within_reach(robot, flags.config, flags.run_dir, ()):
+        return _listen(robot, flags, buses)
+
+
+def latency(flags: LatencyFlags) -> int:
+    """Measure; an axis that does not answer is a fault."""
+    robot = load(flags.config)
+    buses = _buses(robot, flags.bus)
+    with drives_within_reach(robot, flags.config, flags.run_dir, ()):
+        return _measure(robot, flags, buses)
 
 
 def _buses(robot: RobotConfig, only: str | None) -> dict[str, tuple[int, ...]]:
@@ -131,13 +144,11 @@ def _ran(words: list[str]) -> bool:
     return done.returncode == 0
 
 
-def _listen(
-    robot: RobotConfig, args: argparse.Namespace, buses: Mapping[str, tuple[int, ...]]
-) -> int:
+def _listen(robot: RobotConfig, flags: TestFlags, buses: Mapping[str, tuple[int, ...]]) -> int:
     console, complete = Console(), True
     for name, nodes in buses.items():
-        bus = bus_config(robot, name, args.run_dir)
-        traffic = listen_to(robot, name, args.run_dir, poll_nodes=False, seconds=args.for_s)
+        bus = bus_config(robot, name, flags.run_dir)
+        traffic = listen_to(robot, name, flags.run_dir, poll_nodes=False, seconds=flags.for_s)
         console.print(_heading(name, bus, traffic), highlight=False, soft_wrap=True)
         if traffic.trouble:
             complete = False
@@ -195,15 +206,13 @@ def _rate(times_s: list[float], seconds: float) -> Text:
     return Text(f"{len(times_s) / seconds:.0f} Hz") if times_s else SILENT
 
 
-def _measure(
-    robot: RobotConfig, args: argparse.Namespace, buses: Mapping[str, tuple[int, ...]]
-) -> int:
+def _measure(robot: RobotConfig, flags: LatencyFlags, buses: Mapping[str, tuple[int, ...]]) -> int:
     """Ask each axis, and print how long it takes.
 
     Raises:
         FleetError: joint services are up.
     """
-    up = check_robot.joint_services(check_robot.services_up(robot, args.run_dir))
+    up = check_robot.joint_services(check_robot.services_up(robot, flags.run_dir))
     if up:
         raise FleetError(
             f"{', '.join(up)}: up, and a request would feed a drive's watchdog; `xrl down` first"
@@ -214,8 +223,8 @@ def _measure(
     complete = True
     for name, nodes in buses.items():
         try:
-            bus = bus_config(robot, name, args.run_dir)
-            found = round_trips(bus, nodes, args.count) if nodes else {}
+            bus = bus_config(robot, name, flags.run_dir)
+            found = round_trips(bus, nodes, flags.count) if nodes else {}
         except DriveError as error:
             raise FleetError(f"bus {name}: {error}; `xrl drive can setup`, `xrl doctor`") from None
         for node, trips in found.items():

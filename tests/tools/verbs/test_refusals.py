@@ -1,0 +1,198 @@
+"""Command lines that are refused before anything is touched: what is typed, and what is said.
+
+LOG stands for a short record. What a hostile file or number does is in tests/tools/test_bad_input.
+"""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from shared.joints import N_JOINTS
+from tests.shared.mcap_log.runs import item, write
+from tests.tools.exit_codes import exit_code
+from tools.verbs import inject
+
+LENGTH: Final = 40
+"""Messages of the record, a millisecond apart."""
+ZEROS: Final = ",0" * (N_JOINTS - 1)
+
+REFUSALS: Final = {
+    "demo --duration 0": "a number of at least 0.001 s",
+    "demo --pace 2": "a number from 0.1 to 1",
+    "demo --kill recorder@3": "without the recorder there is nothing to judge the run by",
+    "demo --push 1:2": "write START:DURATION:FX,FY,FZ",
+    "sim --loss 1.5": "a number from 0 to 1",
+    "sim --controller x.py --control centralised": "one of them says who computes the torques",
+    "up --only planner,elbow": "no service 'elbow'; one of",
+    "up --only ,": "--only names no service",
+    "up --only host_recorder": "beside services of its own",
+    "up --no-sim --scenario squat": "--scenario is for the simulator, and --no-sim starts none",
+    "up --only planner --plant ideal": "--plant is for the simulator, and --only starts none",
+    "up --only planner,harness --snapshot 3": "--snapshot is for the recorder",
+    "up --only harness --injectable": "--injectable is for the planner",
+    "up --accept estop": "--accept is for the gateway to ROS 2: add --ros2",
+    "status --json --traffic": "--traffic is a screen for people",
+    "status --json --watch": "not allowed with",
+    "pendant": "no joint service",
+    "pendant --for 0": "a number of at least 0.001 s",
+    "estop --partly knee_left": "--partly goes with --local",
+    "estop --local --partly elbow": "'elbow': one of",
+    "estop --local --wait": "--wait is for the bus",
+    "lead --hold a --stop a": "two buttons are right",
+    "lead --calibrate --keys": "--calibrate is for a pad",
+    "lead --for 5": "go with --assist N",
+    "lead --assist 5 --shift 1,2": "2 numbers; 4 are right; such as 0.02,0,0,0",
+    "lead --assist 5 --keys": "not allowed with",
+    "view": "`xrl up` starts one",
+    "view no-such-file.mcap": "no-such-file.mcap",
+    "view --port 70000 --sim": "a whole number from 0 to 65535",
+    "view --sim --act": "--act is for the fleet that is up",
+    "view LOG --sim": "a record and --sim do not go together",
+    "view LOG --act": "--act is for the fleet that is up",
+    "view --html x.html": "--html is for a record: name one",
+    "view LOG --foxglove": "--foxglove only looks",
+    "drive zero knee_left --at 0.1": "1 numbers; 2 are right; phi and theta in rad",
+    "drive zero knee_left --at a,b": "number 1, 'a': one within",
+    "drive zero knee_left --at 0,0": "knee_left: theta 0 rad is outside of -3 .. -0.2",
+    "drive zero knee_left --at nan,-0.5": "number 1, 'nan': one within",
+    "drive zero --all --at 0,-0.5": "for one module; for all give --standing",
+    "drive zero knee_left --at 0,-28": "if these are degrees: --at 0,-0.4887",
+    "drive zero knee_left --at 0,-3.1": "leg could then not be bent by lifting alone",
+    "drive zero knee_left --standing 1.5": "between 0 and",
+    "drive zero knee_left --standing 1188": "if these are mm: --standing 1.188",
+    "drive zero knee_left --standing nan": "'nan': a number is right",
+    "drive zero knee_left --standing 0.4": "cannot be reached",
+    "drive zero knee_left": "one of the arguments --at --by --standing is required",
+    "drive zero --at 0,0": "one of the arguments MODULE --all is required",
+    "drive jog elbow": "invalid choice: 'elbow' (choose from 'ankle_right'",
+    "drive jog knee_left --by 0": "--by 0: up to 0.5 rad either way, and not 0",
+    "drive jog knee_left --by -0.51": "a number from -0.5 to 0.5 rad",
+    "drive jog knee_left --period 0.4": "a number from 0.5 to 60 s",
+    "drive jog knee_left --cycles 101": "a whole number from 1 to 100",
+    "drive jog knee_left --torque-limit 0.5": "--torque-limit",
+    "drive configure --dry-run --apply": "not allowed with",
+    "drive configure --restore none.json": "none.json",
+    "drive can test --bus foot": "--bus foot: the robot has ",
+    "drive can latency --count 0": "a whole number from 1",
+    "drive identify body --level 0": "a number from 1e-06 to 0.1 rad",
+    "drive identify body --added 1 --added 2": "2 for 1",
+    "drive identify body --added -1": "from 0 to 100 kg",
+    "drive identify body /nowhere/run.mcap": "/nowhere",
+    "drive identify joint": "one of the arguments MODULE --all is required",
+    "drive identify joint --all knee_left": "not allowed with",
+    "drive identify joint shin_left": "shin_left: one of ankle_right",
+    "drive identify joint knee_left --torque -1": "'-1': a number of at least 0.001 N m",
+    "drive tune up": "invalid choice: 'up' (choose from 'x', 'y', 'z'",
+    "drive tune x --bandwidth 7": "both, or none",
+    "drive tune x --bandwidth 0 --damping 0.5": "0.1 to 500 rad/s",
+    "drive tune x --bandwidth 7 --damping 9": "0.05 to 3",
+    "drive tune x --size 0.5 --sim": "law.probe_max",
+    "drive tune x --size 0 --sim": "law.probe_max",
+    "drive tune x": "no fleet",
+    "drive tune knee_left --sim": "--sim: for a direction",
+    "drive tune knee_left --size 0.01 --plant ideal": "--plant, --size: for a direction",
+    "drive tune x --sim --torque 10": "--torque: for a module",
+    "drive tune x --sim --axis phi": "--axis: for a module",
+    "drive tune x --plant ideal": "(--sim)",
+    "drive tune knee_left --torque 0": "a number of at least 0.001 N m",
+    "log export LOG": "say what to write: --scene",
+    "log export LOG --scene --topic estop": "--topic chooses what is in tables",
+    "log export LOG --gif x.gif --rate 5": "--rate is that of tables or a bag",
+    "log export LOG --csv t --rate 0": "a number from 0.001 to 10000 Hz",
+    "log export LOG --csv t --rate nan": "a number from 0.001 to 10000 Hz",
+    "log export LOG --gif x.gif --topic sim/truth": "--topic chooses what is in tables",
+    "log export LOG --scene --curves": "--curves go beside a picture",
+    "log report LOG --from 3 --to 2": "--from 3 --to 2: the first is to be the smaller one",
+    "log report LOG -o LOG": "is the record itself",
+    "log resim LOG --tolerance -1": "a number of at least 0",
+    "log resim LOG --service elbow": "invalid choice: 'elbow'",
+    "log explain": "one of them",
+    "log explain --q 1,2,3": f"3 numbers; {N_JOINTS} are right; rad",
+    f"log explain --q {'0,' * 13}": f"13 numbers; {N_JOINTS} are right",
+    f"log explain --q 0,0,nan{',0' * 9}": "number 3, 'nan'",
+    f"log explain --q 0,one{',0' * 10}": "number 2, 'one'",
+    f"log explain --q inf{ZEROS}": "number 1, 'inf'",
+    f"log explain --q 1e300{ZEROS}": "within +-6.283",
+    f"log explain --q 0{ZEROS}": "singular pose: the right leg is straight",
+    "log explain --q 0,.14,0,-1,0,.9,0,0,0,-1e-9,0,0": "the left leg is straight",
+    "log explain --p 0,0,1e300,0,0,0": "number 3, '1e300'",
+    "log explain --p 0,0,1.4,0,0,0": "COM z 1.40 m wanted",
+    "log explain --p -0.01,0,1.4,0,0,0": "COM z 1.40 m wanted",
+    "log explain --p 0,0,0.8,0,0,0 --q 0": "one of them",
+    "log explain no_such.mcap": "cannot be read",
+    "log play --topics 'joint/*/state' LOG": "write it first",
+    "log play LOG --start-paused --listen none": "a terminal is needed",
+    "log play LOG --rate 0": "a number from 0.001 to 1000",
+    "log play LOG --rate -1": "a number from 0.001 to 1000",
+    "log play LOG --start-offset -0.1": "'-0.1': a number of at least 0 s",
+    "log play LOG --start-offset 9": "the log is 0.04 s long",
+    "log play LOG --duration 0": "a number of at least 1e-09 s",
+    "log play LOG --clock-hz 0": "a number from 0.001 to 1000 Hz",
+    "log play LOG --topics joint/*/sate": "the nearest is joint/*/state",
+    "log play LOG --topics estop": "nothing is left to play; the log holds joint/*/state",
+    "log play LOG --exclude wrenchh": "the nearest is harness/wrench",
+    "log play LOG --remap joint/knee_right/state": "OLD=NEW is right",
+    "log play LOG --prefix xrl/lab": "--prefix",
+    "log play LOG --config nowhere.toml": "nowhere.toml",
+    "topic hz foo": "foo",
+    "topic hz estop --for 0": "a number of at least 0.001 s",
+    "topic echo": "TOPIC",
+    "topic echo foo": "foo",
+    "topic echo estop --field mode": "--field mode: estop has no such field; it has",
+    "topic echo estop --count 0": "a whole number from 1",
+    "topic echo estop --hz 0": "a number from 0.001 to 10000 Hz",
+    "keys pack planner": "one of the arguments -o/--out --install is required",
+    "keys renew": "one of the arguments NAME --all is required",
+    "gains --check --stiffness": "not allowed with",
+    "bench --rounds 0": "a whole number from 1",
+    "bench bus --rounds 0": "a whole number from 1",
+    "bench bus --seconds 0": "a number of at least 0.001 s",
+    "bench bus --transport pigeon": "invalid choice: 'pigeon'",
+    "bench fleet --pace 0": "a number from 0.1 to 1",
+    "inject --loss 20": "--loss: '20' is out of range; must be from 0 to 1 (1 is 100 %)",
+    "inject --loss x": "--loss: 'x' is not understood; write 0.2 or 20%",
+    "inject --delay 100s": "--delay: '100s' is out of range; must be from 0 to 60000 ms",
+    "inject --delay 5 --for 0": "--for: '0' is out of range",
+    "inject --delay 5 --at inf": "--at: 'inf' is not understood; write 4 (s) or 500ms",
+    "inject --delay 5 --at 1e12": "--at: '1e12' is out of range; must be from 0 to 86400 s",
+    "inject --delay 5 --at -1": "--at: '-1' is out of range",
+    "inject --jitter 5 --distribution wild": "--distribution: 'wild'; one of uniform",
+    "inject --link elbow --loss 1": "--link: 'elbow'; one of planner->joints",
+    "inject --loss 0.1 --distribution pareto": "give a jitter",
+    "inject --reorder 0.1": "give a delay",
+    "inject --ordered": "give a delay, a rate or a partition",
+    "inject": "give a delay",
+    "inject 'all loss=x'": "'all loss=x': loss: 'x' is not understood; write 0.2 or 20%",
+    "inject 'all loss=1' --link all": "'LINK KEY=VALUE ...' with --link: without effect",
+    "inject --clear --link planner-": "--link: 'planner-'; the shell took the rest",
+    "inject --list 'all loss=1'": "--list with 'LINK KEY=VALUE ...': without effect",
+    "inject --list --delay 30": "--list with --delay: without effect",
+    "inject --list --link all": "--list with --link: without effect",
+    "inject --clear --for 3 --partition": "--clear with --for, --partition: without effect",
+}
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("log"), [item(n) for n in range(LENGTH)])
+
+
+@pytest.mark.parametrize("typed", REFUSALS)
+def test_what_cannot_be_meant_is_refused_with_what_is_right(
+    typed: str, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    before = log.read_bytes()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XRL_RUN_DIR", str(tmp_path / "r"))
+    monkeypatch.setattr(inject, "ProxyClient", lambda _run_dir: None)
+    assert exit_code([log if word == "LOG" else word for word in shlex.split(typed)]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert REFUSALS[typed] in " ".join(" ".join(lines).split())
+    assert len(lines) == 1 or lines[0].startswith("usage: xrl ")
+    assert list(tmp_path.iterdir()) == [], "nothing was begun"
+    assert log.read_bytes() == before, "a record is never touched"

@@ -1,0 +1,227 @@
+"""`xrl log export`: a run for others: a 3-D scene in it, a picture, tables, a bag of ROS 2."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+from rich.progress import Progress
+
+from shared.clock import NS_PER_S
+from shared.exceptions import RunError
+from shared.extras import require
+from shared.mcap_log.files import SUFFIX
+from shared.mcap_log.log_copy import write_extended
+from shared.places import FILES
+from tools.export.folders import whole_folder
+from tools.export.tables import (
+    FOR_REEXECUTION,
+    GRID_NAME,
+    CsvFile,
+    ParquetFile,
+    write_grid,
+    write_tables,
+)
+from tools.flags import RUN_HELP, Arg, Folder, Rate, option, positional
+from tools.judge.reports import scene
+from tools.judge.run_parts import PartFlags, part_of
+from tools.logs.run_index import RunIndex
+from tools.logs.run_log import SEE_INFO, RunLog, RunPart, parts_of, read_part, robot_of
+from tools.output import progress_along, refuse_taken, write_atomically
+from tools.terminal import Console, marked
+from tools.topic_keys import keys_named
+
+SCENE_SUFFIX: Final = ".scene" + SUFFIX
+LAYOUT: Final = FILES / "foxglove" / "xrl.json"
+"""For a robot of this name; `--layout` writes it for the name in the log."""
+LAYOUT_ROBOT: Final = "xrl"
+BAG_RATE_HZ: Final = 100.0
+"""Of joint states, transforms and wrench in a bag."""
+
+
+EXAMPLES: Final = """
+xrl log export out/a/run.mcap --scene
+xrl log export out/a/run.mcap --scene -o shown.mcap --layout layout.json
+xrl log export out/a/run.mcap --gif squat.gif     # the robot moving, from side and front
+xrl log export out/a/run.mcap --gif shove.gif --from 5 --to 9
+xrl log export out/a/run.mcap --gif fig7.gif --curves     # with curves, as the paper's Fig. 7
+xrl log export out/a --csv tables                         # a file for each topic and module
+xrl log export out/a --parquet t --rate 100 --topic 'joint/*/state' --topic harness/wrench
+xrl log export out/a --ros2bag bag                        # ros2 bag play bag
+"""
+
+
+class ExportFlags(PartFlags):
+    """Which run, and what is made of it."""
+
+    file: Annotated[Path, positional("FILE", help=f"{RUN_HELP}; it is not touched")]
+    scene: bool = False
+    """copy it with frames, bodies and forces at 30 Hz, for the 3-D views of Foxglove (all of it)
+    and Rerun (frames and bodies)"""
+    out: Annotated[Path | None, option("-o", "--out", metavar="OUT")] = None
+    """where the copy goes (default: NAME.scene.mcap beside the record)"""
+    layout: Path | None = None
+    """also write Foxglove's layout for this robot's name (that for `xrl` is shipped,
+    deploy/foxglove/xrl.json)"""
+    gif: Path | None = None
+    """also draw the robot from the side and the front, as an animated picture"""
+    curves: bool = False
+    """beside it COM, height and hand as they come"""
+    csv: Folder | None = None
+    """also write CSV tables: a file for each key, with all of its messages"""
+    parquet: Folder | None = None
+    """also write Parquet tables: a file for each key, with all of its messages"""
+    topic: Annotated[tuple[str, ...], Arg(metavar="NAME")] = ()
+    """only these topics in the tables, such as 'joint/*/state'; may be repeated"""
+    ros2bag: Folder | None = None
+    """also write a bag of ROS 2 (MCAP): joint states, transforms, wrench, diagnostics"""
+    rate: Annotated[
+        Rate | None,
+        Arg(
+            help="of the tables: all topics in one, at each time the newest messages; of the bag: "
+            f"default {BAG_RATE_HZ:g} Hz"
+        ),
+    ] = None
+    force: bool = False
+    """replace what exists"""
+
+    def check(self) -> None:
+        """Refuse nothing to write, and what goes with something that is not written."""
+        super().check()
+        tables = self.csv is not None or self.parquet is not None
+        if not (self.scene or self.layout or self.gif or tables or self.ros2bag):
+            raise RunError(
+                "say what to write: --scene, --layout FILE, --gif FILE, --csv DIR, --parquet DIR, "
+                "--ros2bag DIR, or several of them"
+            )
+        if self.topic and not tables:
+            raise RunError("--topic chooses what is in tables: add --csv DIR or --parquet DIR")
+        if self.rate is not None and not tables and self.ros2bag is None:
+            raise RunError("--rate is that of tables or a bag: add --csv, --parquet or --ros2bag")
+        if self.curves and self.gif is None:
+            raise RunError("--curves go beside a picture: name it with --gif FILE")
+
+
+def run(flags: ExportFlags) -> int:
+    """Write the requested files."""
+    tables: list[tuple[Path | None, type[CsvFile] | type[ParquetFile]]] = [
+        (flags.csv, CsvFile), (flags.parquet, ParquetFile),
+    ]  # fmt: skip
+    for extra, wanted, otherwise in (
+        ("foxglove", flags.scene, ""),
+        ("plot", flags.gif, ""),
+        ("parquet", flags.parquet, "take --csv"),
+        ("ros2", flags.ros2bag, ""),
+    ):
+        if wanted:
+            require(extra, otherwise)
+    path = flags.file
+    if path.is_dir() and flags.scene:
+        raise RunError(f"{path}: is a directory; give --scene one of its files")
+    index = RunIndex(path)
+    part = part_of(flags, index)
+    console = Console()
+    if flags.scene:
+        out = flags.out or path.with_name(path.name.removesuffix(SUFFIX) + SCENE_SUFFIX)
+        refuse_taken(out, path, force=flags.force)
+        count = export_scene(index, out)
+        console.print(marked("[bold]{}[/]: {} messages", out, count), soft_wrap=True)
+    if flags.gif is not None:
+        refuse_taken(flags.gif, path, force=flags.force)
+        _draw(read_part(index, part), flags.gif, console, with_curves=flags.curves)
+    for folder, kind in tables:
+        if folder is not None:
+            _write_tables(index, part, flags, folder, kind, console)
+    if flags.ros2bag is not None:
+        _write_bag(index, part, flags, flags.ros2bag, console)
+    if flags.layout is not None:
+        refuse_taken(flags.layout, path, force=flags.force)
+        write_atomically(
+            flags.layout, json.dumps(layout_for(index.robot), indent=2).encode() + b"\n"
+        )
+        console.print(marked("[bold]{}[/]: import it in Foxglove", flags.layout))
+    return 0
+
+
+def _write_tables(
+    index: RunIndex,
+    part: RunPart,
+    flags: ExportFlags,
+    out: Path,
+    kind: type[CsvFile] | type[ParquetFile],
+    console: Console,
+) -> None:
+    """Write a folder of tables, with progress."""
+    keys = keys_named(flags.topic, FOR_REEXECUTION)
+    with (
+        whole_folder(out, index.path, force=flags.force) as folder,
+        progress_along("writing", index.length_s) as done,
+    ):
+        folder.mkdir()
+        if flags.rate is None:
+            rows = write_tables(index, part, keys, folder, kind, done)
+        else:
+            grid = write_grid(index, part, keys, flags.rate, folder / GRID_NAME, kind, done)
+            rows = {GRID_NAME: grid}
+        if not any(rows.values()):
+            raise RunError(f"{index.path}: has no message of these topics in this part; {SEE_INFO}")
+    told = f"{len(rows)} table{'s' * (len(rows) != 1)}, {sum(rows.values())} rows"
+    console.print(marked("[bold]{}[/]: {}", out, told), soft_wrap=True)
+
+
+def _write_bag(
+    index: RunIndex, part: RunPart, flags: ExportFlags, out: Path, console: Console
+) -> None:
+    """Write a bag of ROS 2, with progress."""
+    require("ros2")
+    from tools.export.ros2_bag import write_bag  # noqa: PLC0415 - needs the extra
+
+    with (
+        whole_folder(out, index.path, force=flags.force) as folder,
+        progress_along("writing", index.length_s) as done,
+    ):
+        rate_hz = flags.rate or BAG_RATE_HZ
+        count = write_bag(index, part, robot_of(index), folder, rate_hz, done)
+    told = f"{count} messages; ros2 bag play {out}"
+    console.print(marked("[bold]{}[/]: {}", out, told), soft_wrap=True)
+
+
+def _draw(log: RunLog, out: Path, console: Console, *, with_curves: bool) -> None:
+    """Draw the run's moving picture, with progress."""
+    require("plot")
+    from tools.judge.reports.moving_picture import write_gif  # noqa: PLC0415 - needs the extra
+
+    with Progress(console=console, transient=True) as shown:
+        bar = shown.add_task("drawing", total=1.0)
+        count = write_gif(
+            log, robot_of(log), out, lambda part: shown.update(bar, completed=part),
+            with_curves=with_curves,
+        )  # fmt: skip
+    console.print(marked("[bold]{}[/]: {} frames", out, count), soft_wrap=True)
+
+
+def export_scene(index: RunIndex, out: Path) -> int:
+    """Write a copy of a log with its scene, with progress; return how many messages it has."""
+    robot = robot_of(index)
+
+    def parts() -> Iterator[RunLog]:
+        with progress_along("copying", index.length_s) as done:
+            for log in parts_of(index):
+                yield log
+                done((log.end_ns - log.began_ns()) / NS_PER_S)
+
+    return write_extended(
+        index.path, out, scene.channels(index.robot), scene.messages(parts(), robot)
+    )
+
+
+def layout_for(robot: str) -> dict[str, Any]:
+    """Return Foxglove's layout for a robot of some name."""
+    try:
+        text = LAYOUT.read_text(encoding="utf-8")
+    except OSError as error:
+        raise RunError(f"{LAYOUT}: cannot be read: {error.strerror}") from None
+    found: dict[str, Any] = json.loads(text.replace(f"xrl/{LAYOUT_ROBOT}/", f"xrl/{robot}/"))
+    return found
