@@ -22,7 +22,7 @@ from shared.config.scenarios import Inject, Scenario
 from shared.robot.robot_model import stand_pose
 from tests.joint.helpers import command
 from tests.lockstep.runs import push, variant
-from tests.planner.conftest import standing_torque
+from tests.planner.states import standing_torque
 from tests.test_architecture import IMPORTS, Import, imports_in
 from tools import cli
 from tools.sim.centralised.control import CentralPlanner, PassThrough
