@@ -68,12 +68,16 @@ class Rig:
     def cycle(self, driver: OdriveCan) -> DriveReading:
         """Step, read twice what the step sent, so that its heartbeats are in, and return it."""
         self.step()
-        first = driver.read(0.5)
-        assert first is not None
+        read(driver)
         self.step()
-        second = driver.read(0.5)
-        assert second is not None
-        return second
+        return read(driver)
+
+
+def read(driver: OdriveCan, timeout_s: float = 0.5) -> DriveReading:
+    """Return the reading that is there for sure."""
+    reading = driver.read(timeout_s)
+    assert reading is not None
+    return reading
 
 
 def make_driver(path: Path) -> OdriveCan:

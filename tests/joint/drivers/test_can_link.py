@@ -38,7 +38,7 @@ from tests.joint.drivers.can_bench import (
     interface_down,
     receiving_fails,
 )
-from tests.joint.drivers.rig import DRIVE, MS, NODES, TARGET, Rig, arm, connected, make_driver
+from tests.joint.drivers.rig import DRIVE, MS, NODES, TARGET, Rig, arm, connected, make_driver, read
 
 TROUBLES = pytest.mark.parametrize(
     ("trouble", "counted"),
@@ -57,14 +57,12 @@ def test_a_bus_that_fails_is_silence_then_a_lost_drive_and_is_opened_again(
     assert failed.closed == 1
     assert bench.driver.bus_offs == counted
     assert bench.after(0.5e3 * DRIVE.watchdog_timeout) is None
-    reading = bench.after(1e3 * DRIVE.watchdog_timeout)
-    assert reading is not None
-    assert reading.status is DriveStatus.LOST
+    assert bench.seen(1e3 * DRIVE.watchdog_timeout).status is DriveStatus.LOST
     bench.after(RETRY_MS)
     assert bench.driver.connections == 2
-    reading = bench.receive(AxisState.CLOSED_LOOP_CONTROL)
-    assert reading is not None
-    assert reading.status is DriveStatus.ARMED, "the drive has held on all the while"
+    assert bench.receive(AxisState.CLOSED_LOOP_CONTROL).status is DriveStatus.ARMED, (
+        "the drive has held on all the while"
+    )
 
 
 @TROUBLES
@@ -114,7 +112,6 @@ def test_a_bus_that_is_back_at_once_is_gone_on_with_before_the_next_heartbeat(
     bench.after(1)
     assert bench.driver.connections == 2
     reading = bench.receive(None)
-    assert reading is not None
     assert (reading.status, bench.driver.dialect) == (DriveStatus.ARMED, "0.5")
 
 
@@ -129,9 +126,7 @@ def test_trouble_on_the_wire_that_leaves_the_controller_on_it_is_counted_only(be
     bench.armed()
     passive = error_frame(0x04, bytes((0, 0x20, 0, 0, 0, 0, 0, 0)))
     bench.bus.waiting.extend([passive, passive])
-    reading = bench.receive(AxisState.CLOSED_LOOP_CONTROL)
-    assert reading is not None
-    assert reading.status is DriveStatus.ARMED
+    assert bench.receive(AxisState.CLOSED_LOOP_CONTROL).status is DriveStatus.ARMED
     assert bench.driver._link.error_frames == 2
     assert (bench.driver.bus_offs, bench.driver.connections) == (0, 1)
 
@@ -173,9 +168,7 @@ def test_a_flooded_bus_does_not_hold_up_the_loop(bench: Bench) -> None:
 
 def test_driver_starts_without_a_bus_and_finds_it_later(path: Path) -> None:
     driver = make_driver(path)
-    reading = driver.read(0.001)
-    assert reading is not None
-    assert reading.status == DriveStatus.LOST
+    assert read(driver, 0.001).status is DriveStatus.LOST
     driver.write_torque((1.0, 1.0))
     driver.arm(onboard=False)
     driver.idle()
@@ -195,9 +188,7 @@ def test_driver_is_lost_with_its_hub_and_arms_again_with_a_new_one(path: Path) -
     arm(old, driver)
     time.sleep(RETRY_MS * MS)
     old.hub.close()
-    reading = driver.read(0.01)
-    assert reading is not None
-    assert reading.status == DriveStatus.LOST
+    assert read(driver, 0.01).status is DriveStatus.LOST
     driver.write_torque((1.0, 1.0))
     new = Rig(path)
     time.sleep(RETRY_MS * MS)

@@ -1,9 +1,10 @@
-"""What a heartbeat says in either dialect of CANSimple, and which dialect it is in."""
+"""What a drive's registers and heartbeats say of a module, in either dialect of CANSimple."""
 
 from __future__ import annotations
 
 import pytest
 
+from services.joint.drivers.axes_status import AxesStatus
 from services.joint.drivers.base import DriveStatus
 from services.joint.drivers.firmware import (
     OTHER_ERROR,
@@ -20,6 +21,8 @@ from shared.can.cansimple import AxisError, AxisState, Heartbeat
 from shared.can.cansimple_06 import DriveError06, Heartbeat06, ProcedureResult
 
 CLOSED, IDLE = AxisState.CLOSED_LOOP_CONTROL, AxisState.IDLE
+
+
 VERSION = cansimple_06.pack_version(VERSION_06)
 
 
@@ -42,9 +45,6 @@ def report_of(*pairs: tuple[int, bytes], armed: bool = False) -> AxesReport:
     for axis, heartbeat in pairs:
         report.receive(axis, heartbeat)
     return report
-
-
-# ---- which dialect
 
 
 @pytest.mark.parametrize(
@@ -103,9 +103,6 @@ def test_what_is_forgotten_is_found_out_anew() -> None:
     assert (report.dialect, report.status) == ("0.6", DriveStatus.ERROR)
 
 
-# ---- what an error is
-
-
 @pytest.mark.parametrize("bit", range(32))
 def test_no_error_of_0_6_looks_like_none(bit: int) -> None:
     assert errors_from_06(1 << bit) != 0
@@ -117,14 +114,11 @@ def test_no_error_of_0_6_looks_like_none(bit: int) -> None:
     assert report.errors != 0
 
 
-def test_no_error_of_0_6_is_none_of_ours() -> None:
-    assert errors_from_06(0) == 0
-
-
 def test_every_named_error_of_0_6_has_one_of_0_5() -> None:
+    assert errors_from_06(0) == 0
+    assert errors_from_06(0x8000_0000) == OTHER_ERROR
     for error in DriveError06:
         assert errors_from_06(error) < OTHER_ERROR
-    assert errors_from_06(0x8000_0000) == OTHER_ERROR
 
 
 def test_the_watchdog_has_its_own_bit_in_each_dialect_and_the_other_one_is_something_else() -> None:
@@ -193,3 +187,57 @@ def test_an_axis_that_left_closed_loop_without_an_error_bit_is_an_error(
     report.receive(1, left)
     statuses.append(report.status)
     assert statuses == [DriveStatus.ARMED, DriveStatus.ERROR]
+
+
+NONE = (0,) * 8
+
+
+@pytest.mark.parametrize(
+    ("states", "error", "status"),
+    [
+        ((IDLE, IDLE), 0, DriveStatus.IDLE),
+        ((CLOSED, IDLE), 0, DriveStatus.IDLE),
+        ((IDLE, CLOSED), 0, DriveStatus.IDLE),
+        ((CLOSED, CLOSED), 0, DriveStatus.ARMED),
+        ((CLOSED, CLOSED), 1, DriveStatus.ERROR),
+    ],
+)
+def test_a_module_is_armed_when_both_axes_are_without_an_error(
+    states: tuple[int, int], error: int, status: DriveStatus
+) -> None:
+    assert AxesStatus().judge(states, error) is status
+
+
+@pytest.mark.parametrize("left", [(IDLE, CLOSED), (CLOSED, IDLE), (IDLE, IDLE)])
+def test_either_axis_that_left_closed_loop_is_an_error(left: tuple[int, int]) -> None:
+    axes = AxesStatus()
+    axes.judge((CLOSED, CLOSED), 0)
+    assert axes.judge(left, 0) is DriveStatus.ERROR
+    assert axes.judge((CLOSED, CLOSED), 0) is DriveStatus.ARMED
+
+
+@pytest.mark.parametrize("first", [0, 4])
+@pytest.mark.parametrize(
+    ("register", "value", "error"),
+    [
+        (0, AxisError.OVER_TEMP, AxisError.OVER_TEMP),
+        (1, 0x8, AxisError.MOTOR_FAILED),
+        (1, 1 << 40, AxisError.MOTOR_FAILED),
+        (2, 0x4, AxisError.ENCODER_FAILED),
+        (3, 0x1, AxisError.CONTROLLER_FAILED),
+    ],
+)
+def test_every_register_of_either_axis_shows(
+    first: int, register: int, value: int, error: int
+) -> None:
+    registers = list(NONE)
+    registers[first + register] = value
+    assert AxesStatus.errors(registers, wanted_armed=True) == error
+
+
+@pytest.mark.parametrize(("wanted_armed", "seen"), [(True, True), (False, False)])
+def test_a_watchdog_that_ran_out_counts_only_where_the_drive_was_to_be_armed(
+    wanted_armed: bool, seen: bool
+) -> None:
+    registers = [AxisError.WATCHDOG_TIMER_EXPIRED, *NONE[1:]]
+    assert bool(AxesStatus.errors(registers, wanted_armed=wanted_armed)) == seen

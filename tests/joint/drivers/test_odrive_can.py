@@ -31,7 +31,18 @@ from shared.can.cansimple import (
     pack_two_floats,
 )
 from tests.joint.drivers.can_bench import Bench, frame
-from tests.joint.drivers.rig import AXES, DRIVE, MS, NODES, TARGET, Rig, arm, connected, make_driver
+from tests.joint.drivers.rig import (
+    AXES,
+    DRIVE,
+    MS,
+    NODES,
+    TARGET,
+    Rig,
+    arm,
+    connected,
+    make_driver,
+    read,
+)
 
 CLOSED, IDLE = AxisState.CLOSED_LOOP_CONTROL, AxisState.IDLE
 AWAY_FROM_ZERO = pack_two_floats(0.25, 0.0)
@@ -126,8 +137,7 @@ def test_newest_of_several_frames_in_one_packet_wins(rig: Rig, driver: OdriveCan
             for i, can_id in enumerate(ids)
         ]
     )
-    reading = driver.read(0.5)
-    assert reading is not None
+    reading = read(driver)
     assert reading.pos_turns == (20.0, 21.0)
 
 
@@ -137,13 +147,9 @@ def test_one_axis_alone_makes_no_sample_and_after_a_while_the_drive_is_lost(
     frame = (arbitration_id(NODES[0], Command.GET_ENCODER_ESTIMATES), pack_two_floats(1.0, 0.0))
     rig.hub.broadcast([frame])
     time.sleep(1.5 * DRIVE.watchdog_timeout)
-    reading = driver.read(0.0)
-    assert reading is not None
-    assert reading.status == DriveStatus.LOST
+    assert read(driver, 0.0).status is DriveStatus.LOST
     rig.hub.broadcast([(arbitration_id(NODES[1], Command.GET_ENCODER_ESTIMATES), frame[1])])
-    reading = driver.read(0.5)
-    assert reading is not None
-    assert reading.status == DriveStatus.IDLE
+    assert read(driver).status is DriveStatus.IDLE
 
 
 def test_driver_arms_again_after_an_error(rig: Rig, driver: OdriveCan) -> None:
@@ -173,9 +179,7 @@ def test_watchdog_does_not_run_out_between_arming_and_the_heartbeat_that_shows_i
     for _ in range(300):
         rig.bank.step(rig.now_s, rig.pos, rig.vel)
         rig.front.send_encoders()
-        reading = driver.read(0.5)
-        assert reading is not None
-        assert reading.status == DriveStatus.IDLE
+        assert read(driver).status is DriveStatus.IDLE
         rig.front.receive()
         rig.now_s += MS
     assert [rig.bank.state[axis] for axis in AXES] == [AxisState.CLOSED_LOOP_CONTROL] * 2
@@ -306,11 +310,9 @@ def test_a_heartbeat_from_before_an_order_is_not_believed_after_it(bench: Bench)
     bench.receive()
     bench.driver.arm(onboard=True)
     reading = bench.receive(AxisState.IDLE, error=0x40)
-    assert reading is not None
     assert (reading.status, reading.error) == (DriveStatus.IDLE, 0)
     bench.wait(1e-3 * ARM_GRACE_MS)
     reading = bench.receive(AxisState.IDLE, error=0x40)
-    assert reading is not None
     assert (reading.status, reading.error) == (DriveStatus.ERROR, 0x40)
 
 
@@ -367,14 +369,11 @@ def test_estimates_without_heartbeats_are_a_lost_drive_since_it_could_disarm_uns
     statuses = []
     for _ in range(REBOOT_MS + 20):
         reading = bench.receive(None)
-        assert reading is not None
         statuses.append(reading.status)
     assert statuses[: REBOOT_MS - 20] == [DriveStatus.ARMED] * (REBOOT_MS - 20)
     assert statuses[-10:] == [DriveStatus.LOST] * 10
     bench.receive(CLOSED)
-    reading = bench.receive(CLOSED)
-    assert reading is not None
-    assert reading.status is DriveStatus.ARMED
+    assert bench.receive(CLOSED).status is DriveStatus.ARMED
 
 
 @pytest.mark.parametrize("silent", NODES)
@@ -383,6 +382,4 @@ def test_heartbeats_of_one_axis_do_not_count_for_the_other(bench: Bench, silent:
     sending = NODES[1 - NODES.index(silent)]
     for _ in range(2 * REBOOT_MS // (2 * ARM_GRACE_MS)):
         receive_heartbeat(bench, sending, CLOSED)
-    reading = bench.receive(None)
-    assert reading is not None
-    assert reading.status is DriveStatus.LOST
+    assert bench.receive(None).status is DriveStatus.LOST

@@ -18,7 +18,7 @@ from services.simulator.fronts.cansimple_front import CanSimpleFront
 from services.simulator.fronts.unix_can_hub import UnixCanHub
 from shared.can.cansimple import AxisState, Command, arbitration_id, pack_two_floats
 from shared.config.sections import CanConfig
-from tests.joint.drivers.rig import DRIVE, MS
+from tests.joint.drivers.rig import DRIVE, MS, read
 
 MODULES = 3
 NODES = [(0, 1), (2, 3), (4, 5)]
@@ -51,8 +51,7 @@ class Leg:
             self.step()
             readings = []
             for driver in self.drivers:
-                reading = driver.read(0.5)
-                assert reading is not None
+                reading = read(driver)
                 readings.append(reading)
         return readings
 

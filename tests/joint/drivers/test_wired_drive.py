@@ -1,0 +1,166 @@
+"""The joint's zero on its motors: the mark, what is known by it, and read-only drives."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.joint.drivers.base import Drive, DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.wired_drive import MotorFrame, WiredDrive
+from shared.bus.messages import Pair
+
+MARK = 64.0
+
+
+TARGET = MotorTarget((0.5, -1.5), (1.0, 2.0), (0.1, 0.2), (20.0, 20.0), (0.3, 0.3))
+
+
+class Recorder:
+    """A drive that reads what it is told to, and keeps what it is sent."""
+
+    def __init__(self) -> None:
+        self.reading: DriveReading | None = None
+        self.sent: list[object] = []
+
+    def read(self, _timeout_s: float) -> DriveReading | None:
+        return self.reading
+
+    def write_torque(self, torque: Pair) -> None:
+        self.sent.append(torque)
+
+    def write(self, target: MotorTarget) -> None:
+        self.sent.append(target)
+
+    def arm(self, *, onboard: bool) -> None:
+        self.sent.append(("arm", onboard))
+
+    def idle(self) -> None:
+        self.sent.append("idle")
+
+    def set_position(self, turns: Pair) -> None:
+        self.sent.append(turns)
+
+    def close(self) -> None:
+        self.sent.append("close")
+
+
+def at(pos: Pair, status: DriveStatus = DriveStatus.ARMED) -> DriveReading:
+    return DriveReading(7, pos, (0.5, -0.5), status, 0x40, (0.1, 0.2))
+
+
+@pytest.fixture
+def inner() -> Recorder:
+    return Recorder()
+
+
+def status_by(inner: Recorder, frame: MotorFrame, reading: DriveReading) -> DriveStatus:
+    """Return the status of a reading as it comes through."""
+    inner.reading = reading
+    found = WiredDrive(inner, frame).read(0.0)
+    assert found is not None
+    return found.status
+
+
+def test_positions_are_counted_from_the_mark_both_ways(inner: Recorder) -> None:
+    drive: Drive = WiredDrive(inner, MotorFrame(MARK))
+    inner.reading = at((MARK + 3.0, MARK - 4.0))
+    reading = drive.read(0.0)
+    assert reading == DriveReading(7, (3.0, -4.0), (0.5, -0.5), DriveStatus.ARMED, 0x40, (0.1, 0.2))
+    drive.write(TARGET)
+    drive.set_position((3.0, -4.0))
+    sent = inner.sent[0]
+    assert isinstance(sent, MotorTarget)
+    assert sent.pos_turns == (MARK + 0.5, MARK - 1.5)
+    assert (sent.vel_turns, sent.torque) == (TARGET.vel_turns, TARGET.torque)
+    assert (sent.pos_gain, sent.vel_gain) == (TARGET.pos_gain, TARGET.vel_gain)
+    assert inner.sent[1] == (MARK + 3.0, MARK - 4.0)
+
+
+@pytest.mark.parametrize("pos", [(0.0, MARK), (MARK, 0.97), (31.9, MARK), (MARK, 96.1)])
+@pytest.mark.parametrize("status", [DriveStatus.IDLE, DriveStatus.ARMED, DriveStatus.ERROR])
+def test_a_drive_that_counts_far_from_the_mark_is_unzeroed(
+    inner: Recorder, pos: Pair, status: DriveStatus
+) -> None:
+    assert status_by(inner, MotorFrame(MARK), at(pos, status)) is DriveStatus.UNZEROED
+
+
+@pytest.mark.parametrize("signs", [(-1, 1), (-1, -1)])
+def test_so_it_is_with_signs(inner: Recorder, signs: tuple[int, int]) -> None:
+    assert status_by(inner, MotorFrame(MARK, signs), at((0.97, 0.5))) is DriveStatus.UNZEROED
+
+
+def test_a_lost_drive_is_lost_wherever_it_was_and_silence_stays_silence(inner: Recorder) -> None:
+    lost = at((0.0, 0.0), DriveStatus.LOST)
+    assert status_by(inner, MotorFrame(MARK), lost) is DriveStatus.LOST
+    inner.reading = None
+    assert WiredDrive(inner, MotorFrame(MARK)).read(0.0) is None
+
+
+def test_without_a_mark_any_drive_is_taken_for_zeroed(inner: Recorder) -> None:
+    inner.reading = at((0.0, 500.0))
+    assert WiredDrive(inner, MotorFrame(0.0)).read(0.0) == inner.reading
+
+
+def test_everything_else_goes_through(inner: Recorder) -> None:
+    drive = WiredDrive(inner, MotorFrame(MARK))
+    drive.write_torque((0.1, 0.2))
+    drive.arm(onboard=True)
+    drive.idle()
+    drive.close()
+    assert inner.sent == [(0.1, 0.2), ("arm", True), "idle", "close"]
+
+
+def test_a_read_only_drive_is_sent_nothing_at_all(inner: Recorder) -> None:
+    drive: Drive = WiredDrive(inner, MotorFrame(), read_only=True)
+    drive.write_torque((0.1, 0.2))
+    drive.write(TARGET)
+    drive.arm(onboard=True)
+    drive.idle()
+    drive.set_position((0.0, 0.0))
+    assert inner.sent == []
+    drive.close()
+    assert inner.sent == ["close"]
+
+
+@pytest.mark.parametrize("status", DriveStatus)
+def test_a_read_only_drive_reports_all_but_a_foreign_arming(
+    inner: Recorder, status: DriveStatus
+) -> None:
+    inner.reading = at((1.0, 2.0), status)
+    reading = WiredDrive(inner, MotorFrame(), read_only=True).read(0.0)
+    assert reading is not None
+    assert (reading.pos_turns, reading.vel_turns, reading.error) == ((1.0, 2.0), (0.5, -0.5), 0x40)
+    armed = status is DriveStatus.ARMED
+    assert reading.status is (DriveStatus.IDLE if armed else status)
+
+
+@given(
+    pos=st.tuples(st.floats(-20, 20), st.floats(-20, 20)),
+    signs=st.tuples(st.sampled_from([1, -1]), st.sampled_from([1, -1])),
+)
+def test_a_motor_that_counts_down_is_the_same_joint(pos: Pair, signs: tuple[int, int]) -> None:
+    """What is told, armed and written through the signs comes back through them."""
+    inner = Recorder()
+    drive: Drive = WiredDrive(inner, MotorFrame(MARK, signs))
+    drive.set_position(pos)
+    target = inner.sent.pop()
+    assert target == (signs[0] * (pos[0] + MARK), signs[1] * (pos[1] + MARK))
+    inner.reading = DriveReading(7, target, (0.5, -0.5), DriveStatus.ARMED, 0, (0.1, 0.2))  # type: ignore[arg-type]
+    reading = drive.read(0.0)
+    assert reading is not None
+    assert reading.status is DriveStatus.ARMED
+    assert reading.pos_turns == pytest.approx(pos)
+    assert reading.vel_turns == (signs[0] * 0.5, signs[1] * -0.5)
+    assert reading.torque == (signs[0] * 0.1, signs[1] * 0.2)
+    drive.write(TARGET)
+    drive.write_torque((0.1, 0.2))
+    sent, torque = inner.sent
+    assert isinstance(sent, MotorTarget)
+    assert sent.pos_turns == (signs[0] * (MARK + 0.5), signs[1] * (MARK - 1.5))
+    assert (sent.vel_turns, sent.torque) == (
+        (signs[0] * 1.0, signs[1] * 2.0),
+        (signs[0] * 0.1, signs[1] * 0.2),
+    )
+    assert (sent.pos_gain, sent.vel_gain) == (TARGET.pos_gain, TARGET.vel_gain)
+    assert torque == sent.torque
