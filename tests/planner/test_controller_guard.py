@@ -1,9 +1,10 @@
-"""What a controller of somebody's own may do, and what holds all six instead."""
+"""A controller of somebody's own: how it is found, what it may do, what holds all instead."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from services.planner.controller import Action, Observation
+from services.planner.controller_file import absolute, controller_maker, split_spec
 from services.planner.intents import OperatorRequest
 from services.planner.law.hocca import Hocca
 from services.planner.law.split import LocalGains
@@ -18,9 +20,90 @@ from services.planner.watch.controller_guard import SUPPORT, ControllerGuard
 from shared.bus.messages import SplitSource
 from shared.config.files import load
 from shared.config.robot_config import RobotConfig
+from shared.exceptions import ConfigError
 from shared.places import DEFAULT_CONFIG
 from shared.robot.capture_point import capture_point
 from shared.robot.robot_model import stand_pose
+
+GOOD = """
+class Controller:
+    made = 0
+    def __init__(self, robot):
+        self.name = robot.name
+        Controller.made += 1
+    def reset(self, seen): pass
+    def step(self, seen): pass
+
+def other(robot):
+    return Controller(robot)
+"""
+
+
+@pytest.fixture
+def mine(tmp_path: Path) -> Path:
+    return tmp_path / "mine.py"
+
+
+@pytest.mark.parametrize("name", ["", ":Controller", ":other"])
+def test_each_planner_gets_one_of_its_own(mine: Path, robot: RobotConfig, name: str) -> None:
+    mine.write_text(GOOD, encoding="utf-8")
+    make = controller_maker(f"{mine}{name}", robot)
+    assert make() is not make()
+    assert make().name == robot.name  # type: ignore[attr-defined]  # of the file
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "said"),
+    [
+        (GOOD, ":Absent", "has no Absent; a class or function Absent"),
+        ("def Controller(robot): return 3", "", "has no reset and no step"),
+        ("class Controller:\n  def reset(self, s): pass\n  def __init__(self, r): pass", "",
+         "has no step; reset"),
+        ("def Controller(): pass", "", "raised TypeError"),
+        ("import nowhere_to_be_found", "", "raised ModuleNotFoundError: No module named"),
+        ("def (", "", "raised SyntaxError"),
+        ("1 / 0", "", "raised ZeroDivisionError"),
+    ],
+)  # fmt: skip
+def test_a_file_that_cannot_be_used_is_one_clear_line(
+    mine: Path, robot: RobotConfig, text: str, name: str, said: str
+) -> None:
+    mine.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        controller_maker(f"{mine}{name}", robot)
+    assert said in str(caught.value)
+    assert "mine.py" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("spec", ["absent.py", "absent", "absent.txt", ""])
+def test_a_file_that_is_not_there_is_one_clear_line(spec: str, robot: RobotConfig) -> None:
+    with pytest.raises(ConfigError, match=r"FILE\.py or FILE\.py:NAME"):
+        controller_maker(spec, robot)
+
+
+def test_a_spec_is_file_and_name() -> None:
+    assert split_spec("a/b.py") == (Path("a/b.py"), "Controller")
+    assert split_spec("a/b.py:LQR") == (Path("a/b.py"), "LQR")
+    assert split_spec("/home/me/.pyenv/c/mine.py:B") == (Path("/home/me/.pyenv/c/mine.py"), "B")
+    assert absolute("b.py:LQR") == f"{Path.cwd() / 'b.py'}:LQR"
+
+
+def test_the_one_that_was_looked_at_is_the_first_planners(mine: Path, robot: RobotConfig) -> None:
+    """It may have opened a device, which a second one could not."""
+    mine.write_text(GOOD.replace("def __init__", "all = []\n    def __init__"), encoding="utf-8")
+    make = controller_maker(str(mine), robot)
+    first = make()
+    assert type(first).made == 1  # type: ignore[attr-defined]  # of the file
+    make()
+    assert type(first).made == 2  # type: ignore[attr-defined]
+
+
+def test_a_file_beside_it_can_be_imported(mine: Path, robot: RobotConfig) -> None:
+    (mine.parent / "beside_my_controller.py").write_text("GAIN = 3", encoding="utf-8")
+    mine.write_text(f"import beside_my_controller\n{GOOD}", encoding="utf-8")
+    controller_maker(str(mine), robot)
+
 
 GEOMETRY = load(DEFAULT_CONFIG).geometry
 
@@ -95,6 +178,8 @@ def raises(_seen: Observation) -> Action:
 
 
 NAN = np.full(12, math.nan)
+
+
 BAD = {
     "None": lambda _: None,
     "a tuple": lambda seen: tuple(Action.of(seen.law)),

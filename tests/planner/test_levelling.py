@@ -1,3 +1,5 @@
+""""""
+
 from __future__ import annotations
 
 import math
@@ -18,7 +20,11 @@ from tests.planner.conftest import Closed
 from tools.lab.design.torque_breakdown import torque_breakdown
 
 LEVEL = np.zeros(3)
+
+
 DT = 0.004
+
+
 slopes = st.tuples(*[st.floats(-0.14, 0.14)] * 2)
 
 
@@ -75,16 +81,6 @@ def test_without_the_imu_the_last_slope_stands_and_with_none_ever_the_floor_is_l
     for _ in range(1000):
         levelling.advance(None, LEVEL, DT)
     assert levelling.slope == pytest.approx((0.05, 0.0))
-
-
-def test_a_memory_goes_on_bit_for_bit() -> None:
-    first, second = Levelling(1.0), Levelling(1.0)
-    first.advance(told((0.05, 0.01)), LEVEL, DT, jump=True)
-    second.restore(first.snapshot())
-    for each in (first, second):
-        each.advance(told((0.02, 0.0), (0.1, 0.2, 0.0)), np.array((0.1, 0.2, 0.0)), DT)
-    assert first.slope == second.slope
-    assert np.array_equal(first.up, second.up)
 
 
 FLOORS = [(0.0873, 0.0), (-0.0873, 0.0), (0.0, 0.0873), (0.05, -0.05)]

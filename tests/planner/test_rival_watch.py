@@ -19,9 +19,11 @@ from shared.config.robot_config import RobotConfig
 from shared.joints import N_MODULES
 from tests.planner.conftest import Closed
 from tests.planner.oracle import Array
-from tests.planner.test_planner import SESSION, START_NS, lead, receive_all, state
+from tests.planner.states import SESSION, START_NS, TICK_NS, lead, receive_all, receive_but
 
 OWN, OTHER = 7, 9
+
+
 AGE_MAX_NS = 50 * NS_PER_MS
 
 
@@ -41,21 +43,34 @@ def watch(*sessions: int, own: int = OWN, age_ns: int = 2 * NS_PER_MS) -> RivalW
     return rival
 
 
-def test_a_newcomer_yields_to_whom_the_modules_follow() -> None:
-    rival = watch(*[OTHER] * 6)
-    assert rival.yields
-    assert str(OTHER) in rival.describe()
+LATE_NS = AGE_MAX_NS + 1
 
 
-def test_one_who_leads_does_not_yield_to_a_newcomer_that_caught_a_module() -> None:
-    assert not watch(OWN, OWN, OWN, OWN, OWN, OTHER).yields
-
-
-def test_modules_that_follow_nobody_or_whose_command_is_too_old_make_no_rival() -> None:
-    assert not watch(*[0] * 6).yields
-    assert not watch(*[OTHER] * 6, age_ns=AGAIN_NS + 1).yields
-    assert not watch(OWN, OWN, age_ns=AGE_MAX_NS + 1).yields
-    assert not watch(*[OTHER] * 6, age_ns=-1).yields
+@pytest.mark.parametrize(
+    ("states", "own", "yields"),
+    [
+        pytest.param(following(*[OTHER] * 6), OWN, True, id="a newcomer"),
+        pytest.param(following(*[OWN] * 5, OTHER), OWN, False, id="one who leads five"),
+        pytest.param(following(*[0] * 6), OWN, False, id="modules that follow nobody"),
+        pytest.param(following(OWN, OWN, age_ns=LATE_NS), OWN, False, id="its own are too old"),
+        pytest.param(following(*[OTHER] * 6, age_ns=-1), OWN, False, id="no age"),
+        pytest.param(following(*[OWN] * 6), OWN + 1, False, id="its own last session"),
+        pytest.param(
+            [*following(OWN, OWN), *following(*[OTHER] * 3, age_ns=LATE_NS)], OWN, False,
+            id="one who leads and the other's are too old",
+        ),
+        # half a second: younger, the other may only have been held up
+        pytest.param(following(*[OTHER] * 6, age_ns=AGAIN_NS), OWN, True, id="young"),
+        pytest.param(following(*[OTHER] * 6, age_ns=AGAIN_NS + 1), OWN, False, id="old"),
+    ],
+)  # fmt: skip
+def test_it_yields_to_whom_the_modules_follow(
+    states: list[JointState], own: int, yields: bool
+) -> None:
+    rival = RivalWatch()
+    rival.advance(own, states, AGE_MAX_NS)
+    assert rival.yields is yields
+    assert (str(OTHER) in rival.describe()) is yields
 
 
 @given(st.lists(st.sampled_from([0, OWN, OTHER]), min_size=6, max_size=6))
@@ -66,30 +81,6 @@ def test_of_two_planners_never_both_yield_and_never_both_go_on_while_both_are_fo
     assert not (one and two)
     if {OWN, OTHER} <= set(sessions):
         assert one != two
-
-
-def test_it_goes_on_when_the_others_command_is_half_a_second_old() -> None:
-    """Younger, the other may only have been held up: also for one that has just started."""
-    assert watch(*[OTHER] * 6, age_ns=AGAIN_NS).yields
-    rival = watch(*[OTHER] * 6, age_ns=AGAIN_NS + 1)
-    assert not rival.yields
-    assert rival.describe() == ""
-
-
-def test_one_who_leads_waits_for_nobody_whose_command_is_too_old() -> None:
-    states = [*following(OWN, OWN), *following(OTHER, OTHER, OTHER, age_ns=AGE_MAX_NS + 1)]
-    rival = RivalWatch()
-    rival.advance(OWN, states, AGE_MAX_NS)
-    assert not rival.yields
-
-
-def test_modules_that_still_follow_ones_last_session_are_no_rivals() -> None:
-    assert not watch(*[OWN] * 6, own=OWN + 1).yields
-
-
-@pytest.fixture
-def planner(robot: RobotConfig) -> Planner:
-    return Planner(robot, SESSION)
 
 
 @pytest.fixture
@@ -120,10 +111,8 @@ def test_a_planner_beside_one_that_leads_is_refused_by_each_module_and_says_why(
 def test_ready_counts_only_for_ones_own_session(planner: Planner, q: Array) -> None:
     """A module that is ready for another planner's commands has none of this one."""
     for tick in range(20):
-        now_ns = START_NS + 4 * NS_PER_MS * tick
-        for module in range(N_MODULES):
-            stale = {"session": OTHER, "age_ns": 60 * NS_PER_MS} if module == 2 else {}
-            planner.receive_state(module, state(module, q, tick, **stale), now_ns)
+        now_ns = START_NS + TICK_NS * tick
+        receive_but(planner, 2, q, now_ns, tick, session=OTHER, age_ns=60 * NS_PER_MS)
         planner.tick(now_ns)
     assert planner.status(now_ns, 0.0).mode == PlannerMode.ALIGNING
 
@@ -150,39 +139,20 @@ def test_once_the_other_has_ended_it_leads_and_in_a_new_session_if_its_own_is_re
 
 
 def test_one_module_that_has_retired_its_session_is_regained(planner: Planner, q: Array) -> None:
-    now_ns = lead(planner, q) + 4 * NS_PER_MS
+    now_ns = lead(planner, q)
     lost = {
         "session": OTHER, "age_ns": 60 * NS_PER_MS, "ready": False,
         "refusal": int(Refusal.FOREIGN_SESSION), "refused_session": SESSION,
     }  # fmt: skip
-    for module in range(N_MODULES):
-        planner.receive_state(module, state(module, q, 9, **(lost if module == 1 else {})), now_ns)
-    assert {command.session for command in planner.tick(now_ns)} == {SESSION + 1}
-    now_ns += 4 * NS_PER_MS
-    for module in range(N_MODULES):
-        planner.receive_state(module, state(module, q, 10, **(lost if module == 1 else {})), now_ns)
-    commands = planner.tick(now_ns)
-    assert {command.session for command in commands} == {SESSION + 1}, "once, and it goes on"
+    for seq in (9, 10):  # once, and it goes on
+        now_ns += TICK_NS
+        receive_but(planner, 1, q, now_ns, seq, **lost)
+        assert {command.session for command in planner.tick(now_ns)} == {SESSION + 1}
 
 
 def test_one_that_leads_goes_on_beside_a_module_that_another_caught(
     planner: Planner, q: Array
 ) -> None:
-    now_ns = lead(planner, q) + 4 * NS_PER_MS
-    for module in range(N_MODULES):
-        caught = {"session": OTHER} if module == 1 else {}
-        planner.receive_state(module, state(module, q, 9, **caught), now_ns)
+    now_ns = lead(planner, q) + TICK_NS
+    receive_but(planner, 1, q, now_ns, 9, session=OTHER)
     assert len(planner.tick(now_ns)) == N_MODULES
-
-
-def test_what_it_knows_of_the_other_outlives_a_snapshot(
-    planner: Planner, robot: RobotConfig, q: Array
-) -> None:
-    receive_all(planner, q, START_NS, session=OTHER)
-    planner.tick(START_NS)
-    successor = Planner(robot, SESSION)
-    successor.restore(planner.snapshot())
-    later_ns = START_NS + 100 * NS_PER_MS
-    receive_all(successor, q, later_ns, seq=2, session=OTHER, age_ns=AGAIN_NS + 1)
-    assert len(successor.tick(later_ns)) == N_MODULES
-    assert str(OTHER) not in successor.status(later_ns, 0.0).why

@@ -21,7 +21,7 @@ from services.planner.state_phases import (
 from shared.bus.messages import JointState
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.joints import N_MODULES
-from tests.planner.test_planner import state
+from tests.planner.states import state
 
 RATE_HZ, STATE_HZ = 500.0, 250.0
 CYCLE_NS = round(NS_PER_S / RATE_HZ)
