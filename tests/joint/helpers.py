@@ -98,10 +98,7 @@ class Bench:
         start = self.q
         for step in range(1, steps + 1):
             share = step / steps
-            self.q = (
-                start[0] + share * (q[0] - start[0]),
-                start[1] + share * (q[1] - start[1]),
-            )
+            self.q = (start[0] + share * (q[0] - start[0]), start[1] + share * (q[1] - start[1]))
             self.cycle()
 
     def to_hold(self) -> None:

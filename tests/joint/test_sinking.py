@@ -18,9 +18,15 @@ from shared.config.robot_config import RobotConfig
 FULL = Setpoint(
     (0.1, -1.0), (0.2, -0.4), (3.0, -20.0), (5.0, -6.0), (100.0, 800.0), (10.0, 50.0)
 )  # fmt: skip
+
+
 Q: Pair = (0.02, -0.4)
+
+
 LONG_NS = 10 * NS_PER_S
 """All has faded and risen by then."""
+
+
 UNHEARD = NeighbourView(sinks=False)
 
 
@@ -121,9 +127,7 @@ def test_an_ankle_that_does_not_see_its_knee_stays_within_its_limits_and_where_i
         assert (lost.q_ref, lost.v_ref[1]) == (seen.q_ref, 0.0)
 
 
-def test_a_leg_of_equal_links_that_folds_onto_itself_divides_by_nothing(
-    robot: RobotConfig,
-) -> None:
+def test_a_leg_of_equal_links_that_folds_onto_itself_divides_by_nothing(robot: RobotConfig) -> None:
     alike = msgspec.structs.replace(robot.geometry, l1=robot.geometry.l2)
     sinking, frozen = begun(msgspec.structs.replace(robot, geometry=alike), "ankle_left")
     for knee in (-math.pi, -3.0):
@@ -133,6 +137,8 @@ def test_a_leg_of_equal_links_that_folds_onto_itself_divides_by_nothing(
 
 BELOW_ITS_STOP = -2.6
 """rad, of a knee."""
+
+
 PLACES = {
     "ankle": ("ankle_right", -0.4, UNKNOWN),
     "an ankle that follows its knee": ("ankle_right", 0.2, NeighbourView((-1.0, -0.2))),
@@ -207,14 +213,16 @@ def test_of_a_hip_only_the_theta_is_stiffer_for_a_limp_knee_than_in_a_stand(
 
 def test_a_reason_that_passes_is_none(robot: RobotConfig) -> None:
     sinking, frozen = begun(robot, "knee_right")
-    sinking.law(frozen, frozen, 0, Q, UNHEARD)
-    sinking.law(frozen, frozen, DOUBT_NS - 1, Q, UNKNOWN)
-    assert sinking.doubt_ns == -1
-    sinking.law(frozen, frozen, DOUBT_NS, Q, UNHEARD)
-    sinking.law(frozen, frozen, 2 * DOUBT_NS - 1, Q, UNHEARD)
-    assert not sinking.caught
-    sinking.law(frozen, frozen, 2 * DOUBT_NS, Q, UNHEARD)
-    assert sinking.caught
+    for since_ns, near, caught in (
+        (0, UNHEARD, False),
+        (DOUBT_NS - 1, UNKNOWN, False),
+        (DOUBT_NS, UNHEARD, False),
+        (2 * DOUBT_NS - 1, UNHEARD, False),
+        (2 * DOUBT_NS, UNHEARD, True),
+    ):
+        sinking.law(frozen, frozen, since_ns, Q, near)
+        assert sinking.caught is caught
+        assert (sinking.doubt_ns == -1) is (near is UNKNOWN)
 
 
 def test_a_knee_beside_one_that_does_not_sink_is_caught_where_it_is(robot: RobotConfig) -> None:
@@ -237,11 +245,9 @@ def test_a_knee_beside_one_that_does_not_sink_is_caught_where_it_is(robot: Robot
 @pytest.mark.parametrize("module", ["ankle_right", "hip_right"])
 def test_only_knees_are_caught(robot: RobotConfig, module: str) -> None:
     sinking, frozen = begun(robot, module)
-    assert sinking.stop == -math.inf
-    sinking.law(frozen, frozen, 0, Q, UNHEARD)
-    sinking.law(frozen, frozen, DOUBT_NS, Q, UNHEARD)
-    assert not sinking.caught
-    assert sinking.stop == -math.inf
+    for since_ns in (0, DOUBT_NS):
+        sinking.law(frozen, frozen, since_ns, Q, UNHEARD)
+        assert (sinking.caught, sinking.stop) == (False, -math.inf)
 
 
 def test_a_second_stop_begins_anew(robot: RobotConfig) -> None:

@@ -128,12 +128,7 @@ def test_a_person_who_sags_is_caught(robot: RobotConfig, height: float, delay_ms
             statuses.append(message)
 
     fleet, heights, fell = run(
-        robot,
-        _sags(height),
-        RESTS_TWICE,
-        record=record,
-        let_go_s=2.4,
-        delay_ms=delay_ms,
+        robot, _sags(height), RESTS_TWICE, record=record, let_go_s=2.4, delay_ms=delay_ms
     )
     assert not fell
     sagged = heights[round(1.4 * 100.0) :]

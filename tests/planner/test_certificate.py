@@ -30,9 +30,7 @@ ASSISTS = (0.0, 200.0)
 
 
 @pytest.fixture(
-    scope="module",
-    params=product(POSES, ASSISTS),
-    ids=lambda s: f"{s[0]['height']:g}m-{s[1]:g}N",
+    scope="module", params=product(POSES, ASSISTS), ids=lambda s: f"{s[0]['height']:g}m-{s[1]:g}N"
 )
 def stand(request: pytest.FixtureRequest, robot: RobotConfig, closed: Closed) -> Stand:
     pose, assist = request.param
@@ -231,9 +229,7 @@ def test_the_worst_pose_of_the_design_falls_forward_and_a_stiff_one_stands(
     assert verdicts[0] < 0.0 < verdicts[1]
 
 
-def test_a_stiffness_that_was_returned_stays_when_another_is_asked_for(
-    robot: RobotConfig,
-) -> None:
+def test_a_stiffness_that_was_returned_stays_when_another_is_asked_for(robot: RobotConfig) -> None:
     certificate, rng = Certificate(robot), np.random.default_rng(3)
     certificate.at(rng.normal(size=(12, 6)), np.zeros((12, 12)))
     soft, stiff = rng.uniform(100.0, 200.0, 12), rng.uniform(1000.0, 2000.0, 12)

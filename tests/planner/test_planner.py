@@ -12,13 +12,7 @@ from services.planner.intents import OperatorRequest
 from services.planner.law.certificate import Margins
 from services.planner.planner import EARLY_FRACTION, LATE_FRACTION, TICK_GAP_MAX_S, Planner
 from services.planner.watch.engagement_fsm import WAITS_NS
-from shared.bus.messages import (
-    Attitude,
-    JointCommand,
-    Mode,
-    PlannerMode,
-    SplitSource,
-)
+from shared.bus.messages import Attitude, JointCommand, Mode, PlannerMode, SplitSource
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import gain_schedule
 from shared.config.robot_config import RobotConfig

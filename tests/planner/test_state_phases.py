@@ -12,12 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.planner.state_phases import (
-    COMPARED_TICKS,
-    EVERY_TICKS,
-    SOON_TICKS,
-    StatePhases,
-)
+from services.planner.state_phases import COMPARED_TICKS, EVERY_TICKS, SOON_TICKS, StatePhases
 from shared.bus.messages import JointState
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.joints import N_MODULES

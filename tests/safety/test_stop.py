@@ -121,19 +121,6 @@ def test_damp_resists_motion(robot: RobotConfig, bench: Bench) -> None:
     assert settled.tau[1] == pytest.approx(robot.joint_service.damp_k_d * 0.3)
 
 
-def test_a_knee_is_caught_before_it_folds_so_far_that_the_robot_topples(
-    robot: RobotConfig,
-) -> None:
-    bench = Bench(robot, "knee_left")
-    bench.to_hold()
-    bench.cycle(estop=True)
-    bench.run(3000)
-    stop = robot.joint_service.damp_knee_stop
-    bench.move((bench.q[0], stop - 0.02))
-    caught = bench.run(5)[-1].tau[1]
-    assert caught == pytest.approx(0.02 * robot.stand_gains("knee_left").k_p[1])
-
-
 def test_emergency_stop_never_drops_the_load_that_the_springs_carried(
     bench: Bench, robot: RobotConfig
 ) -> None:
@@ -146,3 +133,72 @@ def test_emergency_stop_never_drops_the_load_that_the_springs_carried(
     bench.cycle(estop=True)
     bench.run(5)
     assert bench.controller.tau[1] > 0.9 * carried
+
+
+GENTLE = (3.0, -5.0)
+"""N m"""
+
+
+@pytest.mark.parametrize("module", ["ankle_left", "knee_left", "hip_right"])
+def test_in_damp_what_does_not_sink_comes_to_the_stand_gains(
+    robot: RobotConfig, module: str
+) -> None:
+    bench = Bench(robot, module)
+    soft = {"k_p": (100.0, 90.0), "k_d": (5.0, 4.0), "tau_ff": GENTLE}
+    bench.to_track(**soft)
+    bench.cycle(estop=True)
+    bench.run(round(robot.joint_service.damp_fade_s * robot.joint_service.rate_hz) + 50)
+    setpoint, stand = bench.controller.setpoint, robot.stand_gains(module)
+    sinks = kind_of(module) in robot.joint_service.damp_sinks
+    for axis in (0,) if sinks else (0, 1):
+        assert setpoint.k_p[axis] == pytest.approx(max(stand.k_p[axis], soft["k_p"][axis]))
+        assert setpoint.k_d[axis] == pytest.approx(max(stand.k_d[axis], soft["k_d"][axis]))
+
+
+@pytest.mark.parametrize("carried", [(200.0, 0.0), (-90.0, 90.0), (1e4, -1e4)])
+def test_what_a_drive_carried_in_a_gap_goes_on_within_the_motors_limits(
+    robot: RobotConfig, carried: tuple[float, float]
+) -> None:
+    bench = Bench(robot)
+    bench.to_hold()
+    phi, theta = bench.controller.resume(bench.now_ns, carried)
+    most = robot.joint.tau_module_max + 1e-9
+    assert abs(phi + theta) <= most
+    assert abs(theta - phi) <= most
+    assert np.sign(theta) == np.sign(carried[1]) or carried[1] == 0.0
+
+
+@pytest.fixture
+def sunk(robot: RobotConfig) -> Bench:
+    """Return a knee in DAMP, all of whose load has faded."""
+    bench = Bench(robot, "knee_left")
+    bench.to_hold()
+    bench.cycle(estop=True)
+    bench.run(3000)
+    return bench
+
+
+def test_a_knee_is_caught_and_damped_before_it_folds_so_far_that_the_robot_topples(
+    robot: RobotConfig, sunk: Bench
+) -> None:
+    stand = robot.stand_gains("knee_left")
+    sunk.move((sunk.q[0], robot.joint_service.damp_knee_stop - 0.02))
+    still = sunk.run(5)[-1].tau[1]
+    assert still == pytest.approx(0.02 * stand.k_p[1])
+    sunk.v = (0.0, -0.1)
+    moving = sunk.run(200)[-1].tau[1]
+    assert moving - still == pytest.approx(0.1 * stand.k_d[1], rel=0.05)
+
+
+def test_a_knee_that_is_lower_than_the_stop_is_caught_where_it_is(robot: RobotConfig) -> None:
+    """Not pushed up to the stop: the robot would rise by itself after an emergency stop."""
+    bench = Bench(robot, "knee_left")
+    low = robot.joint_service.damp_knee_stop - 0.1
+    bench.q = (0.02, low)
+    bench.to_hold()
+    bench.cycle(estop=True)
+    bench.run(3000)
+    assert bench.cycle().tau[1] == pytest.approx(0.0, abs=1e-6)
+    bench.move((0.02, low - 0.01))
+    caught = bench.run(5)[-1].tau[1]
+    assert caught == pytest.approx(0.01 * robot.stand_gains("knee_left").k_p[1], rel=1e-3)

@@ -7,15 +7,9 @@ from typing import NamedTuple
 
 import pytest
 
-from services.joint.failsafe import TRANSITIONS, TRIPS, Event, Failsafe, Timing, timing_of
+from services.joint.failsafe import TRANSITIONS, TRIPS, Event, Failsafe, Timing
 from shared.bus.messages import Cause, Mode
-from shared.config.robot_config import RobotConfig
 from tests.joint.helpers import SESSION, T0, command
-
-
-@pytest.fixture(scope="module")
-def timing(robot: RobotConfig) -> Timing:
-    return timing_of(robot)
 
 
 class Situation(NamedTuple):
@@ -39,8 +33,14 @@ DRIVE_EVENTS = (
     Event.DRIVE_LOST,
     Event.POSITION_LOST,
 )
+
+
 TRIP_EVENTS = (Event.NONE, *TRIPS)
+
+
 FLAGS = (False, True)
+
+
 SITUATIONS = [
     Situation(mode, drive, *flags, trip)
     for mode, drive, trip in product(Mode, DRIVE_EVENTS, TRIP_EVENTS)

@@ -20,7 +20,11 @@ from shared.clock import NS_PER_MS
 from tests.joint.drivers.rig import AXES, DRIVE, MS, TARGET, Rig, make_driver
 
 LOSS = 0.3
+
+
 STEP_MS = 4
+
+
 ASK_EVERY_MS = 500
 """How often a joint service repeats a request that has shown no effect."""
 
@@ -109,35 +113,28 @@ def bench(
     bench.hub.close()
 
 
-def test_modes_limits_gains_and_targets_arrive(
-    bench: Bench,
-) -> None:
-    bench.run(100)
-    assert bench.until_armed(onboard=True)
-    bench.run(1200, TARGET)
+@pytest.mark.parametrize("onboard", [True, False])
+def test_modes_limits_gains_and_targets_arrive(bench: Bench, onboard: bool) -> None:
     bank, axes = bench.rig.bank, list(AXES)
-    assert [bank.state[axis] for axis in axes] == [AxisState.CLOSED_LOOP_CONTROL] * 2
-    assert list(bank.control_mode[axes]) == [ControlMode.POSITION] * 2
-    np.testing.assert_allclose(bank.vel_limit[axes], DRIVE.vel_limit)
-    np.testing.assert_allclose(bank.current_lim[axes], DRIVE.current_lim)
-    np.testing.assert_allclose(bank.pos_gain[axes], TARGET.pos_gain, rtol=1e-6)
-    np.testing.assert_allclose(bank.vel_gain[axes], TARGET.vel_gain, rtol=1e-6)
-    assert not bank.vel_integrator_gain[axes].any()
-    np.testing.assert_allclose(bank.input_pos[axes], TARGET.pos_turns)
-    assert bench.status is DriveStatus.ARMED
-
-
-def test_modes_and_limits_arrive_with_torques_too(bench: Bench) -> None:
-    bench.rig.bank.control_mode[:] = ControlMode.POSITION
+    bank.control_mode[:] = ControlMode.POSITION
     bench.run(100)
-    assert bench.until_armed(onboard=False)
+    assert bench.until_armed(onboard=onboard)
     for _ in range(1200 // STEP_MS):
         bench.cycle()
-        bench.driver.write_torque((0.25, -0.5))
-    bank, axes = bench.rig.bank, list(AXES)
-    assert list(bank.control_mode[axes]) == [ControlMode.TORQUE] * 2
+        bench.driver.write(TARGET) if onboard else bench.driver.write_torque((0.25, -0.5))
+    assert [bank.state[axis] for axis in axes] == [AxisState.CLOSED_LOOP_CONTROL] * 2
+    mode = ControlMode.POSITION if onboard else ControlMode.TORQUE
+    assert list(bank.control_mode[axes]) == [mode] * 2
     np.testing.assert_allclose(bank.vel_limit[axes], DRIVE.vel_limit)
-    assert list(bank.input_torque[axes]) == [0.25, -0.5]
+    np.testing.assert_allclose(bank.current_lim[axes], DRIVE.current_lim)
+    if onboard:
+        np.testing.assert_allclose(bank.pos_gain[axes], TARGET.pos_gain, rtol=1e-6)
+        np.testing.assert_allclose(bank.vel_gain[axes], TARGET.vel_gain, rtol=1e-6)
+        assert not bank.vel_integrator_gain[axes].any()
+        np.testing.assert_allclose(bank.input_pos[axes], TARGET.pos_turns)
+    else:
+        assert list(bank.input_torque[axes]) == [0.25, -0.5]
+    assert bench.status is DriveStatus.ARMED
 
 
 def test_a_drive_that_is_idled_until_it_is_idle_ends_idle(bench: Bench) -> None:

@@ -9,18 +9,9 @@ import pytest
 
 from services.joint.drivers.base import DriveReading
 from services.joint.drivers.encoder_pair import EncoderPair
-from services.joint.drivers.odrive_can import (
-    REBOOT_MS,
-    RETRY_MS,
-    OdriveCan,
-)
+from services.joint.drivers.odrive_can import REBOOT_MS, RETRY_MS, OdriveCan
 from shared.bus.messages import Pair
-from shared.can.cansimple import (
-    AxisState,
-    Command,
-    pack_two_floats,
-    pack_two_ints,
-)
+from shared.can.cansimple import AxisState, Command, pack_two_floats, pack_two_ints
 from shared.config.sections import CanConfig
 from tests.joint.drivers.can_bench import Bench, receiving_fails
 from tests.joint.drivers.rig import DRIVE, NODES, Rig, arm
@@ -67,9 +58,7 @@ def receive_counts(bench: Bench) -> None:
         bench.send(node, Command.GET_ENCODER_COUNT, data)
 
 
-def test_a_drive_whose_estimates_are_zero_is_asked_for_its_counts(
-    counting: Bench,
-) -> None:
+def test_a_drive_whose_estimates_are_zero_is_asked_for_its_counts(counting: Bench) -> None:
     counting.commands()
     assert receive_estimates(counting, ZERO).pos_turns == ZERO
     assert counting.commands().count(Command.GET_ENCODER_COUNT) == 2
