@@ -44,9 +44,7 @@ def pd(sent: JointCommand, q: Pair, v: Pair, age_s: float = 0.0) -> npt.NDArray[
 
 
 @pytest.mark.parametrize("status", [DriveStatus.IDLE, DriveStatus.LOST, DriveStatus.ERROR])
-def test_no_torque_and_no_change_before_the_drive_is_armed(
-    bench: Bench, status: DriveStatus
-) -> None:
+def test_nothing_happens_before_the_drive_is_armed(bench: Bench, status: DriveStatus) -> None:
     bench.status = status
     for result in bench.run(50, fresh=True):
         assert result == CycleResult((0.0, 0.0), None)
@@ -174,9 +172,7 @@ def test_torque_makes_no_larger_step_than_the_ramps_allow(
     assert steps.max() <= largest_step(robot, reach=0.02 + SWING)
 
 
-def test_the_script_changes_over_both_ways_and_a_bare_switch_would_break_the_bound(
-    robot: RobotConfig,
-) -> None:
+def test_the_script_changes_over_both_ways_and_the_bound_bites(robot: RobotConfig) -> None:
     _, changes = play(Bench(robot), FIG_7)
     assert {(Mode.HOLD, Mode.TRACK), (Mode.TRACK, Mode.HOLD)} <= changes
     assert largest_step(robot, reach=0.02 + SWING) < 5.0 < max(map(abs, COUPLED))
@@ -317,9 +313,7 @@ def test_an_event_holds_the_torque_on_both_sides_of_the_change(bench: Bench) -> 
     assert event.seq == 3
 
 
-def test_a_controller_restored_from_a_snapshot_shares_nothing_with_it(
-    bench: Bench, robot: RobotConfig
-) -> None:
+def test_a_restored_controller_shares_nothing(bench: Bench, robot: RobotConfig) -> None:
     bench.to_track(tau_coupled=COUPLED)
     taken = bench.controller.snapshot()
     state = msgspec.structs.replace(
@@ -349,9 +343,7 @@ def test_a_snapshot_shares_nothing_with_the_controller_that_it_was_taken_from(be
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_a_joint_at_its_soft_stop_is_inside_and_beyond_it_is_not(
-    robot: RobotConfig, axis: int
-) -> None:
+def test_a_joint_is_inside_up_to_its_soft_stop(robot: RobotConfig, axis: int) -> None:
     limits = limits_of(robot, "knee_right")
     low, high = (limits.phi, limits.theta)[axis]
     controller = JointController(robot, "knee_right")

@@ -71,9 +71,7 @@ def test_after_a_freeze_the_drives_torque_goes_on_without_a_step(
 
 
 @pytest.mark.parametrize("loop", LOOPS)
-def test_in_the_end_it_holds_as_if_it_had_never_been_frozen(
-    robot: RobotConfig, loop: LoopName
-) -> None:
+def test_at_last_it_holds_as_if_never_frozen(robot: RobotConfig, loop: LoopName) -> None:
     frozen, twin = ModuleBench(robot, loop), ModuleBench(robot, loop)
     for each in (frozen, twin):
         each.to(Mode.TRACK)
@@ -129,9 +127,7 @@ def test_an_emergency_stop_that_came_meanwhile_is_obeyed(held: ModuleBench) -> N
 
 
 @given(st.integers(0, 60), st.tuples(st.floats(-0.05, 0.09), st.floats(-1.1, -0.9)))
-def test_a_memory_taken_while_it_goes_on_is_gone_on_with_bit_for_bit(
-    robot: RobotConfig, cycles: int, moved: Pair
-) -> None:
+def test_its_memory_goes_on_bit_for_bit(robot: RobotConfig, cycles: int, moved: Pair) -> None:
     bench, twin = ModuleBench(robot), ModuleBench(robot)
     bench.to(Mode.HOLD)
     bench.freeze(NS_PER_S, moved)
@@ -144,9 +140,7 @@ def test_a_memory_taken_while_it_goes_on_is_gone_on_with_bit_for_bit(
 
 
 @pytest.mark.parametrize("loop", LOOPS)
-def test_what_the_link_kept_from_before_the_freeze_does_not_make_the_joint_seem_to_jump(
-    robot: RobotConfig, loop: LoopName
-) -> None:
+def test_what_a_link_kept_in_a_freeze_is_no_jump(robot: RobotConfig, loop: LoopName) -> None:
     """The first sample is of the time before, the next is where the hand has led the joint."""
     bench = ModuleBench(robot, loop)
     bench.to(Mode.HOLD)
@@ -164,9 +158,7 @@ def test_a_jump_without_a_freeze_is_not_believed(held: ModuleBench) -> None:
     assert held.mode is Mode.FAULT
 
 
-def test_after_a_freeze_the_change_of_mode_is_published_with_the_torques_that_were_carried(
-    bench: ModuleBench,
-) -> None:
+def test_after_a_freeze_the_event_has_the_torques_carried(bench: ModuleBench) -> None:
     bench.to(Mode.TRACK)
     bench.freeze(2 * NS_PER_S, MOVED)
     carried = bench.carried()
@@ -182,9 +174,7 @@ def test_after_a_freeze_the_change_of_mode_is_published_with_the_torques_that_we
 
 
 @pytest.mark.parametrize("status", [DriveStatus.IDLE, DriveStatus.ERROR])
-def test_a_module_that_controls_nothing_listens_to_nothing(
-    bench: ModuleBench, status: DriveStatus
-) -> None:
+def test_uncontrolled_it_listens_to_nothing(bench: ModuleBench, status: DriveStatus) -> None:
     if status is DriveStatus.ERROR:
         bench.to(Mode.HOLD)
     else:
@@ -291,9 +281,7 @@ def soft_in_track(robot: RobotConfig, module: str) -> ModuleBench:
 
 
 @pytest.mark.parametrize("module", ["ankle_right", "ankle_left", "knee_right", "hip_left"])
-def test_a_drive_is_left_with_holds_gains_at_an_ankle_and_with_the_laws_own_elsewhere(
-    robot: RobotConfig, module: str
-) -> None:
+def test_only_an_ankles_drive_is_left_with_holds_gains(robot: RobotConfig, module: str) -> None:
     """With 4 N m s/rad on each ankle 7 of 26 pairs of pushes fell, all six services dead.
 
     At the sample it changes nothing: TRACK's law is the command's, to the last of its torque.
@@ -322,9 +310,7 @@ def test_a_drive_left_in_damp_goes_on_with_damps_own_gains(robot: RobotConfig, m
 
 
 @pytest.mark.parametrize("back", [DriveStatus.ERROR, DriveStatus.IDLE, DriveStatus.UNZEROED])
-def test_both_axes_of_a_drive_that_was_lost_go_idle_if_it_comes_back_with_one_disarmed(
-    held: ModuleBench, back: DriveStatus
-) -> None:
+def test_a_lost_drive_that_is_back_disarmed_is_idled(held: ModuleBench, back: DriveStatus) -> None:
     """Its sibling went on pulling alone: on theta by what it pulled on phi."""
     held.status = DriveStatus.LOST
     orders = [step.command for step in held.run(200 * held.cycle_ns)]
@@ -338,9 +324,7 @@ def test_both_axes_of_a_drive_that_was_lost_go_idle_if_it_comes_back_with_one_di
 
 
 @pytest.mark.parametrize("back", [DriveStatus.ARMED, DriveStatus.HOLDING])
-def test_a_drive_that_was_lost_and_comes_back_holding_is_left_alone(
-    held: ModuleBench, back: DriveStatus
-) -> None:
+def test_a_lost_drive_that_is_back_holding_is_left(held: ModuleBench, back: DriveStatus) -> None:
     """It must find no torque of zero and no order to go idle."""
     for status in (DriveStatus.LOST, back):
         held.status = status

@@ -116,9 +116,7 @@ def firmware(target: MotorTarget, pos: Pair, vel: Pair, input_torque_max: float 
 
 
 @given(setpoints, pairs(angle), pairs(rate), pairs(torque))
-def test_the_drive_gives_the_torque_that_the_service_asks_for(
-    setpoint: Setpoint, q: Pair, v: Pair, tau: Pair
-) -> None:
+def test_the_drive_gives_the_torque_asked(setpoint: Setpoint, q: Pair, v: Pair, tau: Pair) -> None:
     """At the sample, for any gains, references and rates, whatever the clamp does."""
     pos, vel = motor_from_joint(q, N), motor_from_joint(v, N)
     target = DriveSetpointLaw(N, VEL_LIMIT).target(NOW, setpoint, tau, pos, vel)
@@ -137,9 +135,7 @@ def test_the_service_knows_what_a_drive_that_it_left_alone_gives_anywhere(
 
 
 @given(st.lists(setpoints, min_size=2, max_size=5), pairs(angle), pairs(torque))
-def test_it_does_so_with_the_gains_that_the_drive_happens_to_have(
-    course: list[Setpoint], q: Pair, tau: Pair
-) -> None:
+def test_it_does_so_with_whatever_gains_it_has(course: list[Setpoint], q: Pair, tau: Pair) -> None:
     law = DriveSetpointLaw(N, VEL_LIMIT)
     pos = motor_from_joint(q, N)
     for cycle, setpoint in enumerate(course):
@@ -148,9 +144,7 @@ def test_it_does_so_with_the_gains_that_the_drive_happens_to_have(
 
 
 @given(pairs(st.floats(1.0, 1500.0)), pairs(st.floats(8.0, 200.0)), pairs(torque))
-def test_with_the_service_gone_the_module_holds_with_the_mean_of_its_two_axes(
-    k_p: Pair, k_d: Pair, tau: Pair
-) -> None:
+def test_left_alone_it_holds_with_the_mean_of_its_axes(k_p: Pair, k_d: Pair, tau: Pair) -> None:
     """And carries on with the last torque: the target stays, only the motors move."""
     setpoint = Setpoint((0.1, -1.0), ZERO, ZERO, ZERO, k_p, k_d)
     at = motor_from_joint(setpoint.q_ref, N)
@@ -245,9 +239,7 @@ def test_the_firmware_clamps_no_input_torque_if_any_target_gives_the_torque_aske
 
 
 @given(setpoints, pairs(angle), pairs(rate), pairs(torque))
-def test_targets_within_the_firmwares_clamp_are_the_ones_without_it(
-    setpoint: Setpoint, q: Pair, v: Pair, tau: Pair
-) -> None:
+def test_targets_within_the_clamp_stay(setpoint: Setpoint, q: Pair, v: Pair, tau: Pair) -> None:
     pos, vel = motor_from_joint(q, N), motor_from_joint(v, N)
     free = DriveSetpointLaw(N, VEL_LIMIT).target(NOW, setpoint, tau, pos, vel)
     most = max(map(abs, free.torque)) + 1e-9

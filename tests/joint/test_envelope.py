@@ -148,9 +148,7 @@ def test_each_number_is_believed_up_to_its_bound_and_not_beyond(
 
 
 @pytest.mark.parametrize("name", ["margin", "margin_onboard"])
-def test_a_margin_that_no_gains_may_leave_with_is_not_believed(
-    robot: RobotConfig, name: str
-) -> None:
+def test_a_margin_below_the_least_is_not_believed(robot: RobotConfig, name: str) -> None:
     limits = robot.certificate
     least = limits.margin_min if name == "margin" else limits.onboard_margin_min
     believed = [0.981 * least, (1.0 - ROUNDING) * least]
@@ -213,9 +211,7 @@ def test_a_coupled_torque_that_drives_the_joint_from_its_reference_is_not_believ
         assert Envelope(robot, MODULE).judge(told, None, Q, V, settled=settled) is outside
 
 
-def test_the_reference_at_its_age_is_what_a_coupled_torque_must_not_drive_from(
-    robot: RobotConfig,
-) -> None:
+def test_the_work_of_a_coupled_torque_is_about_the_aged_reference(robot: RobotConfig) -> None:
     told = middle(robot, q_ref=Q, v_ref=(0.0, 1.0), tau_coupled=(0.0, -55.0))
     envelope = Envelope(robot, MODULE)
     assert envelope.judge(told, None, Q, V, age_s=0.01) is Outside.NOTHING
@@ -223,17 +219,13 @@ def test_the_reference_at_its_age_is_what_a_coupled_torque_must_not_drive_from(
 
 
 @pytest.mark.parametrize("change", [{"session": SESSION + 1}, {"hold": True}])
-def test_the_step_is_from_what_this_planner_led_with(
-    robot: RobotConfig, change: dict[str, Any]
-) -> None:
+def test_the_step_is_from_this_planners_lead(robot: RobotConfig, change: dict[str, Any]) -> None:
     last = msgspec.structs.replace(middle(robot), **change)
     assert judge(robot, middle(robot, tau_coupled=(0.0, 40.0), seq=2), last) is Outside.NOTHING
 
 
 @pytest.mark.parametrize("name", ["k_p", "k_d", "q_ref", "tau_ff"])
-def test_a_request_for_hold_is_obeyed_and_implausible_numbers_make_no_module_ready(
-    robot: RobotConfig, name: str
-) -> None:
+def test_hold_is_obeyed_and_wild_numbers_make_none_ready(robot: RobotConfig, name: str) -> None:
     failsafe, timing = Failsafe(mode=Mode.HOLD), timing_of(robot)
     wild = {"tau_ff": (0.5, -90.0), "q_ref": (0.5, -2.0)}.get(name, (0.0, 0.0))
     for seq in range(2000):
@@ -257,9 +249,7 @@ def test_the_reference_is_judged_where_it_is_used(robot: RobotConfig) -> None:
     assert envelope.judge(told, None, ran_ahead, V, age_s=0.041) is Outside.NOTHING
 
 
-def test_while_track_blends_in_the_reference_may_be_as_far_as_it_was_held_off(
-    robot: RobotConfig,
-) -> None:
+def test_while_track_blends_in_the_reference_may_be_farther(robot: RobotConfig) -> None:
     k_p = bounds_of(robot, "ankle_left").k_p[1]
     told = middle(robot, "ankle_left", k_p=k_p, q_ref=(Q[0], Q[1] + 0.06))
     envelope = Envelope(robot, "ankle_left")

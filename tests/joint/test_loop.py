@@ -162,9 +162,7 @@ class Stop:
 
 
 @pytest.mark.parametrize("status", [DriveStatus.IDLE, DriveStatus.ERROR])
-def test_a_drive_that_answers_is_armed_with_its_latched_errors(
-    rig: Rig, status: DriveStatus
-) -> None:
+def test_a_drive_that_answers_is_armed_despite_errors(rig: Rig, status: DriveStatus) -> None:
     rig.drive.status = status
     rig.run(2)
     assert rig.drive.armed == 1
@@ -224,9 +222,7 @@ def test_a_drive_that_holds_the_robot_is_taken_over_without_a_step(onboard: Rig)
 
 
 @pytest.mark.parametrize("sinks", [False, True], ids=["holds", "sinks"])
-def test_a_service_that_is_stopped_alone_leaves_its_drive_as_it_is(
-    onboard: Rig, sinks: bool
-) -> None:
+def test_a_service_stopped_alone_leaves_its_drive_as_it_is(onboard: Rig, sinks: bool) -> None:
     onboard.run(20)
     if sinks:
         onboard.estops.waiting.append(Estop(t_ns=0, seq=1, source="test"))

@@ -72,9 +72,7 @@ def test_stiffened_never_lowers_a_gain(s: Setpoint, k_p: Pair, k_d: Pair, share:
 
 
 @given(s=setpoints, k_p=pairs(gains), k_d=pairs(gains))
-def test_stiffened_fully_has_at_least_the_gains_asked_for(
-    s: Setpoint, k_p: Pair, k_d: Pair
-) -> None:
+def test_raised_fully_it_has_the_gains_asked_for(s: Setpoint, k_p: Pair, k_d: Pair) -> None:
     risen = pd_law.raise_gains(s, k_p, k_d, 1.0)
     np.testing.assert_allclose(risen.k_p, np.maximum(s.k_p, k_p), rtol=1e-12)
     np.testing.assert_allclose(risen.k_d, np.maximum(s.k_d, k_d), rtol=1e-12)
@@ -111,18 +109,14 @@ def test_aged_moves_references_on_by_their_rates(age_s: float) -> None:
 
 
 @given(s=setpoints, share=shares, q=angles, v=rates)
-def test_damped_has_no_stiffness_and_only_what_is_left_of_the_feedforward(
-    s: Setpoint, share: float, q: Pair, v: Pair
-) -> None:
+def test_damped_only_feedforward_is_left(s: Setpoint, share: float, q: Pair, v: Pair) -> None:
     expected = share * np.array(s.tau_ff) - 60.0 * np.array(v)
     damped = pd_law.damp(pd_law.freeze(s, 0.0), (True, True), 60.0, share, 1.0)
     np.testing.assert_allclose(pd_law.torque(damped, q, v), expected, rtol=1e-12, atol=1e-9)
 
 
 @given(s=setpoints, share=shares, q=angles, v=rates)
-def test_axes_that_do_not_sink_hold_as_they_did(
-    s: Setpoint, share: float, q: Pair, v: Pair
-) -> None:
+def test_axes_that_do_not_sink_hold_on(s: Setpoint, share: float, q: Pair, v: Pair) -> None:
     frozen = pd_law.freeze(s, 0.0)
     tau = pd_law.torque(pd_law.damp(frozen, (False, True), 60.0, share, 1.0), q, v)
     assert tau[0] == pd_law.torque(frozen, q, v)[0]
@@ -131,9 +125,7 @@ def test_axes_that_do_not_sink_hold_as_they_did(
 
 
 @given(s=setpoints, q=angles, v=rates, k_d=gains)
-def test_damping_begins_with_the_torque_that_was_in_force(
-    s: Setpoint, q: Pair, v: Pair, k_d: float
-) -> None:
+def test_damping_begins_with_the_torque_before(s: Setpoint, q: Pair, v: Pair, k_d: float) -> None:
     both = (True, True)
     begun = pd_law.torque(
         pd_law.damp(pd_law.load_to_feedforward(s, both, q), both, k_d, 1.0, 0.0), q, v
@@ -149,9 +141,7 @@ def test_stand_asks_for_no_torque_where_it_stands(q: Pair) -> None:
 
 @pytest.mark.parametrize("away_phi", [-0.126, -0.125, 0.0, 0.125, 0.126])
 @pytest.mark.parametrize("away_theta", [-0.063, -0.0625, 0.0, 0.0625, 0.063])
-def test_where_a_stiffer_spring_would_pull_too_hard_the_axis_holds_where_it_is(
-    away_phi: float, away_theta: float
-) -> None:
+def test_too_far_for_a_stiffer_spring_it_holds_here(away_phi: float, away_theta: float) -> None:
     """50 N m more are allowed: phi rises by 400 N m/rad, theta by 800."""
     s = msgspec.structs.replace(FULL, q_ref=(0.0, 0.0))
     q = (-away_phi, -away_theta)

@@ -51,9 +51,7 @@ def orders(service: ModuleBench, lasting_ns: int) -> set[DriveCommand]:
     return {step.command for step in service.run(lasting_ns)}
 
 
-def test_a_service_leaves_that_it_held_or_was_stopped_also_when_it_faults(
-    robot: RobotConfig,
-) -> None:
+def test_a_service_that_faults_leaves_that_it_held_or_was_stopped(robot: RobotConfig) -> None:
     service = successor(robot, LastState.NOTHING, DriveStatus.IDLE)
     left = [service.module.last_state]
     assert service.cycle().command is DriveCommand.ARM
@@ -98,18 +96,14 @@ def test_a_drive_that_held_and_has_let_go_is_not_armed_by_a_service_that_was_not
 
 
 @LET_GO
-def test_after_an_emergency_stop_a_drive_that_has_let_go_is_not_armed(
-    robot: RobotConfig, status: DriveStatus
-) -> None:
+def test_after_a_stop_what_let_go_is_not_armed(robot: RobotConfig, status: DriveStatus) -> None:
     service = successor(robot, LastState.DAMP, status)
     assert DriveCommand.ARM not in orders(service, 2 * NS_PER_S)
     assert service.module.last_state is LastState.DAMP
 
 
 @pytest.mark.parametrize("last_state", [LastState.NOTHING, LastState.HELD])
-def test_a_drive_that_holds_is_left_alone_until_a_planner_sends(
-    robot: RobotConfig, last_state: LastState
-) -> None:
+def test_what_holds_waits_for_a_planner_to_send(robot: RobotConfig, last_state: LastState) -> None:
     """Taken over with stand gains, beside a knee on soft ones, it tipped the robot."""
     service = successor(robot, last_state)
     steps = service.run(2 * NS_PER_S)
@@ -151,9 +145,7 @@ def test_it_is_taken_over_with_the_commands_gains_and_the_torque_that_it_carries
 
 
 @pytest.mark.parametrize("carries", [CARRIED, None])
-def test_a_command_does_not_take_over_a_drive_whose_torques_are_not_known(
-    robot: RobotConfig, carries: Pair | None
-) -> None:
+def test_unknown_torques_are_not_taken_over(robot: RobotConfig, carries: Pair | None) -> None:
     service = successor(robot, LastState.HELD, carries=carries)
     service.lead(100)
     assert (service.mode is Mode.DISARMED) is (carries is None)
@@ -164,9 +156,7 @@ def test_a_drive_of_unknown_torques_is_no_reason_to_wait_for_a_planner(robot: Ro
     assert {step.inhibit for step in service.run(3 * ARM_EVERY_NS)} == {ArmingInhibit.NONE}
 
 
-def test_a_module_that_found_nothing_or_what_let_go_leaves_nothing_holding(
-    robot: RobotConfig,
-) -> None:
+def test_what_found_nothing_or_let_go_leaves_nothing_holding(robot: RobotConfig) -> None:
     assert not DriveManager(robot, "knee_left").leaves_holding
     service = successor(robot, LastState.HELD)
     service.run(ARM_EVERY_NS)
@@ -177,9 +167,7 @@ def test_a_module_that_found_nothing_or_what_let_go_leaves_nothing_holding(
     assert not service.module.leaves_holding
 
 
-def test_after_an_emergency_stop_a_drive_that_holds_is_taken_over_and_sinks(
-    robot: RobotConfig,
-) -> None:
+def test_after_a_stop_a_drive_that_holds_is_taken_over_and_sinks(robot: RobotConfig) -> None:
     """Without a planner too: in HOLD it would be the one strut while five sink."""
     service = successor(robot, LastState.DAMP)
     before = joint_torque(CARRIED, service.ratio)
@@ -243,9 +231,7 @@ def test_a_fleet_that_goes_down_leaves_nothing_and_a_service_ended_alone_that_it
 
 
 @pytest.mark.parametrize("asked", [True, False])
-def test_a_service_that_crashed_and_is_started_again_arms_only_if_a_person_asked_for_it(
-    start: Start, tmp_path: Path, asked: bool
-) -> None:
+def test_a_crashed_service_arms_only_if_asked_to(start: Start, tmp_path: Path, asked: bool) -> None:
     dead = start()
     dead.run(10)
     assert dead.drive.armed == 1

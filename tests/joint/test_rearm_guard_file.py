@@ -57,9 +57,7 @@ def test_what_a_process_leaves_the_next_one_reads(tmp_path: Path, last_state: La
 
 
 @pytest.mark.parametrize("byte", [3, 0x20, 0xFF, LastState.HELD])
-def test_a_file_of_one_byte_is_read_as_before_and_an_unreadable_state_counts_as_held(
-    tmp_path: Path, byte: int
-) -> None:
+def test_a_file_of_one_byte_is_read_and_an_odd_state_is_held(tmp_path: Path, byte: int) -> None:
     path_of(tmp_path, MODULE).write_bytes(bytes([byte]))
     old = RearmGuard(tmp_path, MODULE)
     assert (old.read(), old.stop_requested) == (LastState.HELD, False)
@@ -121,9 +119,7 @@ def fleet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fleet:
     return Fleet(tmp_path, monkeypatch)
 
 
-def test_a_stop_is_seen_by_a_process_that_has_it_mapped_until_it_is_forgotten(
-    tmp_path: Path, file: RearmGuard
-) -> None:
+def test_a_stop_is_seen_at_once_until_it_is_forgotten(tmp_path: Path, file: RearmGuard) -> None:
     assert not file.stop_requested
     assert request_stop(tmp_path, MODULE)
     assert file.stop_requested
@@ -167,18 +163,14 @@ def test_the_file_does_not_grow_and_a_stop_is_one_byte_of_it(tmp_path: Path) -> 
     assert path_of(tmp_path, MODULE).read_bytes() == b"\x00\x01" + bytes(14 + SOURCE_MAX)
 
 
-def test_a_service_that_is_down_is_started_as_if_none_had_been_before(
-    fleet: Fleet, left: RearmGuard
-) -> None:
+def test_a_service_that_is_down_starts_with_no_past(fleet: Fleet, left: RearmGuard) -> None:
     fleet.start.start_service(MODULE)
     assert ("supervisor.startProcess", MODULE, False) in fleet.made
     assert left.read() is LastState.NOTHING
 
 
 @pytest.mark.parametrize("suspended", [True, False])
-def test_a_service_that_is_up_is_not_asked_for_anew_by_starting_it(
-    fleet: Fleet, left: RearmGuard, suspended: bool
-) -> None:
+def test_starting_what_runs_asks_for_none(fleet: Fleet, left: RearmGuard, suspended: bool) -> None:
     """It knows itself what it has held; should it crash after, the next has to know as well."""
     fleet.pids, fleet.suspended = {MODULE: PID}, suspended
     runs = fleet.start.start_service(MODULE)
@@ -210,9 +202,7 @@ def test_a_service_without_a_drive_leaves_nothing_to_forget(fleet: Fleet, tmp_pa
 
 
 @pytest.mark.parametrize("ends", ["a new fleet", "a fleet that goes down"])
-def test_a_fleet_does_not_hear_of_what_held_before_it(
-    tmp_path: Path, left: RearmGuard, ends: str
-) -> None:
+def test_a_fleet_knows_no_state_before_it(tmp_path: Path, left: RearmGuard, ends: str) -> None:
     assert left.read() is LastState.HELD
     neighbours.Neighbours(tmp_path, MODULE)
     if ends == "a new fleet":
@@ -258,9 +248,7 @@ def test_a_signal_stops_a_service_whose_file_is_gone(tmp_path: Path, file: Rearm
         signal.signal(signal.SIGUSR1, before)
 
 
-def test_the_first_named_source_of_a_stop_is_kept_until_a_person_asks_for_the_module(
-    tmp_path: Path,
-) -> None:
+def test_the_first_named_source_of_a_stop_is_kept_until_asked_for(tmp_path: Path) -> None:
     guard = RearmGuard(tmp_path, MODULE)
     assert stop_source(tmp_path, MODULE) == ""
     guard.note_stop("")

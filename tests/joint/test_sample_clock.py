@@ -34,9 +34,7 @@ def counted(times_ns: list[int]) -> list[int]:
     late=st.floats(0.0, 0.45),
     lost=st.floats(0.0, 0.2),
 )
-def test_the_count_is_that_of_the_periods_whatever_is_late_or_lost(
-    seed: int, ppm: float, late: float, lost: float
-) -> None:
+def test_periods_are_counted_late_or_lost(seed: int, ppm: float, late: float, lost: float) -> None:
     dice = random.Random(seed)
     numbers = [0, *(number for number in range(1, 2000) if dice.random() >= lost)]
     period = PERIOD_NS * (1.0 + 1e-6 * ppm)
@@ -57,9 +55,7 @@ def test_after_a_service_was_held_up_the_count_goes_on_as_if_it_had_not(held_up_
 
 
 @pytest.mark.parametrize(("late", "count"), [(0.45, 2), (0.55, 3), (1.45, 3), (1.55, 4)])
-def test_a_sample_late_by_more_than_half_a_period_counts_as_the_next(
-    late: float, count: int
-) -> None:
+def test_a_sample_half_a_period_late_counts_as_the_next(late: float, count: int) -> None:
     assert counted([NS_PER_S, NS_PER_S + round((1.0 + late) * PERIOD_NS)]) == [1, count]
 
 
@@ -75,9 +71,7 @@ def test_two_samples_within_a_period_begin_one() -> None:
 @pytest.mark.parametrize("phase", [0, 1, 2, 3])
 @pytest.mark.parametrize("every", [1, 2, 4])
 @pytest.mark.parametrize("rate", [1, 2, 3])
-def test_each_due_period_is_passed_once_whatever_samples_are_lost(
-    every: int, phase: int, rate: int
-) -> None:
+def test_each_due_period_passes_once_despite_losses(every: int, phase: int, rate: int) -> None:
     """With a drive that sends at a half or a third of the rate, no sample meets it exactly."""
     clock, passed = SampleClock(), 0
     for number in range(0, 1200, rate):
@@ -119,7 +113,7 @@ def asked(phase: int, number: int) -> JointCommand:
 
 @pytest.mark.parametrize("every", [1, 2, 4])
 @pytest.mark.parametrize("phase", [0, 1, 2, 3, -1, 2**40 + 1])
-def test_it_changes_to_the_phase_that_a_command_names_and_keeps_it(
+def test_it_keeps_the_phase_that_a_command_names(
     robot: RobotConfig, every: int, phase: int
 ) -> None:
     robot = with_service(robot, state_rate_hz=500.0 / every)

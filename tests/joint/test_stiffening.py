@@ -58,9 +58,7 @@ def at_least(robot: RobotConfig, module: str, k_p: Pair, k_d: Pair) -> tuple[Pai
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_on_request_it_rises_to_its_support_gains_within_the_blend_time(
-    robot: RobotConfig, module: str
-) -> None:
+def test_on_request_it_rises_to_its_support_gains(robot: RobotConfig, module: str) -> None:
     bench = holding(robot, module)
     bench.run(2 * blended(bench, robot), fresh=True, hold=True, k_p=SOFT_P, k_d=SOFT_D)
     plain = bench.controller.setpoint
@@ -144,9 +142,7 @@ def test_no_gain_is_ever_lowered_and_none_jumps(
 
 
 @pytest.mark.parametrize("after", ["told so no more", "told nothing"])
-def test_it_stays_stiff_until_it_tracks_again_and_no_old_command_stiffens_it(
-    robot: RobotConfig, after: str
-) -> None:
+def test_it_stays_stiff_until_it_tracks_again(robot: RobotConfig, after: str) -> None:
     """A knee that a restarted service reports for a moment is not to loosen the other five."""
     bench, soft = holding(robot, "hip_right"), {"k_p": SOFT_P, "k_d": SOFT_D}
     bench.run(1, fresh=True, hold=True, stiffen=True)
@@ -214,9 +210,7 @@ def test_a_controller_that_is_restored_stays_stiff(robot: RobotConfig) -> None:
 
 
 @pytest.mark.parametrize("module", ["ankle_left", "knee_right", "hip_right"])
-def test_an_emergency_stop_of_a_stiffened_module_goes_on_holding(
-    robot: RobotConfig, module: str
-) -> None:
+def test_stiffened_it_goes_on_holding_when_stopped(robot: RobotConfig, module: str) -> None:
     """Its planner has told it of a limp knee, which may be on another host."""
     bench = holding(robot, module)
     bench.run(300, fresh=True, hold=True, stiffen=True)
@@ -229,9 +223,7 @@ def test_an_emergency_stop_of_a_stiffened_module_goes_on_holding(
 
 @pytest.mark.parametrize("mode", [Mode.HOLD, Mode.DAMP])
 @pytest.mark.parametrize("module", ["ankle_left", "knee_right", "hip_right"])
-def test_a_limp_neighbour_braces_it_without_a_planner(
-    robot: RobotConfig, module: str, mode: Mode
-) -> None:
+def test_a_limp_neighbour_braces_it_alone(robot: RobotConfig, module: str, mode: Mode) -> None:
     bench = holding(robot, module)
     if mode is Mode.DAMP:
         bench.cycle(estop=True)

@@ -32,9 +32,7 @@ def test_torque_within_all_limits_goes_out_as_it_came(tau: Pair) -> None:
 
 
 @given(tau=torques, last=sent)
-def test_away_from_the_stops_no_axis_gets_more_than_was_asked_or_went_out_before(
-    tau: Pair, last: Pair
-) -> None:
+def test_no_axis_gets_more_than_was_asked_or_went_out_before(tau: Pair, last: Pair) -> None:
     out = limit_torque(tau, FREE, last, LIMITS)
     for axis in (0, 1):
         low, high = min(0.0, tau[axis], last[axis]), max(0.0, tau[axis], last[axis])
@@ -84,9 +82,7 @@ def test_soft_stop_does_nothing_at_the_stop_itself(q: Pair) -> None:
 @pytest.mark.parametrize(
     ("module", "theta"), [("ankle_left", (-0.6, 0.9)), ("knee_right", (-3.0, -0.2))]
 )
-def test_limits_come_from_the_configuration_of_the_modules_kind(
-    robot: RobotConfig, module: str, theta: Pair
-) -> None:
+def test_limits_are_those_of_its_kind(robot: RobotConfig, module: str, theta: Pair) -> None:
     limits = limits_of(robot, module)
     assert limits.theta == theta
     assert limits.tau_module_max == MAX

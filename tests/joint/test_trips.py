@@ -161,9 +161,7 @@ def test_in_hold_nothing_trips(robot: RobotConfig) -> None:
     assert bench.controller.failsafe.mode is Mode.HOLD
 
 
-def test_a_restored_controller_knows_the_torques_of_its_trips(
-    tracking: Bench, robot: RobotConfig
-) -> None:
+def test_a_restored_controller_knows_its_trips(tracking: Bench, robot: RobotConfig) -> None:
     tracking.v = (0.6, -0.3)
     tracking.run(3, fresh=True)
     snapshot, other = tracking.controller.snapshot(), Bench(robot).controller

@@ -76,9 +76,7 @@ def test_the_eased_lead_is_lighter_and_as_steady(robot: RobotConfig, delay_ms: f
     assert np.abs(eased.com_mm[:, 0]).max() < np.abs(plain.com_mm[:, 0]).max() + 1.0
 
 
-def test_an_overloaded_harness_makes_all_six_hold_and_lets_them_lead_again(
-    robot: RobotConfig,
-) -> None:
+def test_an_overloaded_harness_makes_all_hold_and_lead_again(robot: RobotConfig) -> None:
     frames = tuple(
         Keyframe(at=t, height=1.1, assist=a)
         for t, a in ((0.0, 0.0), (2.0, 190.0), (3.0, 190.0), (5.0, 0.0))

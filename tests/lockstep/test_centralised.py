@@ -84,9 +84,7 @@ def test_without_delay_it_does_what_the_distributed_control_does(
 
 
 @pytest.mark.parametrize(("control", "falls"), [("centralised", True), ("distributed", False)])
-def test_with_100_ms_each_way_it_falls_and_the_shipped_control_stands(
-    robot: RobotConfig, control: str, falls: bool
-) -> None:
+def test_at_100_ms_only_the_shipped_stands(robot: RobotConfig, control: str, falls: bool) -> None:
     late = Inject(link="all", at=0.05, delay_ms=100.0)
     pushed = variant(
         "squat", duration=2.5, kill=(), inject=(late,), push=(push(0.2, 40.0, 0.0, 0.0),)
@@ -211,9 +209,7 @@ def states(robot: RobotConfig, now_ns: int, seq: int) -> list[JointState]:
     ]
 
 
-def test_a_command_is_all_that_the_shipped_planner_asks_for_as_one_torque(
-    robot: RobotConfig,
-) -> None:
+def test_a_command_is_all_of_the_shipped_one_as_a_torque(robot: RobotConfig) -> None:
     shipped, central = Planner(robot, 1), CentralPlanner(robot, 1)
     now = NS_PER_S
     for seq in range(1, 4):

@@ -50,9 +50,7 @@ def test_the_cases_are_about_half_of_either_kind(drawn: list[CertificateCase]) -
     assert 0.4 * DRAWN < positive < 0.6 * DRAWN
 
 
-def test_a_case_starts_at_rest_in_its_posture_on_flat_soles(
-    robot: RobotConfig, drawn: list[CertificateCase]
-) -> None:
+def test_a_case_starts_at_rest(robot: RobotConfig, drawn: list[CertificateCase]) -> None:
     """p by the oracle's own kinematics, and by where the simulated robot is."""
     for case in (drawn[0], drawn[DRAWN // 2], drawn[-1]):
         loaded = study.with_payload(robot, case.posture.payload)
@@ -74,9 +72,7 @@ def test_what_the_certificate_lets_stand_stands_and_what_it_refuses_falls(
     assert set(stood.values()) == {side > 0.0}, stood
 
 
-def test_on_a_rigid_floor_the_sign_is_right_much_nearer_to_zero(
-    robot: RobotConfig, drawn: list[CertificateCase]
-) -> None:
+def test_on_a_rigid_floor_it_is_sharper(robot: RobotConfig, drawn: list[CertificateCase]) -> None:
     near = [case for case in drawn if 0.005 < abs(margin_of(case)) < 0.03]
     assert {margin_of(case) > 0.0 for case in near} == {True, False}
     outcomes = [study.run(robot, case, rigid=True) for case in near]
@@ -102,9 +98,7 @@ def test_a_slow_drift_away_is_no_stand(robot: RobotConfig, drawn: list[Certifica
     assert not study.judge(case, course(0.0, 0.1, 0.2, 0.1, 0.0, 0.0)).stood
 
 
-def test_the_same_number_is_the_same_case_whatever_was_drawn_before(
-    robot: RobotConfig, drawn: list[CertificateCase]
-) -> None:
+def test_the_same_number_is_the_same_case(robot: RobotConfig, drawn: list[CertificateCase]) -> None:
     case = drawn[7]
     again = CertificateCases(robot).draw(SEED, case.number)
     np.testing.assert_array_equal(again.D, case.D)

@@ -118,9 +118,7 @@ def without_stamp(rows: list[SimTruth]) -> list[SimTruth]:
     return [msgspec.structs.replace(row, t_ns=0) for row in rows]
 
 
-def test_hosts_that_count_from_different_moments_change_not_one_bit(
-    robot: RobotConfig, plain: Run
-) -> None:
+def test_hosts_offset_by_months_change_not_one_bit(robot: RobotConfig, plain: Run) -> None:
     """Months apart, each joint service on a host of its own."""
     dice = random.Random(1)
     other = squat(robot, 1.2, {host: HostClock(dice.randrange(10**16)) for host in HOSTS})
@@ -130,9 +128,7 @@ def test_hosts_that_count_from_different_moments_change_not_one_bit(
     assert len(stamps) == len(MODULES), "there were six clocks"
 
 
-def test_clocks_that_drift_200_ppm_apart_change_nothing_that_matters(
-    robot: RobotConfig, plain: Run
-) -> None:
+def test_clocks_200_ppm_apart_change_nothing_much(robot: RobotConfig, plain: Run) -> None:
     """Not bit for bit: ages and periods are read 0.04 % longer or shorter; play adds to it."""
     clocks = {host: HostClock(HOUR_NS, 200.0 * (-1) ** n) for n, host in enumerate(HOSTS)}
     other = squat(robot, 1.2, clocks)
@@ -142,9 +138,7 @@ def test_clocks_that_drift_200_ppm_apart_change_nothing_that_matters(
     assert all(not controller.failsafe.refused for controller in other.fleet.controllers)
 
 
-def test_a_planner_whose_clock_were_put_on_by_an_hour_holds_and_leads_again(
-    robot: RobotConfig,
-) -> None:
+def test_a_planner_an_hour_ahead_holds_and_leads_again(robot: RobotConfig) -> None:
     """It cannot be, on a monotonic clock: all states look an hour old to one tick."""
     clock = HostClock(2 * HOUR_NS)
     other = squat(robot, 2.4, {"planner": clock}, lambda: clock.step(HOUR_NS))
@@ -154,9 +148,7 @@ def test_a_planner_whose_clock_were_put_on_by_an_hour_holds_and_leads_again(
     assert held[-1] - held[0] <= WAITS_NS[1] + 100 * NS_PER_MS
 
 
-def test_with_a_planner_whose_clock_were_put_back_by_an_hour_the_robot_holds(
-    robot: RobotConfig,
-) -> None:
+def test_with_a_planner_put_back_by_an_hour_it_holds(robot: RobotConfig) -> None:
     """It waits for its next tick, an hour long; the age rule does not. A restart mends it."""
     clock = HostClock(2 * HOUR_NS)
     other = squat(robot, 1.2, {"planner": clock}, lambda: clock.step(-HOUR_NS))
@@ -223,9 +215,7 @@ class Sent:
 
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("skewed", [(1,), (0, 2, 4), (1, 2, 3, 4, 5)])
-def test_after_one_comparison_all_six_are_in_step_and_stay_so_with_the_next_planner(
-    robot: RobotConfig, skewed: tuple[int, ...]
-) -> None:
+def test_after_one_comparison_all_are_in_step(robot: RobotConfig, skewed: tuple[int, ...]) -> None:
     """Joint services that began to count at different times send in the same period."""
     sent = Sent()
     restarted = {"kill": kill(1.0), "restart": restart(2.0), "push": ()}

@@ -106,9 +106,7 @@ def test_one_that_raises_is_told_and_not_asked_again(robot: RobotConfig) -> None
 
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("number", range(3))
-def test_the_lqr_of_the_examples_stands_through_pushes_and_the_kill_on_drawn_plants(
-    robot: RobotConfig, number: int
-) -> None:
+def test_the_examples_lqr_stands_through_pushes_and_kill(robot: RobotConfig, number: int) -> None:
     plant = plants.draw(f"lqr {number}") if number else PlantConfig()
     pushes = (push(0.5, 30.0, 0.0, 0.0), push(2.5, 30.0, 0.0, 0.0))
     tracked: list[bool] = []

@@ -61,9 +61,7 @@ PUSHES = (push(3.6, 30.0, 0.0, 0.0), push(4.6, 0.0, 30.0, 0.0))
 
 
 @pytest.mark.parametrize("at", [0.4, 1.25, 2.5, 3.3])
-def test_all_six_services_dead_at_any_phase_of_a_squat_stand_through_pushes(
-    robot: RobotConfig, at: float
-) -> None:
+def test_all_six_dead_in_a_squat_stand_through_pushes(robot: RobotConfig, at: float) -> None:
     result = run(robot, variant("squat", duration=7.0, kill=kill(at, *MODULES), push=PUSHES))
     assert result.stood
     assert np.abs(result.com_mm[result.t > at, :2]).max() < 80.0
@@ -79,9 +77,7 @@ def test_all_six_dead_stand_through_two_pushes_in_step_with_the_sway(robot: Robo
 
 
 @pytest.mark.parametrize("module", ["ankle_left", "knee_right", "hip_left"])
-def test_one_dead_service_stands_and_its_successor_leads_again(
-    robot: RobotConfig, module: str
-) -> None:
+def test_a_dead_services_successor_leads_again(robot: RobotConfig, module: str) -> None:
     """Taken over without a step: no module's torque jumps, and all six track in the end."""
     dies = {"kill": kill(2.2, module), "restart": restart(5.0, module)}
     result = run(robot, variant("squat", duration=7.5, push=PUSHES, **dies))

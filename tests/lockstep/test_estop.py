@@ -27,9 +27,7 @@ def fastest(heights: list[float]) -> float:
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("height", [1.188, 0.9])
 @pytest.mark.parametrize("hand", [True, False])
-def test_the_robot_sinks_slowly_and_does_not_topple(
-    robot: RobotConfig, height: float, hand: bool
-) -> None:
+def test_it_sinks_slowly_and_never_topples(robot: RobotConfig, height: float, hand: bool) -> None:
     heights: list[float] = []
     stopped: list[SimTruth] = []
 

@@ -182,9 +182,7 @@ def test_for_a_limp_ankle_the_knees_alone_brace(robot: RobotConfig) -> None:
 
 
 @pytest.mark.parametrize(("height", "pitch"), [(1.1, 0.5), (0.95, 0.9)])
-def test_a_torso_that_a_hand_has_turned_stays_there_when_a_knee_goes_limp(
-    robot: RobotConfig, height: float, pitch: float
-) -> None:
+def test_a_turned_torso_stays_turned(robot: RobotConfig, height: float, pitch: float) -> None:
     """Six such robots without a planner: pulled upright against the hand, two fell."""
     turned = (Keyframe(at=0.0, height=height), Keyframe(at=2.0, height=height, pitch=pitch))
     happens = {"kill": kill(0.5), "fault": fault("disarmed", "knee_left", 3.0)}
@@ -197,9 +195,7 @@ def test_a_torso_that_a_hand_has_turned_stays_there_when_a_knee_goes_limp(
 
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("number", range(8, 16))
-def test_on_drawn_plants_a_limp_knee_stands_with_a_hand_and_without(
-    robot: RobotConfig, number: int
-) -> None:
+def test_on_drawn_plants_a_limp_knee_stands(robot: RobotConfig, number: int) -> None:
     """Half of them with the planner dead, half let go. On the hips' stand gains 3 of 8 fell."""
     draw = random.Random(f"limp knee {number}")
     at, angle = draw.uniform(0.3, 3.0), draw.uniform(0.0, math.tau)

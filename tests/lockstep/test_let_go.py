@@ -77,9 +77,7 @@ def test_let_go_of_it_stays(
 
 
 @pytest.mark.parametrize("scale", [0.0, 0.3])
-def test_without_its_payload_it_holds_as_the_hoist_lets_go(
-    robot: RobotConfig, scale: float
-) -> None:
+def test_without_its_payload_it_is_not_led(robot: RobotConfig, scale: float) -> None:
     """Led on the hoist, it rose by 0.1 m to straight legs, where torques tell nothing."""
     fleet, heights = not_led(robot, {"body.payload_scale": scale})
     assert max(heights) - min(heights) < 0.01

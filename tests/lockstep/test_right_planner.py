@@ -129,9 +129,7 @@ def test_at_the_corners_of_a_stance(
 
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("number", range(4))
-def test_on_drawn_plants_under_pushes_of_three_quarters_of_the_physical_limit(
-    robot: RobotConfig, judged: Judged, number: int
-) -> None:
+def test_on_drawn_plants_pushed_hard(robot: RobotConfig, judged: Judged, number: int) -> None:
     angle = (0.0, math.pi, math.pi / 2, -2.0)[number]
     hard = (PushRange(robot).push(2.0, 0.3, 0.75, angle),)
     scenario = variant("stand", **(DOWN | {"duration": 4.5, "push": hard}))

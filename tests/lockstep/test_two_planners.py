@@ -115,9 +115,7 @@ def test_one_that_was_held_up_leads_again_when_the_other_has_ended(
     assert led[-1] == fleet.accepted[-1][1] == (fleet.planner.session,) * 6
 
 
-def test_a_second_one_that_starts_while_the_first_is_held_up_for_a_moment_waits(
-    robot: RobotConfig,
-) -> None:
+def test_a_second_one_that_starts_in_a_gap_waits(robot: RobotConfig) -> None:
     """It caught some modules in the gap, and neither led any more."""
     fleet = TwoPlanners(robot, 4.0, 1.1, 9.0, **lost("planner->joints", 0.3))
     fleet.to_the_end()

@@ -238,9 +238,7 @@ def make_overload(*, holds: bool = False) -> Overload:
 @pytest.mark.parametrize("kind", ["force", "moment"])
 @pytest.mark.parametrize("share", [0.0, 0.5, 0.999, 1.001, 2.0])
 @pytest.mark.parametrize("for_ns", [0, AFTER - 1, AFTER, 10 * AFTER])
-def test_hold_is_asked_for_beyond_a_limit_for_its_time(
-    kind: str, share: float, for_ns: int
-) -> None:
+def test_hold_is_asked_for_beyond_a_limit_in_time(kind: str, share: float, for_ns: int) -> None:
     overload = make_overload()
     for t_ns in sorted({0, for_ns // 3, for_ns}):
         overload.receive(at(share, kind), T0 + t_ns)

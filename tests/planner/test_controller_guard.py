@@ -153,9 +153,7 @@ def test_what_is_the_shipped_laws_stays_it_to_the_last_bit(hocca: Hocca, seen: O
     assert np.array_equal(found.local.D_B, seen.law.local.D_B)
 
 
-def test_while_it_does_not_lead_it_is_reset_and_the_shipped_law_counts(
-    hocca: Hocca, seen: Observation
-) -> None:
+def test_unless_it_leads_the_shipped_law_counts(hocca: Hocca, seen: Observation) -> None:
     mine = Scripted(changed(tau_coupled=np.ones(12)))
     guard = ControllerGuard(mine, hocca, GEOMETRY)
     assert guard.act(seen, leads=False) is seen.law
@@ -197,9 +195,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_what_is_no_action_holds_all_and_is_not_asked_again(
-    hocca: Hocca, seen: Observation, name: str
-) -> None:
+def test_what_is_no_action_holds_all(hocca: Hocca, seen: Observation, name: str) -> None:
     mine = Scripted(BAD[name])
     guard = ControllerGuard(mine, hocca, GEOMETRY)
     for _ in range(3):
@@ -212,9 +208,7 @@ def test_what_is_no_action_holds_all_and_is_not_asked_again(
 
 
 @pytest.mark.parametrize("scale", [0.0, 0.3, 0.6, -1.0, 1e3])
-def test_gains_that_do_not_stand_alone_or_are_beyond_the_limit_are_never_sent(
-    hocca: Hocca, seen: Observation, scale: float
-) -> None:
+def test_gains_that_fall_are_never_sent(hocca: Hocca, seen: Observation, scale: float) -> None:
     soft = Scripted(lambda seen: Action.of(seen.law)._replace(D=scale * seen.law.local.D))
     guard = ControllerGuard(soft, hocca, GEOMETRY)
     found = guard.act(seen, leads=True)
@@ -237,9 +231,7 @@ def test_stiffer_gains_that_stand_are_sent(hocca: Hocca, seen: Observation, scal
     assert found.local.margins.service >= seen.law.local.margins.service
 
 
-def test_without_a_certified_schedule_no_own_gains_are_sent(
-    robot: RobotConfig, seen: Observation
-) -> None:
+def test_no_own_gains_without_a_schedule(robot: RobotConfig, seen: Observation) -> None:
     papers = msgspec.structs.replace(
         robot, law=msgspec.structs.replace(robot.law, split="diagonal"), gain_schedule=None
     )
@@ -273,9 +265,7 @@ def test_on_a_slope_the_capture_point_is_against_gravity() -> None:
     assert capture_point(p, (0.0,) * 6, (0.05, -0.02)) == (-0.05, 0.02), "downhill of the ankles"
 
 
-def test_what_it_sees_cannot_be_written_and_nothing_of_the_guards_changes(
-    hocca: Hocca, seen: Observation
-) -> None:
+def test_what_it_sees_cannot_be_written(hocca: Hocca, seen: Observation) -> None:
     for part in ("p", "pdot", "q", "J", "T"):
 
         def write(shown: Observation, part: str = part) -> Action:
@@ -325,9 +315,7 @@ def test_after_the_edge_all_hold_until_it_is_calm(hocca: Hocca, seen: Observatio
     assert back.index(SplitSource.SCHEDULE) == pytest.approx(250, abs=2)
 
 
-def test_references_that_would_come_to_rest_off_the_soles_are_not_sent(
-    hocca: Hocca, seen: Observation
-) -> None:
+def test_references_off_the_soles_are_not_sent(hocca: Hocca, seen: Observation) -> None:
     """Each joint is within its bounds; held, the whole would lean by 8 cm."""
     lean = Scripted(
         lambda seen: Action.of(seen.law)._replace(q_ref=seen.law.q_ref + 0.08 * seen.T[:, 0])

@@ -134,9 +134,7 @@ class Fleet:
         return tracking
 
 
-def test_all_six_track_in_the_same_tick_and_hold_for_good_once_one_has_faulted(
-    robot: RobotConfig,
-) -> None:
+def test_all_six_track_in_one_tick_and_none_beside_a_fault(robot: RobotConfig) -> None:
     fleet = Fleet(robot)
     tracking = fleet.run(300)
     assert set(tracking) == {0, 6}
@@ -159,9 +157,7 @@ FORBIDDEN = [PlannerMode.OVERLOADED, PlannerMode.UNCERTIFIED]
 
 @pytest.mark.parametrize("inhibit", FORBIDDEN)
 @pytest.mark.parametrize("mode", list(PlannerMode))
-def test_what_is_forbidden_holds_from_every_mode_at_once_and_is_no_drop_out(
-    mode: PlannerMode, inhibit: PlannerMode
-) -> None:
+def test_what_is_forbidden_holds_at_once(mode: PlannerMode, inhibit: PlannerMode) -> None:
     """Within the grace time too."""
     engagement = Engagement(mode, T0)
     engagement.advance(T0, YES, YES, TRACK, inhibit)

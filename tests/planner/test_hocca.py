@@ -105,9 +105,7 @@ def test_align_makes_no_step_from_any_pose_before(law: Hocca, closed: Closed) ->
         np.testing.assert_allclose(torque(output, q), output.tau_ff, atol=0.02)
 
 
-def test_after_align_the_reference_glides_to_the_centre(
-    robot: RobotConfig, law: Hocca, closed: Closed
-) -> None:
+def test_the_reference_glides_to_the_centre(robot: RobotConfig, law: Hocca, closed: Closed) -> None:
     q = closed(1.0, x=0.03, y=-0.02, roll=0.05, yaw=-0.04)
     p = oracle.pose(robot, q)
     shut = [0, 1, 3, 5]
@@ -124,9 +122,7 @@ def test_after_align_the_reference_glides_to_the_centre(
     np.testing.assert_allclose(p_ref[[2, 4]], p[[2, 4]], atol=1e-8)  # where the person leads
 
 
-def test_a_height_and_a_pitch_that_are_closed_stay_where_they_were_found(
-    robot: RobotConfig, closed: Closed
-) -> None:
+def test_closed_heights_and_pitches_stay_as_found(robot: RobotConfig, closed: Closed) -> None:
     """They glided to a COM on the floor once: zero is no stand."""
     K_p = (2810.0, 2810.0, 3000.0, 800.0, 300.0, 400.0)
     closing = Hocca(with_law(robot, S=(0,) * 6, K_p=K_p, split="diagonal"))
@@ -141,9 +137,7 @@ def test_a_height_and_a_pitch_that_are_closed_stay_where_they_were_found(
     np.testing.assert_allclose(closing.tick(q, STILL, 0.0, DT).p_ref[[2, 4]], p[[2, 4]], atol=1e-9)
 
 
-def test_reference_rates_keep_the_legs_together_and_follow_the_person(
-    robot: RobotConfig, law: Hocca, q: Array
-) -> None:
+def test_reference_rates_follow_the_person(robot: RobotConfig, law: Hocca, q: Array) -> None:
     """C v_ref = 0 and J v_ref = S J v, p_C resting."""
     law.tick(q, STILL, 0.0, DT, align=True)
     v = 0.3 * np.random.default_rng(6).normal(size=12)
@@ -294,9 +288,7 @@ def to_carry(robot: RobotConfig, q: Array, assist: float) -> Array:
 
 
 @pytest.mark.parametrize("assist", [0.0, 200.0])
-def test_feedforward_is_exact_in_static_balance(
-    robot: RobotConfig, posed: Array, assist: float
-) -> None:
+def test_feedforward_is_exact_at_rest(robot: RobotConfig, posed: Array, assist: float) -> None:
     """T^T tau_ff = d(energy)/dp to 1e-9 N and N m, at the pose that the law itself takes."""
     output = settled(Hocca(robot), posed, assist)
     np.testing.assert_allclose(output.q_ref, posed, atol=1e-6)
@@ -307,9 +299,7 @@ def test_feedforward_is_exact_in_static_balance(
 
 
 @pytest.mark.parametrize("assist", [0.0, 200.0])
-def test_the_feet_carry_the_weight_and_the_assist_and_their_moments(
-    robot: RobotConfig, posed: Array, assist: float
-) -> None:
+def test_the_feet_carry_weight_and_assist(robot: RobotConfig, posed: Array, assist: float) -> None:
     """All six parts of the sum, about the world's origin."""
     output = settled(Hocca(robot), posed, assist)
     got = on_the_feet(robot, posed, torque(output, posed))
@@ -387,9 +377,7 @@ def torque_of(law: Hocca) -> Callable[[Array, Array], Array]:
 
 
 @pytest.mark.usefixtures("exact_ik")
-def test_along_the_closed_chain_the_law_feels_like_k_p_or_more_where_it_balances_and_free_elsewhere(
-    robot: RobotConfig, posed: Array
-) -> None:
+def test_it_feels_like_k_p_where_it_balances_or_free(robot: RobotConfig, posed: Array) -> None:
     """With the real S, references moving: -dQ/dp = (K_fail + K_c) S_perp, Q all forces."""
     law = Hocca(robot)
     law.tick(posed, STILL, 0.0, 0.0, align=True)
@@ -415,9 +403,7 @@ def test_along_the_closed_chain_the_law_feels_like_k_p_or_more_where_it_balances
 
 
 @pytest.mark.usefixtures("exact_ik")
-def test_along_the_closed_chain_motion_is_damped_where_it_balances_and_free_elsewhere(
-    robot: RobotConfig, posed: Array
-) -> None:
+def test_motion_is_damped_where_it_balances_or_free(robot: RobotConfig, posed: Array) -> None:
     law = Hocca(robot)
     law.tick(posed, STILL, 0.0, 0.0, align=True)
     total, T = torque_of(law), oracle.feasible(robot, posed)

@@ -107,9 +107,7 @@ def advanced(follower: ShiftReference, wanted: Vector4, dt: float) -> tuple[Arra
 
 
 @given(course=st.lists(st.tuples(asked, st.sampled_from([DT, 2 * DT, 0.02])), max_size=60))
-def test_neither_shift_nor_rate_is_ever_beyond_its_limit(
-    course: list[tuple[Vector4, float]],
-) -> None:
+def test_shift_and_rate_stay_within_their_limits(course: list[tuple[Vector4, float]]) -> None:
     follower, last = ShiftReference(LARGEST), np.zeros(6)
     for wanted, dt in course:
         shift, rate = advanced(follower, wanted, dt)
@@ -170,9 +168,7 @@ REST = np.zeros(6)
         max_size=80,
     )
 )
-def test_an_offset_is_never_larger_nor_faster_than_it_may_be(
-    course: list[tuple[int, float, float]],
-) -> None:
+def test_an_offset_stays_within_size_and_rate(course: list[tuple[int, float, float]]) -> None:
     probe, last = ReferenceProbe(MOST, LED), (NO_ROW, 0.0)
     for row, wanted, dt in course:
         probe.advance(row, wanted, P, REST, dt)
@@ -244,9 +240,7 @@ def test_a_led_row_is_held_and_given_back_without_a_step() -> None:
 
 
 @pytest.mark.parametrize(("row", "offset"), [(6, 0.0), (-2, 0.0), (0, math.inf)])
-def test_an_intent_with_an_impossible_probe_is_ignored(
-    robot: RobotConfig, row: int, offset: float
-) -> None:
+def test_an_impossible_probe_is_ignored(robot: RobotConfig, row: int, offset: float) -> None:
     intents = Intents(robot.assist)
     intents.receive(intent(probe_row=1, probe=0.005), 1)
     intents.receive(intent(probe_row=row, probe=offset), 2)
@@ -289,9 +283,7 @@ def probed(
 
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("row", range(6), ids=DIRECTIONS)
-def test_the_largest_probe_of_each_direction_is_led_without_a_refused_command_or_a_trip(
-    robot: RobotConfig, row: int
-) -> None:
+def test_the_largest_probes_meet_no_refusal_and_no_trip(robot: RobotConfig, row: int) -> None:
     """A led row is held while it is probed and led again afterwards."""
     size = robot.law.probe_max[row]
     plan = Excitation(size, (SinePart(9.0, 2.0, 4),))

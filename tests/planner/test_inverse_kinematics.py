@@ -239,9 +239,7 @@ def test_out_of_reach_no_small_move_of_the_closed_chain_comes_nearer(
         assert nearer <= 2e-6 or np.abs(C @ move).max() > 1e-9
 
 
-def test_out_of_reach_it_is_not_worse_than_where_it_started(
-    robot: RobotConfig, ik: InverseKinematics
-) -> None:
+def test_out_of_reach_it_gets_no_worse(robot: RobotConfig, ik: InverseKinematics) -> None:
     """A start near the best pose there is, where all other starts end 8 mm further away."""
     right, left = [0.1676, 0.1146, -0.5614, -0.5274, 0.3547], [0.0495, 0.0588, -0.2621, -0.9647]
     ik.q[:] = np.array([*right, 1.5819, *left, 0.2394, 2.0868])

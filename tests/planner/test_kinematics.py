@@ -63,9 +63,7 @@ def test_closure_is_the_legs_disagreement_when_they_are_open(
     np.testing.assert_allclose(kinematics.closure, oracle.closure(robot, q_open), atol=1e-9)
 
 
-def test_an_open_pose_lies_between_the_poses_of_the_legs(
-    robot: RobotConfig, averaging: Kinematics, q: Array
-) -> None:
+def test_an_open_pose_is_in_between(robot: RobotConfig, averaging: Kinematics, q: Array) -> None:
     q_open = q + 1e-3 * np.random.default_rng(5).normal(size=12)
     averaging.update(q_open)
     middle = 0.5 * (oracle.pose(robot, q_open, RIGHT) + oracle.pose(robot, q_open, LEFT))
@@ -296,9 +294,7 @@ def laden_q(request: pytest.FixtureRequest, laden: RobotConfig) -> Array:
     return ik.q.copy()
 
 
-def test_pose_and_jacobian_are_the_papers_with_the_payload_beside(
-    laden: RobotConfig, laden_q: Array
-) -> None:
+def test_a_payload_beside_is_in_pose_and_jacobian(laden: RobotConfig, laden_q: Array) -> None:
     kinematics = Kinematics(laden)
     kinematics.update(laden_q)
     np.testing.assert_allclose(kinematics.p, oracle.pose(laden, laden_q), atol=1e-7)
@@ -306,9 +302,7 @@ def test_pose_and_jacobian_are_the_papers_with_the_payload_beside(
     np.testing.assert_allclose(kinematics.J @ T, np.eye(6), atol=1e-6)
 
 
-def test_feedforward_balances_and_the_certificate_has_the_curvature_that_is_felt(
-    laden: RobotConfig, laden_q: Array
-) -> None:
+def test_a_payload_beside_is_balanced_and_certified(laden: RobotConfig, laden_q: Array) -> None:
     stand = Stand(laden, laden_q, assist=80.0)
     D = np.tile([900.0, 1500.0, 3000.0, 3000.0, 3000.0, 900.0], 2)
     felt = stand.stiffness_felt(D)  # asserts balance
@@ -328,8 +322,6 @@ def test_the_push_limits_knees_weigh_the_same_wherever_the_payload_is(
     np.testing.assert_allclose(knees[0]._tau_knees, knees[1]._tau_knees, atol=1e-6)
 
 
-def test_a_centred_payload_leaves_the_gain_schedule_what_it_was(
-    robot: RobotConfig, laden: RobotConfig
-) -> None:
+def test_a_centred_payload_leaves_the_schedule(robot: RobotConfig, laden: RobotConfig) -> None:
     assert "mass.payload_com" not in inputs_of(robot)
     assert inputs_of(laden)["mass.payload_com"] == list(PLACE)

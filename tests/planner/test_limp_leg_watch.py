@@ -42,9 +42,7 @@ def braced_in(rows: list[JointState], ticks: int) -> set[Support]:
 
 @pytest.mark.parametrize("module", MODULES)
 @pytest.mark.parametrize("drive", list(DriveStatus))
-def test_the_leg_is_stiffened_at_once_for_a_module_in_fault_whatever_its_drive_reports(
-    q: Array, module: str, drive: DriveStatus
-) -> None:
+def test_a_fault_is_braced_for_at_once(q: Array, module: str, drive: DriveStatus) -> None:
     """One that is silent may hold or have no power."""
     decided = LimpLegWatch().advance(START_NS, states(q, module, Mode.FAULT, drive))
     assert decided is FOR[kind_of(module)]
@@ -52,9 +50,7 @@ def test_the_leg_is_stiffened_at_once_for_a_module_in_fault_whatever_its_drive_r
 
 @pytest.mark.parametrize("module", BRACED_FOR)
 @pytest.mark.parametrize("drive", [d for d in DriveStatus if d is not DriveStatus.HOLDING])
-def test_one_that_stays_disarmed_is_stiffened_for_after_the_time_a_takeover_may_take(
-    q: Array, module: str, drive: DriveStatus
-) -> None:
+def test_what_stays_disarmed_is_braced_for_late(q: Array, module: str, drive: DriveStatus) -> None:
     limp_legs, rows = LimpLegWatch(), states(q, module, Mode.DISARMED, drive)
     decided = [
         limp_legs.advance(START_NS + off, rows) for off in range(0, DISARMED_NS + 1, TICK_NS)
@@ -66,17 +62,13 @@ def test_one_that_stays_disarmed_is_stiffened_for_after_the_time_a_takeover_may_
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_one_that_waits_to_be_taken_over_is_not_stiffened_for_its_drive_holds_it(
-    q: Array, module: str
-) -> None:
+def test_nobody_braces_for_a_drive_that_holds(q: Array, module: str) -> None:
     rows = states(q, module, Mode.DISARMED, DriveStatus.HOLDING)
     assert braced_in(rows, 1000) == {Support.NONE}
 
 
 @pytest.mark.parametrize("module", BRACED_FOR)
-def test_a_restarted_service_that_knows_its_drive_in_time_is_not_stiffened_for(
-    q: Array, module: str
-) -> None:
+def test_nobody_braces_for_a_restart_in_time(q: Array, module: str) -> None:
     limp_legs = LimpLegWatch()
     course = [
         (0, Mode.DISARMED, DriveStatus.LOST),
@@ -121,9 +113,7 @@ def test_modules_that_are_controlled_do_not_brace(q: Array, mode: Mode) -> None:
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_the_commands_of_those_that_are_to_brace_carry_it_with_the_hold(
-    planner: Planner, q: Array, module: str
-) -> None:
+def test_commands_to_brace_carry_the_hold(planner: Planner, q: Array, module: str) -> None:
     now_ns = lead(planner, q)
     assert not any(command.stiffen for command in planner.tick(now_ns))
     now_ns += TICK_NS

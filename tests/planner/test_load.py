@@ -177,9 +177,7 @@ def test_a_dip_of_some_hundredths_of_a_second_is_no_hoist(load: Load) -> None:
 
 
 @pytest.mark.parametrize("led", [False, True])
-def test_without_a_harness_one_that_hangs_is_not_led_until_it_is_down(
-    load: Load, led: bool
-) -> None:
+def test_one_that_hangs_without_a_harness_is_not_led(load: Load, led: bool) -> None:
     load.advance_without_harness(0.3 * WEIGHT, DT, led=led)
     assert load.refused is not led, "what is led already is let down again, or falls"
     for _ in range(250):
@@ -189,9 +187,7 @@ def test_without_a_harness_one_that_hangs_is_not_led_until_it_is_down(
 
 
 @pytest.mark.parametrize("rates", [(0.06, 0.0), (-0.06, 0.0), (0.0, 0.11), (0.0, -0.11)])
-def test_in_motion_it_is_looked_for_only_while_the_robot_is_not_led(
-    load: Load, rates: Pair
-) -> None:
+def test_in_motion_it_is_sought_only_if_not_led(load: Load, rates: Pair) -> None:
     F = (WEIGHT + 50.0) * STRAIGHT_UP
     for _ in range(1000):
         load.advance(F, STRAIGHT_UP, 0.0, rates, DT, led=True)
@@ -202,9 +198,7 @@ def test_in_motion_it_is_looked_for_only_while_the_robot_is_not_led(
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_what_friction_may_be_is_left_to_the_hand_and_no_more_is_given_than_may(
-    load: Load, sign: float
-) -> None:
+def test_friction_is_left_to_the_hand_and_the_rest_capped(load: Load, sign: float) -> None:
     for newtons, given in (
         (0.9 * FRICTION_BAND[0], 0.0),
         (FRICTION_BAND[0] + 10.0, 10.0),
@@ -226,9 +220,7 @@ def test_what_friction_may_be_is_left_to_the_hand_and_no_more_is_given_than_may(
         (0.0, -30.0, "too far ahead, by 30 N m"),
     ],
 )
-def test_far_from_the_file_it_is_refused_until_it_is_well_within(
-    load: Load, kg: float, a: float, said: str
-) -> None:
+def test_far_from_the_file_it_is_refused(load: Load, kg: float, a: float, said: str) -> None:
     found(load, kg, a)
     assert load.refused
     assert said in load.refusal()

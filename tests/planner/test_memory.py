@@ -132,9 +132,7 @@ COURSES: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("name", COURSES)
-def test_a_planner_goes_on_from_its_state_bit_for_bit(
-    robot: RobotConfig, closed: Closed, name: str
-) -> None:
+def test_a_planner_goes_on_bit_for_bit(robot: RobotConfig, closed: Closed, name: str) -> None:
     """It goes on counting, with the wish, the stance and the rival that it had."""
     changes, q = COURSES[name], closed(1.188, x=0.01, pitch=0.1)
     q = astray(q) if name == "feet astray" else q

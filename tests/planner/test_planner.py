@@ -101,9 +101,7 @@ def test_commands_carry_each_modules_part_of_the_law(planner: Planner, q: Array)
     assert joined(commands, "k_d").min() > 0.0
 
 
-def test_leading_again_starts_from_the_measured_height_and_pitch_and_from_the_middle(
-    planner: Planner, q: Array, closed: Closed
-) -> None:
+def test_it_leads_again_from_where_it_is(planner: Planner, q: Array, closed: Closed) -> None:
     now = lead(planner, q) + NS_PER_S
     elsewhere = closed(1.0, x=-0.03, y=0.02, roll=0.04, pitch=0.4)
     receive_all(planner, elsewhere, now, seq=90)
@@ -119,9 +117,7 @@ def test_leading_again_starts_from_the_measured_height_and_pitch_and_from_the_mi
     )
 
 
-def test_six_new_states_are_due_after_half_a_period_and_are_used_up(
-    robot: RobotConfig, planner: Planner, q: Array
-) -> None:
+def test_six_new_states_are_due_once(robot: RobotConfig, planner: Planner, q: Array) -> None:
     last = lead(planner, q)
     half = round(EARLY_FRACTION * NS_PER_S / robot.planner.rate_hz)
     receive_all(planner, q, last + 1, seq=50)
@@ -177,9 +173,7 @@ def test_a_status_holds_what_the_tick_saw(planner: Planner, q: Array) -> None:
     assert status.ik_residual < 1e-6
 
 
-def test_commands_and_status_hold_both_margins_and_where_the_gains_come_from(
-    robot: RobotConfig, planner: Planner, q: Array
-) -> None:
+def test_both_margins_are_told(robot: RobotConfig, planner: Planner, q: Array) -> None:
     now = lead(planner, q)
     receive_all(planner, q, now, seq=50)
     commands = planner.tick(now + 4 * NS_PER_MS)
@@ -191,9 +185,7 @@ def test_commands_and_status_hold_both_margins_and_where_the_gains_come_from(
     assert status.margin_onboard >= robot.certificate.onboard_margin_min
 
 
-def test_gains_that_would_not_stand_ask_for_hold_in_that_very_tick(
-    robot: RobotConfig, planner: Planner, q: Array
-) -> None:
+def test_gains_that_fall_hold_at_once(robot: RobotConfig, planner: Planner, q: Array) -> None:
     """The mode follows a tick later; when the gains stand again it waits as after a drop-out."""
     now = lead(planner, q)
     split = planner._law._split
@@ -240,9 +232,7 @@ def test_a_robot_that_nothing_holds_is_never_lead(robot: RobotConfig, q: Array) 
     assert status.margin < robot.certificate.margin_min
 
 
-def test_a_stale_state_counts_before_uncertified_gains(
-    robot: RobotConfig, planner: Planner, q: Array
-) -> None:
+def test_staleness_counts_before_gains(robot: RobotConfig, planner: Planner, q: Array) -> None:
     now = lead(planner, q)
     planner._law._split._margins_min = Margins(1e9, 1e9)
     for silence_ms in (4, 200):

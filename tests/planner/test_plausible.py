@@ -54,9 +54,7 @@ def test_a_speed_that_is_none_is_no_state(robot: RobotConfig, speed: float) -> N
 
 
 @pytest.mark.parametrize("angle", [math.nan, 1e308, 64.0])
-def test_a_module_that_sends_only_such_angles_goes_stale_and_the_planner_holds(
-    planner: Planner, closed: Closed, angle: float
-) -> None:
+def test_absurd_angles_alone_are_silence(planner: Planner, closed: Closed, angle: float) -> None:
     q = closed(1.188)
     now_ns, wrong = lead(planner, q), q.copy()
     wrong[4] = angle

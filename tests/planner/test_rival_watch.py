@@ -74,9 +74,7 @@ def test_it_yields_to_whom_the_modules_follow(
 
 
 @given(st.lists(st.sampled_from([0, OWN, OTHER]), min_size=6, max_size=6))
-def test_of_two_planners_never_both_yield_and_never_both_go_on_while_both_are_followed(
-    sessions: list[int],
-) -> None:
+def test_of_two_that_are_followed_exactly_one_yields(sessions: list[int]) -> None:
     one, two = watch(*sessions, own=OWN).yields, watch(*sessions, own=OTHER).yields
     assert not (one and two)
     if {OWN, OTHER} <= set(sessions):
@@ -88,9 +86,7 @@ def q(closed: Closed) -> Array:
     return closed(1.188)
 
 
-def test_a_planner_beside_one_that_leads_is_refused_by_each_module_and_says_why(
-    planner: Planner, q: Array, robot: RobotConfig
-) -> None:
+def test_beside_a_leader_it_is_refused(planner: Planner, q: Array, robot: RobotConfig) -> None:
     timing = timing_of(robot)
     told = 0
     for tick in range(200):
@@ -117,9 +113,7 @@ def test_ready_counts_only_for_ones_own_session(planner: Planner, q: Array) -> N
     assert planner.status(now_ns, 0.0).mode == PlannerMode.ALIGNING
 
 
-def test_once_the_other_has_ended_it_leads_and_in_a_new_session_if_its_own_is_refused(
-    planner: Planner, q: Array
-) -> None:
+def test_refused_in_its_own_session_it_leads_in_a_new_one(planner: Planner, q: Array) -> None:
     """The modules retired its session for the other's while it was held up."""
     receive_all(planner, q, START_NS, session=OTHER)
     assert all(command.echo_t_ns < START_NS - AGE_MAX_NS for command in planner.tick(START_NS))
@@ -150,9 +144,7 @@ def test_one_module_that_has_retired_its_session_is_regained(planner: Planner, q
         assert {command.session for command in planner.tick(now_ns)} == {SESSION + 1}
 
 
-def test_one_that_leads_goes_on_beside_a_module_that_another_caught(
-    planner: Planner, q: Array
-) -> None:
+def test_one_that_leads_goes_on_beside_a_caught_module(planner: Planner, q: Array) -> None:
     now_ns = lead(planner, q) + TICK_NS
     receive_but(planner, 1, q, now_ns, 9, session=OTHER)
     assert len(planner.tick(now_ns)) == N_MODULES

@@ -114,9 +114,7 @@ def halved(nodes: tuple[float, ...]) -> Array:
     return np.sort(np.concatenate([nodes, 0.5 * (np.array(nodes[1:]) + np.array(nodes[:-1]))]))
 
 
-def test_the_schedule_is_certified_at_every_node_and_half_way_between(
-    robot: RobotConfig, schedule: GainSchedule
-) -> None:
+def test_the_schedule_is_certified_throughout(robot: RobotConfig, schedule: GainSchedule) -> None:
     """Both margins, without and with the full assist, wherever the robot can stand."""
     kinematics, certificate = Kinematics(robot), Certificate(robot)
     ik = InverseKinematics(kinematics, np.array(robot.joint_limits()))
@@ -156,9 +154,7 @@ def test_in_the_squat_and_the_crawl_the_schedule_is_enough(
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_off_centre_leaning_and_twisted_the_schedule_is_still_enough(
-    robot: RobotConfig, closed: Closed, seed: int
-) -> None:
+def test_off_centre_the_schedule_is_enough(robot: RobotConfig, closed: Closed, seed: int) -> None:
     """What a push leaves: up to 4 cm, 0.04 rad of roll and of yaw."""
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(-0.04, 0.04, 2)
@@ -168,17 +164,13 @@ def test_off_centre_leaning_and_twisted_the_schedule_is_still_enough(
     assert local.source is SplitSource.SCHEDULE
 
 
-def test_the_published_margins_are_the_certificates_of_what_is_sent(
-    robot: RobotConfig, stand: Stand
-) -> None:
+def test_the_margins_told_are_of_what_is_sent(robot: RobotConfig, stand: Stand) -> None:
     for changed in (robot, with_table(robot, 0.0), with_law(robot, split="diagonal")):
         local = stand.split(GainSplit(changed))
         assert local.margins == pytest.approx(stand.certificate.margins(local.D))
 
 
-def test_scheduled_gains_are_far_softer_than_the_papers_where_the_person_leads(
-    robot: RobotConfig, stand: Stand
-) -> None:
+def test_scheduled_gains_are_softer_where_a_person_leads(robot: RobotConfig, stand: Stand) -> None:
     """docs/law.md#gain-split: along z; diag(K_q) gives 2-3e5 N/m there."""
     soft = stand.split(GainSplit(robot)).D
     stiff = stand.split(GainSplit(with_law(robot, split="diagonal"))).D
@@ -186,9 +178,7 @@ def test_scheduled_gains_are_far_softer_than_the_papers_where_the_person_leads(
     assert K_z[0] < 0.35 * K_z[1]
 
 
-def test_gains_that_would_fall_are_stiffened_until_they_stand_and_no_further(
-    robot: RobotConfig, stand: Stand
-) -> None:
+def test_gains_that_fall_are_stiffened_no_further(robot: RobotConfig, stand: Stand) -> None:
     """A quarter of the way less would not have stood."""
     assert stand.certificate.margins(np.zeros(12)).service < 0.0
     local = stand.split(GainSplit(with_table(robot, 0.0)))
@@ -202,9 +192,7 @@ def test_gains_that_would_fall_are_stiffened_until_they_stand_and_no_further(
 
 
 @pytest.mark.parametrize("name", ["service", "onboard"])
-def test_either_margin_alone_is_enough_to_be_stiffened(
-    robot: RobotConfig, stand: Stand, name: str
-) -> None:
+def test_either_margin_alone_stiffens(robot: RobotConfig, stand: Stand, name: str) -> None:
     scheduled = stand.split(GainSplit(robot)).margins
     key = "margin_min" if name == "service" else "onboard_margin_min"
     changed = requiring(robot, **{key: min(1.0, getattr(scheduled, name) + 0.01)})
@@ -213,9 +201,7 @@ def test_either_margin_alone_is_enough_to_be_stiffened(
     assert local.source is not SplitSource.STIFFENED or is_enough(local.margins, least)
 
 
-def test_without_a_foot_on_the_ground_the_stiffest_allowed_are_sent_and_it_is_reported(
-    robot: RobotConfig, stand: Stand
-) -> None:
+def test_uncertified_gains_are_the_stiffest_allowed(robot: RobotConfig, stand: Stand) -> None:
     local = stand.split(GainSplit(requiring(robot, K_required=(1e5,) * 6)))
     assert local.source is SplitSource.UNCERTIFIED
     assert local.margins.service < robot.certificate.margin_min
@@ -262,9 +248,7 @@ def test_gains_are_never_negative_nor_over_the_limits(
         assert gains.max() <= limit
 
 
-def test_the_papers_split_is_the_diagonal_and_needs_no_schedule(
-    robot: RobotConfig, stand: Stand
-) -> None:
+def test_the_papers_split_is_the_diagonal(robot: RobotConfig, stand: Stand) -> None:
     bare = msgspec.structs.replace(with_law(robot, split="diagonal"), gain_schedule=None)
     local, (K_q, B_q), service = stand.split(GainSplit(bare)), stand.gains(), bare.joint_service
     share = robot.law.local_damping_fraction

@@ -127,9 +127,7 @@ def test_each_sole_is_asked_for_little_moment_where_it_stands(
         assert abs(pitch_moment) < 0.01 * 500.0, "less than a centimetre of lever"
 
 
-def test_align_makes_no_step_where_the_feet_stand_astray(
-    robot: RobotConfig, closed: Closed
-) -> None:
+def test_feet_astray_make_no_step_at_align(robot: RobotConfig, closed: Closed) -> None:
     """What the legs disagree by is how the feet stand: it is taken, not fought."""
     q = closed(1.0, pitch=0.3) + 1e-2 * np.random.default_rng(4).normal(size=12)
     output = Hocca(robot).tick(q, STILL, 0.0, DT, align=True)
@@ -138,9 +136,7 @@ def test_align_makes_no_step_where_the_feet_stand_astray(
     np.testing.assert_allclose(output.closure, 0.0, atol=1e-6)
 
 
-def test_while_it_leads_it_keeps_the_stance_and_in_hold_it_follows_slowly(
-    robot: RobotConfig, closed: Closed
-) -> None:
+def test_led_it_keeps_the_stance_held_it_follows(robot: RobotConfig, closed: Closed) -> None:
     """A joint that gives is not a foot that has moved; one that stays moved is."""
     q = closed(1.0, pitch=0.3)
     law = Hocca(robot)

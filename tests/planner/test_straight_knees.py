@@ -138,9 +138,7 @@ def test_the_gains_go_through_straight_knees_without_a_jump(path: Path) -> None:
 
 
 @pytest.mark.parametrize("split", ["certified", "diagonal"])
-def test_the_local_gains_go_through_straight_knees_without_a_jump(
-    leaning: Path, limits: Array, split: str
-) -> None:
+def test_local_gains_pass_straight_knees_smoothly(leaning: Path, limits: Array, split: str) -> None:
     robot = leaning.robot
     splitting, gain_law = GainSplit(with_law(robot, split=split)), GainLaw(robot)
     ik = InverseKinematics(Kinematics(robot), limits)
@@ -163,9 +161,7 @@ def per_p(ik: InverseKinematics, q: Array) -> Array:
     return ik.solve_rates(np.eye(12)[:, :6])
 
 
-def test_rates_that_follow_the_robots_own_motion_are_never_larger_than_it(
-    leaning: Path, limits: Array
-) -> None:
+def test_rates_never_exceed_the_motion_they_follow(leaning: Path, limits: Array) -> None:
     """The robot led through straight knees: v_ref = T S J v."""
     ik = InverseKinematics(Kinematics(leaning.robot), limits)
     S = np.array(leaning.robot.law.S)

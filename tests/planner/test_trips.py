@@ -85,9 +85,7 @@ def test_at_its_limit_nothing_trips_yet(robot: RobotConfig, trip: Trip) -> None:
 
 
 @pytest.mark.parametrize("trip", TRIPS)
-def test_a_planner_that_does_not_lead_trips_on_nothing_and_it_does_not_count_later(
-    robot: RobotConfig, trip: Trip
-) -> None:
+def test_a_planner_that_does_not_lead_trips_on_nothing(robot: RobotConfig, trip: Trip) -> None:
     trips = go_on(PlannerTrips(robot), beyond(robot, trip), range(1000), leads=False)
     assert go_on(trips, beyond(robot, trip), range(1000, 1001)).tripped is Trip.NONE
 
@@ -99,9 +97,7 @@ def test_what_is_not_known_is_no_reason_nor_a_leg_on_the_hoist(robot: RobotConfi
 
 @pytest.mark.parametrize("known", [True, False], ids=["it lasts", "it is not known"])
 @pytest.mark.parametrize("trip", TRIPS)
-def test_it_goes_on_while_it_lasts_or_is_not_known_and_ends_after_a_calm_second(
-    robot: RobotConfig, trip: Trip, known: bool
-) -> None:
+def test_it_ends_after_a_calm_second(robot: RobotConfig, trip: Trip, known: bool) -> None:
     """A harness that falls silent takes no load off the person."""
     trips = go_on(led(robot), beyond(robot, trip), range(1000))
     other = beyond(robot, Trip.LEGS if trip is Trip.REACH else Trip.REACH)

@@ -37,25 +37,19 @@ def test_the_limit_is_fifty_milliseconds(timing: Timing) -> None:
 @pytest.mark.parametrize(
     ("off_ns", "refusal"), [(-1, Refusal.NONE), (0, Refusal.NONE), (1, Refusal.TOO_OLD)]
 )
-def test_a_command_is_taken_up_to_the_limit_to_the_nanosecond(
-    off_ns: int, refusal: Refusal, timing: Timing
-) -> None:
+def test_a_command_is_taken_to_a_nanosecond(off_ns: int, refusal: Refusal, timing: Timing) -> None:
     sent = command(echo_t_ns=T0 - timing.max_command_age_ns - off_ns)
     assert Failsafe().offer(sent, T0, timing) is refusal
 
 
 @pytest.mark.parametrize(("off_ns", "usable"), [(-1, True), (0, True), (1, False)])
-def test_a_taken_command_is_usable_up_to_the_limit_to_the_nanosecond(
-    off_ns: int, usable: bool, timing: Timing
-) -> None:
+def test_a_command_is_usable_to_a_nanosecond(off_ns: int, usable: bool, timing: Timing) -> None:
     failsafe = taken(timing)
     assert failsafe.is_fresh(T0 + timing.max_command_age_ns + off_ns, timing) is usable
 
 
 @pytest.mark.parametrize(("off_ns", "mode"), [(-1, Mode.TRACK), (0, Mode.TRACK), (1, Mode.HOLD)])
-def test_track_is_left_one_nanosecond_past_the_limit(
-    off_ns: int, mode: Mode, timing: Timing
-) -> None:
+def test_track_is_left_a_nanosecond_after(off_ns: int, mode: Mode, timing: Timing) -> None:
     failsafe = taken(timing)
     failsafe.mode = Mode.TRACK
     failsafe.fresh_since_ns = T0
@@ -72,9 +66,7 @@ def test_track_is_left_one_nanosecond_past_the_limit(
         (1 << 62, Refusal.FROM_THE_FUTURE),
     ],
 )
-def test_a_stamp_this_module_has_not_given_yet_is_refused(
-    ahead_ns: int, refusal: Refusal, timing: Timing
-) -> None:
+def test_a_stamp_not_given_yet_is_refused(ahead_ns: int, refusal: Refusal, timing: Timing) -> None:
     assert Failsafe().offer(command(echo_t_ns=T0 + ahead_ns), T0, timing) is refusal
 
 
@@ -258,9 +250,7 @@ def test_the_step_of_a_number_may_be_500_and_not_one_more(timing: Timing) -> Non
 
 
 @pytest.mark.parametrize("away_s", [0.0, 1.0, 60.0, 3600.0])
-def test_a_planner_that_was_not_heard_for_a_while_is_heard_again(
-    timing: Timing, away_s: float
-) -> None:
+def test_a_planner_unheard_for_a_while_is_heard_again(timing: Timing, away_s: float) -> None:
     """It ticks on at 250 Hz, or at any rate up to 1 kHz, while its link is cut."""
     failsafe = taken(timing, seq=10)
     now_ns = T0 + round(away_s * NS_PER_S)
@@ -269,9 +259,7 @@ def test_a_planner_that_was_not_heard_for_a_while_is_heard_again(
 
 
 @given(ahead=st.integers(1, 2**62), away_ns=st.integers(0, 3600 * NS_PER_S))
-def test_no_message_locks_the_planner_out_for_longer_than_it_was_away(
-    ahead: int, away_ns: int
-) -> None:
+def test_no_message_locks_a_planner_out_longer_than_away(ahead: int, away_ns: int) -> None:
     """Whatever was accepted, a planner of 250 Hz has counted beyond it soon after."""
     timing = Timing(
         max_command_age_ns=50 * NS_PER_MS, engage_after_ns=1, engage_after_max_ns=1,
@@ -295,9 +283,7 @@ def test_the_newest_refusal_is_told_for_a_second_and_of_whom_it_came(timing: Tim
     assert failsafe.newest_refusal(T0 + NS_PER_S + 1) == (Refusal.NONE, 0)
 
 
-def test_commands_that_came_before_the_drive_was_armed_do_not_count_for_track(
-    timing: Timing,
-) -> None:
+def test_commands_from_before_the_drive_was_armed_do_not_count(timing: Timing) -> None:
     failsafe, now_ns = Failsafe(), T0
     for seq in range(1000):
         now_ns += 2 * NS_PER_MS

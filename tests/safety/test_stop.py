@@ -54,9 +54,7 @@ def test_emergency_stop_leads_from_any_mode_to_damp(bench: Bench, before: Mode) 
 
 @pytest.mark.parametrize("before", [Mode.HOLD, Mode.TRACK])
 @pytest.mark.parametrize("module", ["knee_right", "hip_left"])
-def test_the_axes_that_sink_have_no_stiffness_in_damp(
-    robot: RobotConfig, before: Mode, module: str
-) -> None:
+def test_what_sinks_has_no_stiffness(robot: RobotConfig, before: Mode, module: str) -> None:
     bench = at_rest(robot, module)
     bench.to(before)
     bench.cycle(estop=True)
@@ -69,9 +67,7 @@ def test_the_axes_that_sink_have_no_stiffness_in_damp(
 @pytest.mark.parametrize(
     ("module", "axis"), [("ankle_left", 0), ("ankle_left", 1), ("knee_right", 0), ("hip_right", 0)]
 )
-def test_ankles_and_frontal_axes_keep_holding_in_damp(
-    robot: RobotConfig, module: str, axis: int
-) -> None:
+def test_ankles_and_frontal_axes_hold_in_damp(robot: RobotConfig, module: str, axis: int) -> None:
     """With every stiffness off, an inverted pendulum is left: it toppled."""
     bench = at_rest(robot, module)
     bench.to_hold()
@@ -84,9 +80,7 @@ def test_ankles_and_frontal_axes_keep_holding_in_damp(
     assert bench.run(5)[-1].tau[axis] == pytest.approx(-0.01 * stand)
 
 
-def test_damp_fades_the_sinking_feedforward_to_zero_in_its_time(
-    robot: RobotConfig, bench: Bench
-) -> None:
+def test_damp_fades_the_feedforward_that_sinks(robot: RobotConfig, bench: Bench) -> None:
     bench.to_track(tau_ff=(3.0, -25.0))
     bench.cycle(estop=True)
     cycles = round(robot.joint_service.damp_fade_s * robot.joint_service.rate_hz)
@@ -96,9 +90,7 @@ def test_damp_fades_the_sinking_feedforward_to_zero_in_its_time(
     assert bench.controller.tau[1] == 0.0
 
 
-def test_torque_in_damp_is_what_is_left_of_the_feedforward(
-    robot: RobotConfig, bench: Bench
-) -> None:
+def test_torque_in_damp_is_the_feedforward_left(robot: RobotConfig, bench: Bench) -> None:
     bench.to_track(tau_ff=(3.0, -25.0), tau_coupled=(12.0, -9.0))
     bench.cycle(estop=True)
     entered_ns, fade_ns = bench.now_ns, robot.joint_service.damp_fade_s * NS_PER_S
@@ -121,9 +113,7 @@ def test_damp_resists_motion(robot: RobotConfig, bench: Bench) -> None:
     assert settled.tau[1] == pytest.approx(robot.joint_service.damp_k_d * 0.3)
 
 
-def test_emergency_stop_never_drops_the_load_that_the_springs_carried(
-    bench: Bench, robot: RobotConfig
-) -> None:
+def test_a_stop_never_drops_what_springs_carried(bench: Bench, robot: RobotConfig) -> None:
     """A slow sink, never a drop: a stand without a planner has no feedforward to fade."""
     bench.to_hold()
     bench.q = (0.02, -1.02)
@@ -140,9 +130,7 @@ GENTLE = (3.0, -5.0)
 
 
 @pytest.mark.parametrize("module", ["ankle_left", "knee_left", "hip_right"])
-def test_in_damp_what_does_not_sink_comes_to_the_stand_gains(
-    robot: RobotConfig, module: str
-) -> None:
+def test_in_damp_the_rest_comes_to_the_stand_gains(robot: RobotConfig, module: str) -> None:
     bench = Bench(robot, module)
     soft = {"k_p": (100.0, 90.0), "k_d": (5.0, 4.0), "tau_ff": GENTLE}
     bench.to_track(**soft)
@@ -178,9 +166,7 @@ def sunk(robot: RobotConfig) -> Bench:
     return bench
 
 
-def test_a_knee_is_caught_and_damped_before_it_folds_so_far_that_the_robot_topples(
-    robot: RobotConfig, sunk: Bench
-) -> None:
+def test_a_knee_is_caught_and_damped_before_it_topples(robot: RobotConfig, sunk: Bench) -> None:
     stand = robot.stand_gains("knee_left")
     sunk.move((sunk.q[0], robot.joint_service.damp_knee_stop - 0.02))
     still = sunk.run(5)[-1].tau[1]

@@ -104,9 +104,7 @@ def test_every_situation_leads_to_its_state_by_the_age_rule(mode: Mode, timing: 
 
 
 @pytest.mark.parametrize(("mode", "event"), list(product(Mode, Event)))
-def test_advance_follows_the_table_for_every_state_and_event(
-    mode: Mode, event: Event, timing: Timing
-) -> None:
+def test_advance_follows_the_table_throughout(mode: Mode, event: Event, timing: Timing) -> None:
     situation = Situation(
         mode,
         drive=event if event in DRIVE_EVENTS else Event.NONE,

@@ -192,9 +192,7 @@ def test_driver_is_lost_with_its_hub_and_arms_again_with_a_new_one(shed: Shed) -
     assert list(new.step()[[4, 5]]) == [0.5, 0.25]
 
 
-def test_writing_to_a_hub_that_does_not_read_never_blocks_or_raises(
-    rig: Rig, driver: OdriveCan
-) -> None:
+def test_writing_to_a_deaf_hub_never_blocks_or_raises(rig: Rig, driver: OdriveCan) -> None:
     for _ in range(5000):
         driver.write_torque((1.0, 2.0))
     rig.front.receive()

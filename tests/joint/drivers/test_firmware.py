@@ -61,9 +61,7 @@ def report_of(*pairs: tuple[int, bytes], armed: bool = False) -> AxesReport:
         (new(IDLE, result=ProcedureResult.NOT_CALIBRATED, done=False), "0.6"),
     ],
 )
-def test_a_heartbeat_shows_its_dialect_only_where_the_other_could_not_have_sent_it(
-    heartbeat: bytes, dialect: Dialect
-) -> None:
+def test_a_heartbeat_only_one_dialect_can_send_shows_it(heartbeat: bytes, dialect: Dialect) -> None:
     assert dialect_of(heartbeat) == dialect
 
 
@@ -134,9 +132,7 @@ def test_the_watchdog_has_its_own_bit_in_each_dialect_and_the_other_one_is_somet
     ("dialect", "heartbeat"),
     [("0.5", old(IDLE, 0x800)), ("0.6", new(IDLE, 0x0100_0000, ProcedureResult.DISARMED))],
 )
-def test_a_watchdog_that_ran_out_before_the_first_write_is_no_error(
-    dialect: Dialect, heartbeat: bytes
-) -> None:
+def test_a_watchdog_out_before_any_write_is_no_error(dialect: Dialect, heartbeat: bytes) -> None:
     assert judged(dialect, heartbeat, wanted_armed=False) == (IDLE, 0)
     assert judged(dialect, heartbeat, wanted_armed=True)[1] != 0
 
@@ -162,9 +158,7 @@ def test_a_failed_motor_of_0_5_is_an_error_even_before_its_dialect_is_known() ->
 
 
 @pytest.mark.parametrize("result", [ProcedureResult.NOT_CALIBRATED, ProcedureResult.INVALID_STATE])
-def test_closed_loop_that_0_6_refuses_is_an_error_only_if_it_was_asked_for(
-    result: ProcedureResult,
-) -> None:
+def test_closed_loop_refused_by_0_6_is_an_error_if_asked_for(result: ProcedureResult) -> None:
     refused = new(IDLE, result=result)
     assert judged("0.6", refused, wanted_armed=True) == (IDLE, AxisError.INVALID_STATE)
     assert judged("0.6", refused, wanted_armed=False) == (IDLE, 0)
@@ -179,9 +173,7 @@ def test_closed_loop_that_0_6_refuses_is_an_error_only_if_it_was_asked_for(
         (new(CLOSED, result=ProcedureResult.BUSY), new(AxisState.UNDEFINED)),
     ],
 )
-def test_an_axis_that_left_closed_loop_without_an_error_bit_is_an_error(
-    closed: bytes, left: bytes
-) -> None:
+def test_leaving_closed_loop_without_an_error_is_one(closed: bytes, left: bytes) -> None:
     report = report_of((0, closed), (1, closed))
     statuses = [report.status]
     report.receive(1, left)
@@ -236,8 +228,6 @@ def test_every_register_of_either_axis_shows(
 
 
 @pytest.mark.parametrize(("wanted_armed", "seen"), [(True, True), (False, False)])
-def test_a_watchdog_that_ran_out_counts_only_where_the_drive_was_to_be_armed(
-    wanted_armed: bool, seen: bool
-) -> None:
+def test_a_watchdog_counts_only_where_armed_is_wanted(wanted_armed: bool, seen: bool) -> None:
     registers = [AxisError.WATCHDOG_TIMER_EXPIRED, *NONE[1:]]
     assert bool(AxesStatus.errors(registers, wanted_armed=wanted_armed)) == seen

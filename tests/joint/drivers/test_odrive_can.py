@@ -117,9 +117,7 @@ def test_newest_of_several_frames_in_one_packet_wins(rig: Rig, driver: OdriveCan
     assert read(driver).pos_turns == (20.0, 21.0)
 
 
-def test_one_axis_alone_makes_no_sample_and_after_a_while_the_drive_is_lost(
-    rig: Rig, driver: OdriveCan
-) -> None:
+def test_one_axis_alone_makes_no_sample_and_is_lost(rig: Rig, driver: OdriveCan) -> None:
     frame = (arbitration_id(NODES[0], Command.GET_ENCODER_ESTIMATES), pack_two_floats(1.0, 0.0))
     rig.hub.broadcast([frame])
     time.sleep(1.5 * DRIVE.watchdog_timeout)
@@ -143,9 +141,7 @@ def test_going_idle_on_request_is_no_error(rig: Rig, driver: OdriveCan) -> None:
     assert [rig.bank.state[axis] for axis in AXES] == [IDLE] * 2
 
 
-def test_watchdog_does_not_run_out_between_arming_and_the_heartbeat_that_shows_it(
-    shed: Shed,
-) -> None:
+def test_the_watchdog_is_fed_until_a_heartbeat_shows_the_arming(shed: Shed) -> None:
     rig = shed.rig(watchdog=True)
     driver = shed.connected(rig)
     driver.arm(onboard=False)
@@ -181,9 +177,7 @@ def test_reconnected_driver_is_lost_until_heartbeats_show_the_state(rig: Rig, sh
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_an_estimate_that_is_no_number_is_no_sample(
-    rig: Rig, driver: OdriveCan, bad: float
-) -> None:
+def test_an_estimate_of_nan_is_no_sample(rig: Rig, driver: OdriveCan, bad: float) -> None:
     for node in NODES:
         can_id = arbitration_id(node, Command.GET_ENCODER_ESTIMATES)
         rig.hub.broadcast([(can_id, pack_two_floats(bad, 0.0))])
@@ -218,9 +212,7 @@ def test_a_target_that_is_no_number_is_not_sent(bench: Bench, field: int, bad: f
     assert bench.driver.write_failures == 1
 
 
-def test_arming_onboard_is_position_mode_without_gains_where_the_motors_are(
-    rig: Rig, shed: Shed
-) -> None:
+def test_arming_onboard_holds_the_positions_without_gains(rig: Rig, shed: Shed) -> None:
     rig.pos[list(AXES)] = (1.5, -0.75)
     arm(rig, shed.connected(rig), onboard=True)
     bank, axes = rig.bank, list(AXES)
@@ -230,9 +222,7 @@ def test_arming_onboard_is_position_mode_without_gains_where_the_motors_are(
     assert not rig.step()[axes].any()
 
 
-def test_the_joint_gets_the_same_torque_by_either_loop_to_rounding(
-    rig: Rig, driver: OdriveCan
-) -> None:
+def test_either_loop_gives_the_joint_the_same_torque(rig: Rig, driver: OdriveCan) -> None:
     """Over the wire, in the emulated firmware: thousandths of a newton metre at the motor."""
     arm(rig, driver, onboard=True)
     law = DriveSetpointLaw(N, DRIVE.vel_limit)
@@ -278,9 +268,7 @@ def receive_heartbeat(bench: Bench, node: int, state: AxisState) -> None:
     bench.after(2 * ARM_GRACE_MS)
 
 
-def test_an_axis_that_stays_armed_after_idle_is_idled_again_at_its_next_heartbeat(
-    bench: Bench,
-) -> None:
+def test_an_axis_still_armed_after_idle_is_idled_again(bench: Bench) -> None:
     """Its sibling may have disarmed: two motors of a differential, and one of them pulls."""
     bench.armed()
     bench.driver.idle()
@@ -315,9 +303,7 @@ def test_an_axis_that_was_armed_since_is_not_idled_again(bench: Bench, armed_aga
     assert Command.SET_AXIS_STATE not in bench.commands()
 
 
-def test_estimates_without_heartbeats_are_a_lost_drive_since_it_could_disarm_unseen(
-    bench: Bench,
-) -> None:
+def test_estimates_without_heartbeats_are_a_lost_drive(bench: Bench) -> None:
     bench.armed()
     statuses = [bench.receive(None).status for _ in range(REBOOT_MS + 20)]
     assert statuses[: REBOOT_MS - 20] == [DriveStatus.ARMED] * (REBOOT_MS - 20)

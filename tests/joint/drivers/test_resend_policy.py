@@ -171,9 +171,7 @@ def test_gains_that_were_lost_are_sent_again(rig: Rig, driver: OdriveCan) -> Non
         np.testing.assert_allclose(rig.bank.pos_gain[axes], TARGET.pos_gain, rtol=1e-6)
 
 
-def test_arming_goes_on_as_the_queue_empties_and_closed_loop_is_asked_for_last(
-    bench: Bench,
-) -> None:
+def test_arming_goes_on_as_the_queue_empties_closed_loop_last(bench: Bench) -> None:
     bench.receive()
     bench.commands()
     bench.bus.room = 1 << 30
@@ -241,9 +239,7 @@ def test_an_order_does_not_go_to_the_next_bus(bench: Bench) -> None:
     assert Command.SET_AXIS_STATE not in bench.commands()
 
 
-def test_closing_waits_a_little_for_the_order_to_go_idle(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_closing_waits_for_the_order_to_idle(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     bench.armed()
     bench.bus.room = 0
     bench.driver.idle()

@@ -79,7 +79,7 @@ def test_positions_are_counted_from_the_mark_both_ways(inner: Recorder) -> None:
 
 @pytest.mark.parametrize("pos", [(0.0, MARK), (MARK, 0.97), (31.9, MARK), (MARK, 96.1)])
 @pytest.mark.parametrize("status", [DriveStatus.IDLE, DriveStatus.ARMED, DriveStatus.ERROR])
-def test_a_drive_that_counts_far_from_the_mark_is_unzeroed(
+def test_a_count_far_from_the_mark_is_no_zero(
     inner: Recorder, pos: Pair, status: DriveStatus
 ) -> None:
     assert status_by(inner, MotorFrame(MARK), at(pos, status)) is DriveStatus.UNZEROED
@@ -124,9 +124,7 @@ def test_a_read_only_drive_is_sent_nothing_at_all(inner: Recorder) -> None:
 
 
 @pytest.mark.parametrize("status", DriveStatus)
-def test_a_read_only_drive_reports_all_but_a_foreign_arming(
-    inner: Recorder, status: DriveStatus
-) -> None:
+def test_a_read_only_drive_hides_a_foreign_arming(inner: Recorder, status: DriveStatus) -> None:
     inner.reading = at((1.0, 2.0), status)
     reading = WiredDrive(inner, MotorFrame(), read_only=True).read(0.0)
     assert reading is not None
