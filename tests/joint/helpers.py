@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, Literal
 
 import msgspec
@@ -146,10 +147,11 @@ class ModuleBench:
         status: DriveStatus = DriveStatus.IDLE,
         carries: Pair | None = None,
         obeys: bool = True,
+        make: Callable[[RobotConfig, str, LastState], DriveManager] = DriveManager,
     ) -> None:
         """Begin after a service that left `last_state`, with a drive that `carries` torques."""
         self.robot = with_service(robot, loop=loop)
-        self.module = DriveManager(self.robot, module, last_state)
+        self.module = make(self.robot, module, last_state)
         self.ratio = robot.joint.gear_ratio
         self.cycle_ns = round(NS_PER_S / robot.joint_service.rate_hz)
         self.now_ns = T0

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.controller import Controller
 from services.simulator.physics.plant import PlantConfig
 from shared.bus.messages import Message, Mode, PlannerStatus, SimTruth, Vector4
 from shared.bus.topics import Topic
@@ -19,7 +18,7 @@ from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Kill, Push, Restart, Scenario
 from tools.lab.studies.sweeps.figures import event_steps_nm
-from tools.sim.lockstep import Lockstep, Record, forget
+from tools.sim.lockstep import Lockstep
 from tools.sim.network import BASE
 from tools.sim.standing_start import begin_standing
 
@@ -153,20 +152,17 @@ def run(
     *,
     network: Impairment | None = None,
     stands: bool = True,
-    seed: int = 0,
-    record: Record = forget,
-    controller: Callable[[], Controller] | None = None,
     fleet_type: type[Lockstep] = Lockstep,
     each: Callable[[Lockstep, SimTruth], bool | None] = lambda _fleet, _row: None,
+    **how: Any,
 ) -> Run:
     """Run to the end, to a fall, or until `each`, which sees each row, returns True.
 
     On the network of the stand-up it begins standing, unless that is not to be taken for granted.
+    What else a fleet takes, such as `seed`, `record` or `controller`, is handed on.
     """
     network = network or Impairment(delay_ms=delay_ms)
-    lockstep = fleet_type(
-        robot, scenario, network, seed=seed, record=record, plant=plant, controller=controller
-    )
+    lockstep = fleet_type(robot, scenario, network, plant=plant, **how)
     if stands and network == BASE:
         assert begin_standing(lockstep), "it stands and tracks"
     rows = []
