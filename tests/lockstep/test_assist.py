@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import msgspec
 import numpy as np
 import pytest
@@ -29,9 +31,6 @@ def with_keys(robot: RobotConfig, section: str, **changes: object) -> RobotConfi
     """Return the robot with keys of a section changed."""
     changed = msgspec.structs.replace(getattr(robot, section), **changes)
     return msgspec.structs.replace(robot, **{section: changed})
-
-
-# ---- the assist
 
 
 @pytest.fixture(scope="module")
@@ -97,22 +96,23 @@ def test_an_overloaded_harness_makes_all_hold_and_lead_again(robot: RobotConfig)
     assert Cause.HOLD_ALL in {event.cause for _, event in outcome.lockstep.events}
 
 
-# ---- its sensor
-
-
 def leaning(assist: float) -> Scenario:
     """Return a scenario in which the torso pitches while a load comes to rest on it."""
     end = Keyframe(at=2.0, height=1.1, pitch=0.4, assist=assist)
     return variant("stand", duration=3.5, keyframe=(Keyframe(at=0.0, height=1.188), end))
 
 
-def heard_in(
-    robot: RobotConfig, scenario: Scenario, delay_ms: float = 1.0, seed: int = 0
-) -> list[Message]:
+def heard_in(robot: RobotConfig, scenario: Scenario, **how: Any) -> list[Message]:
     """Return every wrench, status and truth of a run from the hoist on, in the log's order."""
     heard = Heard(Wrench, PlannerStatus, SimTruth)
-    run(robot, scenario, delay_ms, seed=seed, stands=False, record=heard)
+    run(robot, scenario, stands=False, record=heard, **how)
     return heard
+
+
+@pytest.fixture(scope="module")
+def from_hoist(robot: RobotConfig) -> list[Message]:
+    """A stand-up with 8 ms on each link, each way."""
+    return heard_in(robot, still(0.5), delay_ms=8.0)
 
 
 def of(kind: type[Message], heard: list[Message]) -> list[Message]:
@@ -140,32 +140,39 @@ def test_the_wrench_is_what_acts_on_the_torso_and_comes_at_its_rate(robot: Robot
     assert np.abs(errors).max() < 4.0
 
 
-def test_the_tare_is_done_on_the_hoist_before_anything_loads_it(robot: RobotConfig) -> None:
-    heard = heard_in(robot, still(0.5))
-    first_valid = next(m for m in heard if isinstance(m, Wrench) and m.valid)
-    begin_ns = heard[0].t_ns
+def test_the_tare_is_done_on_the_hoist_before_anything_loads_it(
+    robot: RobotConfig, from_hoist: list[Message]
+) -> None:
+    first_valid = next(m for m in from_hoist if isinstance(m, Wrench) and m.valid)
+    begin_ns = from_hoist[0].t_ns
     assert first_valid.t_ns - begin_ns == pytest.approx(robot.harness.tare_s * 1e9, abs=5e6)
-    hoisted = [m for m in heard if isinstance(m, SimTruth) and m.t_ns <= first_valid.t_ns]
+    hoisted = [m for m in of(SimTruth, from_hoist) if m.t_ns <= first_valid.t_ns]
     assert all(m.hoist > 0.5 and m.harness_force_z == 0.0 for m in hoisted)
 
 
-def test_the_planner_receives_the_wrench_after_the_links_delay(robot: RobotConfig) -> None:
-    heard = heard_in(robot, still(0.5), delay_ms=8.0)
-    sent = {m.seq: m.t_ns for m in heard if isinstance(m, Wrench)}
+def test_the_planner_receives_the_wrench_after_the_links_delay(
+    robot: RobotConfig, from_hoist: list[Message]
+) -> None:
+    sent = {m.seq: m.t_ns for m in of(Wrench, from_hoist)}
     ages_ms = [
         (m.t_ns - sent[m.wrench_seq]) / 1e6
-        for m in heard
-        if isinstance(m, PlannerStatus) and m.wrench_seq >= 0
+        for m in of(PlannerStatus, from_hoist)
+        if m.wrench_seq >= 0
     ]
     assert len(ages_ms) > 100
     assert min(ages_ms) >= 8.0
     assert max(ages_ms) < 8.0 + 2e3 / robot.planner.rate_hz
 
 
-def test_the_wrench_is_bit_identical_with_the_same_seed_alone(robot: RobotConfig) -> None:
-    wrenches = [of(Wrench, heard_in(robot, still(0.3), seed=seed)) for seed in (4, 4, 5)]
-    assert wrenches[0] == wrenches[1]
-    assert wrenches[0] != wrenches[2]
+def test_the_wrench_is_bit_identical_with_the_same_seed_alone(
+    robot: RobotConfig, from_hoist: list[Message]
+) -> None:
+    first = of(Wrench, from_hoist)
+    same, other = (
+        of(Wrench, heard_in(robot, still(0.5), delay_ms=8.0, seed=seed)) for seed in (0, 5)
+    )
+    assert same == first
+    assert other != first
 
 
 def unheeded(robot: RobotConfig) -> RobotConfig:

@@ -56,12 +56,9 @@ def test_it_waits_aligns_and_leads_in_three_steps() -> None:
         changed = engagement.advance(T0, fresh, modules_ready, HOLD)
         assert (engagement.mode, engagement.hold) == reported
     assert changed
-
-
-def test_modules_that_are_ready_at_once_are_aligned_before_they_are_led() -> None:
-    engagement = Engagement()
-    engagement.advance(T0, YES, YES, HOLD)
-    assert engagement.hold
+    at_once = Engagement()
+    at_once.advance(T0, YES, YES, HOLD)
+    assert at_once.hold, "ready at once, they are aligned before they are led"
 
 
 @pytest.mark.parametrize("index", range(6))

@@ -200,14 +200,6 @@ def test_a_module_is_armed_when_both_axes_are_without_an_error(
     assert AxesStatus().judge(states, error) is status
 
 
-@pytest.mark.parametrize("left", [(IDLE, CLOSED), (CLOSED, IDLE), (IDLE, IDLE)])
-def test_either_axis_that_left_closed_loop_is_an_error(left: tuple[int, int]) -> None:
-    axes = AxesStatus()
-    axes.judge((CLOSED, CLOSED), 0)
-    assert axes.judge(left, 0) is DriveStatus.ERROR
-    assert axes.judge((CLOSED, CLOSED), 0) is DriveStatus.ARMED
-
-
 @pytest.mark.parametrize("first", [0, 4])
 @pytest.mark.parametrize(
     ("register", "value", "error"),

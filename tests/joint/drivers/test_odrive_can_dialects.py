@@ -44,20 +44,6 @@ def test_the_driver_finds_out_the_firmware(driver: OdriveCan, dialect: DialectNa
     assert driver.firmware == ((0, 6, 10) if dialect == "0.6" else None)
 
 
-def test_a_written_target_reaches_both_axes(rig: Rig, driver: OdriveCan) -> None:
-    arm(rig, driver, onboard=True)
-    driver.write(TARGET)
-    rig.step()
-    bank, axes = rig.bank, list(AXES)
-    assert [bank.state[axis] for axis in axes] == [CLOSED, CLOSED]
-    np.testing.assert_allclose(bank.input_pos[axes], TARGET.pos_turns)
-    np.testing.assert_allclose(bank.input_vel[axes], TARGET.vel_turns)
-    np.testing.assert_allclose(bank.input_torque[axes], TARGET.torque)
-    np.testing.assert_allclose(bank.pos_gain[axes], TARGET.pos_gain, rtol=1e-6)
-    np.testing.assert_allclose(bank.vel_gain[axes], TARGET.vel_gain, rtol=1e-6)
-    assert not bank.vel_integrator_gain[axes].any()
-
-
 @pytest.mark.parametrize("fault", ["DISARM", "OVERSPEED", "DRV_FAULT", "ESTOP", "WATCHDOG"])
 def test_a_disarmed_axis_is_an_error(rig: Rig, driver: OdriveCan, fault: str) -> None:
     arm(rig, driver, onboard=True)
@@ -67,16 +53,6 @@ def test_a_disarmed_axis_is_an_error(rig: Rig, driver: OdriveCan, fault: str) ->
     assert (reading.error == 0) == (fault == "DISARM")
     assert bool(reading.error & AxisError.WATCHDOG_TIMER_EXPIRED) == (fault == "WATCHDOG")
     assert rig.bank.state[AXES[0]] == CLOSED, "its neighbour goes on: the joint service idles it"
-
-
-def test_a_watchdog_out_before_any_write_is_no_error(shed: Shed, dialect: DialectName) -> None:
-    rig = shed.rig(watchdog=True, dialect=dialect)
-    for _ in range(200):
-        rig.step()
-    assert rig.bank.heartbeat(AXES[0]).axis_error == AxisError.WATCHDOG_TIMER_EXPIRED
-    driver = shed.connected(rig)
-    assert rig.cycle(driver).error == 0
-    arm(rig, driver, onboard=True)
 
 
 def test_a_drive_found_armed_tells_its_torques(rig: Rig, driver: OdriveCan, shed: Shed) -> None:

@@ -132,6 +132,8 @@ def test_modes_limits_gains_and_targets_arrive(bench: Bench, onboard: bool) -> N
         np.testing.assert_allclose(bank.vel_gain[axes], TARGET.vel_gain, rtol=1e-6)
         assert not bank.vel_integrator_gain[axes].any()
         np.testing.assert_allclose(bank.input_pos[axes], TARGET.pos_turns)
+        np.testing.assert_allclose(bank.input_vel[axes], TARGET.vel_turns)
+        np.testing.assert_allclose(bank.input_torque[axes], TARGET.torque)
     else:
         assert list(bank.input_torque[axes]) == [0.25, -0.5]
     assert bench.status is DriveStatus.ARMED

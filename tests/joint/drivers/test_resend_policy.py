@@ -6,16 +6,14 @@ import itertools
 import time
 
 import can
-import numpy as np
 import pytest
 
 from services.joint.drivers.base import MotorTarget
 from services.joint.drivers.can_link import COMMANDS_MS, RETRY_MS
-from services.joint.drivers.odrive_can import OdriveCan
 from services.joint.drivers.resend_policy import DRIFT_MS, GAINS_MS, SETTLE_MS
 from shared.can.cansimple import AxisState, Command, split_id
 from tests.joint.drivers.can_bench import Bench
-from tests.joint.drivers.rig import AXES, MS, NODES, TARGET, Rig, arm
+from tests.joint.drivers.rig import NODES, TARGET
 
 GAINS: list[int] = [Command.SET_POS_GAIN, Command.SET_VEL_GAINS, Command.SET_INPUT_POS]
 
@@ -156,19 +154,6 @@ def test_an_axis_gets_its_target_right_after_its_mode(bench: Bench) -> None:
     for node in NODES:
         at = ids.index((node, Command.SET_CONTROLLER_MODE))
         assert ids[at + 1] == (node, Command.SET_INPUT_POS)
-
-
-def test_gains_that_were_lost_are_sent_again(rig: Rig, driver: OdriveCan) -> None:
-    arm(rig, driver, onboard=True)
-    driver.write(TARGET)
-    rig.step()
-    axes = list(AXES)
-    for wait_ms in (DRIFT_MS, GAINS_MS):
-        rig.bank.pos_gain[axes] = 1.0  # as if the frames had been lost
-        time.sleep((wait_ms + 5) * MS)
-        driver.write(TARGET)
-        rig.step()
-        np.testing.assert_allclose(rig.bank.pos_gain[axes], TARGET.pos_gain, rtol=1e-6)
 
 
 def test_arming_goes_on_as_the_queue_empties_closed_loop_last(bench: Bench) -> None:
