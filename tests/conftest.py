@@ -30,8 +30,8 @@ settings.register_profile(
 )
 
 SLOWEST = (
-    "test_sweep.py", "test_assist.py", "test_gains_verb.py", "test_flapping.py", "test_estop.py",
-    "test_uneven.py", "test_split_program.py", "test_onboard.py", "test_faults.py", "test_crawl.py",
+    "test_sweep.py", "test_assist.py", "test_gains_verb.py", "test_estop.py",
+    "test_uneven.py", "test_split_program.py", "test_dead_services.py", "test_faults.py",
     "test_squat.py", "test_sim.py", "test_run_log.py", "test_sweep_cases.py",
     "test_sweep_certificate.py", "test_drivetrain.py", "test_sampled_loop.py", "test_identify.py",
 )  # fmt: skip

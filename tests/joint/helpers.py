@@ -1,16 +1,19 @@
-"""A module's controller on a bench: virtual time, a drive that answers, a planner's commands."""
+"""A module's controller, and its manager with a drive, on a bench: virtual time and commands."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Literal
 
 import msgspec
 
 from services.joint.controller import CycleResult, JointController
-from services.joint.differential import motor_from_joint
-from services.joint.drivers.base import DriveReading, DriveStatus
+from services.joint.differential import joint_torque, motor_from_joint
+from services.joint.drive_manager import DriveAction, DriveCommand, DriveManager
+from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.neighbours import UNKNOWN, NeighbourView
+from services.joint.rearm_guard import LastState
 from shared.bus.messages import JointCommand, Mode, Pair
 from shared.clock import NS_PER_S
 from shared.config.gain_schedule import believing
@@ -18,26 +21,17 @@ from shared.config.robot_config import RobotConfig
 
 T0 = 1_000 * NS_PER_S
 SESSION = 7
+LoopName = Literal["onboard", "service"]
 
 
 def command(**changes: Any) -> JointCommand:
     """Return a command within every limit, with some fields changed."""
     fields: dict[str, Any] = {
-        "t_ns": T0,
-        "seq": 1,
-        "session": SESSION,
-        "echo_t_ns": T0,
-        "hold": False,
-        "q_ref": (0.02, -1.0),
-        "v_ref": (0.0, 0.0),
-        "tau_ff": (3.0, -25.0),
-        "dtau_ff": (0.0, 0.0),
-        "tau_coupled": (0.0, 0.0),
-        "k_p": (600.0, 800.0),
-        "k_d": (40.0, 50.0),
-        "margin": 1.0,
-        "margin_onboard": 0.5,
-    }
+        "t_ns": T0, "seq": 1, "session": SESSION, "echo_t_ns": T0, "hold": False,
+        "q_ref": (0.02, -1.0), "v_ref": (0.0, 0.0),
+        "tau_ff": (3.0, -25.0), "dtau_ff": (0.0, 0.0), "tau_coupled": (0.0, 0.0),
+        "k_p": (600.0, 800.0), "k_d": (40.0, 50.0), "margin": 1.0, "margin_onboard": 0.5,
+    }  # fmt: skip
     return JointCommand(**(fields | changes))
 
 
@@ -64,6 +58,11 @@ class Bench:
     def mode(self) -> Mode:
         """Return the mode the controller is in."""
         return self.controller.failsafe.mode
+
+    @property
+    def is_stiffened(self) -> bool:
+        """Return True if the module says that it holds with all it has."""
+        return self.controller.state(self.now_ns).stiffened
 
     def reading(self) -> DriveReading:
         """Return what the drive measures."""
@@ -100,10 +99,7 @@ class Bench:
         start = self.q
         for step in range(1, steps + 1):
             share = step / steps
-            self.q = (
-                start[0] + share * (q[0] - start[0]),
-                start[1] + share * (q[1] - start[1]),
-            )
+            self.q = (start[0] + share * (q[0] - start[0]), start[1] + share * (q[1] - start[1]))
             self.cycle()
 
     def to_hold(self) -> None:
@@ -136,3 +132,102 @@ class Bench:
             self.status = DriveStatus.LOST
             self.cycle()
         assert self.mode is mode
+
+
+class ModuleBench:
+    """A module and its drive: the drive goes on with what it was told last, if it obeys."""
+
+    def __init__(
+        self,
+        robot: RobotConfig,
+        loop: LoopName = "onboard",
+        module: str = "knee_right",
+        *,
+        last_state: LastState = LastState.NOTHING,
+        status: DriveStatus = DriveStatus.IDLE,
+        carries: Pair | None = None,
+        obeys: bool = True,
+        make: Callable[[RobotConfig, str, LastState], DriveManager] = DriveManager,
+    ) -> None:
+        """Begin after a service that left `last_state`, with a drive that `carries` torques."""
+        self.robot = with_service(robot, loop=loop)
+        self.module = make(self.robot, module, last_state)
+        self.ratio = robot.joint.gear_ratio
+        self.cycle_ns = round(NS_PER_S / robot.joint_service.rate_hz)
+        self.now_ns = T0
+        self.q: Pair = (0.02, -1.0)
+        self.v: Pair = (0.0, 0.0)
+        self.status, self.carries, self.obeys = status, carries, obeys
+        self.target: MotorTarget | None = None
+        self.torque: Pair = (0.0, 0.0)
+        self.seq = 0
+
+    @property
+    def mode(self) -> Mode:
+        """Return the mode of the module."""
+        return self.module.controller.failsafe.mode
+
+    def carried(self) -> Pair:
+        """Return the joint torques that the drive gives now, N m, by the firmware's law."""
+        if self.target is None:
+            return joint_torque(self.torque, self.ratio)
+        t, motors = self.target, []
+        pos, vel = motor_from_joint(self.q, self.ratio), motor_from_joint(self.v, self.ratio)
+        for i in (0, 1):
+            wanted = t.vel_turns[i] + t.pos_gain[i] * (t.pos_turns[i] - pos[i])
+            motors.append(t.torque[i] + t.vel_gain[i] * (wanted - vel[i]))
+        return joint_torque((motors[0], motors[1]), self.ratio)
+
+    def reading(self) -> DriveReading:
+        """Return what the drive measures."""
+        pos, vel = motor_from_joint(self.q, self.ratio), motor_from_joint(self.v, self.ratio)
+        return DriveReading(self.now_ns, pos, vel, self.status, 0, self.carries)
+
+    def cycle(
+        self,
+        sent: JointCommand | None = None,
+        *,
+        estop: bool = False,
+        silent: bool = False,
+        near: NeighbourView = UNKNOWN,
+    ) -> DriveAction:
+        """Run a cycle, and have the drive do what it orders."""
+        self.now_ns += self.cycle_ns
+        step = self.module.step(self.now_ns, None if silent else self.reading(), sent, estop, near)
+        if self.obeys and step.command is DriveCommand.ARM:
+            self.status = DriveStatus.ARMED
+        elif step.command is DriveCommand.TARGET:
+            self.target = step.target
+        elif step.command is DriveCommand.TORQUE:
+            self.torque = step.torque
+        return step
+
+    def run(self, lasting_ns: int) -> list[DriveAction]:
+        """Run cycles without commands."""
+        return [self.cycle() for _ in range(lasting_ns // self.cycle_ns)]
+
+    def lead(self, cycles: int = 1, **changes: Any) -> list[DriveAction]:
+        """Run cycles, each with a usable command."""
+        steps = []
+        for _ in range(cycles):
+            self.seq += 1
+            steps.append(self.cycle(command(seq=self.seq, echo_t_ns=self.now_ns, **changes)))
+        return steps
+
+    def to(self, mode: Mode) -> None:
+        """Bring the module into HOLD, TRACK or DAMP, settled there."""
+        coupled = {"tau_coupled": (3.0, -4.0)}
+        while self.mode is not Mode.HOLD:
+            self.cycle()
+        if mode in (Mode.TRACK, Mode.DAMP):
+            self.lead(2000, **coupled)
+        if mode is Mode.DAMP:
+            self.cycle(estop=True)
+        for _ in range(40):
+            self.lead(**coupled) if mode is Mode.TRACK else self.cycle()
+        assert self.mode is mode
+
+    def freeze(self, lasting_ns: int, q: Pair, v: Pair = (0.0, 0.0)) -> None:
+        """Run no cycle for a while; the joint is then somewhere else."""
+        self.now_ns += lasting_ns
+        self.q, self.v = q, v

@@ -1,17 +1,25 @@
+"""One cycle of a controller: power-up, TRACK, hand-over, what it tells and remembers."""
+
 from __future__ import annotations
 
 import math
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from services.joint.controller import CycleResult
+from services.joint.controller import ControllerSnapshot, CycleResult, JointController, row_of
 from services.joint.drivers.base import DriveReading, DriveStatus
+from services.joint.neighbours import NeighbourRow, NeighbourView
+from services.joint.sinking import SinkingState
+from services.joint.torque_limiter import limits_of
+from services.joint.trips import JointTrips
 from shared.bus.messages import Cause, JointCommand, Mode, Pair, Refusal
 from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config.gain_schedule import believing
 from shared.config.robot_config import RobotConfig
 from tests.joint.helpers import SESSION, T0, Bench, command, with_service
 
@@ -34,13 +42,8 @@ def pd(sent: JointCommand, q: Pair, v: Pair, age_s: float = 0.0) -> npt.NDArray[
     return tau
 
 
-# ---- power-up
-
-
 @pytest.mark.parametrize("status", [DriveStatus.IDLE, DriveStatus.LOST, DriveStatus.ERROR])
-def test_no_torque_and_no_change_before_the_drive_is_armed(
-    bench: Bench, status: DriveStatus
-) -> None:
+def test_nothing_happens_before_the_drive_is_armed(bench: Bench, status: DriveStatus) -> None:
     bench.status = status
     for result in bench.run(50, fresh=True):
         assert result == CycleResult((0.0, 0.0), None)
@@ -59,9 +62,6 @@ def test_power_up_holds_the_measured_pose_without_a_planner(bench: Bench) -> Non
     bench.q, bench.v = (0.11, -1.52), (0.1, -0.2)
     expected = (-900.0 * 0.01 - 45.0 * 0.1, 1500.0 * 0.02 + 25.0 * 0.2)
     assert bench.run(20)[-1].tau == pytest.approx(expected)
-
-
-# ---- track
 
 
 def test_track_gives_the_commands_torque_at_its_age(bench: Bench) -> None:
@@ -104,9 +104,9 @@ def test_track_blends_in_over_its_blend_time(robot: RobotConfig, share: float) -
     np.testing.assert_allclose(tau, (1.0 - share) * np.array(held) + share * fresh, atol=1e-6)
 
 
-# ---- hand-over
-
 SWING, OMEGA = 0.02, 5.0  # rad, rad/s: the references' motion
+
+
 COUPLED: Pair = (12.0, -9.0)
 
 
@@ -137,7 +137,11 @@ def largest_step(robot: RobotConfig, reach: float) -> float:
 
 
 KINDS = ("fresh", "hold", "silent")
+
+
 scripts = st.lists(st.tuples(st.sampled_from(KINDS), st.integers(1, 60)), min_size=1, max_size=12)
+
+
 FIG_7 = [("fresh", 200), ("silent", 40), ("fresh", 300), ("hold", 30), ("fresh", 60)]
 
 
@@ -167,17 +171,13 @@ def test_torque_makes_no_larger_step_than_the_ramps_allow(
     assert steps.max() <= largest_step(robot, reach=0.02 + SWING)
 
 
-def test_the_script_changes_over_both_ways_and_a_bare_switch_would_break_the_bound(
-    robot: RobotConfig,
-) -> None:
+def test_the_script_changes_over_both_ways_and_the_bound_bites(robot: RobotConfig) -> None:
     _, changes = play(Bench(robot), FIG_7)
     assert {(Mode.HOLD, Mode.TRACK), (Mode.TRACK, Mode.HOLD)} <= changes
     assert largest_step(robot, reach=0.02 + SWING) < 5.0 < max(map(abs, COUPLED))
 
 
-def test_hold_freezes_references_and_drops_the_coupled_torque_over_its_ramp(
-    bench: Bench,
-) -> None:
+def test_hold_freezes_references_and_drops_the_coupled_torque_over_its_ramp(bench: Bench) -> None:
     sent = {"tau_coupled": COUPLED, "k_p": K_P_STAND, "k_d": K_D_STAND}
     bench.to_track(**sent)
     before = np.array(bench.controller.tau)
@@ -221,9 +221,6 @@ def test_a_new_session_in_track_makes_no_step_in_the_torque(bench: Bench) -> Non
     assert np.abs(np.diff(np.array(taus), axis=0)).max() < 5.0  # docs/results.md#targets
 
 
-# ---- the rest of a cycle
-
-
 def test_late_cycles_are_counted_beyond_twice_the_period(bench: Bench) -> None:
     bench.to_hold()
     period_ns = bench.cycle_ns
@@ -234,22 +231,17 @@ def test_late_cycles_are_counted_beyond_twice_the_period(bench: Bench) -> None:
     assert late == [0, 0, 1, 1, 2, 2]
 
 
-def test_a_stalled_drive_keeps_the_failsafe_going(bench: Bench) -> None:
-    bench.to_track()
-    events = [bench.cycle(stalled=True).event for _ in range(26)]
-    causes = [event.cause for event in events if event is not None]
-    assert causes == [Cause.COMMAND_STALE]
-    assert bench.controller.samples.q == pytest.approx(bench.q)
-    event = bench.cycle(stalled=True, estop=True).event
-    assert event is not None
-    assert (event.mode_before, event.mode_after) == (Mode.HOLD, Mode.DAMP)
-
-
-def test_a_stalled_drive_still_tracks_fresh_commands(bench: Bench) -> None:
+def test_a_stalled_drive_tracks_fresh_commands_and_keeps_the_failsafe_going(bench: Bench) -> None:
     bench.to_track()
     for _ in range(50):
         bench.cycle(bench.fresh(), stalled=True)
     assert bench.mode is Mode.TRACK
+    events = [bench.cycle(stalled=True).event for _ in range(26)]
+    assert [event.cause for event in events if event is not None] == [Cause.COMMAND_STALE]
+    assert bench.controller.samples.q == pytest.approx(bench.q)
+    event = bench.cycle(stalled=True, estop=True).event
+    assert event is not None
+    assert (event.mode_before, event.mode_after) == (Mode.HOLD, Mode.DAMP)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
@@ -283,16 +275,18 @@ def test_a_state_holds_what_the_cycle_saw_and_did(bench: Bench) -> None:
     assert state.cycle == bench.controller.cycle > 400
 
 
-def test_states_count_up_by_one(bench: Bench) -> None:
-    seqs = [bench.controller.state(T0 + n).seq for n in range(3)]
-    assert seqs == [1, 2, 3]
-
-
-def test_a_state_before_any_command_is_marked_so(bench: Bench) -> None:
+def test_a_state_before_any_command_is_marked_so_and_states_count_up(bench: Bench) -> None:
+    first = bench.controller.state(bench.now_ns)
+    assert (first.seq, first.cause, first.stiffened) == (1, 0, False)
     bench.to_hold()
     state = bench.controller.state(bench.now_ns)
     assert (state.age_ns, state.session, state.command_seq) == (-1, 0, -1)
-    assert not state.ready
+    assert (state.seq, state.cycle, state.ready) == (2, 1, False)
+    bench.now_ns += bench.cycle_ns
+    failed = msgspec.structs.replace(bench.reading(), status=DriveStatus.ERROR, error=0x40)
+    bench.controller.step(bench.now_ns, failed, None, False)
+    state = bench.controller.state(bench.now_ns)
+    assert (state.seq, state.cycle, state.drive_error) == (3, 2, 0x40)
 
 
 @pytest.mark.parametrize("mode", [Mode.DISARMED, Mode.DAMP, Mode.FAULT])
@@ -302,14 +296,6 @@ def test_a_module_that_cannot_track_does_not_report_ready(bench: Bench, mode: Mo
     bench.run(100, fresh=True, hold=True)
     assert bench.mode is mode
     assert not bench.controller.state(bench.now_ns).ready
-
-
-def test_drive_error_bits_are_reported(bench: Bench) -> None:
-    bench.to_hold()
-    at = bench.now_ns + bench.cycle_ns
-    reading = DriveReading(at, (0.0, 0.0), (0.0, 0.0), DriveStatus.ERROR, 0x40)
-    bench.controller.step(at, reading, None, False)
-    assert bench.controller.state(at).drive_error == 0x40
 
 
 def test_an_event_holds_the_torque_on_both_sides_of_the_change(bench: Bench) -> None:
@@ -324,3 +310,63 @@ def test_an_event_holds_the_torque_on_both_sides_of_the_change(bench: Bench) -> 
     assert (event.mode_before, event.mode_after) == (Mode.TRACK, Mode.HOLD)
     assert event.cause == Cause.HOLD_ALL
     assert event.seq == 3
+
+
+def test_a_restored_controller_shares_nothing(bench: Bench, robot: RobotConfig) -> None:
+    bench.to_track(tau_coupled=COUPLED)
+    taken = bench.controller.snapshot()
+    state = msgspec.structs.replace(
+        taken.state, last_cycle_ns=12, initial_torque=(1.0, 2.0), cause=3, tau=(4.0, 5.0), cycle=6,
+        late=7, events=8, states=9, takeover_offset=(0.1, 0.2), resumed_ns=10,
+        trips=JointTrips(slow=(1.0, 2.0), mean=(3.0, 4.0), at_limit_ns=5, fast_ns=6),
+    )  # fmt: skip
+    sinking = SinkingState(-2.2, 0.1, -0.3, 0.4, caught=True, doubt_ns=7)
+    law = msgspec.structs.replace(taken.law, changed_ns=11, stiffened_ns=13, sinking=sinking)
+    snapshot = ControllerSnapshot(state=state, law=law)
+    before = msgspec.msgpack.encode(snapshot)
+    other = JointController(believing(robot), "knee_right")
+    other.restore(snapshot)
+    assert other.snapshot() == snapshot
+    other.step(bench.now_ns, None, bench.fresh(), True)
+    assert msgspec.msgpack.encode(snapshot) == before
+
+
+def test_a_snapshot_shares_nothing_with_the_controller_that_it_was_taken_from(bench: Bench) -> None:
+    bench.to_track(tau_coupled=COUPLED)
+    snapshot = bench.controller.snapshot()
+    before = msgspec.msgpack.encode(snapshot)
+    bench.run(3, fresh=True)
+    bench.run(60)
+    assert bench.controller.failsafe.dropouts.count == 1
+    assert msgspec.msgpack.encode(snapshot) == before
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_joint_is_inside_up_to_its_soft_stop(robot: RobotConfig, axis: int) -> None:
+    limits = limits_of(robot, "knee_right")
+    low, high = (limits.phi, limits.theta)[axis]
+    controller = JointController(robot, "knee_right")
+    for angle, inside in ((low - 1e-6, False), (low, True), (high, True), (high + 1e-6, False)):
+        at = [0.5 * sum(limits.phi), 0.5 * sum(limits.theta)]
+        at[axis] = angle
+        controller.samples.q = (at[0], at[1])
+        assert controller.inside_limits() is inside
+
+
+def test_neighbours_are_given_the_joints_position_and_state(bench: Bench) -> None:
+    bench.v = (0.3, -0.2)
+    bench.to_hold()
+    at = (pytest.approx(bench.q[1]), pytest.approx(-0.2))
+    assert row_of(bench.controller) == NeighbourRow(bench.now_ns, *at, Mode.HOLD, 0)
+    bench.cycle(estop=True)
+    for _ in range(200):
+        bench.cycle(estop=True, near=NeighbourView(sinks=False))
+    assert row_of(bench.controller)[3:] == (Mode.DAMP, 1)
+
+
+def test_a_module_that_holds_with_all_it_has_reports_it_from_the_first_cycle(bench: Bench) -> None:
+    taken = bench.controller.snapshot()
+    for stiffened_ns, stiffened in ((0, False), (1, True)):
+        law = msgspec.structs.replace(taken.law, stiffened_ns=stiffened_ns)
+        bench.controller.restore(msgspec.structs.replace(taken, law=law))
+        assert bench.controller.state(bench.now_ns).stiffened is stiffened

@@ -1,105 +1,53 @@
-"""A service that was frozen goes on from what its drive carries (docs/drives.md)."""
+"""What a module orders of its drive: arming, after a freeze, and what the drive is left with."""
 
 from __future__ import annotations
 
-from typing import Literal
+import math
+from itertools import pairwise
 
 import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.joint.differential import joint_torque, motor_from_joint
 from services.joint.drive_manager import (
+    ARM_EVERY_NS,
+    ARM_TRIES,
     GAP_NS,
+    IDLE_EVERY_NS,
     LISTEN_NS,
-    DriveAction,
+    ArmingInhibit,
     DriveCommand,
     DriveManager,
     DriveManagerState,
 )
-from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
-from shared.bus.messages import JointCommand, Mode, Pair
+from services.joint.drive_setpoint import INPUT_TORQUE_SHARE
+from services.joint.drivers.base import DriveStatus
+from services.joint.neighbours import NeighbourView
+from services.joint.sinking import DOUBT_NS
+from shared.bus.messages import Mode, Pair
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
-from tests.joint.helpers import T0, command, with_service
-
-LoopName = Literal["onboard", "service"]
-
-
-class Bench:
-    """A module and its drive: the drive goes on with what it was told last."""
-
-    def __init__(self, robot: RobotConfig, loop: LoopName, module: str = "knee_right") -> None:
-        self.robot = with_service(robot, loop=loop)
-        self.module = DriveManager(self.robot, module)
-        self.cycle_ns = round(NS_PER_S / robot.joint_service.rate_hz)
-        self.now_ns = T0
-        self.q: Pair = (0.02, -1.0)
-        self.v: Pair = (0.0, 0.0)
-        self.status = DriveStatus.IDLE
-        self.target: MotorTarget | None = None
-        self.torque: Pair = (0.0, 0.0)
-        self.seq = 0
-
-    @property
-    def mode(self) -> Mode:
-        return self.module.controller.failsafe.mode
-
-    def carried(self) -> Pair:
-        """Return the joint torques that the drive gives now, N m, by the firmware's law."""
-        ratio = self.robot.joint.gear_ratio
-        if self.target is None:
-            return joint_torque(self.torque, ratio)
-        t, motors = self.target, []
-        pos, vel = motor_from_joint(self.q, ratio), motor_from_joint(self.v, ratio)
-        for i in (0, 1):
-            wanted = t.vel_turns[i] + t.pos_gain[i] * (t.pos_turns[i] - pos[i])
-            motors.append(t.torque[i] + t.vel_gain[i] * (wanted - vel[i]))
-        return joint_torque((motors[0], motors[1]), ratio)
-
-    def cycle(
-        self, sent: JointCommand | None = None, *, estop: bool = False, silent: bool = False
-    ) -> DriveAction:
-        """Run a cycle, and have the drive do what it orders."""
-        self.now_ns += self.cycle_ns
-        ratio = self.robot.joint.gear_ratio
-        pos, vel = motor_from_joint(self.q, ratio), motor_from_joint(self.v, ratio)
-        reading = DriveReading(self.now_ns, pos, vel, self.status, 0)
-        step = self.module.step(self.now_ns, None if silent else reading, sent, estop)
-        if step.command is DriveCommand.ARM:
-            self.status = DriveStatus.ARMED
-        elif step.command is DriveCommand.TARGET:
-            self.target = step.target
-        elif step.command is DriveCommand.TORQUE:
-            self.torque = step.torque
-        return step
-
-    def track(self, cycles: int) -> None:
-        for _ in range(cycles):
-            self.seq += 1
-            self.cycle(command(seq=self.seq, echo_t_ns=self.now_ns, tau_coupled=(3.0, -4.0)))
-
-    def to(self, mode: Mode) -> None:
-        while self.mode is not Mode.HOLD:
-            self.cycle()
-        if mode in (Mode.TRACK, Mode.DAMP):
-            self.track(2000)
-        if mode is Mode.DAMP:
-            self.cycle(estop=True)
-        for _ in range(40):
-            self.track(1) if mode is Mode.TRACK else self.cycle()
-        assert self.mode is mode
-
-    def freeze(self, lasting_ns: int, q: Pair, v: Pair = (0.0, 0.0)) -> None:
-        """Run no cycle for a while; the joint is then somewhere else."""
-        self.now_ns += lasting_ns
-        self.q, self.v = q, v
-
+from tests.joint.helpers import LoopName, ModuleBench
 
 MODES = (Mode.HOLD, Mode.TRACK, Mode.DAMP)
 LOOPS: tuple[LoopName, ...] = ("onboard", "service")
 MOVED: Pair = (0.05, -0.97)
+
+
+@pytest.fixture
+def bench(robot: RobotConfig) -> ModuleBench:
+    return ModuleBench(robot)
+
+
+@pytest.fixture
+def held(bench: ModuleBench) -> ModuleBench:
+    """Return a module that holds."""
+    bench.to(Mode.HOLD)
+    return bench
+
+
+# ---- a service that was frozen goes on from what its drive carries (docs/drives.md)
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -107,7 +55,7 @@ MOVED: Pair = (0.05, -0.97)
 def test_after_a_freeze_the_drives_torque_goes_on_without_a_step(
     robot: RobotConfig, mode: Mode, loop: LoopName
 ) -> None:
-    bench = Bench(robot, loop)
+    bench = ModuleBench(robot, loop)
     bench.to(mode)
     bench.freeze(2 * NS_PER_S, MOVED)
     last = bench.carried()
@@ -117,20 +65,16 @@ def test_after_a_freeze_the_drives_torque_goes_on_without_a_step(
         now = bench.carried()
         assert max(abs(b - a) for a, b in zip(last, now, strict=True)) < 0.6
         last = now
-    listening = round(LISTEN_NS / bench.cycle_ns)
-    assert orders[:listening] == [DriveCommand.NOTHING] * listening, (
-        "what the link has queued is old"
-    )
-    assert DriveCommand.NOTHING not in orders[listening:]
+    listening = [DriveCommand.NOTHING] * round(LISTEN_NS / bench.cycle_ns)
+    assert orders[: len(listening)] == listening, "what the link has queued is old"
+    assert DriveCommand.NOTHING not in orders[len(listening) :]
 
 
 @pytest.mark.parametrize("loop", LOOPS)
-def test_in_the_end_it_holds_as_if_it_had_never_been_frozen(
-    robot: RobotConfig, loop: LoopName
-) -> None:
-    frozen, twin = Bench(robot, loop), Bench(robot, loop)
-    for bench in (frozen, twin):
-        bench.to(Mode.TRACK)
+def test_at_last_it_holds_as_if_never_frozen(robot: RobotConfig, loop: LoopName) -> None:
+    frozen, twin = ModuleBench(robot, loop), ModuleBench(robot, loop)
+    for each in (frozen, twin):
+        each.to(Mode.TRACK)
     frozen.freeze(NS_PER_S, MOVED)
     for share in (0.25, 0.5, 0.75, 1.0):  # a joint moves, and does not jump
         twin.q = tuple(a + share * (b - a) for a, b in zip((0.02, -1.0), MOVED, strict=True))
@@ -142,96 +86,248 @@ def test_in_the_end_it_holds_as_if_it_had_never_been_frozen(
     assert frozen.carried() == pytest.approx(twin.carried(), abs=1e-9)
 
 
-def test_a_gap_within_the_age_rule_goes_on_in_track_without_a_step(robot: RobotConfig) -> None:
-    bench = Bench(robot, "onboard")
+def test_a_gap_within_the_age_rule_goes_on_in_track_without_a_step(bench: ModuleBench) -> None:
     bench.to(Mode.TRACK)
     bench.freeze(GAP_NS + NS_PER_MS, (0.03, -0.98))
     carried = bench.carried()
     for _ in range(20):
-        bench.track(1)
+        bench.lead(tau_coupled=(3.0, -4.0))
         assert bench.carried() == pytest.approx(carried, abs=2.0)
     assert bench.mode is Mode.TRACK
 
 
-def test_shorter_gaps_are_no_freeze(robot: RobotConfig) -> None:
-    bench = Bench(robot, "onboard")
-    bench.to(Mode.HOLD)
-    bench.freeze(GAP_NS - bench.cycle_ns, bench.q)
-    assert bench.cycle().command is DriveCommand.TARGET
+def test_shorter_gaps_are_no_freeze(held: ModuleBench) -> None:
+    held.freeze(GAP_NS - held.cycle_ns, held.q)
+    assert held.cycle().command is DriveCommand.TARGET
 
 
-def test_it_sends_nothing_before_the_drive_has_sent(robot: RobotConfig) -> None:
-    bench = Bench(robot, "onboard")
-    bench.to(Mode.HOLD)
-    bench.freeze(NS_PER_S, MOVED)
-    silent = [bench.cycle(silent=True).command for _ in range(20)]
+def test_it_sends_nothing_before_the_drive_has_sent(held: ModuleBench) -> None:
+    held.freeze(NS_PER_S, MOVED)
+    silent = [held.cycle(silent=True).command for _ in range(20)]
     assert silent == [DriveCommand.NOTHING] * 20
-    before = bench.carried()
-    assert bench.cycle().command is DriveCommand.TARGET
-    assert bench.carried() == pytest.approx(before, abs=1e-6)
+    before = held.carried()
+    assert held.cycle().command is DriveCommand.TARGET
+    assert held.carried() == pytest.approx(before, abs=1e-6)
 
 
-def test_a_drive_that_disarmed_meanwhile_is_a_fault_at_once(robot: RobotConfig) -> None:
-    bench = Bench(robot, "onboard")
-    bench.to(Mode.HOLD)
-    bench.freeze(NS_PER_S, MOVED)
-    bench.status = DriveStatus.IDLE
-    assert bench.cycle().command is DriveCommand.IDLE
-    assert bench.mode is Mode.FAULT
+def test_a_drive_that_disarmed_meanwhile_is_a_fault_at_once(held: ModuleBench) -> None:
+    held.freeze(NS_PER_S, MOVED)
+    held.status = DriveStatus.IDLE
+    assert held.cycle().command is DriveCommand.IDLE
+    assert held.mode is Mode.FAULT
 
 
-def test_an_emergency_stop_that_came_meanwhile_is_obeyed(robot: RobotConfig) -> None:
-    bench = Bench(robot, "onboard")
-    bench.to(Mode.HOLD)
-    bench.freeze(NS_PER_S, MOVED)
-    before = bench.carried()
-    bench.cycle(estop=True)
-    assert bench.mode is Mode.DAMP
-    for _ in range(10):
-        bench.cycle()
-    assert bench.carried() == pytest.approx(before, abs=5.0)
+def test_an_emergency_stop_that_came_meanwhile_is_obeyed(held: ModuleBench) -> None:
+    held.freeze(NS_PER_S, MOVED)
+    before = held.carried()
+    held.cycle(estop=True)
+    assert held.mode is Mode.DAMP
+    held.run(10 * held.cycle_ns)
+    assert held.carried() == pytest.approx(before, abs=5.0)
 
 
 @given(st.integers(0, 60), st.tuples(st.floats(-0.05, 0.09), st.floats(-1.1, -0.9)))
-def test_a_memory_taken_while_it_goes_on_is_gone_on_with_bit_for_bit(
-    robot: RobotConfig, cycles: int, moved: Pair
-) -> None:
-    bench = Bench(robot, "onboard")
+def test_its_memory_goes_on_bit_for_bit(robot: RobotConfig, cycles: int, moved: Pair) -> None:
+    bench, twin = ModuleBench(robot), ModuleBench(robot)
     bench.to(Mode.HOLD)
     bench.freeze(NS_PER_S, moved)
-    for _ in range(cycles):
-        bench.cycle()
+    bench.run(cycles * bench.cycle_ns)
     text = msgspec.json.encode(bench.module.snapshot())
-    twin = DriveManager(bench.robot, "knee_right")
-    twin.restore(msgspec.json.decode(text, type=DriveManagerState))
-    ratio = robot.joint.gear_ratio
+    twin.module.restore(msgspec.json.decode(text, type=DriveManagerState))
+    twin.now_ns, twin.q, twin.status = bench.now_ns, bench.q, bench.status
     for _ in range(30):
-        now = bench.now_ns + bench.cycle_ns
-        pos, vel = motor_from_joint(bench.q, ratio), motor_from_joint(bench.v, ratio)
-        reading = DriveReading(now, pos, vel, bench.status, 0)
-        assert bench.cycle() == twin.step(now, reading, None, estop=False)
+        assert bench.cycle() == twin.cycle()
 
 
 @pytest.mark.parametrize("loop", LOOPS)
-def test_what_the_link_kept_from_before_the_freeze_does_not_make_the_joint_seem_to_jump(
-    robot: RobotConfig, loop: LoopName
-) -> None:
+def test_what_a_link_kept_in_a_freeze_is_no_jump(robot: RobotConfig, loop: LoopName) -> None:
     """The first sample is of the time before, the next is where the hand has led the joint."""
-    bench = Bench(robot, loop)
+    bench = ModuleBench(robot, loop)
     bench.to(Mode.HOLD)
     bench.now_ns += 3 * NS_PER_S
     bench.cycle()
     bench.q = (0.02, -1.1)
-    for _ in range(100):
-        bench.cycle()
+    bench.run(100 * bench.cycle_ns)
     assert bench.mode is Mode.HOLD
     assert bench.module.controller.samples.q == pytest.approx(bench.q)
 
 
-def test_a_jump_without_a_freeze_is_not_believed(robot: RobotConfig) -> None:
-    bench = Bench(robot, "onboard")
+def test_a_jump_without_a_freeze_is_not_believed(held: ModuleBench) -> None:
+    held.q = (0.02, -1.1)
+    held.run(5 * held.cycle_ns)
+    assert held.mode is Mode.FAULT
+
+
+def test_after_a_freeze_the_event_has_the_torques_carried(bench: ModuleBench) -> None:
+    bench.to(Mode.TRACK)
+    bench.freeze(2 * NS_PER_S, MOVED)
+    carried = bench.carried()
+    step = bench.cycle()
+    assert step.command is DriveCommand.NOTHING, "it listens first"
+    assert (step.torque, step.target, step.inhibit) == ((0.0, 0.0), None, ArmingInhibit.NONE)
+    event = step.event
+    assert event is not None
+    assert (event.mode_before, event.mode_after) == (Mode.TRACK, Mode.HOLD)
+    assert event.tau_before == pytest.approx(carried)
+    assert event.tau_after == pytest.approx(bench.module.controller.tau)
+    assert event.tau_after == pytest.approx(carried, abs=1.0)
+
+
+@pytest.mark.parametrize("status", [DriveStatus.IDLE, DriveStatus.ERROR])
+def test_uncontrolled_it_listens_to_nothing(bench: ModuleBench, status: DriveStatus) -> None:
+    if status is DriveStatus.ERROR:
+        bench.to(Mode.HOLD)
+    else:
+        bench.cycle(silent=True)
+    bench.status = status
+    bench.freeze(2 * GAP_NS, MOVED)
+    for _ in range(3):
+        bench.cycle(silent=status is DriveStatus.IDLE)
+        assert bench.module.snapshot().listen_until_ns == 0
+    assert bench.mode in (Mode.FAULT, Mode.DISARMED)
+
+
+# ---- arming
+
+
+def test_a_drive_that_never_arms_is_asked_so_often_and_reported_once(robot: RobotConfig) -> None:
+    bench, told = ModuleBench(robot, obeys=False), []
+    for _ in range((ARM_TRIES + 4) * ARM_EVERY_NS // bench.cycle_ns):
+        step = bench.cycle()
+        assert step.torque == (0.0, 0.0)
+        if step.command is DriveCommand.ARM or step.inhibit is not ArmingInhibit.NONE:
+            told.append((bench.now_ns, step.command, step.inhibit))
+    assert [row[1:] for row in told] == [
+        *[(DriveCommand.ARM, ArmingInhibit.NONE)] * ARM_TRIES,
+        (DriveCommand.NOTHING, ArmingInhibit.REFUSED),
+    ]
+    assert {later[0] - sooner[0] for sooner, later in pairwise(told)} == {ARM_EVERY_NS}
+    assert bench.mode is Mode.DISARMED
+
+
+@pytest.mark.parametrize(
+    ("status", "mark_turns", "forgets"),
+    [
+        (DriveStatus.UNZEROED, 0.0, False),
+        (DriveStatus.UNZEROED, 0.5, True),
+        (DriveStatus.UNZEROED, 40.0, True),
+        (DriveStatus.ERROR, 40.0, False),
+    ],
+)
+def test_only_a_drive_with_a_mark_for_no_zero_that_lost_it_is_made_to_forget_its_zero(
+    robot: RobotConfig, status: DriveStatus, mark_turns: float, forgets: bool
+) -> None:
+    drive = msgspec.structs.replace(robot.drive, zero_mark_turns=mark_turns)
+    bench = ModuleBench(msgspec.structs.replace(robot, drive=drive))
     bench.to(Mode.HOLD)
-    bench.q = (0.02, -1.1)
-    for _ in range(5):
-        bench.cycle()
+    bench.status = status
+    orders = [step.command for step in bench.run(1000 * bench.cycle_ns)]
     assert bench.mode is Mode.FAULT
+    assert orders.count(DriveCommand.CLEAR_ZERO) == int(forgets)
+
+
+def test_what_the_neighbours_do_comes_through(bench: ModuleBench) -> None:
+    bench.to(Mode.DAMP)
+    assert bench.module.needs_neighbours
+    for _ in range(2 * DOUBT_NS // bench.cycle_ns):
+        bench.cycle(silent=True, estop=True, near=NeighbourView(sinks=False))
+    assert bench.module.controller.caught
+
+
+def test_a_module_goes_on_from_all_that_it_remembers(bench: ModuleBench) -> None:
+    bench.to(Mode.TRACK)
+    memory = bench.module.snapshot()
+    assert memory.gains_changed_ns > 0
+    other = DriveManager(bench.robot, "knee_right")
+    other.restore(memory)
+    assert other.snapshot() == memory
+
+
+def test_a_motors_torque_is_within_what_its_current_gives(held: ModuleBench) -> None:
+    """N m of the motor: current limit times torque constant, not over it."""
+    drive = held.robot.drive
+    most = drive.current_lim * drive.torque_constant
+    assert held.module._law._input_max == pytest.approx(INPUT_TORQUE_SHARE * most)
+
+
+# ---- what a drive does that is left alone: its service has died, or its cable is out
+
+SOFT_P: Pair = (120.0, 300.0)
+SOFT_D: Pair = (4.0, 10.0)
+OFF: Pair = (0.02, -0.03)
+"""rad from the joint to its reference."""
+
+
+def joint_gains(bench: ModuleBench) -> Pair:
+    """Return the stiffness, N m/rad, and the damping, N m s/rad, of each axis, by its drive."""
+    assert bench.target is not None
+    scale = (2.0 * bench.ratio) ** 2 / (4.0 * math.pi)
+    (pos_gain, _), (vel_gain, _) = bench.target.pos_gain, bench.target.vel_gain
+    return scale * pos_gain * vel_gain, scale * vel_gain
+
+
+def soft_in_track(robot: RobotConfig, module: str) -> ModuleBench:
+    """Bring a module to TRACK on gains far below HOLD's, off its reference and moving."""
+    bench = ModuleBench(robot, module=module)
+    bench.q = (0.02, -1.0) if module.startswith("knee") else (0.02, 0.1)
+    while bench.mode is not Mode.HOLD:
+        bench.cycle()
+    soft = {"q_ref": (bench.q[0] + OFF[0], bench.q[1] + OFF[1]), "k_p": SOFT_P, "k_d": SOFT_D}
+    bench.lead(800, **soft)
+    assert bench.mode is Mode.TRACK
+    bench.v = (0.1, -0.2)
+    bench.lead(**soft)
+    return bench
+
+
+@pytest.mark.parametrize("module", ["ankle_right", "ankle_left", "knee_right", "hip_left"])
+def test_only_an_ankles_drive_is_left_with_holds_gains(robot: RobotConfig, module: str) -> None:
+    """With 4 N m s/rad on each ankle 7 of 26 pairs of pushes fell, all six services dead.
+
+    At the sample it changes nothing: TRACK's law is the command's, to the last of its torque.
+    """
+    bench = soft_in_track(robot, module)
+    k_p, k_d = SOFT_P, SOFT_D
+    if module.startswith("ankle"):
+        k_p, k_d = robot.hold_gains(module)
+        assert min(k_p) > max(SOFT_P)
+        assert min(k_d) > max(SOFT_D)
+    assert joint_gains(bench) == pytest.approx((sum(k_p) / 2.0, sum(k_d) / 2.0), rel=0.03)
+    law = [SOFT_P[i] * OFF[i] - SOFT_D[i] * bench.v[i] + ff for i, ff in enumerate((3.0, -25.0))]
+    assert bench.carried() == pytest.approx(law, abs=1e-9)
+
+
+@pytest.mark.parametrize("module", ["ankle_right", "knee_right"])
+def test_a_drive_left_in_damp_goes_on_with_damps_own_gains(robot: RobotConfig, module: str) -> None:
+    """A drive that is left sinks: with HOLD's gains it would be the one that does not."""
+    bench = soft_in_track(robot, module)
+    bench.cycle(estop=True)
+    bench.run(1000 * bench.cycle_ns)
+    assert bench.mode is Mode.DAMP
+    own = bench.module.controller.setpoint
+    wanted = (sum(own.k_p) / 2.0, sum(own.k_d) / 2.0)
+    assert joint_gains(bench) == pytest.approx(wanted, rel=0.03)
+
+
+@pytest.mark.parametrize("back", [DriveStatus.ERROR, DriveStatus.IDLE, DriveStatus.UNZEROED])
+def test_a_lost_drive_that_is_back_disarmed_is_idled(held: ModuleBench, back: DriveStatus) -> None:
+    """Its sibling went on pulling alone: on theta by what it pulled on phi."""
+    held.status = DriveStatus.LOST
+    orders = [step.command for step in held.run(200 * held.cycle_ns)]
+    assert held.mode is Mode.FAULT
+    assert set(orders) == {DriveCommand.NOTHING}, "it may hold still"
+    held.status = back
+    assert held.cycle().command is DriveCommand.IDLE
+    again = [step.command for step in held.run(3 * IDLE_EVERY_NS)]
+    assert again.count(DriveCommand.IDLE) == 3, "the frame may have been lost"
+    assert held.mode is Mode.FAULT
+
+
+@pytest.mark.parametrize("back", [DriveStatus.ARMED, DriveStatus.HOLDING])
+def test_a_lost_drive_that_is_back_holding_is_left(held: ModuleBench, back: DriveStatus) -> None:
+    """It must find no torque of zero and no order to go idle."""
+    for status in (DriveStatus.LOST, back):
+        held.status = status
+        assert {step.command for step in held.run(4 * NS_PER_S)} == {DriveCommand.NOTHING}
+    assert held.mode is Mode.FAULT
+    assert held.module.leaves_holding, "nor does ending its service idle it"

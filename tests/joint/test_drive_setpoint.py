@@ -1,4 +1,4 @@
-"""The onboard loop: drive and service hold one law between them (docs/drives.md)."""
+"""Motors and joint, and the onboard loop: drive and service hold one law (docs/drives.md)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,12 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from services.joint.differential import joint_torque, motor_from_joint, motor_torque
+from services.joint.differential import (
+    joint_from_motor,
+    joint_torque,
+    motor_from_joint,
+    motor_torque,
+)
 from services.joint.drive_setpoint import (
     GAIN_CHANGE,
     GAIN_UPDATE_MIN_MS,
@@ -24,17 +29,69 @@ from services.joint.pd_law import torque as law_torque
 from shared.bus.messages import Pair
 from shared.clock import NS_PER_MS
 
+gear_ratios = st.floats(1.0, 200.0)
+
+
+motor_pairs = st.tuples(st.floats(-300.0, 300.0), st.floats(-300.0, 300.0))
+
+
+@given(joint=motor_pairs, n=gear_ratios)
+def test_angles_come_back_from_the_motors(joint: Pair, n: float) -> None:
+    np.testing.assert_allclose(joint_from_motor(motor_from_joint(joint, n), n), joint, atol=1e-9)
+
+
+@given(tau=motor_pairs, n=gear_ratios)
+def test_torques_come_back_from_the_motors(tau: Pair, n: float) -> None:
+    np.testing.assert_allclose(joint_torque(motor_torque(tau, n), n), tau, atol=1e-9)
+
+
+@given(tau=motor_pairs, v=motor_pairs, n=gear_ratios)
+def test_power_is_the_same_on_both_sides(tau: Pair, v: Pair, n: float) -> None:
+    motor_rates = 2.0 * math.pi * np.array(motor_from_joint(v, n))  # rad/s
+    at_motors = np.array(motor_torque(tau, n)) @ motor_rates
+    assert at_motors == pytest.approx(np.array(tau) @ np.array(v), rel=1e-9, abs=1e-6)
+
+
+@given(tau=motor_pairs, n=gear_ratios)
+def test_the_harder_worked_motor_carries_the_sum_of_both_torques(tau: Pair, n: float) -> None:
+    harder = max(abs(torque) for torque in motor_torque(tau, n))
+    assert 2.0 * n * harder == pytest.approx(abs(tau[0]) + abs(tau[1]), rel=1e-12, abs=1e-12)
+
+
+def test_first_motor_turns_both_axes_forward_and_the_second_turns_phi_back() -> None:
+    turn = math.pi / 17.5  # rad at the joint: one motor turn, through the gear, halved
+    assert joint_from_motor((1.0, 0.0), 17.5) == pytest.approx((turn, turn))
+    assert joint_from_motor((0.0, 1.0), 17.5) == pytest.approx((-turn, turn))
+
+
 N = 17.5
+
+
 VEL_LIMIT = 60.0
+
+
 NOW = 5_000_000_000
+
+
 CYCLE_NS = 2 * NS_PER_MS
+
+
 TORQUE_MAX = 3.3
 """What current_lim gives, N m a motor; the firmware clamps input_torque to it."""
 
+
 angle = st.floats(-3.0, 3.0)
+
+
 rate = st.floats(-5.0, 5.0)
+
+
 gain = st.floats(0.0, 6000.0)
+
+
 damping = st.floats(0.0, 400.0)
+
+
 torque = st.floats(-115.0, 115.0)
 
 
@@ -59,9 +116,7 @@ def firmware(target: MotorTarget, pos: Pair, vel: Pair, input_torque_max: float 
 
 
 @given(setpoints, pairs(angle), pairs(rate), pairs(torque))
-def test_the_drive_gives_the_torque_that_the_service_asks_for(
-    setpoint: Setpoint, q: Pair, v: Pair, tau: Pair
-) -> None:
+def test_the_drive_gives_the_torque_asked(setpoint: Setpoint, q: Pair, v: Pair, tau: Pair) -> None:
     """At the sample, for any gains, references and rates, whatever the clamp does."""
     pos, vel = motor_from_joint(q, N), motor_from_joint(v, N)
     target = DriveSetpointLaw(N, VEL_LIMIT).target(NOW, setpoint, tau, pos, vel)
@@ -80,9 +135,7 @@ def test_the_service_knows_what_a_drive_that_it_left_alone_gives_anywhere(
 
 
 @given(st.lists(setpoints, min_size=2, max_size=5), pairs(angle), pairs(torque))
-def test_it_does_so_with_the_gains_that_the_drive_happens_to_have(
-    course: list[Setpoint], q: Pair, tau: Pair
-) -> None:
+def test_it_does_so_with_whatever_gains_it_has(course: list[Setpoint], q: Pair, tau: Pair) -> None:
     law = DriveSetpointLaw(N, VEL_LIMIT)
     pos = motor_from_joint(q, N)
     for cycle, setpoint in enumerate(course):
@@ -91,9 +144,7 @@ def test_it_does_so_with_the_gains_that_the_drive_happens_to_have(
 
 
 @given(pairs(st.floats(1.0, 1500.0)), pairs(st.floats(8.0, 200.0)), pairs(torque))
-def test_with_the_service_gone_the_module_holds_with_the_mean_of_its_two_axes(
-    k_p: Pair, k_d: Pair, tau: Pair
-) -> None:
+def test_left_alone_it_holds_with_the_mean_of_its_axes(k_p: Pair, k_d: Pair, tau: Pair) -> None:
     """And carries on with the last torque: the target stays, only the motors move."""
     setpoint = Setpoint((0.1, -1.0), ZERO, ZERO, ZERO, k_p, k_d)
     at = motor_from_joint(setpoint.q_ref, N)
@@ -120,15 +171,17 @@ def test_small_changes_of_the_gains_are_not_sent_and_large_ones_are() -> None:
     assert sent[0] == sent[1] != sent[2]
 
 
+def gains_only(k_p: Pair, k_d: Pair) -> Setpoint:
+    return Setpoint(ZERO, ZERO, ZERO, ZERO, k_p, k_d)
+
+
 def test_in_a_blend_the_gains_change_at_most_every_few_ms_and_in_the_end_they_are_there() -> None:
     """A bus that three modules share has no room for them in every cycle."""
     law = DriveSetpointLaw(N, VEL_LIMIT)
     changed, before = [], None
     for cycle in range(150):
         share = min(1.0, cycle / 100)
-        setpoint = Setpoint(
-            ZERO, ZERO, ZERO, ZERO, (900.0 * share, 26.0), (60.0, 5.0 + 55.0 * share)
-        )
+        setpoint = gains_only((900.0 * share, 26.0), (60.0, 5.0 + 55.0 * share))
         target = law.target(NOW + cycle * CYCLE_NS, setpoint, ZERO, ZERO, ZERO)
         if (target.pos_gain, target.vel_gain) != before:
             before = (target.pos_gain, target.vel_gain)
@@ -141,9 +194,9 @@ def test_in_a_blend_the_gains_change_at_most_every_few_ms_and_in_the_end_they_ar
 
 def test_gains_that_change_after_a_pause_change_at_once() -> None:
     law = DriveSetpointLaw(N, VEL_LIMIT)
-    law.target(NOW, Setpoint(ZERO, ZERO, ZERO, ZERO, (900.0, 26.0), (60.0, 60.0)), ZERO, ZERO, ZERO)
+    law.target(NOW, gains_only((900.0, 26.0), (60.0, 60.0)), ZERO, ZERO, ZERO)
     later = NOW + GAIN_UPDATE_MIN_MS * NS_PER_MS
-    law.target(later, Setpoint(ZERO, ZERO, ZERO, ZERO, ZERO, (60.0, 60.0)), ZERO, ZERO, ZERO)
+    law.target(later, gains_only(ZERO, (60.0, 60.0)), ZERO, ZERO, ZERO)
     assert law.gains[0] == 0.0
 
 
@@ -163,9 +216,8 @@ def test_stiffness_without_damping_gets_a_little_and_no_endless_position_gain(k_
 
 def test_without_any_gains_only_torque_is_left() -> None:
     setpoint = Setpoint((0.1, 0.2), (1.0, 1.0), ZERO, ZERO, ZERO, ZERO)
-    target = DriveSetpointLaw(N, VEL_LIMIT).target(
-        NOW, setpoint, (3.0, -4.0), (1.0, 2.0), (3.0, 4.0)
-    )
+    law = DriveSetpointLaw(N, VEL_LIMIT)
+    target = law.target(NOW, setpoint, (3.0, -4.0), (1.0, 2.0), (3.0, 4.0))
     assert target.vel_gain == (0.0, 0.0)
     assert joint_torque(target.torque, N) == pytest.approx((3.0, -4.0))
 
@@ -187,9 +239,7 @@ def test_the_firmware_clamps_no_input_torque_if_any_target_gives_the_torque_aske
 
 
 @given(setpoints, pairs(angle), pairs(rate), pairs(torque))
-def test_targets_within_the_firmwares_clamp_are_the_ones_without_it(
-    setpoint: Setpoint, q: Pair, v: Pair, tau: Pair
-) -> None:
+def test_targets_within_the_clamp_stay(setpoint: Setpoint, q: Pair, v: Pair, tau: Pair) -> None:
     pos, vel = motor_from_joint(q, N), motor_from_joint(v, N)
     free = DriveSetpointLaw(N, VEL_LIMIT).target(NOW, setpoint, tau, pos, vel)
     most = max(map(abs, free.torque)) + 1e-9

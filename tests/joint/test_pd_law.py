@@ -1,3 +1,5 @@
+""""""
+
 from __future__ import annotations
 
 import msgspec
@@ -12,6 +14,8 @@ from shared.bus.messages import Pair
 from tests.joint.helpers import command
 
 shares = st.floats(0.0, 1.0)
+
+
 gains = st.just(0.0) | st.floats(1e-3, 6000.0)
 
 
@@ -20,11 +24,19 @@ def pairs(elements: st.SearchStrategy[float]) -> st.SearchStrategy[Pair]:
 
 
 angles = pairs(st.floats(-6.0, 6.0))
+
+
 rates = pairs(st.floats(-20.0, 20.0))
+
+
 torques = pairs(st.floats(-200.0, 200.0))
+
+
 setpoints = st.builds(Setpoint, angles, rates, torques, torques, pairs(gains), pairs(gains))
 
+
 SOFT = Setpoint((0.1, -1.0), (0.2, -0.4), (3.0, -20.0), (5.0, -6.0), (100.0, 0.0), (10.0, 0.0))
+
 
 FULL = Setpoint(
     (0.1, -1.0), (0.2, -0.4), (3.0, -20.0), (5.0, -6.0), (100.0, 800.0), (10.0, 50.0)
@@ -41,12 +53,14 @@ def test_torque_is_pd_plus_feedforward_plus_coupled(s: Setpoint, q: Pair, v: Pai
 
 @given(a=setpoints, b=setpoints, share=shares, q=angles, v=rates)
 @example(a=SOFT, b=SOFT, share=0.5, q=(0.0, 0.0), v=(0.0, 0.0))
-def test_blend_of_two_laws_gives_the_blended_torque_everywhere(
+def test_blend_of_two_laws_gives_the_blended_torque_everywhere_and_no_negative_gain(
     a: Setpoint, b: Setpoint, share: float, q: Pair, v: Pair
 ) -> None:
-    blended = pd_law.torque(pd_law.blend(a, b, share), q, v)
+    blended = pd_law.blend(a, b, share)
     apart = np.array([pd_law.torque(a, q, v), pd_law.torque(b, q, v)])
-    np.testing.assert_allclose(blended, [1.0 - share, share] @ apart, rtol=1e-9, atol=1e-6)
+    together = [1.0 - share, share] @ apart
+    np.testing.assert_allclose(pd_law.torque(blended, q, v), together, rtol=1e-9, atol=1e-6)
+    assert min(*blended.k_p, *blended.k_d) >= 0.0
 
 
 def test_with_no_gain_at_all_a_blend_goes_to_the_later_reference() -> None:
@@ -56,48 +70,27 @@ def test_with_no_gain_at_all_a_blend_goes_to_the_later_reference() -> None:
     assert (blended.q_ref, blended.v_ref) == ((0.3, 0.5), (0.7, 0.9))
 
 
-@given(a=setpoints, b=setpoints, share=shares)
-def test_blend_of_two_laws_has_no_negative_gain(a: Setpoint, b: Setpoint, share: float) -> None:
-    blended = pd_law.blend(a, b, share)
-    assert min(*blended.k_p, *blended.k_d) >= 0.0
-
-
 @given(s=setpoints, k_p=pairs(gains), k_d=pairs(gains), share=shares)
-def test_stiffened_never_lowers_a_gain(s: Setpoint, k_p: Pair, k_d: Pair, share: float) -> None:
-    risen = pd_law.raise_gains(s, k_p, k_d, share)
+def test_raising_never_lowers_a_gain_and_fully_it_has_the_gains_asked_for(
+    s: Setpoint, k_p: Pair, k_d: Pair, share: float
+) -> None:
+    risen, full = (pd_law.raise_gains(s, k_p, k_d, part) for part in (share, 1.0))
     assert np.all(np.subtract(risen.k_p, s.k_p) >= 0.0)
     assert np.all(np.subtract(risen.k_d, s.k_d) >= 0.0)
-    changed = Setpoint(s.q_ref, s.v_ref, s.tau_ff, s.tau_coupled, risen.k_p, risen.k_d)
+    changed = msgspec.structs.replace(s, k_p=risen.k_p, k_d=risen.k_d)
     assert risen == changed, "only gains are changed"
-
-
-@given(s=setpoints, k_p=pairs(gains), k_d=pairs(gains))
-def test_stiffened_fully_has_at_least_the_gains_asked_for(
-    s: Setpoint, k_p: Pair, k_d: Pair
-) -> None:
-    risen = pd_law.raise_gains(s, k_p, k_d, 1.0)
-    np.testing.assert_allclose(risen.k_p, np.maximum(s.k_p, k_p), rtol=1e-12)
-    np.testing.assert_allclose(risen.k_d, np.maximum(s.k_d, k_d), rtol=1e-12)
+    np.testing.assert_allclose(full.k_p, np.maximum(s.k_p, k_p), rtol=1e-12)
+    np.testing.assert_allclose(full.k_d, np.maximum(s.k_d, k_d), rtol=1e-12)
 
 
 @given(s=setpoints, share=shares)
-def test_held_keeps_references_feedforward_and_gains(s: Setpoint, share: float) -> None:
-    kept = pd_law.freeze(s, share)
+@example(s=SOFT, share=0.0)
+@example(s=SOFT, share=-0.1)
+def test_held_keeps_all_but_rates_and_coupled_torque_which_fade(s: Setpoint, share: float) -> None:
+    kept, left = pd_law.freeze(s, share), max(0.0, share)
     assert (kept.q_ref, kept.tau_ff, kept.k_p, kept.k_d) == (s.q_ref, s.tau_ff, s.k_p, s.k_d)
-
-
-@given(s=setpoints, share=shares)
-def test_held_drops_rates_and_coupled_torque_by_share(s: Setpoint, share: float) -> None:
-    kept = pd_law.freeze(s, share)
-    np.testing.assert_allclose(kept.v_ref, share * np.array(s.v_ref), rtol=1e-12)
-    np.testing.assert_allclose(kept.tau_coupled, share * np.array(s.tau_coupled), rtol=1e-12)
-
-
-@pytest.mark.parametrize("share", [0.0, -0.1])
-def test_held_with_nothing_left_moving_has_neither_rate_nor_coupled_torque(share: float) -> None:
-    kept = pd_law.freeze(SOFT, share)
-    assert kept.v_ref == (0.0, 0.0)
-    assert kept.tau_coupled == (0.0, 0.0)
+    np.testing.assert_allclose(kept.v_ref, left * np.array(s.v_ref), rtol=1e-12)
+    np.testing.assert_allclose(kept.tau_coupled, left * np.array(s.tau_coupled), rtol=1e-12)
 
 
 @pytest.mark.parametrize("age_s", [0.0, 0.004, 0.03])
@@ -111,18 +104,14 @@ def test_aged_moves_references_on_by_their_rates(age_s: float) -> None:
 
 
 @given(s=setpoints, share=shares, q=angles, v=rates)
-def test_damped_has_no_stiffness_and_only_what_is_left_of_the_feedforward(
-    s: Setpoint, share: float, q: Pair, v: Pair
-) -> None:
+def test_damped_only_feedforward_is_left(s: Setpoint, share: float, q: Pair, v: Pair) -> None:
     expected = share * np.array(s.tau_ff) - 60.0 * np.array(v)
     damped = pd_law.damp(pd_law.freeze(s, 0.0), (True, True), 60.0, share, 1.0)
     np.testing.assert_allclose(pd_law.torque(damped, q, v), expected, rtol=1e-12, atol=1e-9)
 
 
 @given(s=setpoints, share=shares, q=angles, v=rates)
-def test_axes_that_do_not_sink_hold_as_they_did(
-    s: Setpoint, share: float, q: Pair, v: Pair
-) -> None:
+def test_axes_that_do_not_sink_hold_on(s: Setpoint, share: float, q: Pair, v: Pair) -> None:
     frozen = pd_law.freeze(s, 0.0)
     tau = pd_law.torque(pd_law.damp(frozen, (False, True), 60.0, share, 1.0), q, v)
     assert tau[0] == pd_law.torque(frozen, q, v)[0]
@@ -131,9 +120,7 @@ def test_axes_that_do_not_sink_hold_as_they_did(
 
 
 @given(s=setpoints, q=angles, v=rates, k_d=gains)
-def test_damping_begins_with_the_torque_that_was_in_force(
-    s: Setpoint, q: Pair, v: Pair, k_d: float
-) -> None:
+def test_damping_begins_with_the_torque_before(s: Setpoint, q: Pair, v: Pair, k_d: float) -> None:
     both = (True, True)
     begun = pd_law.torque(
         pd_law.damp(pd_law.load_to_feedforward(s, both, q), both, k_d, 1.0, 0.0), q, v
@@ -149,9 +136,7 @@ def test_stand_asks_for_no_torque_where_it_stands(q: Pair) -> None:
 
 @pytest.mark.parametrize("away_phi", [-0.126, -0.125, 0.0, 0.125, 0.126])
 @pytest.mark.parametrize("away_theta", [-0.063, -0.0625, 0.0, 0.0625, 0.063])
-def test_where_a_stiffer_spring_would_pull_too_hard_the_axis_holds_where_it_is(
-    away_phi: float, away_theta: float
-) -> None:
+def test_too_far_for_a_stiffer_spring_it_holds_here(away_phi: float, away_theta: float) -> None:
     """50 N m more are allowed: phi rises by 400 N m/rad, theta by 800."""
     s = msgspec.structs.replace(FULL, q_ref=(0.0, 0.0))
     q = (-away_phi, -away_theta)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import getpass
 import os
 import signal
 from pathlib import Path
@@ -19,16 +20,19 @@ from services.joint.rearm_guard import (
     clear,
     path_of,
     request_stop,
+    stop_source,
 )
 from shared.exceptions import FleetError
 from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
-from tools.fleet import process_table, procfs, supervise
+from tools.fleet import emergency_stop, process_table, procfs, supervise
 from tools.fleet.run_dir import RunDir
 from tools.fleet.supervise import SupervisedFleet
 from tools.verbs import kill
 
 MODULE = "knee_left"
+
+
 PID = 4711
 
 
@@ -45,21 +49,18 @@ def file(tmp_path: Path) -> RearmGuard:
     return RearmGuard(tmp_path, MODULE)
 
 
-def test_without_a_predecessor_there_is_no_last_state(file: RearmGuard) -> None:
-    assert file.read() is LastState.NOTHING
-
-
 @pytest.mark.parametrize("last_state", list(LastState))
 def test_what_a_process_leaves_the_next_one_reads(tmp_path: Path, last_state: LastState) -> None:
     RearmGuard(tmp_path, MODULE).write(last_state)
     assert RearmGuard(tmp_path, MODULE).read() is last_state
-    assert RearmGuard(tmp_path, "ankle_left").read() is LastState.NOTHING
+    assert RearmGuard(tmp_path, "ankle_left").read() is LastState.NOTHING, "without a predecessor"
 
 
-@pytest.mark.parametrize("byte", [3, 0x20, 0xFF])
-def test_an_unreadable_last_state_counts_as_held(tmp_path: Path, byte: int) -> None:
+@pytest.mark.parametrize("byte", [3, 0x20, 0xFF, LastState.HELD])
+def test_a_file_of_one_byte_is_read_and_an_odd_state_is_held(tmp_path: Path, byte: int) -> None:
     path_of(tmp_path, MODULE).write_bytes(bytes([byte]))
-    assert RearmGuard(tmp_path, MODULE).read() is LastState.HELD
+    old = RearmGuard(tmp_path, MODULE)
+    assert (old.read(), old.stop_requested) == (LastState.HELD, False)
 
 
 @pytest.mark.parametrize("last_state", [LastState.HELD, LastState.DAMP])
@@ -67,52 +68,58 @@ def test_what_is_forgotten_is_so_for_a_process_that_has_it_mapped(
     tmp_path: Path, file: RearmGuard, last_state: LastState
 ) -> None:
     file.write(last_state)
+    successor = RearmGuard(tmp_path, MODULE)
     clear(tmp_path, MODULE)
     assert file.read() is LastState.NOTHING
-    file.write(last_state)
-    assert file.read() is LastState.NOTHING, "it has nothing new to say: that undoes nothing"
+    for each in (file, successor):
+        each.write(last_state)
+        assert file.read() is LastState.NOTHING, "it has nothing new to say: that undoes nothing"
     other = LastState.HELD if last_state is LastState.DAMP else LastState.DAMP
     file.write(other)
     assert RearmGuard(tmp_path, MODULE).read() is other, "still the same file"
 
 
-def test_a_will_that_was_never_made_is_forgotten_without_a_word(tmp_path: Path) -> None:
+def test_where_no_service_is_nothing_is_forgotten_or_stopped(tmp_path: Path) -> None:
     clear(tmp_path, MODULE)
+    assert not request_stop(tmp_path, MODULE)
+    assert stop_source(tmp_path, MODULE) == ""
     assert list(tmp_path.iterdir()) == []
 
 
-class Calls:
-    """Stands for the supervisor and the system: takes what they are asked to do."""
+class Fleet:
+    """Stands for the supervisor and the system: keeps what they are asked to do."""
 
-    def __init__(self, pids: dict[str, int], *, suspended: bool) -> None:
-        self.pids = pids
-        self.suspended = suspended
+    def __init__(self, run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.pids: dict[str, int] = {}
+        self.suspended = False
         self.made: list[tuple[object, ...]] = []
+        self.run_dir = run_dir
+        self.start = SupervisedFleet(run_dir)
+        asked = SimpleNamespace(call=lambda *words: self.made.append(words))
+        kill_for = SimpleNamespace(kill=lambda *words: self.made.append(("kill", *words)))
+        monkeypatch.setattr(self.start, "_supervisor", asked)
+        monkeypatch.setattr(self.start, "pids", lambda: self.pids)
+        monkeypatch.setattr(
+            SupervisedFleet, "manifest", SimpleNamespace(services=(MODULE, "planner"))
+        )
+        monkeypatch.setattr(SupervisedFleet, "attach", lambda _run_dir: self.start)
+        monkeypatch.setattr(procfs, "is_suspended", lambda _pid: self.suspended)
+        monkeypatch.setattr(procfs, "belongs", lambda _pid, _run_dir: True)
+        monkeypatch.setattr(supervise, "os", kill_for)
 
-    def call(self, *asked: object) -> None:
-        self.made.append(asked)
-
-    def kill(self, *asked: object) -> None:
-        self.made.append(("kill", *asked))
-
-
-def fleet_of(
-    run_dir: Path, monkeypatch: pytest.MonkeyPatch, calls: Calls, services: tuple[str, ...]
-) -> SupervisedFleet:
-    fleet = SupervisedFleet(run_dir)
-    monkeypatch.setattr(fleet, "_supervisor", SimpleNamespace(call=calls.call))
-    monkeypatch.setattr(fleet, "pids", lambda: calls.pids)
-    monkeypatch.setattr(SupervisedFleet, "manifest", SimpleNamespace(services=services))
-    monkeypatch.setattr(SupervisedFleet, "attach", lambda _run_dir: fleet)
-    monkeypatch.setattr(procfs, "is_suspended", lambda _pid: calls.suspended)
-    monkeypatch.setattr(procfs, "belongs", lambda _pid, _run_dir: True)
-    monkeypatch.setattr(supervise, "os", SimpleNamespace(kill=calls.kill))
-    return fleet
+    def kill(self, service: str, name: str) -> None:
+        """Run `xrl kill` on a service that is up."""
+        self.pids = {service: PID}
+        flags = kill.KillFlags(run_dir=self.run_dir, service=service, signal=cast("Any", name))
+        assert kill.run(flags) == 0
 
 
-def test_a_stop_is_seen_by_a_process_that_has_it_mapped_until_it_is_forgotten(
-    tmp_path: Path, file: RearmGuard
-) -> None:
+@pytest.fixture
+def fleet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fleet:
+    return Fleet(tmp_path, monkeypatch)
+
+
+def test_a_stop_is_seen_at_once_until_it_is_forgotten(tmp_path: Path, file: RearmGuard) -> None:
     assert not file.stop_requested
     assert request_stop(tmp_path, MODULE)
     assert file.stop_requested
@@ -121,11 +128,6 @@ def test_a_stop_is_seen_by_a_process_that_has_it_mapped_until_it_is_forgotten(
     assert file.stop_requested, "what the service leaves does not undo it"
     clear(tmp_path, MODULE)
     assert not file.stop_requested
-
-
-def test_where_no_service_is_nothing_is_stopped(tmp_path: Path) -> None:
-    assert not request_stop(tmp_path, MODULE)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_pendant_reaches_the_services_that_run(tmp_path: Path, file: RearmGuard) -> None:
@@ -161,37 +163,19 @@ def test_the_file_does_not_grow_and_a_stop_is_one_byte_of_it(tmp_path: Path) -> 
     assert path_of(tmp_path, MODULE).read_bytes() == b"\x00\x01" + bytes(14 + SOURCE_MAX)
 
 
-def test_a_found_error_is_not_reported_again(tmp_path: Path, left: RearmGuard) -> None:
-    successor = RearmGuard(tmp_path, MODULE)
-    clear(tmp_path, MODULE)
-    successor.write(LastState.HELD)
-    assert left.read() is LastState.NOTHING
-
-
-def test_a_file_of_one_byte_is_read_as_before(tmp_path: Path) -> None:
-    path_of(tmp_path, MODULE).write_bytes(bytes([LastState.HELD]))
-    old = RearmGuard(tmp_path, MODULE)
-    assert (old.read(), old.stop_requested) == (LastState.HELD, False)
-
-
-def test_a_service_that_is_down_is_started_as_if_none_had_been_before(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left: RearmGuard
-) -> None:
-    calls = Calls({}, suspended=False)
-    fleet_of(tmp_path, monkeypatch, calls, (MODULE,)).start_service(MODULE)
-    assert ("supervisor.startProcess", MODULE, False) in calls.made
+def test_a_service_that_is_down_starts_with_no_past(fleet: Fleet, left: RearmGuard) -> None:
+    fleet.start.start_service(MODULE)
+    assert ("supervisor.startProcess", MODULE, False) in fleet.made
     assert left.read() is LastState.NOTHING
 
 
 @pytest.mark.parametrize("suspended", [True, False])
-def test_a_service_that_is_up_is_not_asked_for_anew_by_starting_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left: RearmGuard, suspended: bool
-) -> None:
+def test_starting_what_runs_asks_for_none(fleet: Fleet, left: RearmGuard, suspended: bool) -> None:
     """It knows itself what it has held; should it crash after, the next has to know as well."""
-    calls = Calls({MODULE: PID}, suspended=suspended)
-    runs = fleet_of(tmp_path, monkeypatch, calls, (MODULE,)).start_service(MODULE)
+    fleet.pids, fleet.suspended = {MODULE: PID}, suspended
+    runs = fleet.start.start_service(MODULE)
     assert runs == (None if suspended else PID), "it runs already"
-    assert [made[0] for made in calls.made] == ["kill"] * suspended
+    assert [made[0] for made in fleet.made] == ["kill"] * suspended
     assert left.read() is LastState.HELD
 
 
@@ -205,38 +189,27 @@ def test_a_service_that_is_up_is_not_asked_for_anew_by_starting_it(
     ],
 )
 def test_the_verb_that_ends_a_service_asks_for_the_next_and_one_that_suspends_it_does_not(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    left: RearmGuard,
-    name: str,
-    after: LastState,
+    fleet: Fleet, left: RearmGuard, name: str, after: LastState
 ) -> None:
-    calls = Calls({MODULE: PID}, suspended=False)
-    fleet_of(tmp_path, monkeypatch, calls, (MODULE,))
-    flags = kill.KillFlags(run_dir=tmp_path, service=MODULE, signal=cast("Any", name))
-    assert kill.run(flags) == 0
-    assert calls.made == [("kill", PID, signal.Signals[f"SIG{name}"])]
+    fleet.kill(MODULE, name)
+    assert fleet.made == [("kill", PID, signal.Signals[f"SIG{name}"])]
     assert left.read() is after
 
 
-def test_a_service_without_a_drive_leaves_nothing_to_forget(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls = Calls({"planner": PID}, suspended=False)
-    fleet_of(tmp_path, monkeypatch, calls, ("planner",))
-    assert kill.run(kill.KillFlags(run_dir=tmp_path, service="planner")) == 0
+def test_a_service_without_a_drive_leaves_nothing_to_forget(fleet: Fleet, tmp_path: Path) -> None:
+    fleet.kill("planner", "KILL")
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("ends", ["a new fleet", "a fleet that goes down"])
-def test_a_fleet_does_not_hear_of_what_held_before_it(
-    tmp_path: Path, left: RearmGuard, ends: str
-) -> None:
+def test_a_fleet_knows_no_state_before_it(tmp_path: Path, left: RearmGuard, ends: str) -> None:
     assert left.read() is LastState.HELD
     neighbours.Neighbours(tmp_path, MODULE)
     if ends == "a new fleet":
-        options = process_table.FleetOptions(services=[MODULE])
-        plan = process_table.make_plan(DEFAULT_CONFIG, Path("/nowhere"), options)
+        plan = process_table.make_plan(
+            DEFAULT_CONFIG, Path("/nowhere"), overrides={}, services=[MODULE], simulation=True,
+            table_path=process_table.TABLE,
+        )  # fmt: skip
         RunDir(tmp_path).prepare(plan)
     else:
         run = RunDir(tmp_path)
@@ -273,3 +246,33 @@ def test_a_signal_stops_a_service_whose_file_is_gone(tmp_path: Path, file: Rearm
         assert file.stop_requested
     finally:
         signal.signal(signal.SIGUSR1, before)
+
+
+def test_the_first_named_source_of_a_stop_is_kept_until_asked_for(tmp_path: Path) -> None:
+    guard = RearmGuard(tmp_path, MODULE)
+    assert stop_source(tmp_path, MODULE) == ""
+    guard.note_stop("")
+    request_stop(tmp_path, MODULE, "xrl estop by anna")
+    guard.note_stop("somebody else")
+    assert stop_source(tmp_path, MODULE) == "xrl estop by anna"
+    clear(tmp_path, MODULE)
+    guard.note_stop("é" * SOURCE_MAX)
+    assert stop_source(tmp_path, MODULE) == "é" * (SOURCE_MAX // 2)
+    assert not guard.stop_requested, "a long name reaches nothing else"
+    assert guard.beats == 0
+
+
+@pytest.mark.parametrize("name", [KeyError("uid not found: 12345"), "l\udce9a"])
+def test_a_user_without_a_name_or_with_a_broken_one_stops_the_robot_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: KeyError | str
+) -> None:
+    def who() -> str:
+        if isinstance(name, KeyError):
+            raise name
+        return name
+
+    monkeypatch.setattr(getpass, "getuser", who)
+    guard = RearmGuard(tmp_path, MODULE)
+    assert emergency_stop.request_here(tmp_path) == ([MODULE], [])
+    assert guard.stop_requested
+    assert stop_source(tmp_path, MODULE).startswith("xrl estop by ")

@@ -1,16 +1,21 @@
-"""Periods are counted, not samples: none is lost or counted twice while a service is held up."""
+"""Periods are counted, not samples, and states are sent in the periods that the planner names."""
 
 from __future__ import annotations
 
+import itertools
 import random
 
-import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from services.joint.controller import JointController
 from services.joint.sample_clock import SampleClock
+from shared.bus.messages import JointCommand
 from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config.gain_schedule import believing
+from shared.config.robot_config import RobotConfig
+from tests.joint.helpers import T0, Bench, command, with_service
 
 PERIOD_NS = 2 * NS_PER_MS
 
@@ -29,9 +34,7 @@ def counted(times_ns: list[int]) -> list[int]:
     late=st.floats(0.0, 0.45),
     lost=st.floats(0.0, 0.2),
 )
-def test_the_count_is_that_of_the_periods_whatever_is_late_or_lost(
-    seed: int, ppm: float, late: float, lost: float
-) -> None:
+def test_periods_are_counted_late_or_lost(seed: int, ppm: float, late: float, lost: float) -> None:
     dice = random.Random(seed)
     numbers = [0, *(number for number in range(1, 2000) if dice.random() >= lost)]
     period = PERIOD_NS * (1.0 + 1e-6 * ppm)
@@ -52,9 +55,7 @@ def test_after_a_service_was_held_up_the_count_goes_on_as_if_it_had_not(held_up_
 
 
 @pytest.mark.parametrize(("late", "count"), [(0.45, 2), (0.55, 3), (1.45, 3), (1.55, 4)])
-def test_a_sample_late_by_more_than_half_a_period_counts_as_the_next(
-    late: float, count: int
-) -> None:
+def test_a_sample_half_a_period_late_counts_as_the_next(late: float, count: int) -> None:
     assert counted([NS_PER_S, NS_PER_S + round((1.0 + late) * PERIOD_NS)]) == [1, count]
 
 
@@ -70,9 +71,7 @@ def test_two_samples_within_a_period_begin_one() -> None:
 @pytest.mark.parametrize("phase", [0, 1, 2, 3])
 @pytest.mark.parametrize("every", [1, 2, 4])
 @pytest.mark.parametrize("rate", [1, 2, 3])
-def test_each_due_period_is_passed_once_whatever_samples_are_lost(
-    every: int, phase: int, rate: int
-) -> None:
+def test_each_due_period_passes_once_despite_losses(every: int, phase: int, rate: int) -> None:
     """With a drive that sends at a half or a third of the rate, no sample meets it exactly."""
     clock, passed = SampleClock(), 0
     for number in range(0, 1200, rate):
@@ -81,9 +80,61 @@ def test_each_due_period_is_passed_once_whatever_samples_are_lost(
     assert abs(passed - 1200 / max(every, rate)) <= 2
 
 
-def test_a_copy_does_not_change_with_it() -> None:
-    clock = SampleClock()
-    clock.advance(NS_PER_S, PERIOD_NS)
-    copy = msgspec.structs.replace(clock)
-    clock.advance(NS_PER_S + PERIOD_NS, PERIOD_NS)
-    assert (copy.count, clock.count) == (1, 2)
+def sent(
+    robot: RobotConfig,
+    commands: dict[int, JointCommand],
+    *,
+    late_ns: dict[int, int] | None = None,
+    restored_at: int = -1,
+    cycles: int = 400,
+) -> list[int]:
+    """Return the numbers of the periods in which a service sends a state.
+
+    Commands come, and cycles are late, by period; before `restored_at` another controller goes on.
+    """
+    bench = Bench(robot)
+    periods = []
+    for number in range(1, cycles + 1):
+        if number == restored_at:
+            other = JointController(believing(robot), "knee_right")
+            other.restore(bench.controller.snapshot())
+            bench.controller = other
+        bench.now_ns = T0 + number * PERIOD_NS + (late_ns or {}).get(number, 0)
+        bench.controller.step(bench.now_ns, bench.reading(), commands.get(number), estop=False)
+        if bench.controller.is_state_due:
+            periods.append(number)
+    return periods
+
+
+def asked(phase: int, number: int) -> JointCommand:
+    now_ns = T0 + number * PERIOD_NS
+    return command(t_ns=now_ns, echo_t_ns=now_ns, seq=number, state_phase=phase)
+
+
+@pytest.mark.parametrize("every", [1, 2, 4])
+@pytest.mark.parametrize("phase", [0, 1, 2, 3, -1, 2**40 + 1])
+def test_it_keeps_the_phase_that_a_command_names(
+    robot: RobotConfig, every: int, phase: int
+) -> None:
+    robot = with_service(robot, state_rate_hz=500.0 / every)
+    periods = sent(robot, {101: asked(phase, 101)})
+    before = [number for number in periods if number <= 100]
+    after = [number for number in periods if number > 101 + every]
+    assert {number % every for number in before} == {0}
+    assert {number % every for number in after} == {phase % every}
+    assert len(after) >= 299 // every - 1, "and none is left out, though no other command comes"
+
+
+def test_the_first_after_a_restore_comes_as_it_would_have(robot: RobotConfig) -> None:
+    commands = {101: asked(1, 101)}
+    for restored_at in (100, 101, 102, 103, 250):
+        assert sent(robot, commands, restored_at=restored_at) == sent(robot, commands)
+
+
+def test_cycles_that_are_held_up_lose_no_state(robot: RobotConfig) -> None:
+    """Late by more than half a period, a cycle counts as the next; the due one was left out."""
+    dice = random.Random(2)
+    late = {number: dice.randrange(1_000_000, 1_400_000) for number in range(5, 1000, 20)}
+    periods = sent(robot, {}, late_ns=late, cycles=1000)
+    assert len(periods) >= 499
+    assert max(later - earlier for earlier, later in itertools.pairwise(periods)) <= 3

@@ -18,9 +18,15 @@ from shared.config.robot_config import RobotConfig
 FULL = Setpoint(
     (0.1, -1.0), (0.2, -0.4), (3.0, -20.0), (5.0, -6.0), (100.0, 800.0), (10.0, 50.0)
 )  # fmt: skip
+
+
 Q: Pair = (0.02, -0.4)
+
+
 LONG_NS = 10 * NS_PER_S
 """All has faded and risen by then."""
+
+
 UNHEARD = NeighbourView(sinks=False)
 
 
@@ -30,9 +36,7 @@ def begun(robot: RobotConfig, module: str, q: Pair = Q) -> tuple[Sinking, Setpoi
 
 
 @pytest.mark.parametrize("theta", [-0.4, -0.45, -0.35])
-def test_a_hip_holds_the_torso_as_it_stood_while_its_leg_folds(
-    robot: RobotConfig, theta: float
-) -> None:
+def test_a_hip_holds_the_torso_while_its_leg_folds(robot: RobotConfig, theta: float) -> None:
     sinking, frozen = begun(robot, "hip_right")
     sinking.law(frozen, frozen, 0, Q, NeighbourView((0.3, 0.05)))
     assert sinking.state.upright == pytest.approx(0.3 - 0.4)
@@ -43,9 +47,7 @@ def test_a_hip_holds_the_torso_as_it_stood_while_its_leg_folds(
 
 
 @pytest.mark.parametrize(("below", "clipped"), [(0.9, -0.4 - LEVEL_MAX), (-0.9, -0.4 + LEVEL_MAX)])
-def test_a_torso_that_is_far_off_is_brought_back_gently(
-    robot: RobotConfig, below: float, clipped: float
-) -> None:
+def test_a_torso_far_off_returns_gently(robot: RobotConfig, below: float, clipped: float) -> None:
     sinking, frozen = begun(robot, "hip_right")
     sinking.law(frozen, frozen, 0, Q, NeighbourView((0.3, 0.0)))
     assert sinking.law(frozen, frozen, LONG_NS, Q, NeighbourView((below, 0.0))).q_ref[
@@ -87,9 +89,7 @@ def hip_ahead(robot: RobotConfig, ankle: float, knee: float) -> float:
 
 @pytest.mark.parametrize("ankle", [0.03, 0.14, 0.3])
 @pytest.mark.parametrize("knee", [-0.2, -0.37, -1.0, -2.0])
-def test_an_ankle_keeps_the_hip_joint_where_it_was_as_its_knee_folds(
-    robot: RobotConfig, ankle: float, knee: float
-) -> None:
+def test_an_ankle_keeps_the_hip_where_it_was(robot: RobotConfig, ankle: float, knee: float) -> None:
     """Held stiffly, it let the robot fall over backwards from nearly straight legs."""
     sinking, frozen = begun(robot, "ankle_left", (0.02, ankle))
     first = sinking.law(frozen, frozen, LONG_NS, (0.02, ankle), NeighbourView((knee, -0.3)))
@@ -107,9 +107,7 @@ def test_an_ankle_keeps_the_hip_joint_where_it_was_as_its_knee_folds(
         assert (found.k_p, found.tau_ff) == (first.k_p, first.tau_ff)
 
 
-def test_an_ankle_that_does_not_see_its_knee_stays_within_its_limits_and_where_it_was(
-    robot: RobotConfig,
-) -> None:
+def test_an_ankle_that_does_not_see_its_knee_stays_where_it_was(robot: RobotConfig) -> None:
     sinking, frozen = begun(robot, "ankle_left", (0.02, 0.14))
     unseen = sinking.law(frozen, frozen, LONG_NS, (0.02, 0.14), UNKNOWN)
     assert unseen.q_ref == frozen.q_ref
@@ -121,9 +119,7 @@ def test_an_ankle_that_does_not_see_its_knee_stays_within_its_limits_and_where_i
         assert (lost.q_ref, lost.v_ref[1]) == (seen.q_ref, 0.0)
 
 
-def test_a_leg_of_equal_links_that_folds_onto_itself_divides_by_nothing(
-    robot: RobotConfig,
-) -> None:
+def test_a_leg_of_equal_links_that_folds_onto_itself_divides_by_nothing(robot: RobotConfig) -> None:
     alike = msgspec.structs.replace(robot.geometry, l1=robot.geometry.l2)
     sinking, frozen = begun(msgspec.structs.replace(robot, geometry=alike), "ankle_left")
     for knee in (-math.pi, -3.0):
@@ -133,6 +129,8 @@ def test_a_leg_of_equal_links_that_folds_onto_itself_divides_by_nothing(
 
 BELOW_ITS_STOP = -2.6
 """rad, of a knee."""
+
+
 PLACES = {
     "ankle": ("ankle_right", -0.4, UNKNOWN),
     "an ankle that follows its knee": ("ankle_right", 0.2, NeighbourView((-1.0, -0.2))),
@@ -147,9 +145,7 @@ PLACES = {
 
 @pytest.mark.parametrize("when", [0.5, 2.0], ids=["while it fades", "when all has faded"])
 @pytest.mark.parametrize("place", PLACES)
-def test_for_a_limp_module_it_holds_where_it_is_with_the_load_it_has(
-    robot: RobotConfig, place: str, when: float
-) -> None:
+def test_for_a_limp_module_it_holds_its_load(robot: RobotConfig, place: str, when: float) -> None:
     """From then on, whatever it is told: a robot under load never softens by itself."""
     module, theta, near = PLACES[place]
     sinking, frozen = begun(robot, module)
@@ -178,9 +174,7 @@ def test_for_a_limp_module_it_holds_where_it_is_with_the_load_it_has(
             assert found.tau_ff[1] == pytest.approx(before.tau_ff[1] + spring)
 
 
-def test_rates_and_coupling_fade_in_a_module_that_stiffens_as_in_any_that_stops(
-    robot: RobotConfig,
-) -> None:
+def test_rates_and_coupling_fade_in_a_module_that_stiffens(robot: RobotConfig) -> None:
     sinking, frozen = begun(robot, "knee_right")
     limp = NeighbourView(stiffen=True)
     ramp_ns = round(robot.joint_service.coupled_ramp_ms * 1e6)
@@ -193,9 +187,7 @@ def test_rates_and_coupling_fade_in_a_module_that_stiffens_as_in_any_that_stops(
     assert found.v_ref == pd_law.ZERO
 
 
-def test_of_a_hip_only_the_theta_is_stiffer_for_a_limp_knee_than_in_a_stand(
-    robot: RobotConfig,
-) -> None:
+def test_for_a_limp_knee_only_a_hips_theta_is_stiffer(robot: RobotConfig) -> None:
     stand, (k_p, k_d) = robot.stand_gains("hip_left"), robot.support_gains("hip_left")
     assert (k_p[0], k_d[0]) == (stand.k_p[0], stand.k_d[0])
     assert k_p[1] >= 2.0 * stand.k_p[1]
@@ -207,14 +199,16 @@ def test_of_a_hip_only_the_theta_is_stiffer_for_a_limp_knee_than_in_a_stand(
 
 def test_a_reason_that_passes_is_none(robot: RobotConfig) -> None:
     sinking, frozen = begun(robot, "knee_right")
-    sinking.law(frozen, frozen, 0, Q, UNHEARD)
-    sinking.law(frozen, frozen, DOUBT_NS - 1, Q, UNKNOWN)
-    assert sinking.state.doubt_ns == -1
-    sinking.law(frozen, frozen, DOUBT_NS, Q, UNHEARD)
-    sinking.law(frozen, frozen, 2 * DOUBT_NS - 1, Q, UNHEARD)
-    assert not sinking.state.caught
-    sinking.law(frozen, frozen, 2 * DOUBT_NS, Q, UNHEARD)
-    assert sinking.state.caught
+    for since_ns, near, caught in (
+        (0, UNHEARD, False),
+        (DOUBT_NS - 1, UNKNOWN, False),
+        (DOUBT_NS, UNHEARD, False),
+        (2 * DOUBT_NS - 1, UNHEARD, False),
+        (2 * DOUBT_NS, UNHEARD, True),
+    ):
+        sinking.law(frozen, frozen, since_ns, Q, near)
+        assert sinking.state.caught is caught
+        assert (sinking.state.doubt_ns == -1) is (near is UNKNOWN)
 
 
 def test_a_knee_beside_one_that_does_not_sink_is_caught_where_it_is(robot: RobotConfig) -> None:
@@ -237,11 +231,9 @@ def test_a_knee_beside_one_that_does_not_sink_is_caught_where_it_is(robot: Robot
 @pytest.mark.parametrize("module", ["ankle_right", "hip_right"])
 def test_only_knees_are_caught(robot: RobotConfig, module: str) -> None:
     sinking, frozen = begun(robot, module)
-    assert sinking.state.stop is None
-    sinking.law(frozen, frozen, 0, Q, UNHEARD)
-    sinking.law(frozen, frozen, DOUBT_NS, Q, UNHEARD)
-    assert not sinking.state.caught
-    assert sinking.state.stop is None
+    for since_ns in (0, DOUBT_NS):
+        sinking.law(frozen, frozen, since_ns, Q, UNHEARD)
+        assert (sinking.state.caught, sinking.state.stop) == (False, None)
 
 
 def test_a_second_stop_begins_anew(robot: RobotConfig) -> None:

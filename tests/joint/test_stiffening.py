@@ -19,10 +19,17 @@ from shared.joints import MODULES, kind_of
 from tests.joint.helpers import Bench
 
 SOFT_P: Pair = (500.0, 12.0)
+
+
 SOFT_D: Pair = (20.0, 0.8)
+
+
 POSES = {"ankle": (0.02, 0.1), "knee": (0.02, -1.0), "hip": (0.02, 0.4)}
 
+
 gain = st.floats(0.0, 3000.0)
+
+
 damping = st.floats(0.0, 200.0)
 
 
@@ -41,10 +48,6 @@ def blended(bench: Bench, robot: RobotConfig) -> int:
     return round(robot.joint_service.blend_ms * NS_PER_MS / bench.cycle_ns)
 
 
-def is_stiffened(bench: Bench) -> bool:
-    return bench.controller.state(bench.now_ns).stiffened
-
-
 def at_least(robot: RobotConfig, module: str, k_p: Pair, k_d: Pair) -> tuple[Pair, Pair]:
     support_p, support_d = robot.support_gains(module)
     return (
@@ -54,16 +57,14 @@ def at_least(robot: RobotConfig, module: str, k_p: Pair, k_d: Pair) -> tuple[Pai
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_on_request_it_rises_to_its_support_gains_within_the_blend_time(
-    robot: RobotConfig, module: str
-) -> None:
+def test_on_request_it_rises_to_its_support_gains(robot: RobotConfig, module: str) -> None:
     bench = holding(robot, module)
     bench.run(2 * blended(bench, robot), fresh=True, hold=True, k_p=SOFT_P, k_d=SOFT_D)
     plain = bench.controller.setpoint
-    assert not is_stiffened(bench)
+    assert not bench.is_stiffened
     for _ in range(blended(bench, robot) + 1):
         bench.run(1, fresh=True, hold=True, stiffen=True)
-        assert is_stiffened(bench)
+        assert bench.is_stiffened
     stiffened = bench.controller.setpoint
     assert (stiffened.k_p, stiffened.k_d) == at_least(robot, module, SOFT_P, SOFT_D)
     frozen = (plain.q_ref, plain.v_ref, plain.tau_ff, plain.tau_coupled)
@@ -142,42 +143,38 @@ def test_no_gain_is_ever_lowered_and_none_jumps(
 @pytest.mark.parametrize("after", ["told so no more", "told nothing"])
 def test_it_stays_stiff_until_it_tracks_again(robot: RobotConfig, after: str) -> None:
     """A knee that a restarted service reports for a moment is not to loosen the other five."""
-    bench = holding(robot, "hip_right")
+    bench, soft = holding(robot, "hip_right"), {"k_p": SOFT_P, "k_d": SOFT_D}
     bench.run(1, fresh=True, hold=True, stiffen=True)
     bench.run(500, fresh=after == "told so no more", hold=True)
-    assert is_stiffened(bench)
+    assert bench.is_stiffened
     assert bench.controller.setpoint.k_p == robot.support_gains("hip_right")[0]
     while bench.mode is Mode.HOLD:
-        bench.run(1, fresh=True, k_p=SOFT_P, k_d=SOFT_D)
+        bench.run(1, fresh=True, **soft)
     assert bench.mode is Mode.TRACK
-    assert not is_stiffened(bench)
-    bench.run(2 * blended(bench, robot), fresh=True, k_p=SOFT_P, k_d=SOFT_D)
+    assert not bench.is_stiffened
+    bench.run(2 * blended(bench, robot), fresh=True, **soft)
     assert bench.controller.setpoint.k_p == SOFT_P
-
-
-def test_it_is_not_stiffened_again_by_an_old_command(robot: RobotConfig) -> None:
-    bench = holding(robot, "hip_right")
-    bench.run(1, fresh=True, hold=True, stiffen=True)
-    while bench.mode is Mode.HOLD:
-        bench.run(1, fresh=True, k_p=SOFT_P, k_d=SOFT_D)
     bench.run(1000)
     assert bench.mode is Mode.HOLD
-    assert not is_stiffened(bench)
+    assert not bench.is_stiffened
 
 
-def test_track_does_not_brace(robot: RobotConfig) -> None:
+@pytest.mark.parametrize("by_a_neighbour", [False, True])
+def test_track_does_not_brace(robot: RobotConfig, by_a_neighbour: bool) -> None:
     """Its gains are certified together: the hold that comes with it is what braces."""
     bench = Bench(robot, "hip_right")
     bench.q = POSES["hip"]
     sent = {"q_ref": bench.q, "k_p": SOFT_P, "k_d": SOFT_D}
     bench.to_track(**sent)
     before = bench.controller.setpoint
-    bench.run(100, fresh=True, stiffen=True, **sent)
+    for _ in range(100):
+        told = bench.fresh(stiffen=not by_a_neighbour, **sent)
+        bench.cycle(told, near=NeighbourView(stiffen=by_a_neighbour))
     assert bench.mode is Mode.TRACK
-    assert not is_stiffened(bench)
+    assert not bench.is_stiffened
     assert bench.controller.setpoint == before
     bench.run(1, fresh=True, hold=True, stiffen=True, **sent)
-    assert is_stiffened(bench)
+    assert bench.is_stiffened
 
 
 def test_stiffening_and_tracking_again_is_without_a_step(robot: RobotConfig) -> None:
@@ -212,42 +209,30 @@ def test_a_controller_that_is_restored_stays_stiff(robot: RobotConfig) -> None:
 
 
 @pytest.mark.parametrize("module", ["ankle_left", "knee_right", "hip_right"])
-def test_an_emergency_stop_of_a_stiffened_module_goes_on_holding(
-    robot: RobotConfig, module: str
-) -> None:
+def test_stiffened_it_goes_on_holding_when_stopped(robot: RobotConfig, module: str) -> None:
     """Its planner has told it of a limp knee, which may be on another host."""
     bench = holding(robot, module)
     bench.run(300, fresh=True, hold=True, stiffen=True)
     bench.cycle(bench.fresh(hold=True, stiffen=True), estop=True)
     assert bench.mode is Mode.DAMP
     bench.run(2 * blended(bench, robot))
-    assert is_stiffened(bench)
+    assert bench.is_stiffened
     assert bench.controller.setpoint.k_p == pytest.approx(robot.support_gains(module)[0])
 
 
 @pytest.mark.parametrize("mode", [Mode.HOLD, Mode.DAMP])
 @pytest.mark.parametrize("module", ["ankle_left", "knee_right", "hip_right"])
-def test_a_limp_neighbour_braces_it_without_a_planner(
-    robot: RobotConfig, module: str, mode: Mode
-) -> None:
+def test_a_limp_neighbour_braces_it_alone(robot: RobotConfig, module: str, mode: Mode) -> None:
     bench = holding(robot, module)
     if mode is Mode.DAMP:
         bench.cycle(estop=True)
     bench.run(10)
-    assert not is_stiffened(bench)
+    assert not bench.is_stiffened
     bench.cycle(near=NeighbourView(stiffen=True))
-    assert is_stiffened(bench)
+    assert bench.is_stiffened
     bench.run(2 * blended(bench, robot))
     assert bench.mode is mode
-    assert is_stiffened(bench), "once is enough: its row may be lost with its service"
+    assert bench.is_stiffened, "once is enough: its row may be lost with its service"
     k_p, k_d = at_least(robot, module, (0.0, 0.0), (0.0, 0.0))
     assert bench.controller.setpoint.k_p == pytest.approx(k_p)
     assert bench.controller.setpoint.k_d == pytest.approx(k_d)
-
-
-def test_in_track_a_limp_neighbour_is_the_planners_business(robot: RobotConfig) -> None:
-    bench = Bench(robot, "hip_right")
-    bench.to_track()
-    bench.cycle(bench.fresh(), near=NeighbourView(stiffen=True))
-    assert bench.mode is Mode.TRACK
-    assert not is_stiffened(bench)

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from services.simulator.physics.plant import PlantConfig
-from shared.bus.messages import SimTruth
+from shared.bus.messages import Message, Mode, PlannerStatus, SimTruth, Vector4
+from shared.bus.topics import Topic
 from shared.config import scenarios
 from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Kill, Push, Restart, Scenario
+from tools.lab.studies.sweeps.figures import event_steps_nm
 from tools.sim.lockstep import Lockstep
 from tools.sim.network import BASE
 from tools.sim.standing_start import begin_standing
@@ -46,9 +48,58 @@ class Run(NamedTuple):
         return np.array([row.operator_force[2] for row in self.rows])
 
     @property
+    def tilt(self) -> float:
+        """Largest tilt of a sole, rad."""
+        return max(max(row.foot_left_tilt, row.foot_right_tilt) for row in self.rows)
+
+    def steps_nm(self, *but: str, after: Mode | None = None) -> list[float]:
+        """Return the step of torque at each change of mode, to `after`, of all modules `but`."""
+        return event_steps_nm(
+            event
+            for module, event in self.lockstep.events
+            if module not in but and (after is None or event.mode_after == after)
+        )
+
+    @property
+    def modes(self) -> list[Mode]:
+        return modes_of(self.lockstep)
+
+    @property
+    def status(self) -> PlannerStatus:
+        return status_of(self.lockstep)
+
+    @property
     def stood(self) -> bool:
         done = self.rows[-1].scenario_s >= self.lockstep.scenario.duration - 0.1
         return done and not any(row.fallen for row in self.rows)
+
+
+class Heard(list[Message]):
+    """A record of the messages of some kinds, in the order in which they came."""
+
+    def __init__(self, *kinds: type[Message]) -> None:
+        super().__init__()
+        self._kinds = kinds
+
+    def __call__(self, _topic: Topic, _module: str, message: Message) -> None:
+        if isinstance(message, self._kinds):
+            self.append(message)
+
+
+def modes_of(fleet: Lockstep) -> list[Mode]:
+    return [controller.failsafe.mode for controller in fleet.controllers]
+
+
+def status_of(fleet: Lockstep) -> PlannerStatus:
+    """Return the status of a planner that lives."""
+    assert fleet.planner is not None
+    return fleet.planner.status(fleet.now_ns, 0.0)
+
+
+def corner(robot: RobotConfig, signs: Sequence[int]) -> Vector4:
+    """Return the farthest lean that may be asked for, in the corner of these signs."""
+    x, y, roll, yaw = (sign * most for sign, most in zip(signs, robot.law.shift_max, strict=True))
+    return x, y, roll, yaw
 
 
 def variant(name: str, **changes: object) -> Scenario:
@@ -56,12 +107,12 @@ def variant(name: str, **changes: object) -> Scenario:
     return msgspec.structs.replace(scenarios.load(SCENARIOS / f"{name}.toml"), **changes)
 
 
-def kill(at: float) -> tuple[Kill, ...]:
-    return (Kill(service="planner", at=at),)
+def kill(at: float, *services: str) -> tuple[Kill, ...]:
+    return tuple(Kill(service=service, at=at) for service in services or ("planner",))
 
 
-def restart(at: float) -> tuple[Restart, ...]:
-    return (Restart(service="planner", at=at),)
+def restart(at: float, *services: str) -> tuple[Restart, ...]:
+    return tuple(Restart(service=service, at=at) for service in services or ("planner",))
 
 
 def push(at: float, *force: float) -> Push:
@@ -85,25 +136,39 @@ def at_rest(rows: Sequence[SimTruth], seconds: float = 1.5) -> bool:
     return bool(moved.max() < 1e-3)
 
 
+def led_to(*poses: tuple[float, float], duration: float, **changes: object) -> Scenario:
+    """Return a scenario in which the hand leads from 1.188 m to heights, m, at times, s."""
+    frames = tuple(Keyframe(at=at, height=height) for at, height in ((0.0, 1.188), *poses))
+    return variant(
+        "stand", **{"duration": duration, "keyframe": frames, "kill": (), "push": ()} | changes
+    )
+
+
 def run(
     robot: RobotConfig,
     scenario: Scenario,
     delay_ms: float = BASE.delay_ms,
     plant: PlantConfig | None = None,
     *,
+    network: Impairment | None = None,
     stands: bool = True,
+    fleet_type: type[Lockstep] = Lockstep,
+    each: Callable[[Lockstep, SimTruth], bool | None] = lambda _fleet, _row: None,
+    **how: Any,
 ) -> Run:
-    """Run to the end, or to a fall.
+    """Run to the end, to a fall, or until `each`, which sees each row, returns True.
 
     On the network of the stand-up it begins standing, unless that is not to be taken for granted.
+    What else a fleet takes, such as `seed`, `record` or `controller`, is handed on.
     """
-    lockstep = Lockstep(robot, scenario, Impairment(delay_ms=delay_ms), plant=plant)
-    if stands and delay_ms == BASE.delay_ms:
+    network = network or Impairment(delay_ms=delay_ms)
+    lockstep = fleet_type(robot, scenario, network, plant=plant, **how)
+    if stands and network == BASE:
         assert begin_standing(lockstep), "it stands and tracks"
     rows = []
     for row in lockstep.run():
         if row.scenario_s >= 0.0:
             rows.append(row)
-        if row.fallen:
+        if each(lockstep, row) or row.fallen:
             break
     return Run(lockstep, rows)

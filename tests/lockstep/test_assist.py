@@ -1,6 +1,8 @@
-"""The harness in the loop, in virtual time."""
+"""The harness in the loop, in virtual time: what its sensor tells, and what becomes of it."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -9,80 +11,196 @@ import pytest
 from services.simulator.physics.body import body_of
 from services.simulator.physics.plant import IDEAL
 from services.simulator.physics.world import World
-from shared.bus.messages import Cause, Mode, SimTruth
+from shared.bus.messages import (
+    Cause,
+    Message,
+    Mode,
+    PlannerStatus,
+    SimTruth,
+    Tare,
+    TareRequest,
+    Wrench,
+)
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Scenario
-from tests.lockstep.runs import run, variant
+from tests.lockstep.runs import Heard, modes_of, run, still, variant
 from tools.sim.lockstep import Lockstep
 
-RESTING = variant(
-    "stand",
-    duration=19.0,
-    keyframe=(Keyframe(at=0.0, height=1.1), Keyframe(at=4.0, height=1.0, assist=200.0)),
-)
+
+def with_keys(robot: RobotConfig, section: str, **changes: object) -> RobotConfig:
+    """Return the robot with keys of a section changed."""
+    changed = msgspec.structs.replace(getattr(robot, section), **changes)
+    return msgspec.structs.replace(robot, **{section: changed})
 
 
-def truths(robot: RobotConfig, scenario: Scenario, payload_error: float) -> list[SimTruth]:
-    """Run with a payload that the planner does not know of, kg."""
+@pytest.fixture(scope="module")
+def resting() -> Scenario:
+    frames = (Keyframe(at=0.0, height=1.1), Keyframe(at=4.0, height=1.0, assist=200.0))
+    return variant("stand", duration=19.0, keyframe=frames)
+
+
+def assisted_n(robot: RobotConfig, scenario: Scenario) -> float:
+    """Return the assist that is given at last, 2 kg of payload less than the planner knows."""
     fleet = Lockstep(robot, scenario)
-    mass = msgspec.structs.replace(robot.mass, payload=robot.mass.payload + payload_error)
-    fleet.world = World(body_of(msgspec.structs.replace(robot, mass=mass), IDEAL), scenario)
-    return [truth for truth in fleet.run() if truth.scenario_s >= 0.0]
+    light = with_keys(robot, "mass", payload=robot.mass.payload - 2.0)
+    fleet.world = World(body_of(light, IDEAL), scenario)
+    return float(np.mean([t.harness_force_z for t in fleet.run() if t.scenario_s > 17.0]))
 
 
+@pytest.mark.parametrize(
+    ("weighed", "integrates", "comes_true"),
+    [(False, True, True), (True, False, True), (False, False, False)],
+    ids=["by its integral", "by the load found", "by neither"],
+)
 def test_the_assist_comes_true_with_a_payload_the_planner_does_not_know(
-    robot: RobotConfig,
+    robot: RobotConfig, resting: Scenario, weighed: bool, integrates: bool, comes_true: bool
 ) -> None:
-    unweighed = msgspec.structs.replace(robot.law, load_correction=(0.0, 0.0))
-    robot = msgspec.structs.replace(robot, law=unweighed)
-    off = msgspec.structs.replace(robot.assist, integral_max=0.0)
-    open_loop = msgspec.structs.replace(robot, assist=off)
-    given = [
-        np.mean([t.harness_force_z for t in truths(r, RESTING, -2.0) if t.scenario_s > 17.0])
-        for r in (robot, open_loop)
-    ]
-    assert given[0] == pytest.approx(200.0, abs=10.0)
-    assert abs(given[1] - 200.0) > 12.0
-
-
-def test_with_the_load_found_it_comes_true_without_the_integral(robot: RobotConfig) -> None:
-    off = msgspec.structs.replace(robot.assist, integral_max=0.0)
-    with_mass = truths(msgspec.structs.replace(robot, assist=off), RESTING, -2.0)
-    given = np.mean([t.harness_force_z for t in with_mass if t.scenario_s > 17.0])
-    assert given == pytest.approx(200.0, abs=10.0)
+    if not weighed:
+        robot = with_keys(robot, "law", load_correction=(0.0, 0.0))
+    if not integrates:
+        robot = with_keys(robot, "assist", integral_max=0.0)
+    error = abs(assisted_n(robot, resting) - 200.0)
+    assert error < 10.0 if comes_true else error > 12.0
 
 
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("delay_ms", [1.0, 20.0])
 def test_the_eased_lead_is_lighter_and_as_steady(robot: RobotConfig, delay_ms: float) -> None:
-    plain_law, easy_law = (
-        msgspec.structs.replace(robot, law=msgspec.structs.replace(robot.law, lead_easing=alpha))
-        for alpha in (0.0, 0.5)
-    )
     squat = variant("squat", duration=6.0, kill=(), push=())
-    plain, eased = run(plain_law, squat, delay_ms), run(easy_law, squat, delay_ms)
+    plain, eased = (
+        run(with_keys(robot, "law", lead_easing=alpha), squat, delay_ms) for alpha in (0.0, 0.5)
+    )
     assert eased.stood
     assert np.abs(eased.operator_n).max() < 0.8 * np.abs(plain.operator_n).max()
     assert np.abs(eased.com_mm[:, 0]).max() < np.abs(plain.com_mm[:, 0]).max() + 1.0
 
 
-def test_an_overloaded_harness_makes_all_six_hold_and_lets_them_lead_again(
-    robot: RobotConfig,
-) -> None:
-    tight = msgspec.structs.replace(robot.harness, overload_force=170.0)
+def test_an_overloaded_harness_makes_all_hold_and_lead_again(robot: RobotConfig) -> None:
     frames = tuple(
         Keyframe(at=t, height=1.1, assist=a)
         for t, a in ((0.0, 0.0), (2.0, 190.0), (3.0, 190.0), (5.0, 0.0))
     )
-    overloading = variant("stand", duration=9.0, keyframe=frames)
-    fleet = Lockstep(msgspec.structs.replace(robot, harness=tight), overloading)
-    held = False
-    for truth in fleet.run():
-        modes = {controller.failsafe.mode for controller in fleet.controllers}
+    held = []
+
+    def look(fleet: Lockstep, truth: SimTruth) -> None:
         if 2.4 < truth.scenario_s < 3.3:
-            assert modes == {Mode.HOLD}
-            held = True
-        assert not truth.fallen
+            held.append(set(modes_of(fleet)))
+
+    tight = with_keys(robot, "harness", overload_force=170.0)
+    overloading = variant("stand", duration=9.0, keyframe=frames)
+    outcome = run(tight, overloading, stands=False, each=look)
+    assert outcome.stood
     assert held
-    assert modes == {Mode.TRACK}
-    assert Cause.HOLD_ALL in {event.cause for _, event in fleet.events}
+    assert all(modes == {Mode.HOLD} for modes in held)
+    assert set(outcome.modes) == {Mode.TRACK}
+    assert Cause.HOLD_ALL in {event.cause for _, event in outcome.lockstep.events}
+
+
+def leaning(assist: float) -> Scenario:
+    """Return a scenario in which the torso pitches while a load comes to rest on it."""
+    end = Keyframe(at=2.0, height=1.1, pitch=0.4, assist=assist)
+    return variant("stand", duration=3.5, keyframe=(Keyframe(at=0.0, height=1.188), end))
+
+
+def heard_in(robot: RobotConfig, scenario: Scenario, **how: Any) -> list[Message]:
+    """Return every wrench, status and truth of a run from the hoist on, in the log's order."""
+    heard = Heard(Wrench, PlannerStatus, SimTruth)
+    run(robot, scenario, stands=False, record=heard, **how)
+    return heard
+
+
+@pytest.fixture(scope="module")
+def from_hoist(robot: RobotConfig) -> list[Message]:
+    """A stand-up with 8 ms on each link, each way."""
+    return heard_in(robot, still(0.5), delay_ms=8.0)
+
+
+def of(kind: type[Message], heard: list[Message]) -> list[Message]:
+    return [message for message in heard if isinstance(message, kind)]
+
+
+def test_the_wrench_is_what_acts_on_the_torso_and_comes_at_its_rate(robot: RobotConfig) -> None:
+    heard = heard_in(robot, leaning(150.0))
+    wrenches = {m.t_ns: m for m in heard if isinstance(m, Wrench)}
+    stamps = sorted(wrenches)
+    assert set(np.diff(stamps)) == {round(1e9 / robot.harness.rate_hz)}
+    errors = []
+    for truth in heard:
+        if isinstance(truth, SimTruth) and truth.scenario_s > 3.0:
+            # truth is told after the step, the sensor sampled before it: nothing moves fast
+            wrench = wrenches[max(t for t in stamps if t <= truth.t_ns)]
+            roll, pitch, _ = truth.angles
+            x, y, z = wrench.force
+            up = np.cos(roll) * (z * np.cos(pitch) - x * np.sin(pitch)) + np.sin(roll) * y
+            errors.append(up + truth.harness_force_z)
+            assert wrench.valid
+            assert truth.harness_force_z > 100.0
+            assert pitch > 0.3
+    assert np.abs(np.mean(errors)) < 1.0
+    assert np.abs(errors).max() < 4.0
+
+
+def test_the_tare_is_done_on_the_hoist_before_anything_loads_it(
+    robot: RobotConfig, from_hoist: list[Message]
+) -> None:
+    first_valid = next(m for m in from_hoist if isinstance(m, Wrench) and m.valid)
+    begin_ns = from_hoist[0].t_ns
+    assert first_valid.t_ns - begin_ns == pytest.approx(robot.harness.tare_s * 1e9, abs=5e6)
+    hoisted = [m for m in of(SimTruth, from_hoist) if m.t_ns <= first_valid.t_ns]
+    assert all(m.hoist > 0.5 and m.harness_force_z == 0.0 for m in hoisted)
+
+
+def test_the_planner_receives_the_wrench_after_the_links_delay(
+    robot: RobotConfig, from_hoist: list[Message]
+) -> None:
+    sent = {m.seq: m.t_ns for m in of(Wrench, from_hoist)}
+    ages_ms = [
+        (m.t_ns - sent[m.wrench_seq]) / 1e6
+        for m in of(PlannerStatus, from_hoist)
+        if m.wrench_seq >= 0
+    ]
+    assert len(ages_ms) > 100
+    assert min(ages_ms) >= 8.0
+    assert max(ages_ms) < 8.0 + 2e3 / robot.planner.rate_hz
+
+
+def test_the_wrench_is_bit_identical_with_the_same_seed_alone(
+    robot: RobotConfig, from_hoist: list[Message]
+) -> None:
+    first = of(Wrench, from_hoist)
+    same, other = (
+        of(Wrench, heard_in(robot, still(0.5), delay_ms=8.0, seed=seed)) for seed in (0, 5)
+    )
+    assert same == first
+    assert other != first
+
+
+def unheeded(robot: RobotConfig) -> RobotConfig:
+    """Return the robot with nothing made of the wrench."""
+    robot = with_keys(robot, "law", lead_easing=0.0, load_correction=(0.0, 0.0))
+    return with_keys(robot, "assist", integral_max=0.0)
+
+
+def test_the_sensors_noise_reaches_the_robot_through_the_law_only(robot: RobotConfig) -> None:
+    deaf = unheeded(robot)
+    noiseless = with_keys(deaf, "simulation", harness_noise=0.0)
+    truths = [of(SimTruth, heard_in(config, still(0.5))) for config in (deaf, noiseless)]
+    assert truths[0] == truths[1]
+
+
+def test_a_tare_on_request_takes_what_rests_on_the_harness_for_its_zero(robot: RobotConfig) -> None:
+    received = Heard(Wrench)
+    loaded: list[Message] = []
+
+    def tare(fleet: Lockstep, truth: SimTruth) -> None:
+        if not loaded and truth.scenario_s >= 2.7:
+            loaded.append(received[-1])
+            fleet.harness.tare(TareRequest(t_ns=fleet.now_ns, seq=1, source="a test"))
+
+    run(unheeded(robot), leaning(150.0), record=received, each=tare)
+    assert loaded[0].valid
+    assert np.linalg.norm(loaded[0].force) > 100.0
+    after = received[received.index(loaded[0]) + 1 :]
+    assert {m.tare for m in after if not m.valid} == {Tare.RUNNING}
+    assert received[-1].valid
+    assert np.linalg.norm(received[-1].force) < 10.0

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 
 from services.joint import pd_law
-from services.joint.differential import joint_torque, motor_from_joint
+from services.joint.differential import joint_torque
 from services.joint.drive_manager import DriveAction, DriveCommand
-from services.joint.drivers.base import DriveReading, DriveStatus
+from services.joint.drivers.base import DriveStatus
 from services.planner.planner import Planner
 from services.simulator.physics.plant import IDEAL, PlantConfig
 from shared.bus.messages import JointState, Mode, Pair, PlannerMode, SimTruth
@@ -19,10 +20,12 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Scenario
+from shared.joints import N_MODULES
 from shared.robot.robot_model import stand_pose
-from tests.joint.helpers import command
+from tests.joint.helpers import ModuleBench, command
+from tests.lockstep import runs
 from tests.lockstep.runs import push, variant
-from tests.planner.conftest import standing_torque
+from tests.planner.states import state
 from tests.test_architecture import IMPORTS, Import, imports_in
 from tools import cli
 from tools.sim.centralised.control import CentralPlanner, PassThrough
@@ -30,7 +33,8 @@ from tools.sim.centralised.fleet import CONTROLS, SHIPPED, torques_only
 from tools.sim.lockstep import Lockstep
 
 ROOT = Path(__file__).resolve().parents[2]
-CYCLE_NS = 2 * NS_PER_MS
+
+
 TAU: Pair = (3.0, -41.0)
 
 
@@ -41,14 +45,9 @@ def run(
     delay_ms: float,
     plant: PlantConfig | None = None,
 ) -> list[SimTruth]:
-    fleet = CONTROLS[control](robot, scenario, Impairment(delay_ms=delay_ms), plant=plant)
-    rows = []
-    for row in fleet.run():
-        if row.scenario_s >= 0.0:
-            rows.append(row)
-        if row.fallen:
-            break
-    return rows
+    network, fleet_type = Impairment(delay_ms=delay_ms), CONTROLS[control]
+    how = {"network": network, "plant": plant, "stands": False, "fleet_type": fleet_type}
+    return runs.run(robot, scenario, **how).rows
 
 
 @pytest.fixture(scope="module")
@@ -84,81 +83,55 @@ def test_without_delay_it_does_what_the_distributed_control_does(
 
 
 @pytest.mark.parametrize(("control", "falls"), [("centralised", True), ("distributed", False)])
-def test_with_100_ms_each_way_it_falls_and_the_shipped_control_stands(
-    robot: RobotConfig, control: str, falls: bool
-) -> None:
-    late = Inject(link="all", at=0.05, delay_ms=100.0)
-    pushed = variant(
-        "squat", duration=2.5, kill=(), inject=(late,), push=(push(0.2, 40.0, 0.0, 0.0),)
-    )
-    assert run(control, robot, pushed, 0.0)[-1].fallen is falls
+def test_at_100_ms_only_the_shipped_stands(robot: RobotConfig, control: str, falls: bool) -> None:
+    late = (Inject(link="all", at=0.05, delay_ms=100.0),)
+    happens = {"kill": (), "inject": late, "push": (push(0.2, 40.0, 0.0, 0.0),)}
+    rows = run(control, robot, variant("squat", duration=2.5, **happens), 0.0)
+    assert rows[-1].fallen is falls
 
 
-class Bench:
+class Bench(ModuleBench):
     """One module that passes torques on; the joint stays where it is."""
 
     def __init__(self, robot: RobotConfig) -> None:
-        self.module = PassThrough(torques_only(robot), "knee_right")
-        self.gear_ratio = robot.joint.gear_ratio
-        self.now_ns = 1000 * NS_PER_S
-        self.seq = 0
-        self.status = DriveStatus.ARMED
-
-    def cycle(
-        self, tau: Pair | None = None, age_ns: int = 0, *, estop: bool = False
-    ) -> DriveAction:
-        """Run a cycle, with a command of this torque or with none."""
-        self.now_ns += CYCLE_NS
-        pos = motor_from_joint((0.02, -1.0), self.gear_ratio)
-        reading = DriveReading(self.now_ns, pos, (0.0, 0.0), self.status, 0)
-        sent = None
-        if tau is not None:
-            self.seq += 1
-            sent = command(
-                seq=self.seq,
-                echo_t_ns=self.now_ns - age_ns,
-                tau_ff=tau,
-                k_p=pd_law.ZERO,
-                k_d=pd_law.ZERO,
-            )
-        return self.module.step(self.now_ns, reading, sent, estop)
-
-    def to_passing(self) -> None:
-        """Arm, and let commands come until the blend into TRACK is over."""
-        self.status = DriveStatus.IDLE
+        super().__init__(
+            torques_only(robot), "service", make=lambda config, name, _: PassThrough(config, name)
+        )
         self.cycle()
-        self.status = DriveStatus.ARMED
-        for _ in range(400):
-            self.cycle(TAU)
+        for _ in range(400):  # until the blend into TRACK is over
+            self.passes(TAU)
         assert self.mode is Mode.TRACK
 
-    @property
-    def mode(self) -> Mode:
-        return self.module.controller.failsafe.mode
+    def passes(self, tau: Pair, age_ns: int = 0) -> DriveAction:
+        """Run a cycle with a command of this torque."""
+        self.seq += 1
+        now_ns = self.now_ns + self.cycle_ns - age_ns
+        law = {"tau_ff": tau, "k_p": pd_law.ZERO, "k_d": pd_law.ZERO}
+        return self.cycle(command(seq=self.seq, echo_t_ns=now_ns, **law))
 
     def torque_of(self, step: DriveAction) -> Pair:
         assert step.command is DriveCommand.TORQUE
-        return joint_torque(step.torque, self.gear_ratio)
+        return joint_torque(step.torque, self.ratio)
 
 
 @pytest.fixture
 def bench(robot: RobotConfig) -> Bench:
-    one = Bench(robot)
-    one.to_passing()
-    return one
+    return Bench(robot)
 
 
 def test_a_torque_goes_to_the_drive_unchanged_until_the_next_however_long(bench: Bench) -> None:
-    assert bench.torque_of(bench.cycle((5.0, -60.0))) == pytest.approx((5.0, -60.0))
+    assert bench.torque_of(bench.passes((5.0, -60.0))) == pytest.approx((5.0, -60.0))
     for _ in range(500):  # 1 s, where the shipped module holds after 50 ms
         step = bench.cycle()
         assert bench.torque_of(step) == pytest.approx((5.0, -60.0))
         assert step.event is None
     assert bench.mode is Mode.TRACK
+    step = bench.passes((math.nan, 0.0))
+    assert bench.torque_of(step) == pytest.approx((5.0, -60.0)), "what is no number is not passed"
 
 
 def test_a_torque_made_from_an_old_state_is_taken(bench: Bench) -> None:
-    step = bench.cycle((1.0, -2.0), age_ns=400 * NS_PER_MS)
+    step = bench.passes((1.0, -2.0), age_ns=400 * NS_PER_MS)
     assert bench.torque_of(step) == pytest.approx((1.0, -2.0))
     assert bench.module.controller.state(bench.now_ns).age_ns == 400 * NS_PER_MS
 
@@ -168,62 +141,37 @@ def test_a_torque_made_from_an_old_state_is_taken(bench: Bench) -> None:
 )
 def test_of_the_gate_the_torque_diamond_is_left(bench: Bench, asked: Pair, given: Pair) -> None:
     """In one cycle: no limit on its step."""
-    assert bench.torque_of(bench.cycle(asked)) == pytest.approx(given)
-
-
-def test_what_is_no_number_is_not_passed_on(bench: Bench) -> None:
-    bench.cycle((5.0, -60.0))
-    step = bench.cycle((float("nan"), 0.0))
-    assert bench.torque_of(step) == pytest.approx((5.0, -60.0))
+    assert bench.torque_of(bench.passes(asked)) == pytest.approx(given)
 
 
 def test_an_estop_and_a_lost_drive_are_as_shipped(robot: RobotConfig, bench: Bench) -> None:
     bench.cycle(estop=True)
     assert bench.mode is Mode.DAMP
     other = Bench(robot)
-    other.to_passing()
     other.status = DriveStatus.LOST
-    other.cycle(TAU)
+    other.passes(TAU)
     assert other.mode is Mode.FAULT
-    assert other.cycle(TAU).command is not DriveCommand.TORQUE
+    assert other.passes(TAU).command is not DriveCommand.TORQUE
 
 
-def states(robot: RobotConfig, now_ns: int, seq: int) -> list[JointState]:
-    """Return six states of a robot that stands on its feet, each joint moving."""
-    q = stand_pose(robot, 1.1)
-    tau = standing_torque(tuple(q))
-    fleet = Lockstep(robot, variant("stand"))
-    blank = [module.state(now_ns) for module in fleet.controllers]
-    return [
-        msgspec.structs.replace(
-            state,
-            t_ns=now_ns,
-            seq=seq,
-            q=(q[2 * i], q[2 * i + 1]),
-            v=(0.01 * i, -0.03 * i),
-            tau=(float(tau[2 * i]), float(tau[2 * i + 1])),
-            mode=int(Mode.TRACK),
-            ready=True,
-            session=1,
-            age_ns=2 * NS_PER_MS,
-        )
-        for i, state in enumerate(blank)
-    ]
+def receive(robot: RobotConfig, now_ns: int, seq: int, *planners: Planner) -> list[JointState]:
+    """Have planners receive six states of a robot that stands on its feet, each joint moving."""
+    q = np.array(stand_pose(robot, 1.1))
+    own = {"t_ns": now_ns, "session": 1, "age_ns": 2 * NS_PER_MS}
+    states = [state(i, q, seq, v=(0.01 * i, -0.03 * i), **own) for i in range(N_MODULES)]
+    for planner, (index, each) in itertools.product(planners, enumerate(states)):
+        planner.receive_state(index, each, now_ns)
+    return states
 
 
-def test_a_command_is_all_that_the_shipped_planner_asks_for_as_one_torque(
-    robot: RobotConfig,
-) -> None:
+def test_a_command_is_all_of_the_shipped_one_as_a_torque(robot: RobotConfig) -> None:
     shipped, central = Planner(robot, 1), CentralPlanner(robot, 1)
     now = NS_PER_S
     for seq in range(1, 4):
         now += 4 * NS_PER_MS
-        received = states(robot, now, seq)
-        for index, state in enumerate(received):
-            shipped.receive_state(index, state, now)
-            central.receive_state(index, state, now)
-        for state, whole, parts in zip(received, central.tick(now), shipped.tick(now), strict=True):
-            wanted = pd_law.torque(pd_law.extrapolate(parts, 0.0), state.q, state.v)
+        received = receive(robot, now, seq, shipped, central)
+        for seen, whole, parts in zip(received, central.tick(now), shipped.tick(now), strict=True):
+            wanted = pd_law.torque(pd_law.extrapolate(parts, 0.0), seen.q, seen.v)
             assert whole.tau_ff == pytest.approx(wanted, abs=1e-12)
             assert whole.k_p == whole.k_d == whole.tau_coupled == whole.dtau_ff == pd_law.ZERO
             assert whole.margin == whole.margin_onboard == 0.0
@@ -232,12 +180,9 @@ def test_a_command_is_all_that_the_shipped_planner_asks_for_as_one_torque(
 
 
 def test_once_it_leads_the_planner_leads_whatever_it_receives(robot: RobotConfig) -> None:
-    planners = Planner(robot, 1), CentralPlanner(robot, 1)
-    received = states(robot, NS_PER_S, 1)
     modes = []
-    for planner in planners:
-        for index, state in enumerate(received):
-            planner.receive_state(index, state, NS_PER_S)
+    for planner in (Planner(robot, 1), CentralPlanner(robot, 1)):
+        receive(robot, NS_PER_S, 1, planner)
         for tick in range(3):
             planner.tick(NS_PER_S + tick * 4 * NS_PER_MS)
         assert planner.status(NS_PER_S, 0.0).mode == PlannerMode.LEADING

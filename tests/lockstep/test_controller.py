@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -15,14 +15,13 @@ from services.planner.controller_file import controller_maker
 from services.planner.law.hocca import LawOutput
 from services.simulator.physics.plant import PlantConfig, changed
 from shared.bus import topics
-from shared.bus.messages import Message, Mode, PlannerMode, PlannerStatus
+from shared.bus.messages import Message, Mode, PlannerMode, SimTruth
 from shared.bus.topics import Topic
 from shared.config.robot_config import RobotConfig
-from shared.config.scenarios import Kill, Push
-from tests.lockstep.runs import still
+from tests.imu.robots import with_imu
+from tests.lockstep.runs import Run, kill, modes_of, push, run, still
 from tools.lab.studies.sweeps import plants
 from tools.sim.lockstep import Lockstep
-from tools.sim.standing_start import begin_standing
 
 LQR = Path(__file__).parents[2] / "examples" / "lqr_controller.py"
 
@@ -76,58 +75,48 @@ CHANGES: dict[str, Callable[[Observation, Action], Action]] = {
 }
 
 
+def fleet_of(
+    robot: RobotConfig, duration: float, change: Callable[[Observation, Action], Action] | None,
+    **how: Any,
+) -> Run:  # fmt: skip
+    """Run with a controller of one's own that changes the shipped law's action, or with none."""
+    controller = None if change is None else lambda: Own(change)
+    return run(robot, still(duration), controller=controller, **how)
+
+
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", CHANGES)
 def test_whatever_it_does_the_robot_stands(robot: RobotConfig, name: str) -> None:
-    fleet = Lockstep(robot, still(8.0), controller=lambda: Own(CHANGES[name]))
-    begin_standing(fleet)
-    for truth in fleet.run():
-        assert not truth.fallen, f"{truth.scenario_s:.2f} s"
-    assert abs(truth.over[0]) < 0.08
+    outcome = fleet_of(robot, 8.0, CHANGES[name])
+    assert outcome.stood
+    assert abs(outcome.rows[-1].over[0]) < 0.08
 
 
 def test_one_that_changes_nothing_is_the_shipped_law_to_the_last_bit(robot: RobotConfig) -> None:
-    def torques(controller: Callable[[], Own] | None) -> list[tuple[float, ...]]:
-        fleet = Lockstep(robot, still(1.5), controller=controller)
-        begin_standing(fleet)
-        return [truth.com for truth in fleet.run()]
-
-    assert torques(lambda: Own(lambda _, action: action)) == torques(None)
+    mine, shipped = (fleet_of(robot, 1.5, change) for change in (lambda _, action: action, None))
+    assert mine.com_mm.tolist() == shipped.com_mm.tolist()
 
 
 def test_one_that_raises_is_told_and_not_asked_again(robot: RobotConfig) -> None:
-    said: list[PlannerStatus] = []
-
-    def record(topic: Topic, _module: str, message: Message) -> None:
-        if topic is topics.PLANNER_STATUS and isinstance(message, PlannerStatus):
-            said.append(message)
-
-    fleet = Lockstep(robot, still(4.0), controller=lambda: Own(wrong), record=record)
-    begin_standing(fleet)
-    for _ in fleet.run():
-        pass
-    assert said[-1].mode == PlannerMode.UNCERTIFIED
-    assert said[-1].why == "the controller raised RuntimeError: lost"
-    assert all(one.failsafe.mode is Mode.HOLD for one in fleet.controllers)
+    outcome = fleet_of(robot, 4.0, wrong)
+    assert outcome.status.mode == PlannerMode.UNCERTIFIED
+    assert outcome.status.why == "the controller raised RuntimeError: lost"
+    assert set(outcome.modes) == {Mode.HOLD}
 
 
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("number", range(3))
-def test_the_lqr_of_the_examples_stands_through_pushes_and_the_kill_on_drawn_plants(
-    robot: RobotConfig, number: int
-) -> None:
+def test_the_examples_lqr_stands_through_pushes_and_kill(robot: RobotConfig, number: int) -> None:
     plant = plants.draw(f"lqr {number}") if number else PlantConfig()
-    pushes = tuple(Push(at=at, duration=0.3, force=(30.0, 0.0, 0.0)) for at in (0.5, 2.5))
-    scenario = still(4.0, push=pushes, kill=(Kill(service="planner", at=1.5),))
-    fleet = Lockstep(robot, scenario, plant=plant, controller=controller_maker(str(LQR), robot))
-    assert begin_standing(fleet)
-    led = 0
-    for truth in fleet.run():
-        assert not truth.fallen
-        led += truth.scenario_s < 1.5 and all(
-            one.failsafe.mode is Mode.TRACK for one in fleet.controllers
-        )
-    assert led > 140 or number, "on the realistic plant it leads until it is killed"
+    pushes = (push(0.5, 30.0, 0.0, 0.0), push(2.5, 30.0, 0.0, 0.0))
+    tracked: list[bool] = []
+
+    def look(fleet: Lockstep, row: SimTruth) -> None:
+        tracked.append(row.scenario_s < 1.5 and set(modes_of(fleet)) == {Mode.TRACK})
+
+    scenario, lqr = still(4.0, push=pushes, kill=kill(1.5)), controller_maker(str(LQR), robot)
+    assert run(robot, scenario, plant=plant, controller=lqr, each=look).stood
+    assert sum(tracked) > 140 or number, "on the realistic plant it leads until it is killed"
 
 
 def test_its_output_is_what_is_sent(robot: RobotConfig) -> None:
@@ -144,24 +133,15 @@ def test_its_output_is_what_is_sent(robot: RobotConfig) -> None:
         if topic is topics.JOINT_COMMAND and module == "knee_left":
             sent.append(message.tau_coupled)  # type: ignore[attr-defined]  # a command
 
-    fleet = Lockstep(robot, still(2.0), controller=lambda: Own(push_forward), record=record)
-    begin_standing(fleet)
-    for _ in fleet.run():
-        pass
+    fleet_of(robot, 2.0, push_forward, record=record)
     assert sent[-1][0] == outputs[-1].tau_coupled[8] + 0.25
 
 
 def test_on_a_slope_it_is_followed_as_on_the_level(robot: RobotConfig) -> None:
     """Where the COM is uphill of the ankles it is over them."""
-    imu = msgspec.structs.replace(robot.imu, fitted=True)
     plant = changed(PlantConfig(), {"floor.slope": [0.06, 0.0]})
-    fleet = Lockstep(
-        msgspec.structs.replace(robot, imu=imu), still(2.0), plant=plant,
-        controller=controller_maker(str(LQR), robot),
-    )  # fmt: skip
-    assert begin_standing(fleet)
-    rows = list(fleet.run())
-    assert not rows[-1].fallen
-    led = [one.failsafe.mode is Mode.TRACK for one in fleet.controllers]
-    assert all(led)
-    assert abs(rows[-1].com[0]) > 0.03, "it stands uphill of its ankles"
+    lqr = controller_maker(str(LQR), robot)
+    outcome = run(with_imu(robot), still(2.0), plant=plant, controller=lqr)
+    assert outcome.stood
+    assert set(outcome.modes) == {Mode.TRACK}
+    assert abs(outcome.rows[-1].com[0]) > 0.03, "it stands uphill of its ankles"

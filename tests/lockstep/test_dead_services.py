@@ -1,28 +1,109 @@
-"""Services that die and come back at a bad moment: falls that a wide search found, each once."""
+"""Services that are dead or come back: what each tier holds without the one above."""
 
 from __future__ import annotations
 
+import msgspec
+import numpy as np
 import pytest
 
-from shared.bus.messages import Mode
+from services.simulator.physics.plant import PlantConfig, changed
+from shared.bus.messages import Mode, SimTruth
 from shared.config.robot_config import RobotConfig
-from shared.config.scenarios import Kill, Push, Restart
+from shared.config.scenarios import Push
+from shared.exceptions import RunError
 from shared.joints import MODULES
-from tests.lockstep.runs import push, run, variant
+from tests.lockstep.runs import kill, push, restart, run, still, variant
 from tools.lab.studies.sweeps.figures import Ending, ending_of
+from tools.sim.lockstep import Lockstep
+
+# ---- no planner: the joint services hold
 
 
-def killed(at: float, *services: str) -> tuple[Kill, ...]:
-    return tuple(Kill(service=service, at=at) for service in services)
+def stand_without_planner(robot: RobotConfig, seconds: float) -> tuple[Lockstep, SimTruth]:
+    """Power up, let the hoist down, start the scenario after 2 s, go on."""
+    fleet = Lockstep(robot, still(seconds, push=(push(0.5, 30, 0, 0), push(1.5, 0, 30, 0))))
+    fleet.planner = None
+    for step in range(round(seconds / robot.simulation.timestep)):
+        fleet.advance()
+        if step == round(2.5 / robot.simulation.timestep):
+            fleet.world.start()
+    return fleet, fleet.world.truth(0, 1.0, 0.0)
+
+
+def test_the_robot_stands_through_pushes_with_no_planner_at_all(robot: RobotConfig) -> None:
+    fleet, truth = stand_without_planner(robot, 7.0)
+    assert truth.hoist == 0.0, "it must stand on its own feet"
+    assert not truth.fallen
+    assert truth.torso[2] > 1.1
+    assert max(truth.foot_left_tilt, truth.foot_right_tilt) < 0.02
+    assert all(controller.failsafe.mode is Mode.HOLD for controller in fleet.controllers)
+
+
+def test_which_way_a_motor_counts_is_not_seen_at_the_joint(robot: RobotConfig) -> None:
+    mirrored = tuple(
+        msgspec.structs.replace(module, motor_signs=(-1, 1 if "left" in module.name else -1))
+        for module in robot.module
+    )
+    # cogging and noise belong to a motor, whichever way it counts
+    quiet = changed(PlantConfig(), {"drivetrain.cogging": 0.0, "encoder.noise_counts": 0.0})
+    plain, signed = (
+        run(config, still(0.5), plant=quiet, stands=False)
+        for config in (robot, msgspec.structs.replace(robot, module=mirrored))
+    )
+    assert signed.stood
+    # an encoder's counts are rounded down, whichever way it counts: 0.8 mm of play and friction
+    np.testing.assert_allclose(signed.com_mm, plain.com_mm, atol=1.5)
+
+
+# ---- no joint service: the drives' own loops hold
+
+PUSHES = (push(3.6, 30.0, 0.0, 0.0), push(4.6, 0.0, 30.0, 0.0))
+
+
+@pytest.mark.parametrize("at", [0.4, 1.25, 2.5, 3.3])
+def test_all_six_dead_in_a_squat_stand_through_pushes(robot: RobotConfig, at: float) -> None:
+    result = run(robot, variant("squat", duration=7.0, kill=kill(at, *MODULES), push=PUSHES))
+    assert result.stood
+    assert np.abs(result.com_mm[result.t > at, :2]).max() < 80.0
 
 
 def test_all_six_dead_stand_through_two_pushes_in_step_with_the_sway(robot: RobotConfig) -> None:
     """With TRACK's gains left on the drives sway was hardly damped: 7 of 26 such pairs fell."""
     pushes = (push(0.354, -24.5, 31.6, 0.0), push(2.074, -2.3, 39.9, 0.0))
-    kills = killed(0.313, "planner", *MODULES)
-    result = run(robot, variant("squat", duration=4.5, kill=kills, push=pushes))
+    dead = kill(0.313, "planner", *MODULES)
+    result = run(robot, variant("squat", duration=4.5, kill=dead, push=pushes))
     assert result.stood
     assert abs(result.com_mm[:, :2]).max() < 45.0
+
+
+@pytest.mark.parametrize("module", ["ankle_left", "knee_right", "hip_left"])
+def test_a_dead_services_successor_leads_again(robot: RobotConfig, module: str) -> None:
+    """Taken over without a step: no module's torque jumps, and all six track in the end."""
+    dies = {"kill": kill(2.2, module), "restart": restart(5.0, module)}
+    result = run(robot, variant("squat", duration=7.5, push=PUSHES, **dies))
+    assert result.stood
+    assert set(result.modes) == {Mode.TRACK}
+    begun = result.lockstep.now_ns - 7.5e9  # what came before is the power-up
+    for _, event in result.lockstep.events:
+        step = np.abs(np.subtract(event.tau_after, event.tau_before)).max()
+        assert event.t_ns < begun or event.mode_before == Mode.DISARMED or step < 5.0
+
+
+def test_a_successor_carries_on_with_what_its_drive_carries(robot: RobotConfig) -> None:
+    dies = {"kill": kill(2.2, "knee_right"), "restart": restart(3.0, "knee_right")}
+    fleet = Lockstep(robot, variant("squat", duration=4.0, push=(), **dies))
+    torques = [
+        fleet.bank.torque[2:4].copy() for truth in fleet.run() if 2.9 < truth.scenario_s < 3.1
+    ]
+    assert np.abs(torques).max() > 1.5  # N m at the motor: it lifts against the operator
+    assert np.abs(np.diff(torques, axis=0)).max() < 0.3  # in 10 ms
+    _, taken_over = (
+        event
+        for module, event in fleet.events
+        if module == "knee_right" and event.mode_before == Mode.DISARMED
+    )
+    assert taken_over.tau_after == pytest.approx(taken_over.tau_before, abs=0.1)
+    assert {controller.failsafe.mode for controller in fleet.controllers} == {Mode.TRACK}
 
 
 @pytest.mark.parametrize(
@@ -45,34 +126,15 @@ def test_a_service_that_comes_back_while_all_hold_is_no_stiffer_than_they_are(
 ) -> None:
     """With stand gains on one, and a hand that leads on, one leg gave and the other did not."""
     name, dies, returns = back
-    scenario = variant(
-        "squat",
-        duration=5.2,
-        kill=(*killed(dies, name), *killed(away[1], away[0])),
-        restart=(Restart(service=name, at=returns),),
-        push=pushes,
-    )
-    result = run(robot, scenario)
+    kills = (*kill(dies, name), *kill(away[1], away[0]))
+    happens = {"kill": kills, "restart": restart(returns, name), "push": pushes}
+    result = run(robot, variant("squat", duration=5.2, **happens))
     assert ending_of(result.rows[-1], 5.2, robot) is Ending.STOOD
-    assert max(max(row.foot_left_tilt, row.foot_right_tilt) for row in result.rows) < 0.03
+    assert result.tilt < 0.03
 
 
-def test_a_service_that_comes_back_takes_its_drive_over_without_a_step(robot: RobotConfig) -> None:
-    """In the middle of the squat, while five hold."""
-    scenario = variant(
-        "squat",
-        duration=2.0,
-        kill=killed(1.2, "knee_left"),
-        restart=(Restart(service="knee_left", at=1.5),),
-        push=(),
-    )
-    result = run(robot, scenario, stands=False)
-    taken = [
-        event
-        for module, event in result.lockstep.events
-        if module == "knee_left" and event.mode_before == Mode.DISARMED
-    ]
-    assert len(taken) == 2, "at power-up, and as it came back"
-    carried = result.lockstep.controllers[MODULES.index("knee_right")].tau
-    assert taken[1].tau_after[1] == pytest.approx(carried[1], abs=15.0), "what the other one has"
-    assert result.lockstep.controllers[MODULES.index("knee_left")].failsafe.mode is Mode.TRACK
+def test_with_torques_only_a_dead_service_cannot_be_run(robot: RobotConfig) -> None:
+    service = msgspec.structs.replace(robot.joint_service, loop="service")
+    torques_only = msgspec.structs.replace(robot, joint_service=service)
+    with pytest.raises(RunError, match="only the planner"):
+        Lockstep(torques_only, variant("squat", kill=kill(1.0, "knee_left"), restart=()))

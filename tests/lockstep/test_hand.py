@@ -50,9 +50,7 @@ def test_the_robot_follows_the_hand_that_is_led_and_is_pushed_by_it(run_of_a_per
     assert fastest < 2.0 * HEIGHT_MAX_RATE * 0.01
 
 
-def test_the_same_path_again_is_the_same_run_bit_for_bit(
-    run_of_a_person: Path, tmp_path: Path
-) -> None:
+def test_the_same_path_is_the_same_run(run_of_a_person: Path, tmp_path: Path) -> None:
     log = read_run(run_of_a_person)
     assert [row.at for row in hand_path(log)] == pytest.approx([0.2, 0.5, 1.7], abs=0.002)
     scenario = run_of_a_person.parent / "scenario.toml"
@@ -63,9 +61,7 @@ def test_the_same_path_again_is_the_same_run_bit_for_bit(
         assert again.messages(topic) == log.messages(topic)
 
 
-def test_a_moment_of_it_has_the_hand_and_what_follows_is_led_on(
-    robot: RobotConfig, run_of_a_person: Path
-) -> None:
+def test_a_moment_of_it_has_the_hand(robot: RobotConfig, run_of_a_person: Path) -> None:
     log = read_run(run_of_a_person)
     state = next(row for row in log.messages(topics.SIM_STATE) if row.scenario_s >= 1.0)
     assert state.hand[0] == 1.0, "somebody leads"

@@ -12,13 +12,10 @@ from typing import Any
 import pytest
 
 from services.simulator.physics.plant import PlantConfig, changed
-from shared.bus.messages import PlannerMode, PlannerStatus, Trip
-from shared.config.impairment import Impairment
+from shared.bus.messages import PlannerMode, SimTruth, Trip
 from shared.config.robot_config import RobotConfig
-from shared.config.scenarios import Keyframe
-from tests.lockstep.runs import variant
+from tests.lockstep.runs import Run, led_to, run, status_of, variant
 from tools.sim.lockstep import Lockstep
-from tools.sim.standing_start import begin_standing
 
 LET_GO_S = 3.0
 
@@ -27,27 +24,22 @@ REFUSED_ROWS = 600
 """Of the simulated world, which is seen at 100 Hz: 6 s."""
 
 
-def run(
+def let_go(
     robot: RobotConfig, errors: dict[str, Any], height: float = 1.1, let_go_s: float = LET_GO_S
-) -> tuple[Lockstep, list[tuple[float, float, float]]]:
-    """Return the fleet after 8 s, and (time, torso's height, pitch) from letting go on."""
-    frames = (Keyframe(at=0.0, height=1.188), Keyframe(at=2.0, height=height))
-    scenario = variant("stand", duration=8.0, keyframe=frames, kill=(), push=())
-    plant = changed(PlantConfig(), errors)
-    fleet = Lockstep(robot, scenario, Impairment(delay_ms=1.0), plant=plant)
-    assert begin_standing(fleet)
-    poses = []
-    for row in fleet.run():
-        assert not row.fallen
+) -> tuple[Run, list[float], list[float]]:
+    """Return the run of 8 s, and the torso's heights and pitches from letting go on."""
+    heights, pitches = [], []
+
+    def look(fleet: Lockstep, row: SimTruth) -> None:
         if row.scenario_s >= let_go_s:
             fleet.world.let_go()
-            poses.append((row.scenario_s, row.torso[2], row.angles[1]))
-    return fleet, poses
+            heights.append(row.torso[2])
+            pitches.append(row.angles[1])
 
-
-def status_of(fleet: Lockstep) -> PlannerStatus:
-    assert fleet.planner is not None
-    return fleet.planner.status(fleet.now_ns, 0.0)
+    plant = changed(PlantConfig(), errors)
+    outcome = run(robot, led_to((2.0, height), duration=8.0), plant=plant, each=look)
+    assert outcome.stood
+    return outcome, heights, pitches
 
 
 def not_led(robot: RobotConfig, errors: dict[str, Any]) -> tuple[Lockstep, list[float]]:
@@ -77,24 +69,15 @@ def not_led(robot: RobotConfig, errors: dict[str, Any]) -> tuple[Lockstep, list[
 def test_let_go_of_it_stays(
     robot: RobotConfig, height: float, errors: dict[str, Any], kg: float
 ) -> None:
-    fleet, poses = run(robot, errors, height)
-    heights, pitches = [z for _, z, _ in poses], [pitch for _, _, pitch in poses]
+    outcome, heights, pitches = let_go(robot, errors, height)
     assert max(heights) - min(heights) < 0.12
     assert max(map(abs, pitches)) < 1.1
-    status = status_of(fleet)
-    assert status.trip == Trip.UNATTENDED
-    assert status.load[0] == pytest.approx(kg, abs=0.7)
-
-
-def test_a_load_too_far_back_is_not_led(robot: RobotConfig) -> None:
-    fleet, _ = not_led(robot, {"body.com_offset": [-0.05, 0.0, 0.1]})
-    assert "lies too far behind" in status_of(fleet).why
+    assert outcome.status.trip == Trip.UNATTENDED
+    assert outcome.status.load[0] == pytest.approx(kg, abs=0.7)
 
 
 @pytest.mark.parametrize("scale", [0.0, 0.3])
-def test_without_its_payload_it_holds_as_the_hoist_lets_go(
-    robot: RobotConfig, scale: float
-) -> None:
+def test_without_its_payload_it_is_not_led(robot: RobotConfig, scale: float) -> None:
     """Led on the hoist, it rose by 0.1 m to straight legs, where torques tell nothing."""
     fleet, heights = not_led(robot, {"body.payload_scale": scale})
     assert max(heights) - min(heights) < 0.01
@@ -102,20 +85,30 @@ def test_without_its_payload_it_holds_as_the_hoist_lets_go(
 
 
 def test_with_nothing_amiss_it_is_led_on_and_stays_too(robot: RobotConfig) -> None:
-    fleet, poses = run(robot, {})
-    assert max(z for _, z, _ in poses) - min(z for _, z, _ in poses) < 0.01
-    assert status_of(fleet).mode == PlannerMode.LEADING
+    outcome, heights, _ = let_go(robot, {})
+    assert max(heights) - min(heights) < 0.01
+    assert outcome.status.mode == PlannerMode.LEADING
 
 
-@pytest.mark.parametrize("scale", [0.5, 1.5])
-def test_half_a_payload_too_much_or_too_little_is_not_led(robot: RobotConfig, scale: float) -> None:
+@pytest.mark.parametrize(
+    ("errors", "words"),
+    [
+        ({"body.com_offset": [-0.05, 0.0, 0.1]}, "lies too far behind"),
+        ({"body.payload_scale": 0.5}, "kg less than its file says"),
+        ({"body.payload_scale": 1.5}, "kg more than its file says"),
+    ],
+)
+def test_half_a_payload_too_much_or_too_little_or_too_far_back_is_not_led(
+    robot: RobotConfig, errors: dict[str, Any], words: str
+) -> None:
     """It went to straight legs, or to the knees' stop, at 0.4 m/s."""
-    fleet, _ = not_led(robot, {"body.payload_scale": scale})
+    fleet, _ = not_led(robot, errors)
     status = status_of(fleet)
-    assert status.load[0] == pytest.approx((scale - 1.0) * robot.mass.payload, abs=1.0)
-    assert f"kg {'more' if scale > 1.0 else 'less'} than its file says" in status.why
+    if scale := errors.get("body.payload_scale"):
+        assert status.load[0] == pytest.approx((scale - 1.0) * robot.mass.payload, abs=1.0)
+    assert words in status.why
 
 
 def test_a_hand_that_comes_back_leads_again(robot: RobotConfig) -> None:
-    fleet, _ = run(robot, {"body.payload_scale": 1.2}, let_go_s=math.inf)
-    assert status_of(fleet).mode == PlannerMode.LEADING
+    outcome, *_ = let_go(robot, {"body.payload_scale": 1.2}, let_go_s=math.inf)
+    assert outcome.status.mode == PlannerMode.LEADING

@@ -13,19 +13,21 @@ from services.joint.envelope import Envelope
 from services.joint.failsafe import Failsafe
 from services.planner.watch.trips import PlannerTrips
 from services.simulator.physics.plant import PlantConfig, changed
-from shared.bus.messages import Cause, Outside, PlannerMode
+from shared.bus.messages import Cause, Outside, PlannerMode, SimTruth
 from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Keyframe, Push, Scenario
 from shared.robot.trip_table import JOINT_TRIPS
-from tests.lockstep.runs import kill, push, restart, variant
+from tests.lockstep.runs import Run, corner, kill, push, restart, run, variant
 from tools.lab.studies.sweeps import plants
 from tools.lab.studies.sweeps.push_range import PushRange
 from tools.sim.lockstep import Lockstep
 from tools.sim.network import BASE
-from tools.sim.standing_start import begin_standing
 
-DOWN = (Keyframe(at=0.0, height=1.188), Keyframe(at=1.5, height=0.95))
+DOWN = {
+    "duration": 4.0,
+    "keyframe": (Keyframe(at=0.0, height=1.188), Keyframe(at=1.5, height=0.95)),
+}
 
 
 class Judged:
@@ -65,36 +67,32 @@ def judged(monkeypatch: pytest.MonkeyPatch) -> Judged:
     return Judged(monkeypatch)
 
 
-def run(
-    robot: RobotConfig, told: Scenario, network: Impairment, plant: PlantConfig | None = None
-) -> Lockstep:
-    fleet = Lockstep(robot, told, network, plant=plant)
-    if network == BASE:
-        begin_standing(fleet)
-    for row in fleet.run():
-        assert not row.fallen
-    return fleet
+def led(
+    judged: Judged, robot: RobotConfig, scenario: Scenario, network: Impairment = BASE,
+    plant: PlantConfig | None = None,
+) -> Run:  # fmt: skip
+    """Run; assert that it never falls and that everything is believed."""
 
+    def look(_fleet: Lockstep, row: SimTruth) -> None:
+        assert not row.fallen, f"{row.scenario_s:.2f} s"  # on a bad network it may never begin
 
-def believed(judged: Judged) -> None:
+    outcome = run(robot, scenario, network=network, plant=plant, each=look)
     assert judged.leading > 500, "there was something to believe"
     assert judged.outside == {}
     assert judged.tripped == []
+    return outcome
 
 
 @pytest.mark.parametrize("name", ["squat", "crawl"])
 def test_while_the_hand_leads(robot: RobotConfig, judged: Judged, name: str) -> None:
     pushes = (push(1.0, 0.0, 40.0, 0.0), push(2.0, 40.0, 0.0, 0.0))
-    run(robot, variant(name, duration=5.0, kill=(), push=pushes), Impairment(delay_ms=1.0))
-    believed(judged)
+    led(judged, robot, variant(name, duration=5.0, kill=(), push=pushes))
 
 
 def test_through_a_killed_planner_and_its_successor(robot: RobotConfig, judged: Judged) -> None:
-    scenario = variant("squat", duration=5.0, kill=kill(1.0), restart=restart(1.6), push=())
-    fleet = run(robot, scenario, Impairment(delay_ms=1.0))
-    believed(judged)
-    assert fleet.planner is not None
-    assert fleet.planner.status(fleet.now_ns, 0.0).mode == PlannerMode.LEADING
+    restarted = {"kill": kill(1.0), "restart": restart(1.6), "push": ()}
+    outcome = led(judged, robot, variant("squat", duration=5.0, **restarted))
+    assert outcome.status.mode == PlannerMode.LEADING
 
 
 @pytest.mark.sampled(2)
@@ -108,9 +106,7 @@ def test_through_a_killed_planner_and_its_successor(robot: RobotConfig, judged: 
     ids=lambda network: f"{network.delay_ms:g}-{network.jitter_ms:g}-{network.loss:g}",
 )
 def test_over_a_bad_network(robot: RobotConfig, judged: Judged, network: Impairment) -> None:
-    scenario = variant("stand", duration=4.0, keyframe=DOWN, push=(push(1.0, 0.0, 40.0, 0.0),))
-    run(robot, scenario, network)
-    believed(judged)
+    led(judged, robot, variant("stand", push=(push(1.0, 0.0, 40.0, 0.0),), **DOWN), network)
 
 
 @pytest.mark.sampled(2)
@@ -118,10 +114,8 @@ def test_over_a_bad_network(robot: RobotConfig, judged: Judged, network: Impairm
 def test_at_the_corners_of_a_lean(
     robot: RobotConfig, judged: Judged, signs: tuple[int, ...]
 ) -> None:
-    x, y, roll, yaw = (sign * most for sign, most in zip(signs, robot.law.shift_max, strict=True))
-    leans = (*DOWN, Keyframe(at=3.0, height=1.05, shift=(x, y, roll, yaw)))
-    run(robot, variant("stand", duration=4.0, keyframe=leans, push=()), Impairment(delay_ms=1.0))
-    believed(judged)
+    leans = (*DOWN["keyframe"], Keyframe(at=3.0, height=1.05, shift=corner(robot, signs)))
+    led(judged, robot, variant("stand", duration=4.0, keyframe=leans, push=()))
 
 
 @pytest.mark.sampled(2)
@@ -130,22 +124,16 @@ def test_at_the_corners_of_a_stance(
     robot: RobotConfig, judged: Judged, right: tuple[float, float, float]
 ) -> None:
     plant = changed(PlantConfig(), {"feet.offset_right": list(right)})
-    scenario = variant("stand", duration=4.0, keyframe=DOWN, push=())
-    run(robot, scenario, Impairment(delay_ms=1.0), plant)
-    believed(judged)
+    led(judged, robot, variant("stand", push=(), **DOWN), plant=plant)
 
 
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("number", range(4))
-def test_on_drawn_plants_under_pushes_of_three_quarters_of_the_physical_limit(
-    robot: RobotConfig, judged: Judged, number: int
-) -> None:
-    pushes = PushRange(robot)
-    angles = (0.0, math.pi, math.pi / 2, -2.0)
-    hard: tuple[Push, ...] = (pushes.push(2.0, 0.3, 0.75, angles[number]),)
-    scenario = variant("stand", duration=4.5, keyframe=DOWN, push=hard)
-    run(robot, scenario, Impairment(delay_ms=5.0), plants.draw(f"right planner {number}"))
-    believed(judged)
+def test_on_drawn_plants_pushed_hard(robot: RobotConfig, judged: Judged, number: int) -> None:
+    angle = (0.0, math.pi, math.pi / 2, -2.0)[number]
+    hard = (PushRange(robot).push(2.0, 0.3, 0.75, angle),)
+    scenario = variant("stand", **(DOWN | {"duration": 4.5, "push": hard}))
+    led(judged, robot, scenario, Impairment(delay_ms=5.0), plants.draw(f"right planner {number}"))
 
 
 @pytest.mark.sampled(2)
@@ -155,20 +143,11 @@ def test_held_off_centre_it_is_believed_and_leads_again(
 ) -> None:
     """Cut off as a push has moved it, it holds there; led again it begins from the middle."""
     x, y = (50.0 * part for part in direction)
-    scenario = variant(
-        "stand",
-        duration=7.0,
-        push=(Push(at=0.5, duration=0.4, force=(x, y, 0.0)),),
-        inject=(Inject(link="planner->joints", at=0.8, partition=True, duration=1.0),),
-    )
-    fleet = Lockstep(robot, scenario, Impairment(delay_ms=1.0))
-    held = []
-    for row in fleet.run():
-        assert not row.fallen
-        if 0.85 < row.scenario_s < 1.8:
-            held.append(np.hypot(*row.com[:2]))
-    assert max(held) > 0.02, "it was off centre"
-    believed(judged)
-    assert fleet.planner is not None
-    assert fleet.planner.status(fleet.now_ns, 0.0).mode == PlannerMode.LEADING
-    assert np.hypot(*fleet.world.truth(0, 1.0, 0.0).com[:2]) < 0.01
+    pushed = (Push(at=0.5, duration=0.4, force=(x, y, 0.0)),)
+    cut = (Inject(link="planner->joints", at=0.8, partition=True, duration=1.0),)
+    outcome = led(judged, robot, variant("stand", duration=7.0, push=pushed, inject=cut))
+    away_mm = np.hypot(outcome.com_mm[:, 0], outcome.com_mm[:, 1])
+    held = (outcome.t > 0.85) & (outcome.t < 1.8)
+    assert away_mm[held].max() > 20.0, "it was off centre"
+    assert outcome.status.mode == PlannerMode.LEADING
+    assert away_mm[-1] < 10.0

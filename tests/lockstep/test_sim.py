@@ -1,19 +1,27 @@
-"""`xrl sim`: the verb around lockstep."""
+"""`xrl sim`, the verb around lockstep; and runs that are the same to the last bit."""
 
 from __future__ import annotations
 
+import itertools
 import json
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from shared.bus import topics
-from shared.bus.messages import PlannerStatus
+from shared.bus.messages import PlannerStatus, SimTruth
 from shared.clock import NS_PER_S
+from shared.config.impairment import Impairment
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Fault, Scenario
 from shared.joints import MODULES
+from tests.lockstep.runs import kill, push, restart, still
 from tools import cli
 from tools.logs.run_log import read_run
 from tools.sim import lockstep
+from tools.sim.standing_start import begin_standing
 
 NOT_HERE = (topics.ATTITUDE, topics.OPERATOR_INTENT, topics.TOOLS)
 """Periodic topics that a run in virtual time does not have: no IMU is fitted, the scenario requests
@@ -24,17 +32,24 @@ def sim(out: Path, *flags: str) -> int:
     return cli.main(["sim", "--out", str(out), *flags])
 
 
+def statuses_of(out: Path) -> list[PlannerStatus]:
+    return read_run(out / "run.mcap").messages(topics.PLANNER_STATUS)
+
+
+def summary_of(out: Path) -> dict[str, Any]:
+    return dict(json.loads((out / "summary.json").read_text()))
+
+
 def test_a_run_is_recorded_judged_and_drawn(tmp_path: Path) -> None:
     flags = ("--duration", "3", "--kill", "planner@1", "--restart", "planner@1.6")
     assert sim(tmp_path, *flags) == 0
-    summary = json.loads((tmp_path / "summary.json").read_text())
+    summary = summary_of(tmp_path)
     assert summary["stood"] is True
     assert summary["reengage_s"] < 1.5
     assert max(summary["handover_ms"].values()) <= 55.0
     assert (tmp_path / "run.png").stat().st_size > 20_000
+    assert len({status.session for status in statuses_of(tmp_path)}) == 2
     log = read_run(tmp_path / "run.mcap")
-    statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
-    assert len({status.session for status in statuses}) == 2
     lacking = {
         topic.name
         for topic in topics.TOPICS
@@ -47,10 +62,8 @@ def test_a_run_is_recorded_judged_and_drawn(tmp_path: Path) -> None:
 def test_a_frozen_planner_goes_on_in_its_session(tmp_path: Path) -> None:
     flags = ("--duration", "3", "--kill", "planner@1:STOP", "--restart", "planner@1.6")
     assert sim(tmp_path, *flags) == 0
-    log = read_run(tmp_path / "run.mcap")
-    statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
-    assert len({status.session for status in statuses}) == 1
-    assert json.loads((tmp_path / "summary.json").read_text())["reengage_s"] < 1.5
+    assert len({status.session for status in statuses_of(tmp_path)}) == 1
+    assert summary_of(tmp_path)["reengage_s"] < 1.5
 
 
 def test_the_same_seed_gives_the_same_log(tmp_path: Path) -> None:
@@ -66,16 +79,14 @@ def test_the_same_seed_gives_the_same_log(tmp_path: Path) -> None:
     assert states[0] != states[2]
 
 
-def test_a_lean_that_was_asked_for_is_not_judged_as_an_excursion_and_comes_out_again(
-    tmp_path: Path,
-) -> None:
+def test_a_lean_that_was_asked_for_is_no_excursion_and_comes_out_again(tmp_path: Path) -> None:
     """`xrl log resim` hears what was asked from the record."""
     assert sim(tmp_path, "--scenario", "shift", "--duration", "2.5", "--kill", "planner@2.4") == 0
-    summary = json.loads((tmp_path / "summary.json").read_text())
+    summary = summary_of(tmp_path)
     assert summary["com_y_max_mm"] > 35.0
     assert summary["alive_com_y_max_mm"] < 10.0
-    statuses: list[PlannerStatus] = read_run(tmp_path / "run.mcap").messages(topics.PLANNER_STATUS)
-    assert max(status.shift_requested[1] for status in statuses) == pytest.approx(0.04, abs=1e-4)
+    asked = max(status.shift_requested[1] for status in statuses_of(tmp_path))
+    assert asked == pytest.approx(0.04, abs=1e-4)
     assert cli.main(["log", "resim", str(tmp_path), "--service", "planner"]) == 0
 
 
@@ -103,3 +114,25 @@ def test_a_stance_that_is_not_led_is_reported_in_words(
     output = capsys.readouterr().err
     assert "the planner did not lead" in output
     assert "ahead of the left" in output
+
+
+CALM = still(1.5, height=1.1, push=(push(0.2, 20.0, 10.0, 0.0),))
+BROWN_OUT = Fault(module="hip_left", kind="brown_out", at=1.2)
+HARD = still(1.5, height=1.0, kill=kill(0.4), restart=restart(0.9), fault=(BROWN_OUT,))
+
+
+def test_two_robots_side_by_side_run_as_each_alone_to_the_last_bit(robot: RobotConfig) -> None:
+    """Twelve joint services and two planners in one process: neither knows of the other."""
+
+    def rows_of(scenario: Scenario, seed: int) -> Iterator[SimTruth]:
+        network = Impairment(delay_ms=2.0, jitter_ms=1.0, loss=0.01)
+        fleet = lockstep.Lockstep(robot, scenario, network, seed=seed)
+        assert begin_standing(fleet)
+        return fleet.run()
+
+    alone = [list(rows_of(CALM, 1)), list(rows_of(HARD, 2))]
+    pairs = list(itertools.zip_longest(rows_of(CALM, 1), rows_of(HARD, 2)))
+    together = [[row for row in rows if row is not None] for rows in zip(*pairs, strict=True)]
+    assert together == alone
+    assert all(rows[-1].scenario_s > 1.4 and not rows[-1].fallen for rows in together)
+    assert together[0][-1].com != together[1][-1].com

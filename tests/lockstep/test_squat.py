@@ -1,4 +1,4 @@
-"""The paper's experiment in virtual time: claims about physics, free of the machine's noise."""
+"""The paper's experiment and the crawl in virtual time: physics, free of the machine's noise."""
 
 from __future__ import annotations
 
@@ -9,12 +9,18 @@ import pytest
 from shared.bus.messages import Cause, Mode
 from shared.config.robot_config import RobotConfig
 from tests.lockstep.runs import Run, kill, push, restart, run, still, variant
+from tools.sim.lockstep import Lockstep
 
 
 @pytest.fixture(scope="module")
 def squat(robot: RobotConfig) -> Run:
     """The whole of Fig. 7: two squats, the planner killed at 10 s, three pushes."""
     return run(robot, variant("squat"))
+
+
+@pytest.fixture(scope="module")
+def crawl(robot: RobotConfig) -> Run:
+    return run(robot, variant("crawl"))
 
 
 def test_the_robot_balances_while_the_operator_leads_two_squats(squat: Run) -> None:
@@ -41,8 +47,7 @@ def test_the_robot_stands_through_pushes_with_the_planner_dead(squat: Run) -> No
 
 
 def test_all_six_modules_hold_within_the_command_age_of_the_kill(squat: Run) -> None:
-    controllers = squat.lockstep.controllers
-    assert all(controller.failsafe.mode is Mode.HOLD for controller in controllers)
+    assert set(squat.modes) == {Mode.HOLD}
     into_hold = [e for _, e in squat.lockstep.events if e.cause == Cause.COMMAND_STALE]
     assert len(into_hold) == 6
     start_ns = squat.rows[0].t_ns - round(squat.rows[0].scenario_s * 1e9)
@@ -57,37 +62,25 @@ def test_handing_over_makes_no_torque_step(squat: Run) -> None:
             assert np.abs(np.subtract(event.tau_after, event.tau_before)).max() <= 5.0
 
 
-def test_the_feet_stay_where_they_are_however_often_it_squats(squat: Run) -> None:
+def test_the_feet_stay_flat_and_where_they_are_however_often_it_squats(squat: Run) -> None:
     """They crept back by 1.9 mm a squat: MuJoCo's contacts leave out dJ/dt v."""
-    alive = squat.t < 10.0
-    slip_mm = 1e3 * np.array([row.feet_slip for row in squat.rows])[alive]
-    assert slip_mm[-1] - slip_mm[0] < 0.6
-
-
-def test_the_soles_stay_flat(squat: Run) -> None:
     alive = [row for row in squat.rows if row.scenario_s < 10.0]
-    assert max(max(row.foot_left_tilt, row.foot_right_tilt) for row in alive) <= 0.005
-
-
-def test_runs_are_bit_identical(robot: RobotConfig) -> None:
-    first, second = (run(robot, still(1.0, push=(push(0.2, 20, 10, 0),))) for _ in range(2))
-    assert first.rows == second.rows
+    assert 1e3 * (alive[-1].feet_slip - alive[0].feet_slip) < 0.6
+    assert Run(squat.lockstep, alive).tilt <= 0.005
 
 
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("at", [0.7, 1.3, 2.5, 3.9])
 def test_the_robot_stands_whenever_the_planner_dies(robot: RobotConfig, at: float) -> None:
     pushes = (push(at + 0.5, 40, 0, 0), push(at + 1.5, 0, -40, 0))
-    outcome = run(robot, variant("squat", duration=at + 3.0, kill=kill(at), push=pushes))
-    assert outcome.stood
+    assert run(robot, variant("squat", duration=at + 3.0, kill=kill(at), push=pushes)).stood
 
 
 def test_a_restarted_planner_takes_over_without_a_step(robot: RobotConfig) -> None:
-    outcome = run(
-        robot, variant("squat", duration=8.0, kill=kill(2.2), restart=restart(4.0), push=())
-    )
+    restarted = {"kill": kill(2.2), "restart": restart(4.0), "push": ()}
+    outcome = run(robot, variant("squat", duration=8.0, **restarted))
     assert outcome.stood
-    assert all(c.failsafe.mode is Mode.TRACK for c in outcome.lockstep.controllers)
+    assert set(outcome.modes) == {Mode.TRACK}
     assert all(c.failsafe.dropouts.count == 1 for c in outcome.lockstep.controllers)
     for _, event in outcome.lockstep.events:
         step = np.abs(np.subtract(event.tau_after, event.tau_before)).max()
@@ -95,12 +88,8 @@ def test_a_restarted_planner_takes_over_without_a_step(robot: RobotConfig) -> No
 
 
 def test_a_plain_average_of_the_legs_tips_the_soles(robot: RobotConfig) -> None:
-    averaged = msgspec.structs.replace(
-        robot, law=msgspec.structs.replace(robot.law, jacobian="average", split="diagonal")
-    )
-    from tools.sim.lockstep import Lockstep  # noqa: PLC0415
-
-    world = Lockstep(averaged, still(5.0))
+    law = msgspec.structs.replace(robot.law, jacobian="average", split="diagonal")
+    world = Lockstep(msgspec.structs.replace(robot, law=law), still(5.0))
     tilt = 0.0
     for _ in range(1200):
         world.advance()
@@ -114,3 +103,43 @@ def test_a_plain_average_of_the_legs_tips_the_soles(robot: RobotConfig) -> None:
 def test_the_robot_stands_at_any_delay_of_the_bus(robot: RobotConfig, delay_ms: float) -> None:
     scenario = variant("squat", duration=5.0, kill=(), push=(push(2.0, 40, 0, 0),))
     assert run(robot, scenario, delay_ms).stood
+
+
+# ---- the crawl under assist
+
+
+def test_the_robot_goes_down_to_crawling_and_back(crawl: Run) -> None:
+    assert crawl.stood
+    assert min(row.torso[2] for row in crawl.rows) < 0.82
+    assert crawl.angles[:, 1].max() > 1.15
+    assert crawl.rows[-1].torso[2] > 1.15
+
+
+def test_balance_is_kept_under_full_assist(crawl: Run) -> None:
+    assert np.abs(crawl.com_mm[:, 0]).max() <= 10.0
+    assert np.abs(crawl.com_mm[:, 1]).max() <= 5.0
+
+
+def test_the_assist_carries_the_operators_weight(crawl: Run) -> None:
+    holding = [row for row in crawl.rows if 7.0 < row.scenario_s < 9.9]
+    rested = 0.9 * 200.0  # of what he asked for: the realistic plant's person
+    assert all(row.load_n == pytest.approx(rested, abs=0.1) for row in holding)
+    given = np.mean([row.harness_force_z for row in holding])
+    assert given == pytest.approx(200.0, abs=10.0)
+
+
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize("at", [3.5, 8.0])
+def test_the_robot_stands_if_the_planner_dies_in_the_crawl(robot: RobotConfig, at: float) -> None:
+    outcome = run(robot, variant("crawl", duration=at + 3.0, kill=kill(at)))
+    assert outcome.stood
+    assert set(outcome.modes) == {Mode.HOLD}
+
+
+def test_the_ankles_hold_against_an_operator_who_pulls_himself_up(robot: RobotConfig) -> None:
+    """With the gains frozen as they were, the soles tipped at 13 s of this run."""
+    outcome = run(robot, variant("crawl", duration=15.5, kill=kill(8.0)))
+    assert outcome.stood
+    hold = outcome.t >= 8.0
+    assert np.abs(outcome.operator_n[hold]).max() == pytest.approx(150.0), "he must pull"
+    assert np.abs(outcome.com_mm[hold, 0]).max() <= 40.0

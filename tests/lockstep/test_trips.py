@@ -10,82 +10,73 @@ import math
 from itertools import pairwise
 from typing import Any
 
-import msgspec
 import pytest
 
 from services.simulator.physics.plant import PlantConfig, changed
-from shared.bus.messages import Cause, Mode, PlannerMode, PlannerStatus, Trip
+from shared.bus.messages import Cause, Mode, PlannerMode, PlannerStatus, SimTruth, Trip
 from shared.clock import NS_PER_S
-from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
-from shared.config.scenarios import Keyframe, Push, Scenario
+from shared.config.scenarios import Keyframe, Scenario
 from shared.robot.trip_table import JOINT_TRIPS, untripped
-from tests.lockstep.runs import still, variant
+from tests.lockstep.runs import Heard, Run, push, run, still, variant
 from tools.lab.studies.sweeps.trips_trial import PLANTS, unfiltered
-from tools.sim.lockstep import Lockstep, forget
-from tools.sim.standing_start import begin_standing
-from tools.sim.virtual_time import Record
+from tools.sim.lockstep import Lockstep
 
 RESTS_TWICE = changed(PlantConfig(), {"person.load_scale": 2.0})
+PUSHED = (push(3.0, 40.0, 0.0, 0.0),)
+
+
 SHAKEN = [name for name in PLANTS if name != "rigid"]
 
 
-def run(
+def trip_run(
     robot: RobotConfig,
     told: Scenario,
-    plant: PlantConfig,
+    plant: PlantConfig | None = None,
     *,
-    record: Record = forget,
     let_go_s: float = math.inf,
-    delay_ms: float = 1.0,
-    from_hoist: bool = False,
     until_s: float = math.inf,
-) -> tuple[Lockstep, list[float], bool]:
-    """Run to the end, to `until_s` of virtual time or a fall.
+    **how: Any,
+) -> tuple[Run, list[float]]:
+    """Run to the end, to `until_s` of virtual time or a fall; return heights from 1 s on too."""
+    heights: list[float] = []
 
-    Returns:
-        The fleet, heights from 1 s of the scenario on, and whether it fell.
-    """
-    fleet = Lockstep(robot, told, Impairment(delay_ms=delay_ms), plant=plant, record=record)
-    if not from_hoist:
-        assert begin_standing(fleet)
-    heights = []
-    for row in fleet.run():
+    def look(fleet: Lockstep, row: SimTruth) -> bool:
         if row.scenario_s > 1.0:
             heights.append(row.torso[2])
         if row.scenario_s >= let_go_s:
             fleet.world.let_go()
-        if row.fallen:
-            return fleet, heights, True
-        if fleet.now_ns > until_s * NS_PER_S:
-            break
-    return fleet, heights, False
+        fell.append(row.fallen)
+        return fleet.now_ns > until_s * NS_PER_S
+
+    fell: list[bool] = []
+    outcome = run(robot, told, plant=plant, each=look, **how)
+    assert not any(fell)
+    return outcome, heights
 
 
-def causes(fleet: Lockstep) -> set[Cause]:
-    return {Cause(event.cause) for _, event in fleet.events}
+def fastest(heights: list[float]) -> float:
+    """Return the fastest way down, m/s."""
+    return max(before - after for before, after in pairwise(heights)) * 100.0
+
+
+def causes(outcome: Run) -> set[Cause]:
+    return {Cause(event.cause) for _, event in outcome.lockstep.events}
 
 
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", SHAKEN)
 def test_a_robot_that_shook_itself_down_stands_in_hold(robot: RobotConfig, name: str) -> None:
-    shaky = unfiltered(robot)
-    scenario = still(4.0, push=(Push(at=3.0, duration=0.3, force=(40.0, 0.0, 0.0)),))
+    shaky, plant = unfiltered(robot), PLANTS[name]
     # with no trip it shakes, and falls after 2 to 4 s: when, the last bit decides
-    _, _, fell = run(
-        untripped(shaky),
-        msgspec.structs.replace(scenario, duration=8.0),
-        PLANTS[name],
-        from_hoist=True,
-    )
-    assert fell, "nothing is proved by a robot that would have stood"
+    falls = run(untripped(shaky), still(8.0, push=PUSHED), plant=plant, stands=False)
+    assert falls.rows[-1].fallen, "nothing is proved by a robot that would have stood"
     # where it is never led for a second the scenario, and its push, do not begin
-    fleet, _, fell = run(shaky, scenario, PLANTS[name], from_hoist=True, until_s=12.0)
-    assert not fell
-    assert Cause.SHAKING in causes(fleet)
+    outcome, _ = trip_run(shaky, still(4.0, push=PUSHED), plant, stands=False, until_s=12.0)
+    assert Cause.SHAKING in causes(outcome)
     led_s = [
         (leaves.t_ns - enters.t_ns) / 1e9
-        for enters, leaves in _led(fleet)
+        for enters, leaves in _led(outcome.lockstep)
         if leaves.cause == Cause.SHAKING
     ]
     assert len(led_s) >= 3, "it was led more than once"
@@ -104,17 +95,18 @@ def _led(fleet: Lockstep) -> list[tuple[Any, Any]]:
 
 
 def test_what_keeps_shaking_is_led_ever_more_rarely(robot: RobotConfig) -> None:
-    fleet, _, fell = run(unfiltered(robot), still(12.0), PLANTS["k 5000"], from_hoist=True)
-    assert not fell
-    tracked = [(enters.t_ns, (leaves.t_ns - enters.t_ns) / 1e9) for enters, leaves in _led(fleet)]
+    outcome, _ = trip_run(unfiltered(robot), still(12.0), PLANTS["k 5000"], stands=False)
+    tracked = [
+        (enters.t_ns, (leaves.t_ns - enters.t_ns) / 1e9)
+        for enters, leaves in _led(outcome.lockstep)
+    ]
     starts = sorted({enters_ns // 10**8 for enters_ns, _ in tracked})  # tenths of a second
     waits = [later - earlier for earlier, later in pairwise(starts)]
     assert len(waits) >= 3
     assert all(later > 1.5 * earlier for earlier, later in pairwise(waits)), waits
     # 1.52 on one processor, under 1.5 on another: shaking amplifies a product's last bit
     assert sum(led_s for _, led_s in tracked) / 6 < 2.0, "seconds led, of 18"
-    assert fleet.planner is not None
-    assert fleet.planner.status(fleet.now_ns, 0.0).wait_s > 2.0
+    assert outcome.status.wait_s > 2.0
 
 
 @pytest.mark.sampled(3)
@@ -122,25 +114,13 @@ def test_what_keeps_shaking_is_led_ever_more_rarely(robot: RobotConfig) -> None:
 @pytest.mark.parametrize("height", [1.1, 0.85])
 def test_a_person_who_sags_is_caught(robot: RobotConfig, height: float, delay_ms: float) -> None:
     """200 N rest on the harness where none were asked for: it went to the knees' stop, 0.76 m."""
-    statuses: list[PlannerStatus] = []
-
-    def record(_topic: object, _module: str, message: object) -> None:
-        if isinstance(message, PlannerStatus):
-            statuses.append(message)
-
-    fleet, heights, fell = run(
-        robot,
-        _sags(height),
-        RESTS_TWICE,
-        record=record,
-        let_go_s=2.4,
-        delay_ms=delay_ms,
-    )
-    assert not fell
+    statuses = Heard(PlannerStatus)
+    how = {"delay_ms": delay_ms, "let_go_s": 2.4, "record": statuses}
+    outcome, heights = trip_run(robot, _sags(height), RESTS_TWICE, **how)
     sagged = heights[round(1.4 * 100.0) :]
     assert min(sagged) > height - 0.06
-    assert max(before - after for before, after in pairwise(sagged)) * 100.0 < 0.32, "m/s"
-    assert Cause.HOLD_ALL in causes(fleet)
+    assert fastest(sagged) < 0.32
+    assert Cause.HOLD_ALL in causes(outcome)
     told_by = [row for row in statuses if row.trip == Trip.SAGGING]
     assert told_by, "and it says why"
     assert statuses[-1].trip == Trip.SAGGING, "it is not led while the load rests on it"
@@ -149,11 +129,10 @@ def test_a_person_who_sags_is_caught(robot: RobotConfig, height: float, delay_ms
 
 
 def test_a_person_who_sags_and_holds_on_is_let_down_slowly(robot: RobotConfig) -> None:
-    fleet, heights, fell = run(robot, _sags(1.1), RESTS_TWICE)
-    assert not fell
-    assert max(before - after for before, after in pairwise(heights)) * 100.0 < 0.32, "m/s"
+    outcome, heights = trip_run(robot, _sags(1.1), RESTS_TWICE)
+    assert fastest(heights) < 0.32
     assert min(heights) > 0.95
-    assert Cause.HOLD_ALL not in causes(fleet)
+    assert Cause.HOLD_ALL not in causes(outcome)
 
 
 def _sags(height: float) -> Scenario:
@@ -169,17 +148,11 @@ def _sags(height: float) -> Scenario:
 
 def test_a_torso_that_is_thrown_about_is_held(robot: RobotConfig) -> None:
     """1.2 rad of pitch in 0.6 s; a person takes 2 s."""
-    frames = (
-        Keyframe(at=0.0, height=1.1),
-        Keyframe(at=1.0, height=1.1),
-        Keyframe(at=1.6, height=1.1, pitch=1.2),
-    )
-    fleet, _, fell = run(
-        robot, variant("stand", duration=4.0, keyframe=frames, kill=(), push=()), PlantConfig()
-    )
-    assert not fell
-    assert Cause.HOLD_ALL in causes(fleet)
-    assert not causes(fleet) & set(JOINT_TRIPS)
+    frames = tuple(Keyframe(at=at, height=1.1, pitch=1.2 * (at > 1.5)) for at in (0.0, 1.0, 1.6))
+    thrown = variant("stand", duration=4.0, keyframe=frames, kill=(), push=())
+    outcome, _ = trip_run(robot, thrown)
+    assert Cause.HOLD_ALL in causes(outcome)
+    assert not causes(outcome) & set(JOINT_TRIPS)
 
 
 @pytest.mark.parametrize(
@@ -190,12 +163,8 @@ def test_a_fast_lead_and_one_beyond_what_legs_reach_are_followed(
     robot: RobotConfig, height: float, pitch: float, ways_s: float
 ) -> None:
     """0.34 m in 1.5 s; to straight legs; the crawl in 2 s; below the knees' stop."""
-    frames = (
-        Keyframe(at=0.0, height=1.188),
-        Keyframe(at=1.0, height=1.188),
-        Keyframe(at=1.0 + ways_s, height=height, pitch=pitch),
-    )
+    end = Keyframe(at=1.0 + ways_s, height=height, pitch=pitch)
+    frames = (Keyframe(at=0.0, height=1.188), Keyframe(at=1.0, height=1.188), end)
     scenario = variant("stand", duration=4.0, keyframe=frames, kill=(), push=())
-    fleet, _, fell = run(robot, scenario, PlantConfig())
-    assert not fell
-    assert not fleet.events, "all six track on"
+    outcome, _ = trip_run(robot, scenario)
+    assert not outcome.lockstep.events, "all six track on"

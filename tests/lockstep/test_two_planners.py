@@ -2,51 +2,44 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from services.planner.planner import Planner
 from shared.bus import topics
-from shared.bus.messages import JointState, Message, Mode, PlannerMode, SimTruth
+from shared.bus.messages import JointState, Message, Mode, PlannerMode
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
-from shared.config.scenarios import Inject, Keyframe, Kill, Restart, Scenario
+from shared.config.scenarios import Inject, Kill
 from shared.joints import MODULE_INDEX
-from tests.lockstep.runs import kill, variant
+from tests.lockstep.runs import kill, led_to, modes_of, restart
 from tools.sim.lockstep import Lockstep
 from tools.sim.standing_start import begin_standing
 
 SECOND = 99
-SQUAT = (
-    Keyframe(at=0.0, height=1.188),
-    Keyframe(at=2.0, height=1.0),
-    Keyframe(at=4.0, height=1.188),
-    Keyframe(at=6.0, height=1.0),
-)
 
 
-def squat(duration: float, **changes: object) -> Scenario:
-    return variant(
-        "stand", **{"duration": duration, "keyframe": SQUAT, "kill": (), "push": ()} | changes
-    )
+def lost(link: str, seconds: float) -> dict[str, Any]:
+    return {"inject": (Inject(link=link, at=1.0, duration=seconds, partition=True),)}
 
 
-def held_up(from_s: float, to_s: float) -> dict[str, object]:
-    """Return what stops the first planner for a while."""
-    return {
-        "kill": (Kill(service="planner", at=from_s, signal="STOP"),),
-        "restart": (Restart(service="planner", at=to_s),),
-    }
+def held_up(to_s: float) -> dict[str, Any]:
+    """Return what stops the first planner from 1 s on."""
+    stopped = (Kill(service="planner", at=1.0, signal="STOP"),)
+    return {"kill": stopped, "restart": restart(to_s)}
 
 
 class TwoPlanners(Lockstep):
     """A second planner hears the same states and sends on the same keys, for a part of the run."""
 
     def __init__(
-        self, robot: RobotConfig, scenario: Scenario, begin_s: float, end_s: float
+        self, robot: RobotConfig, duration: float, begin_s: float, end_s: float, **happens: Any
     ) -> None:
-        """Begin as `Lockstep` does; the second planner lives from `begin_s` to `end_s`."""
-        super().__init__(robot, scenario, record=self._hear)
+        """Squat; the second planner lives from `begin_s` to `end_s`."""
+        squat = led_to((2.0, 1.0), (4.0, 1.188), (6.0, 1.0), duration=duration, **happens)
+        super().__init__(robot, squat, record=self._hear)
         self.second: Planner | None = None
         self.begin_s, self.end_s = begin_s, end_s
         self.sent = self.announced = 0
@@ -58,8 +51,7 @@ class TwoPlanners(Lockstep):
         """Go on by one step of the world."""
         super().advance()
         at_s = self.world.scenario_s
-        lives = self.begin_s <= at_s < self.end_s
-        if not lives:
+        if not self.begin_s <= at_s < self.end_s:
             self.second = None
         elif self.second is None:
             self.second = Planner(self.config, SECOND)
@@ -70,7 +62,7 @@ class TwoPlanners(Lockstep):
                 usable = age_ms <= self.config.joint_service.max_command_age_ms
                 self.sent += usable
                 self.announced += not usable
-        sessions = tuple(controller._state.failsafe.session for controller in self.controllers)
+        sessions = tuple(controller.failsafe.session for controller in self.controllers)
         if not self.accepted or self.accepted[-1][1] != sessions:
             self.accepted.append((at_s, sessions))
 
@@ -79,92 +71,58 @@ class TwoPlanners(Lockstep):
             assert isinstance(message, JointState)
             self.second.receive_state(MODULE_INDEX[module], message, self.now_ns)
 
-    @property
-    def modes(self) -> set[Mode]:
-        return {controller.failsafe.mode for controller in self.controllers}
-
-
-def run(fleet: TwoPlanners) -> list[SimTruth]:
-    assert begin_standing(fleet)
-    rows = []
-    for row in fleet.run():
-        assert not row.fallen, f"{row.scenario_s:.2f} s"
-        rows.append(row)
-    assert rows[-1].scenario_s > fleet.scenario.duration - 0.1
-    return rows
-
-
-def changes_after(fleet: TwoPlanners, at_s: float) -> list[tuple[float, tuple[int, ...]]]:
-    return [row for row in fleet.accepted if row[0] > at_s]
+    def to_the_end(self, *, stands: bool = True) -> list[tuple[int, ...]]:
+        """Run, and end with all six in TRACK; return the modules' sessions after the begin."""
+        assert not stands or begin_standing(self)
+        for row in self.run():
+            assert not row.fallen, f"{row.scenario_s:.2f} s"
+        assert row.scenario_s > self.scenario.duration - 0.1
+        assert set(modes_of(self)) == {Mode.TRACK}
+        return [sessions for at_s, sessions in self.accepted if at_s > 0.1]
 
 
 @pytest.mark.parametrize("link", ["planner->knee_left", "planner->joints"])
 def test_60_ms_of_loss_give_the_second_planner_no_module(robot: RobotConfig, link: str) -> None:
     """It took one knee for good, while the others followed the first."""
-    lost = (Inject(link=link, at=1.0, duration=0.06, partition=True),)
-    scenario = squat(5.0, inject=lost)
-    fleet = TwoPlanners(robot, scenario, 0.5, 4.0)
-    run(fleet)
+    fleet = TwoPlanners(robot, 5.0, 0.5, 4.0, **lost(link, 0.06))
+    assert fleet.to_the_end() == []
     assert fleet.sent == 0
     assert 0 < fleet.announced <= 6 * 5 * 3.6, "it makes itself known five times a second"
-    assert changes_after(fleet, 0.1) == []
-    assert fleet.modes == {Mode.TRACK}
 
 
 def test_when_the_first_ends_the_second_leads(robot: RobotConfig) -> None:
-    scenario = squat(5.0, kill=kill(1.5))
-    fleet = TwoPlanners(robot, scenario, 0.5, 9.0)
-    run(fleet)
-    assert fleet.modes == {Mode.TRACK}
+    fleet = TwoPlanners(robot, 5.0, 0.5, 9.0, kill=kill(1.5))
+    followed = fleet.to_the_end()
     assert fleet.second is not None
     assert fleet.second.status(fleet.now_ns, 0.0).mode == PlannerMode.LEADING
-    ((_, sessions),) = changes_after(fleet, 0.1)[-1:]
-    assert set(sessions) == {fleet.second.session}
+    assert set(followed[-1]) == {fleet.second.session}
 
 
-def test_one_that_was_held_up_lets_the_other_lead_and_leads_when_that_ends(
-    robot: RobotConfig,
+@pytest.mark.parametrize(
+    ("until_s", "other_ends_s", "seconds"),
+    [(3.5, 5.0, 7.5), (4.0, 3.5, 6.0)],
+    ids=["it sees the other", "it never sees it"],
+)
+def test_one_that_was_held_up_leads_again_when_the_other_has_ended(
+    robot: RobotConfig, until_s: float, other_ends_s: float, seconds: float
 ) -> None:
-    """Its session was retired, and all stayed in HOLD."""
-    scenario = squat(7.5, **held_up(1.0, 3.5))
-    fleet = TwoPlanners(robot, scenario, 0.5, 5.0)
-    run(fleet)
-    led = [sessions for _, sessions in changes_after(fleet, 0.1) if len(set(sessions)) == 1]
-    assert led[-2][0] >= SECOND, "the second led while the first was held up, and after"
-    assert fleet.planner is not None
-    assert led[-1] == (fleet.planner.session,) * 6
-    assert fleet.modes == {Mode.TRACK}
-
-
-def test_one_that_was_held_up_past_the_others_end_leads_again(robot: RobotConfig) -> None:
-    """It never saw the other, for which all six had retired it: they refused it for good."""
-    scenario = squat(6.0, **held_up(1.0, 4.0))
-    fleet = TwoPlanners(robot, scenario, 0.5, 3.5)
-    run(fleet)
+    """Its session was retired, and all stayed in HOLD: they refused it for good."""
+    fleet = TwoPlanners(robot, seconds, 0.5, other_ends_s, **held_up(until_s))
+    led = [sessions for sessions in fleet.to_the_end() if len(set(sessions)) == 1]
     assert fleet.sent > 0
+    assert led[-2][0] >= SECOND, "the second led while the first was held up"
     assert fleet.planner is not None
-    assert fleet.accepted[-1][1] == (fleet.planner.session,) * 6
-    assert fleet.modes == {Mode.TRACK}
+    assert led[-1] == fleet.accepted[-1][1] == (fleet.planner.session,) * 6
 
 
-def test_a_second_one_that_starts_while_the_first_is_held_up_for_a_moment_waits(
-    robot: RobotConfig,
-) -> None:
+def test_a_second_one_that_starts_in_a_gap_waits(robot: RobotConfig) -> None:
     """It caught some modules in the gap, and neither led any more."""
-    lost = (Inject(link="planner->joints", at=1.0, duration=0.3, partition=True),)
-    scenario = squat(4.0, inject=lost)
-    fleet = TwoPlanners(robot, scenario, 1.1, 9.0)
-    run(fleet)
+    fleet = TwoPlanners(robot, 4.0, 1.1, 9.0, **lost("planner->joints", 0.3))
+    fleet.to_the_end()
     assert fleet.sent == 0
-    assert fleet.modes == {Mode.TRACK}
 
 
 def test_two_that_start_at_once_agree_on_one(robot: RobotConfig) -> None:
-    scenario = squat(3.0)
-    fleet = TwoPlanners(robot, scenario, -100.0, 9.0)
-    for row in fleet.run():
-        assert not row.fallen
-    assert fleet.world.scenario_s > 2.9
-    assert fleet.modes == {Mode.TRACK}
+    fleet = TwoPlanners(robot, 3.0, -100.0, 9.0)
+    assert fleet.to_the_end(stands=False) == []
     assert len(set(fleet.accepted[-1][1])) == 1
-    assert changes_after(fleet, 0.1) == []

@@ -1,21 +1,24 @@
-"""Networks that are bad unevenly, every command within the age rule: all six track, and it stands.
+"""Networks that are bad unevenly, or that come and go: it stands, and drops out six times a minute.
 
-tau_coupled fades out there. What stands in its place has to damp sway as well: with the certified
-gains alone a push in y swung on by 0.84 from side to side, and a second one in step with it, or
-one of 60 N, made the robot fall.
+With every command within the age rule, tau_coupled fades out. What stands in its place has to damp
+sway as well: with the certified gains alone a push in y swung on by 0.84 from side to side, and a
+second one in step with it, or one of 60 N, made the robot fall. A study found 39 drop-outs in 11 s
+(docs/results.md). How the planner waits is in `tests/planner/test_engagement_fsm.py`.
 """
 
 from __future__ import annotations
+
+from collections import Counter
 
 import numpy as np
 import pytest
 from scipy.signal import find_peaks
 
-from shared.bus.messages import Mode
-from shared.config.impairment import Impairment
+from shared.bus.messages import Cause, Mode, SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Keyframe, Push, Scenario
-from tests.lockstep.runs import Run, push, run, still, variant
+from tests.lockstep.runs import Run, led_to, modes_of, push, run, still, variant
+from tools.lab.studies.sweeps.figures import event_steps_nm
 from tools.sim.lockstep import Lockstep
 
 
@@ -31,8 +34,12 @@ UNEVEN = {
         Inject(link="hip_right->planner", at=0.3, delay_ms=14.0, jitter_ms=14.0),
     ),
 }
+
+
 IN_STEP = (push(2.4, 0.0, 40.0, 0.0), push(4.4, 0.0, 40.0, 0.0))
 """Two seconds apart: in step with the sway of the certified gains."""
+
+
 ALL_WAYS = (
     push(1.0, 28.0, 28.0, 0.0),
     push(2.4, 0.0, 40.0, 0.0),
@@ -43,7 +50,7 @@ ALL_WAYS = (
 
 def assert_it_stood_and_tracked(result: Run) -> None:
     assert result.stood
-    assert {c.failsafe.mode for c in result.lockstep.controllers} == {Mode.TRACK}
+    assert set(result.modes) == {Mode.TRACK}
     assert np.abs(result.com_mm[:, :2]).max() < 50.0
     assert np.abs(result.operator_n).max() < 45.0
 
@@ -60,10 +67,8 @@ def test_it_stands_through_pushes_while_all_six_track(
 
 @pytest.mark.parametrize("module", ["ankle_left", "hip_left"])
 def test_so_it_does_with_any_other_module_late(robot: RobotConfig, module: str) -> None:
-    scenario = still(
-        5.0, height=1.0, push=(push(2.4, 0.0, 60.0, 0.0),), inject=one_late(module, 22.0)
-    )
-    assert_it_stood_and_tracked(run(robot, scenario))
+    happens = {"push": (push(2.4, 0.0, 60.0, 0.0),), "inject": one_late(module, 22.0)}
+    assert_it_stood_and_tracked(run(robot, still(5.0, height=1.0, **happens)))
 
 
 class Steps(Lockstep):
@@ -75,59 +80,92 @@ class Steps(Lockstep):
     def advance(self) -> None:
         before = [controller.tau for controller in self.controllers]
         super().advance()
-        for tau, last in zip([c.tau for c in self.controllers], before, strict=True):
-            change_nm = max(abs(a - b) for a, b in zip(tau, last, strict=True))
-            if self.world.scenario_s > 0.0:
-                self.largest_nm = max(self.largest_nm, change_nm)
-
-
-def steps(robot: RobotConfig, told: Scenario) -> float:
-    """Run to the end; return the largest step of a joint's torque in a cycle, N m."""
-    fleet = Steps(robot, told, Impairment(delay_ms=1.0))
-    falls = [row.fallen for row in fleet.run()]
-    assert not any(falls)
-    return fleet.largest_nm
+        if self.world.scenario_s > 0.0:
+            changes = np.subtract([controller.tau for controller in self.controllers], before)
+            self.largest_nm = max(self.largest_nm, float(np.abs(changes).max()))
 
 
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("delay_ms", [3.5, 4.7])
-def test_two_hips_a_little_late_do_not_make_the_legs_shake(
-    robot: RobotConfig, delay_ms: float
-) -> None:
+def test_two_hips_a_bit_late_shake_no_legs(robot: RobotConfig, delay_ms: float) -> None:
     """At 49 Hz, by 40 N m a cycle, it did from 4.5 s on, unpushed, with all of tau_coupled."""
     late = (*one_late("hip_right", delay_ms), *one_late("hip_left", delay_ms))
-    assert steps(robot, variant("squat", duration=6.0, kill=(), push=(), inject=late)) < 5.0
+    squat = variant("squat", duration=6.0, kill=(), push=(), inject=late)
+    outcome = run(robot, squat, fleet_type=Steps, stands=False)
+    assert outcome.stood
+    assert isinstance(outcome.lockstep, Steps)
+    assert outcome.lockstep.largest_nm < 5.0
 
 
 def test_a_drop_out_in_the_middle_of_a_sway_is_not_held_off_centre(robot: RobotConfig) -> None:
     """Led from where the sway was, and lost again, HOLD stood 25 mm to the side, and fell."""
-    frames = tuple(Keyframe(at=t, height=h) for t, h in ((0.0, 1.188), (1.0, 1.188), (3.0, 0.948)))
-    scenario = variant(
-        "stand",
-        duration=6.0,
-        keyframe=frames,
-        push=tuple(push(t, 0.0, 40.0, 0.0) for t in (1.6, 3.1, 4.6)),
-        inject=(Inject(link="ankle_left->planner", at=0.3, loss=0.7, burst=5),),
-    )
-    fleet = Lockstep(robot, scenario, Impairment(delay_ms=1.0), seed=2038)
-    rows = list(fleet.run())
-    assert not any(row.fallen for row in rows)
-    assert max(abs(row.com[1]) for row in rows) < 0.055
+    pushes = tuple(push(t, 0.0, 40.0, 0.0) for t in (1.6, 3.1, 4.6))
+    lossy = (Inject(link="ankle_left->planner", at=0.3, loss=0.7, burst=5),)
+    scenario = led_to((1.0, 1.188), (3.0, 0.948), duration=6.0, push=pushes, inject=lossy)
+    outcome = run(robot, scenario, seed=2038, stands=False)
+    assert outcome.stood
+    assert np.abs(outcome.com_mm[:, 1]).max() < 55.0
 
 
 def test_without_tau_coupled_sway_is_damped_as_well_as_in_hold(robot: RobotConfig) -> None:
-    pushed = (push(1.5, 0.0, 40.0, 0.0),)
-    networks = {
-        "track": one_late("knee_right", 20.0),
-        "hold": (Inject(link="all", at=0.5, partition=True),),
-    }
+    cut = (Inject(link="all", at=0.5, partition=True),)
     swings = {}
-    for name, network in networks.items():
-        result = run(robot, still(6.5, push=pushed, inject=network))
+    for mode, network in {Mode.TRACK: one_late("knee_right", 20.0), Mode.HOLD: cut}.items():
+        result = run(robot, still(6.5, push=(push(1.5, 0.0, 40.0, 0.0),), inject=network))
         assert result.stood
-        assert {c.failsafe.mode for c in result.lockstep.controllers} == {Mode[name.upper()]}
-        peaks, _ = find_peaks(np.abs(result.com_mm[result.t > 1.6, 1]), distance=40)
-        heights = np.abs(result.com_mm[result.t > 1.6, 1])[peaks]
-        swings[name] = heights[1] / heights[0]
-    assert swings["track"] < 0.65
-    assert swings["track"] < swings["hold"] + 0.05
+        assert set(result.modes) == {mode}
+        sway = np.abs(result.com_mm[result.t > 1.6, 1])
+        heights = sway[find_peaks(sway, distance=40)[0]]
+        swings[mode] = heights[1] / heights[0]
+    assert swings[Mode.TRACK] < 0.65
+    assert swings[Mode.TRACK] < swings[Mode.HOLD] + 0.05
+
+
+def squats(seconds: float) -> tuple[Keyframe, ...]:
+    heights = (1.188, 0.948)
+    return tuple(Keyframe(at=2.5 * n, height=heights[n % 2]) for n in range(2 + int(seconds / 2.5)))
+
+
+@pytest.mark.timeout(600)  # a minute of virtual time, on a machine that may be busy
+@pytest.mark.parametrize(
+    ("ordered", "seconds", "tracked"),
+    [
+        pytest.param(True, 60.0, 0.06, id="a minute of a stream", marks=pytest.mark.wide),
+        pytest.param(True, 15.0, 0.06, id="a stream"),
+        pytest.param(False, 15.0, 0.9, id="datagrams"),
+    ],
+)
+def test_20_ms_jitter_and_10_percent_loss(
+    ordered: bool, seconds: float, tracked: float, robot: RobotConfig
+) -> None:
+    """Before ages were watched and the planner waited, the robot fell in 12 s on streams.
+
+    Jitter is about the delay, and none is given: what it would take off is clipped at 0, so half
+    of the messages have no delay and the others up to 20 ms more.
+
+    It is no network to TRACK on for a minute: on streams six drop-outs, each with a longer wait,
+    leave 11 % of the time (two seeds: 0.108 and 0.113); as datagrams, where what is overtaken is
+    left out, 99 % with one drop-out, and the coupled torques faded to a quarter.
+    """
+    link = Inject(link="all", at=0.0, jitter_ms=20.0, loss=0.1, ordered=ordered)
+    frames = squats(seconds)
+    scenario = Scenario(name="flap", about="", duration=seconds, keyframe=frames, inject=(link,))
+    tracking: list[bool] = []
+
+    def look(fleet: Lockstep, row: SimTruth) -> None:
+        if row.scenario_s >= 0.0:
+            tracking.append(set(modes_of(fleet)) == {Mode.TRACK})
+
+    outcome = run(robot, scenario, stands=False, each=look)
+    assert outcome.stood
+    assert sum(tracking) > tracked * len(tracking), "it comes back, and does not only HOLD"
+    began_ns = outcome.rows[0].t_ns
+    events = [(name, event) for name, event in outcome.lockstep.events if event.t_ns >= began_ns]
+    entries = Counter(name for name, event in events if event.mode_after == Mode.HOLD)
+    assert max(entries.values(), default=0) <= 6
+    if ordered:
+        assert any(event.cause == Cause.COMMAND_STALE for _, event in events), "it is a bad link"
+    assert max(event_steps_nm(event for _, event in events), default=0.0) <= 5.0
+    assert np.abs(outcome.com_mm[:, 0]).max() < 60.0
+    assert np.abs(outcome.com_mm[:, 1]).max() < 20.0
+    assert np.abs(outcome.angles[:, 0]).max() < 0.05

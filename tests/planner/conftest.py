@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 
-import msgspec
 import numpy as np
 import pytest
 
 from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.kinematics import Kinematics
-from shared.config import files as config_file
-from shared.config.robot_config import GRAVITY, RobotConfig
+from services.planner.planner import Planner
+from shared.config.robot_config import RobotConfig
 from shared.robot.robot_model import stand_pose
-from tests.conftest import ROBOT_FILE
 from tests.planner import oracle
 from tests.planner.oracle import Array
+from tests.planner.states import SESSION, with_law
 
 Closed = Callable[..., Array]
 """closed(height, x=, y=, roll=, pitch=, yaw=) -> q (12,) where the legs agree."""
@@ -34,8 +33,7 @@ def kinematics(robot: RobotConfig) -> Kinematics:
 @pytest.fixture(scope="session")
 def averaging(robot: RobotConfig) -> Kinematics:
     """Return kinematics that mix the legs by a plain average."""
-    law = msgspec.structs.replace(robot.law, jacobian="average")
-    return Kinematics(msgspec.structs.replace(robot, law=law))
+    return Kinematics(with_law(robot, jacobian="average"))
 
 
 @pytest.fixture(scope="session")
@@ -46,15 +44,6 @@ def limits(robot: RobotConfig) -> Array:
 @pytest.fixture(scope="session")
 def ik(robot: RobotConfig, limits: Array) -> InverseKinematics:
     return InverseKinematics(Kinematics(robot), limits)
-
-
-@cache
-def standing_torque(q: tuple[float, ...]) -> Array:
-    """Return the torques (12,) of the shipped robot's stand at q (12,), rad; N m."""
-    robot = config_file.load(ROBOT_FILE)
-    kinematics = Kinematics(robot)
-    kinematics.update(np.array(q))
-    return np.asarray(robot.total_mass * GRAVITY * kinematics.J[2])
 
 
 def com_height(robot: RobotConfig, height: float) -> float:
@@ -87,3 +76,14 @@ def closed(robot: RobotConfig, ik: InverseKinematics) -> Closed:
         return made(height, frozenset(parts.items())).copy()
 
     return make
+
+
+@pytest.fixture
+def planner(robot: RobotConfig) -> Planner:
+    return Planner(robot, SESSION)
+
+
+@pytest.fixture
+def q(closed: Closed) -> Array:
+    """Return a stand that is a little off centre and pitched."""
+    return closed(1.188, x=0.01, pitch=0.1)

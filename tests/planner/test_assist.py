@@ -1,8 +1,9 @@
-"""The harness in the loop: assist, easing of the lead, overload."""
+"""The harness in the loop: assist, easing of the lead, overload, and where it is stable."""
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from typing import Any
 
 import msgspec
@@ -18,19 +19,23 @@ from services.planner.law.assist import (
     STILL_RATE_PITCH,
     STILL_RATE_Z,
     AssistLaw,
+    Coupling,
     LeadEasing,
     Overload,
+    alpha_max,
     force_up,
+    integral_s_min,
     is_still,
 )
-from shared.bus.messages import Tare, Vector3, Wrench
+from shared.bus.messages import Wrench
 from shared.clock import NS_PER_MS
 from tests.planner import oracle
+from tests.planner.states import wrench
 
 DT = 0.004
-FORCE_MAX, RATE_MAX, INTEGRAL_MAX, INTEGRAL_S = 200.0, 100.0, 50.0, 3.0
 
-# -- the assist ------------------------------------------------------------------------
+
+FORCE_MAX, RATE_MAX, INTEGRAL_MAX, INTEGRAL_S = 200.0, 100.0, 50.0, 3.0
 
 
 def make_law(wanted: float = 100.0) -> AssistLaw:
@@ -75,11 +80,21 @@ def test_a_steady_error_is_integrated_beyond_what_friction_hides(error: float) -
     assert law.assist == pytest.approx(100.0 + expected)
 
 
-@pytest.mark.parametrize("share", [-1.0, -0.9, 0.9, 1.0])
-def test_an_error_within_friction_is_left_alone(share: float) -> None:
-    law = make_law()
-    run(law, 60.0, 100.0, 100.0 + share * ERROR_MIN)
-    assert law.state.integral == 0.0
+@pytest.mark.parametrize(
+    ("wanted", "measured", "still"),
+    [
+        *[pytest.param(100.0, 100.0 + x * ERROR_MIN, True, id=f"{x} of friction")
+          for x in (-1.0, -0.9, 0.9, 1.0)],
+        # the squat: the operator leads with up to 30 N and asks for nothing
+        pytest.param(0.0, 30.0, True, id="no wish"),
+        pytest.param(100.0, None, True, id="no reading"),
+        pytest.param(100.0, 60.0, False, id="the operator leads"),
+    ],
+)  # fmt: skip
+def test_nothing_is_integrated_of(wanted: float, measured: float | None, still: bool) -> None:
+    law = make_law(wanted)
+    run(law, 60.0, wanted, measured, still=still)
+    assert (law.state.integral, law.assist) == (0.0, wanted)
 
 
 @pytest.mark.parametrize(("measured", "end"), [(-1e3, INTEGRAL_MAX), (1e3, -INTEGRAL_MAX)])
@@ -108,7 +123,7 @@ def test_the_integral_freezes_without_a_reading() -> None:
     assert law.state.integral == before
 
 
-def test_the_integral_freezes_while_the_operator_leads_and_a_little_longer() -> None:
+def test_the_integral_freezes_a_little_longer_than_the_operator_leads() -> None:
     law = make_law()
     run(law, 5.0, 100.0, 60.0, still=False)
     run(law, SETTLE_S - DT, 100.0, 60.0)
@@ -136,13 +151,6 @@ def test_the_integral_leaks_away_when_nothing_is_wanted() -> None:
     assert law.assist == pytest.approx(0.0, abs=0.01)
 
 
-def test_no_wish_no_integral() -> None:
-    """The squat: the operator leads with up to 30 N and asks for nothing."""
-    law = make_law(0.0)
-    run(law, 60.0, 0.0, 30.0)
-    assert law.assist == 0.0
-
-
 @pytest.mark.parametrize("stop", ["request", "lead", "reading"])
 def test_the_assist_makes_no_step_when_the_integral_starts_or_stops(stop: str) -> None:
     law, last = make_law(), 100.0
@@ -154,9 +162,6 @@ def test_the_assist_makes_no_step_when_the_integral_starts_or_stops(stop: str) -
         step_max = (RATE_MAX + 700.0 / INTEGRAL_S) * DT
         assert abs(law.assist - last) <= step_max + 1e-9
         last = law.assist
-
-
-# -- directions ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("roll", [-0.3, 0.0, 0.2])
@@ -174,9 +179,6 @@ def test_still_is_within_both_rates(share: float) -> None:
     still = abs(share) < 1.0
     assert is_still(share * STILL_RATE_Z, 0.0) is still
     assert is_still(0.0, share * STILL_RATE_PITCH) is still
-
-
-# -- easing the lead -------------------------------------------------------------------
 
 
 def eased(easing: LeadEasing, up: float | None, moment: float = 0.0, assist: float = 0.0) -> Any:
@@ -211,43 +213,32 @@ def test_the_easing_fades_out_when_the_wrench_is_lost_and_in_when_it_is_back() -
         assert last == pytest.approx(0.0 if up is None else 50.0)
 
 
-# -- overload --------------------------------------------------------------------------
-
 AFTER, RELEASE = 100 * NS_PER_MS, 1000 * NS_PER_MS
+
+
 T0 = 10**12
-
-
-def wrench(
-    force: Vector3 = (0.0, 0.0, 0.0),
-    moment: Vector3 = (0.0, 0.0, 0.0),
-    *,
-    valid: bool = True,
-    saturated: bool = False,
-) -> Wrench:
-    return Wrench(
-        t_ns=0, seq=0, force=force, moment=moment, valid=valid, saturated=saturated,
-        tare=Tare.DONE, age_ns=0,
-    )  # fmt: skip
 
 
 def at(share: float, kind: str) -> Wrench:
     """Return a wrench at a share of one limit, in a slanted direction."""
     part = share / math.sqrt(3.0)
     if kind == "force":
-        return wrench((500.0 * part, -500.0 * part, 500.0 * part))
+        return wrench(force=(500.0 * part, -500.0 * part, 500.0 * part))
     return wrench(moment=(100.0 * part, 100.0 * part, -100.0 * part))
 
 
-def make_overload() -> Overload:
-    return Overload(500.0, 100.0, AFTER, RELEASE)
+def make_overload(*, holds: bool = False) -> Overload:
+    """Return an overload that holds, by a cell that was saturated, or not."""
+    overload = Overload(500.0, 100.0, AFTER, RELEASE)
+    if holds:
+        overload.receive(wrench(valid=False, saturated=True), T0)
+    return overload
 
 
 @pytest.mark.parametrize("kind", ["force", "moment"])
 @pytest.mark.parametrize("share", [0.0, 0.5, 0.999, 1.001, 2.0])
 @pytest.mark.parametrize("for_ns", [0, AFTER - 1, AFTER, 10 * AFTER])
-def test_hold_is_asked_for_beyond_a_limit_for_its_time(
-    kind: str, share: float, for_ns: int
-) -> None:
+def test_hold_is_asked_for_beyond_a_limit_in_time(kind: str, share: float, for_ns: int) -> None:
     overload = make_overload()
     for t_ns in sorted({0, for_ns // 3, for_ns}):
         overload.receive(at(share, kind), T0 + t_ns)
@@ -274,10 +265,9 @@ def test_a_saturated_cell_asks_for_hold_at_once(valid: bool) -> None:
 @pytest.mark.parametrize("share", [0.0, RELEASE_FRACTION - 0.001, RELEASE_FRACTION + 0.001, 0.99])
 @pytest.mark.parametrize("for_ns", [RELEASE - 1, RELEASE, 3 * RELEASE])
 def test_hold_ends_below_the_lower_limit_for_its_time(kind: str, share: float, for_ns: int) -> None:
-    overload = make_overload()
-    overload.receive(wrench(valid=False, saturated=True), T0)
-    overload.receive(at(share, kind), T0)
-    overload.receive(at(share, kind), T0 + for_ns)
+    overload = make_overload(holds=True)
+    for now_ns in (T0, T0 + for_ns):
+        overload.receive(at(share, kind), now_ns)
     assert overload.hold is not (share < RELEASE_FRACTION and for_ns >= RELEASE)
 
 
@@ -290,23 +280,101 @@ def test_an_invalid_reading_now_and_then_does_not_hold_an_overload_off() -> None
 
 
 def test_an_invalid_reading_begins_the_end_of_an_overload_anew() -> None:
-    overload = make_overload()
-    overload.receive(wrench(valid=False, saturated=True), T0)
-    overload.receive(at(0.0, "force"), T0)
-    overload.receive(wrench(valid=False), T0 + RELEASE // 2)
-    overload.receive(at(0.0, "force"), T0 + RELEASE)
-    assert overload.hold
-    overload.receive(at(0.0, "force"), T0 + 2 * RELEASE)
-    assert not overload.hold
+    overload = make_overload(holds=True)
+    for reading, at_ns, hold in (
+        (wrench(), 0, True),
+        (wrench(valid=False), RELEASE // 2, True),
+        (wrench(), RELEASE, True),
+        (wrench(), 2 * RELEASE, False),
+    ):
+        overload.receive(reading, T0 + at_ns)
+        assert overload.hold is hold
 
 
 def test_numbers_that_are_not_valid_neither_begin_nor_end_it() -> None:
-    overload = make_overload()
     old = msgspec.structs.replace(at(2.0, "force"), valid=False)
-    for t_ns in (0, AFTER, 10 * AFTER):
-        overload.receive(old, T0 + t_ns)
-    assert not overload.hold
-    overload.receive(wrench(valid=False, saturated=True), T0 + 20 * AFTER)
-    for t_ns in (0, RELEASE, 10 * RELEASE):
-        overload.receive(wrench(valid=False), T0 + 30 * AFTER + t_ns)
-    assert overload.hold
+    for overload, reading in (
+        (make_overload(), old),
+        (make_overload(holds=True), wrench(valid=False)),
+    ):
+        before = overload.hold
+        for t_ns in (0, AFTER, RELEASE, 10 * RELEASE):
+            overload.receive(reading, T0 + t_ns)
+            assert overload.hold is before
+
+
+STEP_S = 2e-4
+
+
+Z = Coupling(mass=65.0, b_r=0.0, k_r=0.0, k=1500.0, b=20.0, delay_s=0.05, low_pass_hz=40.0)
+
+
+LOOPS = [
+    Z,
+    msgspec.structs.replace(Z, b=150.0, delay_s=0.02),
+    msgspec.structs.replace(Z, b=150.0, delay_s=0.06),
+    msgspec.structs.replace(Z, k=10_000.0, b=100.0, delay_s=0.02),
+    msgspec.structs.replace(Z, b_r=40.0, k_r=300.0),
+    Coupling(mass=5.0, b_r=1.0, k_r=0.0, k=200.0, b=5.0, delay_s=0.04, low_pass_hz=40.0),
+]
+
+
+def growth(loop: Coupling, *, alpha: float = 0.0, integral_s: float = math.inf) -> float:
+    """Return how much larger late swings are than early ones; the loop starts with a kick.
+
+    Semi-implicit Euler on m dv = w - b_r v - k_r x + alpha w_late + integral.
+    """
+    x, v, filtered, integral = 0.0, 1.0, 0.0, 0.0
+    late = deque([0.0] * round(loop.delay_s / STEP_S))
+    weight = STEP_S * 2.0 * math.pi * loop.low_pass_hz
+    sizes = []
+    for _ in range(round(60.0 / STEP_S)):
+        w = -loop.k * x - loop.b * v
+        filtered += weight * (w - filtered)
+        late.append(filtered)
+        w_late = late.popleft()
+        # measured is what the robot gives the operator: -w
+        integral += STEP_S * w_late / integral_s
+        force = w - loop.b_r * v - loop.k_r * x + alpha * w_late + integral
+        v += STEP_S * force / loop.mass
+        x += STEP_S * v
+        sizes.append(abs(v))
+        if abs(v) > 1e6:
+            return math.inf
+    third = len(sizes) // 3
+    return max(sizes[2 * third :]) / max(sizes[third : 2 * third])
+
+
+@pytest.mark.parametrize("loop", LOOPS)
+def test_the_eased_lead_is_stable_below_alpha_max_and_unstable_above(loop: Coupling) -> None:
+    limit = alpha_max(loop)
+    assert growth(loop, alpha=0.9 * limit) < 0.9
+    assert growth(loop, alpha=1.1 * limit) > 1.1
+
+
+@pytest.mark.parametrize("loop", LOOPS)
+def test_the_integral_is_stable_above_its_least_time_and_unstable_below(loop: Coupling) -> None:
+    least = integral_s_min(loop)
+    assert growth(loop, integral_s=1.1 * least) < 0.95
+    assert growth(loop, integral_s=0.9 * least) > 1.05
+
+
+@pytest.mark.parametrize(("k", "b"), [(1500.0, 150.0), (1500.0, 50.0), (800.0, 60.0)])
+def test_the_integral_without_delay_has_the_limit_of_routh(k: float, b: float) -> None:
+    loop = msgspec.structs.replace(Z, k=k, b=b, delay_s=0.0, low_pass_hz=1e5)
+    assert integral_s_min(loop) == pytest.approx(loop.mass / b - b / k, rel=0.01)
+
+
+def test_later_is_less_stable() -> None:
+    limits = [alpha_max(msgspec.structs.replace(Z, delay_s=ms / 1e3)) for ms in (5, 10, 20, 40)]
+    assert limits == sorted(limits, reverse=True)
+
+
+def test_an_undelayed_lead_may_be_eased_as_much_as_one_likes() -> None:
+    assert alpha_max(msgspec.structs.replace(Z, delay_s=0.0)) == math.inf
+
+
+def test_the_simulated_hand_leaves_room_at_20_ms_one_way() -> None:
+    hand = msgspec.structs.replace(Z, mass=70.0, b=150.0, delay_s=0.048)
+    assert alpha_max(hand) > 5.0
+    assert integral_s_min(hand) < INTEGRAL_S / 5.0

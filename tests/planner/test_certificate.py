@@ -1,4 +1,4 @@
-"""K_fail against the energy of a robot that springs hold, and what is read from it."""
+"""The body's gains, and K_fail against the energy of a robot that springs hold."""
 
 from __future__ import annotations
 
@@ -12,13 +12,15 @@ from hypothesis import strategies as st
 
 from services.joint.differential import motor_from_joint
 from services.planner.law.certificate import DIRECTIONS, UNITS, Certificate, motor_mean
-from services.planner.law.gains import GainLaw
+from services.planner.law.gains import GainLaw, JointGains
 from services.planner.law.inverse_kinematics import InverseKinematics
+from services.planner.law.kinematics import Kinematics
 from shared.config.robot_config import RobotConfig
 from shared.robot.robot_model import stand_pose
 from tests.planner.conftest import Closed, at_pose, p_at
 from tests.planner.oracle import Array
 from tests.planner.stands import Stand
+from tests.planner.states import with_law
 
 POSES = (
     {"height": 1.188},
@@ -26,13 +28,13 @@ POSES = (
     {"height": 0.85, "pitch": 0.6},
     {"height": 0.80, "pitch": 1.2, "yaw": -0.02},
 )
+
+
 ASSISTS = (0.0, 200.0)
 
 
 @pytest.fixture(
-    scope="module",
-    params=product(POSES, ASSISTS),
-    ids=lambda s: f"{s[0]['height']:g}m-{s[1]:g}N",
+    scope="module", params=product(POSES, ASSISTS), ids=lambda s: f"{s[0]['height']:g}m-{s[1]:g}N"
 )
 def stand(request: pytest.FixtureRequest, robot: RobotConfig, closed: Closed) -> Stand:
     pose, assist = request.param
@@ -68,29 +70,18 @@ def smallest(robot: RobotConfig, K: Array) -> tuple[float, Array]:
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_failsafe_stiffness_is_the_curvature_of_the_energy(stand: Stand, seed: int) -> None:
     D = random_stiffness(seed)
-    want = stand.stiffness_felt(D)
-    got = stand.certificate.failsafe_stiffness(D)
+    want, got = stand.stiffness_felt(D), stand.certificate.failsafe_stiffness(D)
     np.testing.assert_allclose(got, want, atol=5e-5 * np.abs(want).max())
     np.testing.assert_allclose(got, got.T, rtol=1e-9, atol=1e-6)
 
 
-def test_failsafe_stiffness_of_the_scheduled_gains_is_exact_to_a_newton_per_metre(
-    robot: RobotConfig, stand: Stand
-) -> None:
-    """Where the numbers are small and the verdict hangs on them."""
+def test_of_the_scheduled_gains_it_is_exact_to_1_n_per_m(robot: RobotConfig, stand: Stand) -> None:
+    """Where the numbers are small and the verdict hangs on them: the smallest eigenvalue."""
     D = scheduled(robot, stand)
-    np.testing.assert_allclose(
-        stand.certificate.failsafe_stiffness(D), stand.stiffness_felt(D), rtol=1e-3, atol=1.0
-    )
-
-
-def test_margins_are_the_smallest_eigenvalues_in_shares_of_what_is_required(
-    robot: RobotConfig, stand: Stand
-) -> None:
-    D = scheduled(robot, stand)
+    felt = stand.stiffness_felt(D)
+    np.testing.assert_allclose(stand.certificate.failsafe_stiffness(D), felt, rtol=1e-3, atol=1.0)
     margins = stand.certificate.margins(D)
-    service, _ = smallest(robot, stand.stiffness_felt(D))
-    assert margins.service == pytest.approx(service, abs=2e-3)
+    assert margins.service == pytest.approx(smallest(robot, felt)[0], abs=2e-3)
     assert margins.service > 0.5
 
 
@@ -110,9 +101,7 @@ def in_motor_space(D_module: Array, gear_ratio: float) -> Array:
 
 
 @pytest.mark.parametrize("seed", [4, 5])
-def test_onboard_margin_is_that_of_what_the_motors_hold_alone(
-    robot: RobotConfig, stand: Stand, seed: int
-) -> None:
+def test_onboard_margin_is_of_motors_alone(robot: RobotConfig, stand: Stand, seed: int) -> None:
     D = random_stiffness(seed)
     D_onboard = np.zeros(12)
     for module in range(6):
@@ -183,9 +172,7 @@ def test_all_a_certificate_requires_is_a_margin_of_one(robot: RobotConfig, stand
         assert certificate.margins(np.full(12, 4000.0)).service == pytest.approx(1.0 / share)
 
 
-def test_weakest_is_the_direction_of_an_independent_decomposition(
-    robot: RobotConfig, stand: Stand
-) -> None:
+def test_weakest_is_an_independent_decompositions(robot: RobotConfig, stand: Stand) -> None:
     required = np.array(robot.certificate.K_required)
     for D in (scheduled(robot, stand), *(random_stiffness(seed) for seed in range(6, 12))):
         weakest = stand.certificate.weakest(D)
@@ -217,9 +204,7 @@ def test_weakest_names_the_way_a_robot_with_soft_joints_falls(
     assert weakest.margin < 0.0
 
 
-def test_the_worst_pose_of_the_design_falls_forward_and_a_stiff_one_stands(
-    robot: RobotConfig, ik: InverseKinematics
-) -> None:
+def test_the_worst_pose_falls_unless_it_is_stiff(robot: RobotConfig, ik: InverseKinematics) -> None:
     """The sign changes with the ankles: 0.948 m, ankle theta from limp to stiff."""
     q = at_pose(robot, ik, p_at(robot, 0.948), np.array(stand_pose(robot, 1.188)))
     certificate = Stand(robot, q, 0.0).certificate
@@ -231,9 +216,7 @@ def test_the_worst_pose_of_the_design_falls_forward_and_a_stiff_one_stands(
     assert verdicts[0] < 0.0 < verdicts[1]
 
 
-def test_a_stiffness_that_was_returned_stays_when_another_is_asked_for(
-    robot: RobotConfig,
-) -> None:
+def test_a_stiffness_that_was_returned_stays_when_another_is_asked_for(robot: RobotConfig) -> None:
     certificate, rng = Certificate(robot), np.random.default_rng(3)
     certificate.at(rng.normal(size=(12, 6)), np.zeros((12, 12)))
     soft, stiff = rng.uniform(100.0, 200.0, 12), rng.uniform(1000.0, 2000.0, 12)
@@ -242,3 +225,81 @@ def test_a_stiffness_that_was_returned_stays_when_another_is_asked_for(
     certificate.margins(stiff)
     np.testing.assert_array_equal(found, kept)
     np.testing.assert_array_equal(certificate.failsafe_stiffness(soft), kept)
+
+
+WEIGHT = np.array([0.0, 0.0, 731.6, 0.0, 0.0, 0.0])
+
+
+NO_HESSIAN = np.zeros((12, 12))
+
+
+OPEN = (2, 4)
+"""z and pitch, where the person leads."""
+LEVEL_POSES = ((1.25, 0.0), (1.188, 0.0), (0.948, 0.0), (0.85, 0.6), (0.80, 1.2))
+
+
+@pytest.fixture(params=LEVEL_POSES, ids=lambda p: f"{p[0]:g}m-{p[1]:g}rad")
+def at(request: pytest.FixtureRequest, kinematics: Kinematics, closed: Closed) -> Kinematics:
+    height, pitch = request.param
+    kinematics.update(closed(height, pitch=pitch))
+    return kinematics
+
+
+def gains_under_weight(robot: RobotConfig, at: Kinematics) -> JointGains:
+    return GainLaw(robot).gains(at, at.hessian_times(WEIGHT, np.array([0.0, 0.0, 200.0])))
+
+
+def null_space(robot: RobotConfig, at: Kinematics) -> Array:
+    """Return N (12, 12) as the law uses it: with no K_p, K_q = N K_0."""
+    return GainLaw(with_law(robot, K_p=(0.0,) * 6, K_0=1.0)).gains(at, NO_HESSIAN).K_q
+
+
+def test_gains_are_symmetric(robot: RobotConfig, at: Kinematics) -> None:
+    gains = gains_under_weight(robot, at)
+    np.testing.assert_array_equal(gains.K_q, gains.K_q.T)
+    np.testing.assert_array_equal(gains.B_q, gains.B_q.T)
+
+
+def test_gains_are_the_papers_sum(robot: RobotConfig, at: Kinematics) -> None:
+    law, J = robot.law, at.J.copy()
+    hessian = at.hessian_times(WEIGHT, np.zeros(3)).copy()
+    gains = GainLaw(robot).gains(at, hessian)
+    closed = 1.0 - np.array(law.S)
+    N = null_space(robot, at)
+    K_q = law.K_0 * N + J.T @ np.diag(law.K_p * closed) @ J - hessian
+    B_q = law.B_0 * N + J.T @ np.diag(law.B_p * closed) @ J
+    np.testing.assert_allclose(gains.K_q, K_q, atol=1e-9)
+    np.testing.assert_allclose(gains.B_q, B_q, atol=1e-9)
+
+
+def test_k_p_in_an_open_direction_is_filtered_out(robot: RobotConfig, at: Kinematics) -> None:
+    K_p = tuple(2000.0 if i in OPEN else k for i, k in enumerate(robot.law.K_p))
+    same = GainLaw(with_law(robot, K_p=K_p)).gains(at, NO_HESSIAN)
+    np.testing.assert_array_equal(same.K_q, GainLaw(robot).gains(at, NO_HESSIAN).K_q)
+
+
+def test_unloaded_stiffness_is_k_p_and_a_known_leak(robot: RobotConfig, at: Kinematics) -> None:
+    """Holds exactly: (J^+)^T K_q J^+ = K_p + K_0 lambda^2 (A (A + lambda^2 I))^-1, A = J J^T."""
+    gains = GainLaw(robot).gains(at, NO_HESSIAN)
+    J_plus, A = np.linalg.pinv(at.J), at.J @ at.J.T
+    damping = robot.law.damping_lambda**2
+    leak = robot.law.K_0 * damping * np.linalg.inv(A @ (A + damping * np.eye(6)))
+    K_p = np.diag(np.where(np.array(robot.law.S) == 1, 0.0, robot.law.K_p))
+    np.testing.assert_allclose(J_plus.T @ gains.K_q @ J_plus, K_p + leak, rtol=1e-6, atol=1e-6)
+
+
+def test_undamped_the_open_directions_are_free(robot: RobotConfig, at: Kinematics) -> None:
+    gains = GainLaw(with_law(robot, damping_lambda=1e-6)).gains(at, NO_HESSIAN)
+    J_plus = np.linalg.pinv(at.J)
+    for gain in (gains.K_q, gains.B_q):
+        np.testing.assert_allclose((J_plus.T @ gain @ J_plus)[list(OPEN)], 0.0, atol=1e-3)
+
+
+def test_the_null_space_is_clear_of_the_task(robot: RobotConfig, at: Kinematics) -> None:
+    """Singular values of J N are s lambda^2 / (s^2 + lambda^2), at most lambda / 2."""
+    N = null_space(robot, at)
+    values = np.linalg.eigvalsh(N)
+    assert values.min() >= -1e-12
+    assert values.max() <= 1.0 + 1e-12
+    assert np.sum(values > 1 - 1e-9) == 6  # the six directions that J does not see are whole
+    assert np.linalg.norm(at.J @ N, 2) <= robot.law.damping_lambda / 2 + 1e-12

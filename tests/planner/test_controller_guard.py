@@ -1,9 +1,10 @@
-"""What a controller of somebody's own may do, and what holds all six instead."""
+"""A controller of somebody's own: how it is found, what it may do, what holds all instead."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from services.planner.controller import Action, Observation
+from services.planner.controller_file import absolute, controller_maker, split_spec
 from services.planner.intents import OperatorRequest
 from services.planner.law.hocca import Hocca
 from services.planner.law.split import LocalGains
@@ -18,10 +20,91 @@ from services.planner.watch.controller_guard import SUPPORT, ControllerGuard
 from shared.bus.messages import SplitSource
 from shared.config.files import load
 from shared.config.robot_config import RobotConfig
+from shared.exceptions import ConfigError
 from shared.places import DEFAULT_CONFIG
 from shared.robot.frames import capture_point
 from shared.robot.robot_model import stand_pose
 from shared.state import copied
+
+GOOD = """
+class Controller:
+    made = 0
+    def __init__(self, robot):
+        self.name = robot.name
+        Controller.made += 1
+    def reset(self, seen): pass
+    def step(self, seen): pass
+
+def other(robot):
+    return Controller(robot)
+"""
+
+
+@pytest.fixture
+def mine(tmp_path: Path) -> Path:
+    return tmp_path / "mine.py"
+
+
+@pytest.mark.parametrize("name", ["", ":Controller", ":other"])
+def test_each_planner_gets_one_of_its_own(mine: Path, robot: RobotConfig, name: str) -> None:
+    mine.write_text(GOOD, encoding="utf-8")
+    make = controller_maker(f"{mine}{name}", robot)
+    assert make() is not make()
+    assert make().name == robot.name  # type: ignore[attr-defined]  # of the file
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "said"),
+    [
+        (GOOD, ":Absent", "has no Absent; a class or function Absent"),
+        ("def Controller(robot): return 3", "", "has no reset and no step"),
+        ("class Controller:\n  def reset(self, s): pass\n  def __init__(self, r): pass", "",
+         "has no step; reset"),
+        ("def Controller(): pass", "", "raised TypeError"),
+        ("import nowhere_to_be_found", "", "raised ModuleNotFoundError: No module named"),
+        ("def (", "", "raised SyntaxError"),
+        ("1 / 0", "", "raised ZeroDivisionError"),
+    ],
+)  # fmt: skip
+def test_a_file_that_cannot_be_used_is_one_clear_line(
+    mine: Path, robot: RobotConfig, text: str, name: str, said: str
+) -> None:
+    mine.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        controller_maker(f"{mine}{name}", robot)
+    assert said in str(caught.value)
+    assert "mine.py" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("spec", ["absent.py", "absent", "absent.txt", ""])
+def test_a_file_that_is_not_there_is_one_clear_line(spec: str, robot: RobotConfig) -> None:
+    with pytest.raises(ConfigError, match=r"FILE\.py or FILE\.py:NAME"):
+        controller_maker(spec, robot)
+
+
+def test_a_spec_is_file_and_name() -> None:
+    assert split_spec("a/b.py") == (Path("a/b.py"), "Controller")
+    assert split_spec("a/b.py:LQR") == (Path("a/b.py"), "LQR")
+    assert split_spec("/home/me/.pyenv/c/mine.py:B") == (Path("/home/me/.pyenv/c/mine.py"), "B")
+    assert absolute("b.py:LQR") == f"{Path.cwd() / 'b.py'}:LQR"
+
+
+def test_the_one_that_was_looked_at_is_the_first_planners(mine: Path, robot: RobotConfig) -> None:
+    """It may have opened a device, which a second one could not."""
+    mine.write_text(GOOD.replace("def __init__", "all = []\n    def __init__"), encoding="utf-8")
+    make = controller_maker(str(mine), robot)
+    first = make()
+    assert type(first).made == 1  # type: ignore[attr-defined]  # of the file
+    make()
+    assert type(first).made == 2  # type: ignore[attr-defined]
+
+
+def test_a_file_beside_it_can_be_imported(mine: Path, robot: RobotConfig) -> None:
+    (mine.parent / "beside_my_controller.py").write_text("GAIN = 3", encoding="utf-8")
+    mine.write_text(f"import beside_my_controller\n{GOOD}", encoding="utf-8")
+    controller_maker(str(mine), robot)
+
 
 GEOMETRY = load(DEFAULT_CONFIG).geometry
 
@@ -71,9 +154,7 @@ def test_what_is_the_shipped_laws_stays_it_to_the_last_bit(hocca: Hocca, seen: O
     assert np.array_equal(found.local.D_B, seen.law.local.D_B)
 
 
-def test_while_it_does_not_lead_it_is_reset_and_the_shipped_law_counts(
-    hocca: Hocca, seen: Observation
-) -> None:
+def test_unless_it_leads_the_shipped_law_counts(hocca: Hocca, seen: Observation) -> None:
     mine = Scripted(changed(tau_coupled=np.ones(12)))
     guard = ControllerGuard(mine, hocca, GEOMETRY)
     assert guard.act(seen, leads=False) is seen.law
@@ -96,6 +177,8 @@ def raises(_seen: Observation) -> Action:
 
 
 NAN = np.full(12, math.nan)
+
+
 BAD = {
     "None": lambda _: None,
     "a tuple": lambda seen: tuple(Action.of(seen.law)),
@@ -113,9 +196,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_what_is_no_action_holds_all_and_is_not_asked_again(
-    hocca: Hocca, seen: Observation, name: str
-) -> None:
+def test_what_is_no_action_holds_all(hocca: Hocca, seen: Observation, name: str) -> None:
     mine = Scripted(BAD[name])
     guard = ControllerGuard(mine, hocca, GEOMETRY)
     for _ in range(3):
@@ -128,9 +209,7 @@ def test_what_is_no_action_holds_all_and_is_not_asked_again(
 
 
 @pytest.mark.parametrize("scale", [0.0, 0.3, 0.6, -1.0, 1e3])
-def test_gains_that_do_not_stand_alone_or_are_beyond_the_limit_are_never_sent(
-    hocca: Hocca, seen: Observation, scale: float
-) -> None:
+def test_gains_that_fall_are_never_sent(hocca: Hocca, seen: Observation, scale: float) -> None:
     soft = Scripted(lambda seen: Action.of(seen.law)._replace(D=scale * seen.law.local.D))
     guard = ControllerGuard(soft, hocca, GEOMETRY)
     found = guard.act(seen, leads=True)
@@ -153,9 +232,7 @@ def test_stiffer_gains_that_stand_are_sent(hocca: Hocca, seen: Observation, scal
     assert found.local.margins.service >= seen.law.local.margins.service
 
 
-def test_without_a_certified_schedule_no_own_gains_are_sent(
-    robot: RobotConfig, seen: Observation
-) -> None:
+def test_no_own_gains_without_a_schedule(robot: RobotConfig, seen: Observation) -> None:
     papers = msgspec.structs.replace(
         robot, law=msgspec.structs.replace(robot.law, split="diagonal"), gain_schedule=None
     )
@@ -189,9 +266,7 @@ def test_on_a_slope_the_capture_point_is_against_gravity() -> None:
     assert capture_point(p, (0.0,) * 6, (0.05, -0.02)) == (-0.05, 0.02), "downhill of the ankles"
 
 
-def test_what_it_sees_cannot_be_written_and_nothing_of_the_guards_changes(
-    hocca: Hocca, seen: Observation
-) -> None:
+def test_what_it_sees_cannot_be_written(hocca: Hocca, seen: Observation) -> None:
     for part in ("p", "pdot", "q", "J", "T"):
 
         def write(shown: Observation, part: str = part) -> Action:
@@ -241,9 +316,7 @@ def test_after_the_edge_all_hold_until_it_is_calm(hocca: Hocca, seen: Observatio
     assert back.index(SplitSource.SCHEDULE) == pytest.approx(250, abs=2)
 
 
-def test_references_that_would_come_to_rest_off_the_soles_are_not_sent(
-    hocca: Hocca, seen: Observation
-) -> None:
+def test_references_off_the_soles_are_not_sent(hocca: Hocca, seen: Observation) -> None:
     """Each joint is within its bounds; held, the whole would lean by 8 cm."""
     lean = Scripted(
         lambda seen: Action.of(seen.law)._replace(q_ref=seen.law.q_ref + 0.08 * seen.T[:, 0])

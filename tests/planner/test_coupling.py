@@ -8,10 +8,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.planner.law.coupling import CouplingFilter, UncoupledGains, pole_gain
+from services.planner.law.small_matrices import LuDecomposition, eigenvalue_min, positive_part
 
 K_P = np.array([2810.0, 2810.0, 0.0, 800.0, 0.0, 400.0])
+
+
 B_P = np.array([300.0, 300.0, 0.0, 60.0, 0.0, 40.0])
+
+
 S = np.array([0.0, 0.0, 1.0, 0.0, 1.0, 0.0])
+
+
 CLOSED = np.ix_([0, 1, 3, 5], [0, 1, 3, 5])
 
 
@@ -38,9 +45,7 @@ def test_gains_that_are_stiffer_than_the_body_s_are_not_softened() -> None:
 
 
 @given(st.integers(0, 10_000), st.floats(1.0, 1e5), st.floats(0.0, 4.0))
-def test_it_is_symmetric_never_negative_and_zero_where_the_person_leads(
-    seed: int, scale: float, damping: float
-) -> None:
+def test_it_only_adds_and_only_where_closed(seed: int, scale: float, damping: float) -> None:
     for matrix in missing(damping).at(symmetric(seed, scale), symmetric(seed + 1, scale)):
         np.testing.assert_allclose(matrix, matrix.T, rtol=1e-9, atol=1e-9 * scale)
         assert np.linalg.eigvalsh(matrix).min() > -1e-8 * max(scale, 1e4)
@@ -80,13 +85,38 @@ def test_above_its_bandwidth_it_falls_with_the_square() -> None:
     assert 3.5 < gains[0] / gains[1] < 4.5
 
 
-def test_it_goes_on_from_what_it_remembers_and_forgets_on_reset() -> None:
-    one, other = CouplingFilter(3.0), CouplingFilter(3.0)
+def test_it_forgets_on_reset() -> None:
+    filtered = CouplingFilter(3.0)
     for step in range(20):
-        one.advance(np.full(12, float(step)), 0.004)
-    other.restore(one.snapshot())
-    np.testing.assert_array_equal(
-        one.advance(np.ones(12), 0.004), other.advance(np.ones(12), 0.004)
-    )
-    one.reset()
-    np.testing.assert_array_equal(one.advance(np.zeros(12), 0.004), 0.0)
+        filtered.advance(np.full(12, float(step)), 0.004)
+    filtered.reset()
+    np.testing.assert_array_equal(filtered.advance(np.zeros(12), 0.004), 0.0)
+
+
+@given(seed=st.integers(0, 10_000), n=st.sampled_from([2, 6, 12]), columns=st.integers(0, 6))
+def test_it_solves_as_numpy_does_and_leaves_its_arguments(seed: int, n: int, columns: int) -> None:
+    draw = np.random.default_rng(seed)
+    A, b = draw.normal(size=(n, n)) + 3.0 * np.eye(n), draw.normal(size=(n, columns or 1))
+    b = b if columns else b[:, 0]
+    A_before, b_before = A.copy(), b.copy()
+    decomposition = LuDecomposition(A)
+    np.testing.assert_allclose(decomposition.solve(b), np.linalg.solve(A, b), atol=1e-9)
+    assert np.array_equal(A, A_before)
+    assert np.array_equal(b, b_before)
+
+
+def test_of_what_is_no_number_nothing_is_solved() -> None:
+    assert np.isnan(LuDecomposition(np.full((3, 3), np.nan)).solve(np.ones(3))).all()
+
+
+@given(seed=st.integers(0, 10_000), n=st.sampled_from([2, 4, 6]))
+def test_eigenvalues_and_positive_parts_are_numpys(seed: int, n: int) -> None:
+    draw = np.random.default_rng(seed)
+    A = draw.normal(size=(n, n))
+    A = A + A.T
+    before = A.copy()
+    values, vectors = np.linalg.eigh(A)
+    np.testing.assert_allclose(eigenvalue_min(A), values[0], atol=1e-9)
+    wanted = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    np.testing.assert_allclose(positive_part(A), wanted, atol=1e-9)
+    assert np.array_equal(A, before)

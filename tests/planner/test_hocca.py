@@ -1,23 +1,32 @@
-"""The whole-body law in closed form: statics, open directions, stiffness, references."""
+"""The whole-body law: statics, open directions, stiffness, references; and its own slopes."""
 
 from __future__ import annotations
 
-import msgspec
+import math
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
+from services.planner.law import inverse_kinematics, reference
 from services.planner.law.hocca import Hocca, LawOutput
 from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.kinematics import Kinematics
 from services.planner.law.split import LocalGains
 from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
-from tests.planner.conftest import Closed, at_pose
+from tests.planner.conftest import Closed, at_pose, p_at
 from tests.planner.oracle import LEFT, RIGHT, Array
+from tests.planner.states import with_law
 
 DT = 0.004
+
+
 STILL = np.zeros(12)
+
+
 OPEN = {"z": 2, "pitch": 4}
+
 
 POSES = ((1.25, 0.0), (1.188, 0.0), (0.948, 0.0), (0.85, 0.6), (0.80, 1.2))
 
@@ -34,36 +43,11 @@ def q(request: pytest.FixtureRequest, closed: Closed) -> Array:
     return closed(height, pitch=pitch)
 
 
-def torque(output: LawOutput, q: Array, v: Array = STILL) -> Array:
-    """Return what the joint services apply from a command that is not aged, once it settles."""
-    spring = output.local.D * (output.q_ref - q)
-    damper = output.local.D_B * (output.v_ref - v)
-    return np.asarray(output.tau_ff + output.tau_unfiltered + spring + damper, float)
-
-
-def gravity(robot: RobotConfig, q: Array) -> Array:
-    """Return the slope of the potential energy (12,), N m."""
-    energy = oracle.derivative(lambda x: np.array([oracle.potential_energy(robot, x)]), q, 1e-5)
-    return np.asarray(energy[0], float)
-
-
 def moved(robot: RobotConfig, ik: InverseKinematics, q: Array, index: int, by: float) -> Array:
     """Return the joint angles after one part of p has moved and the rest stayed."""
     p = oracle.pose(robot, q)
     p[index] += by
     return at_pose(robot, ik, p, q)
-
-
-def test_in_balance_feedforward_holds_gravity_along_every_closed_motion(
-    robot: RobotConfig, law: Hocca, q: Array
-) -> None:
-    """Virtual work, to 1e-6 N m: with T (12, 6) of unit columns that keep the legs together."""
-    output = law.tick(q, STILL, 0.0, DT)
-    C = oracle.derivative(lambda x: oracle.closure(robot, x), q)
-    closed_motions = np.linalg.svd(C)[2][6:]
-    held, weight = closed_motions @ output.tau_ff, closed_motions @ gravity(robot, q)
-    assert np.abs(weight).max() > 10.0
-    np.testing.assert_allclose(held, weight, atol=1e-6)
 
 
 def test_in_balance_nothing_but_feedforward_acts(law: Hocca, q: Array) -> None:
@@ -72,28 +56,6 @@ def test_in_balance_nothing_but_feedforward_acts(law: Hocca, q: Array) -> None:
     np.testing.assert_allclose(output.v_ref, 0.0, atol=1e-6)
     np.testing.assert_allclose(output.tau_coupled, 0.0, atol=1e-3)
     np.testing.assert_allclose(torque(output, q), output.tau_ff, atol=1e-3)
-
-
-@pytest.mark.parametrize("assist", [0.0, 150.0])
-def test_feet_carry_the_weight_and_the_assist(
-    robot: RobotConfig, law: Hocca, q: Array, assist: float
-) -> None:
-    output = law.tick(q, STILL, assist, DT)
-    feet = [oracle.foot_wrench(robot, side, q, output.tau_ff) for side in (RIGHT, LEFT)]
-    expected = 74.58 * oracle.GRAVITY + assist
-    assert feet[0][2] + feet[1][2] == pytest.approx(expected, abs=1e-5)
-    np.testing.assert_allclose(feet[0][:2] + feet[1][:2], 0.0, atol=1e-5)
-
-
-def test_assist_acts_at_the_harness_point(robot: RobotConfig, law: Hocca, q: Array) -> None:
-    """docs/law.md#feedforward: all of the 150 N, at the harness point and not at the COM."""
-    output = law.tick(q, STILL, 150.0, DT)
-    total = sum(oracle.torso_wrench(robot, side, q, output.tau_ff) for side in (RIGHT, LEFT))
-    leg = oracle.leg(robot, RIGHT, q)
-    arm = leg.R @ np.array(robot.geometry.harness_point)
-    lift = np.array([0.0, 0.0, 150.0])
-    weight = np.array([0.0, 0.0, oracle.masses(robot)[0] * oracle.GRAVITY])
-    np.testing.assert_allclose(total, [*(lift + weight), *np.cross(arm, lift)], atol=1e-4)
 
 
 @pytest.mark.parametrize(("direction", "by"), [("z", -0.01), ("pitch", 0.1)])
@@ -108,54 +70,13 @@ def test_open_directions_are_free(
     q_moved = moved(robot, ik, q, OPEN[direction], by)
     assert np.abs(q_moved - q).max() > 5e-3
     T = oracle.feasible(robot, q_moved)
-    weight = gravity(robot, q_moved)
+    weight = weight_and_load(robot, q_moved, 0.0)
     for force, moment in ((2.0, 0.1), (0.1, 0.01)):
         output = law.tick(q_moved, STILL, 0.0, DT)
         np.testing.assert_allclose(output.q_ref, q_moved, atol=2e-5)
         pull = T.T @ (torque(output, q_moved) - weight)
         assert abs(pull[2]) < force
         assert abs(pull[4]) < moment
-
-
-def test_a_motion_in_the_open_directions_is_not_damped(
-    robot: RobotConfig, law: Hocca, q: Array
-) -> None:
-    law.tick(q, STILL, 0.0, DT, align=True)
-    T = oracle.feasible(robot, q)
-    v = T @ np.array([0.0, 0.0, -0.15, 0.0, 0.3, 0.0])
-    output = law.tick(q, v, 0.0, DT)
-    np.testing.assert_allclose(output.v_ref, v, atol=2e-4)
-    pull = T.T @ (torque(output, q, v) - gravity(robot, q))
-    assert np.abs(pull[[2, 4]]).max() < 0.1
-
-
-@pytest.mark.parametrize("index", [0, 1, 3])
-def test_a_displacement_in_x_y_or_roll_is_pushed_back_by_k_p_or_more(
-    robot: RobotConfig, law: Hocca, ik: InverseKinematics, q: Array, index: int
-) -> None:
-    """More where the local gains alone are stiffer: the planner softens nothing."""
-    law.tick(q, STILL, 0.0, DT, align=True)
-    for _ in range(2 * round(robot.law.recentre_s / DT)):
-        law._closed_loop_reference(DT)  # the reference has glided to zero
-    by = 0.01
-    q_moved = moved(robot, ik, q, index, by)
-    output = law.tick(q_moved, STILL, 0.0, DT)
-    T = oracle.feasible(robot, q_moved)
-    pull = T.T @ (torque(output, q_moved) - gravity(robot, q_moved))
-    assert pull[index] < -0.94 * robot.law.K_p[index] * by
-
-
-def test_a_motion_in_x_is_damped_by_its_share_of_b_p(
-    robot: RobotConfig, law: Hocca, q: Array
-) -> None:
-    law.tick(q, STILL, 0.0, DT, align=True)
-    T = oracle.feasible(robot, q)
-    v = T @ np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
-    output = law.tick(q, v, 0.0, DT)
-    pull = T.T @ (torque(output, q, v) - gravity(robot, q))
-    assert robot.gain_schedule is not None
-    share = robot.gain_schedule.coupling_damping
-    assert pull[0] == pytest.approx(-share * robot.law.B_p[0] * 0.1, rel=0.06)
 
 
 def test_coupled_torques_come_slowly_and_ease_at_once(
@@ -171,24 +92,20 @@ def test_coupled_torques_come_slowly_and_ease_at_once(
     np.testing.assert_allclose(output.tau_coupled, output.tau_unfiltered, atol=0.02)
 
 
-def test_align_makes_no_step(law: Hocca, closed: Closed) -> None:
-    """Off centre, rolled and yawed: the references are the measured pose."""
-    q = closed(1.0, x=0.03, y=-0.02, roll=0.05, pitch=0.3, yaw=-0.04)
-    output = law.tick(q, STILL, 0.0, DT, align=True)
-    np.testing.assert_allclose(output.q_ref, q, atol=1e-5)
-    np.testing.assert_allclose(torque(output, q), output.tau_ff, atol=0.02)
-
-
 def test_align_makes_no_step_from_any_pose_before(law: Hocca, closed: Closed) -> None:
-    law.tick(closed(1.188), STILL, 0.0, DT, align=True)
-    q = closed(0.9, x=-0.03, pitch=0.5)
-    output = law.tick(q, STILL, 0.0, DT, align=True)
-    np.testing.assert_allclose(output.q_ref, q, atol=1e-5)
+    """Off centre, rolled and yawed: the references are the measured pose."""
+    for pose in (
+        {"height": 1.0, "x": 0.03, "y": -0.02, "roll": 0.05, "pitch": 0.3, "yaw": -0.04},
+        {"height": 1.188},
+        {"height": 0.9, "x": -0.03, "pitch": 0.5},
+    ):
+        q = closed(**pose)
+        output = law.tick(q, STILL, 0.0, DT, align=True)
+        np.testing.assert_allclose(output.q_ref, q, atol=1e-5)
+        np.testing.assert_allclose(torque(output, q), output.tau_ff, atol=0.02)
 
 
-def test_after_align_the_reference_glides_to_the_centre(
-    robot: RobotConfig, law: Hocca, closed: Closed
-) -> None:
+def test_the_reference_glides_to_the_centre(robot: RobotConfig, law: Hocca, closed: Closed) -> None:
     q = closed(1.0, x=0.03, y=-0.02, roll=0.05, yaw=-0.04)
     p = oracle.pose(robot, q)
     shut = [0, 1, 3, 5]
@@ -205,14 +122,10 @@ def test_after_align_the_reference_glides_to_the_centre(
     np.testing.assert_allclose(p_ref[[2, 4]], p[[2, 4]], atol=1e-8)  # where the person leads
 
 
-def test_a_height_and_a_pitch_that_are_closed_stay_where_they_were_found(
-    robot: RobotConfig, closed: Closed
-) -> None:
+def test_closed_heights_and_pitches_stay_as_found(robot: RobotConfig, closed: Closed) -> None:
     """They glided to a COM on the floor once: zero is no stand."""
-    law = msgspec.structs.replace(
-        robot.law, S=(0,) * 6, K_p=(2810.0, 2810.0, 3000.0, 800.0, 300.0, 400.0), split="diagonal"
-    )
-    closing = Hocca(msgspec.structs.replace(robot, law=law))
+    K_p = (2810.0, 2810.0, 3000.0, 800.0, 300.0, 400.0)
+    closing = Hocca(with_law(robot, S=(0,) * 6, K_p=K_p, split="diagonal"))
     q = closed(1.0, x=0.02, pitch=0.3)
     p = oracle.pose(robot, q)
     closing.tick(q, STILL, 0.0, DT, align=True)
@@ -224,9 +137,7 @@ def test_a_height_and_a_pitch_that_are_closed_stay_where_they_were_found(
     np.testing.assert_allclose(closing.tick(q, STILL, 0.0, DT).p_ref[[2, 4]], p[[2, 4]], atol=1e-9)
 
 
-def test_reference_rates_keep_the_legs_together_and_follow_the_person(
-    robot: RobotConfig, law: Hocca, q: Array
-) -> None:
+def test_reference_rates_follow_the_person(robot: RobotConfig, law: Hocca, q: Array) -> None:
     """C v_ref = 0 and J v_ref = S J v, p_C resting."""
     law.tick(q, STILL, 0.0, DT, align=True)
     v = 0.3 * np.random.default_rng(6).normal(size=12)
@@ -260,37 +171,18 @@ def test_feedforward_rate_is_the_slope_of_feedforward_along_what_the_robot_can_d
 
 
 def test_assist_is_rate_limited_and_capped(robot: RobotConfig, law: Hocca, closed: Closed) -> None:
-    q = closed(1.188)
+    q, most, step = closed(1.188), robot.assist.force_max, robot.assist.rate_max * DT
     law.tick(q, STILL, 0.0, DT, align=True)
-    before, step = 0.0, robot.assist.rate_max * DT
-    for _ in range(round(2 * robot.assist.force_max / step)):
-        assist = law.tick(q, STILL, 1e4, DT).assist
-        assert 0.0 <= assist - before <= step + 1e-9
-        before = assist
-    assert before == pytest.approx(robot.assist.force_max)
-    for _ in range(round(2 * robot.assist.force_max / step)):
-        assist = law.tick(q, STILL, -1e4, DT).assist
-        assert -step - 1e-9 <= assist - before <= 0.0
-        before = assist
-    assert before == 0.0
-
-
-def test_assist_wanted_at_align_is_within_the_cap(
-    robot: RobotConfig, law: Hocca, closed: Closed
-) -> None:
-    q = closed(1.188)
-    assert law.tick(q, STILL, 1e4, DT, align=True).assist == robot.assist.force_max
-    assert Hocca(robot).tick(q, STILL, -1e4, DT, align=True).assist == 0.0
-
-
-def test_assist_is_rate_limited_while_aligning_too(
-    robot: RobotConfig, law: Hocca, closed: Closed
-) -> None:
-    """Only the very first tick takes over at once what HOLD carries."""
-    q = closed(1.188)
-    assert law.tick(q, STILL, 0.0, DT, align=True).assist == 0.0
-    step = robot.assist.rate_max * DT
-    assert law.tick(q, STILL, 200.0, DT, align=True).assist == pytest.approx(step)
+    before = law.tick(q, STILL, most, DT, align=True).assist
+    assert before == pytest.approx(step), "while aligning too"
+    for wanted, end in ((1e4, most), (-1e4, 0.0)):
+        for _ in range(round(2 * most / step)):
+            assist = law.tick(q, STILL, wanted, DT).assist
+            assert 0.0 <= math.copysign(1.0, wanted) * (assist - before) <= step + 1e-9
+            before = assist
+        assert before == pytest.approx(end)
+        # only the very first tick takes over at once what HOLD carries
+        assert Hocca(robot).tick(q, STILL, wanted, DT, align=True).assist == end
 
 
 def test_references_come_back_after_a_lift_past_the_knees_soft_stop(
@@ -324,3 +216,201 @@ def test_two_laws_given_the_same_give_the_same_bits(robot: RobotConfig, closed: 
         for a, b in zip((*one, *one.local), (*other, *other.local), strict=True):
             if not isinstance(a, LocalGains):  # its parts are compared one by one
                 np.testing.assert_array_equal(a, b)
+
+
+STANDS = (
+    {"height": 1.188},
+    {"height": 1.0, "x": 0.02, "y": -0.015, "roll": 0.03, "pitch": 0.3, "yaw": 0.04},
+    {"height": 0.948},
+    {"height": 0.80, "pitch": 1.2},
+)
+
+
+SQUAT = [(height, 0.0) for height in np.linspace(1.188, 0.948, 13)]
+
+
+CRAWL = [(1.188 - 0.398 * share, 1.2 * share) for share in np.linspace(0.0, 1.0, 13)]
+"""docs/simulator.md#reference-scenario: torso height in m and pitch in rad."""
+
+
+@pytest.fixture(params=STANDS, ids=lambda p: f"{p['height']:g}m-{p.get('pitch', 0):g}rad")
+def posed(request: pytest.FixtureRequest, closed: Closed) -> Array:
+    return closed(**request.param)
+
+
+def torque(output: LawOutput, q: Array, v: Array = STILL) -> Array:
+    """Return what the joint services apply from a command that is not aged."""
+    spring = output.local.D * (output.q_ref - q)
+    damper = output.local.D_B * (output.v_ref - v)
+    return np.asarray(output.tau_ff + output.tau_unfiltered + spring + damper, float)
+
+
+def settled(law: Hocca, q: Array, assist: float) -> LawOutput:
+    """Return the law's output at rest at a pose, once all of the assist is given."""
+    for _ in range(2000):
+        if law.tick(q, STILL, assist, DT, align=True).assist == assist:
+            return law.tick(q, STILL, assist, 0.0, align=True)
+    raise AssertionError("the assist never came")
+
+
+def weight_and_load(robot: RobotConfig, q: Array, assist: float) -> Array:
+    """Return the slope (12,) of the potential energy of robot and operator's load, N m."""
+
+    def energy(q_near: Array) -> Array:
+        load = assist * oracle.harness(robot, q_near)[2]
+        return np.array(oracle.potential_energy(robot, q_near) + load)
+
+    return oracle.precise_derivative(energy, q)
+
+
+def feet(robot: RobotConfig, q: Array, tau: Array) -> list[Array]:
+    return [oracle.foot_wrench(robot, side, q, tau) for side in (RIGHT, LEFT)]
+
+
+def about_origin(wrench: Array, at: Array) -> Array:
+    """Return a wrench (6,) at a point with its moment about the world's origin."""
+    return np.concatenate([wrench[:3], wrench[3:] + np.cross(at, wrench[:3])])
+
+
+def on_the_feet(robot: RobotConfig, q: Array, tau: Array) -> Array:
+    """Return the sum (6,) of both feet's wrenches, moment about the world's origin."""
+    ankles = [oracle.leg(robot, side, q).ankle for side in (RIGHT, LEFT)]
+    right, left = feet(robot, q, tau)
+    return about_origin(right, ankles[0]) + about_origin(left, ankles[1])
+
+
+def to_carry(robot: RobotConfig, q: Array, assist: float) -> Array:
+    """Return the wrench (6,) that weight and operator's load ask of the floor."""
+    weight = np.array([0.0, 0.0, oracle.masses(robot)[1] * oracle.GRAVITY, 0.0, 0.0, 0.0])
+    lift = np.array([0.0, 0.0, assist, 0.0, 0.0, 0.0])
+    r_com, r_harness = oracle.pose(robot, q)[:3], oracle.harness(robot, q)
+    return about_origin(weight, r_com) + about_origin(lift, r_harness)
+
+
+@pytest.mark.parametrize("assist", [0.0, 200.0])
+def test_feedforward_is_exact_at_rest(robot: RobotConfig, posed: Array, assist: float) -> None:
+    """T^T tau_ff = d(energy)/dp to 1e-9 N and N m, at the pose that the law itself takes."""
+    output = settled(Hocca(robot), posed, assist)
+    np.testing.assert_allclose(output.q_ref, posed, atol=1e-6)
+    T = oracle.feasible(robot, posed)
+    held, wanted = T.T @ output.tau_ff, T.T @ weight_and_load(robot, posed, assist)
+    assert wanted[2] > 74.0 * oracle.GRAVITY + assist
+    np.testing.assert_allclose(held, wanted, atol=1e-9)
+
+
+@pytest.mark.parametrize("assist", [0.0, 200.0])
+def test_the_feet_carry_weight_and_assist(robot: RobotConfig, posed: Array, assist: float) -> None:
+    """All six parts of the sum, about the world's origin."""
+    output = settled(Hocca(robot), posed, assist)
+    got = on_the_feet(robot, posed, torque(output, posed))
+    np.testing.assert_allclose(got, to_carry(robot, posed, assist), atol=1e-5)
+
+
+def test_pushed_by_the_operator_the_feet_carry_the_push_too(
+    robot: RobotConfig, ik: InverseKinematics, closed: Closed
+) -> None:
+    """Leant on until 2 mm off centre: sum of the feet = weight + assist + operator.
+
+    The operator pushes on the torso with what K_fail and K_c answer along p.
+    """
+    assist, moved = 150.0, np.array([0.002, -0.002, 0.0, 0.002, 0.0, 0.002])
+    centre = closed(1.1)
+    law = Hocca(robot)
+    settled(law, centre, assist)
+    pushed = at_pose(robot, ik, oracle.pose(robot, centre) + moved, centre)
+    for _ in range(2):  # the second tick's feedforward is that of the moved reference
+        output = law.tick(pushed, STILL, assist, 0.0)
+    T = oracle.feasible(robot, pushed)
+    K_fail = law._split.certificate.failsafe_stiffness(output.local.D)
+    K_c, _ = law._terms._uncoupled.at(K_fail, (T.T * output.local.D_B) @ T)
+    along_p = (K_fail + K_c) @ moved
+    torso_per_p = oracle.leg_jacobian(robot, RIGHT, pushed) @ T[oracle.LEG[RIGHT]]
+    operator = np.linalg.solve(torso_per_p.T, along_p)
+    push = about_origin(operator, oracle.leg(robot, RIGHT, pushed).torso)
+    assert np.abs(operator[:2]).min() > 3.0
+    got = on_the_feet(robot, pushed, torque(output, pushed)) - to_carry(robot, pushed, assist)
+    np.testing.assert_allclose(got, -push, atol=0.02 * np.abs(push).max())
+
+
+def test_each_centre_of_pressure_stays_inside_its_sole(
+    robot: RobotConfig, ik: InverseKinematics, closed: Closed
+) -> None:
+    """Over the whole squat and the whole crawl, with 0 and 200 N; and no foot slides."""
+    geometry = robot.geometry
+    law, q, nearest = Hocca(robot), closed(1.188), np.inf
+    for assist in (0.0, 200.0):
+        for height, pitch in [*SQUAT, *SQUAT[::-1], *CRAWL]:
+            q = at_pose(robot, ik, p_at(robot, height, pitch=pitch), q)
+            for wrench in feet(robot, q, torque(settled(law, q, assist), q)):
+                force = wrench[:3]
+                below = np.array([0.0, 0.0, -geometry.foot_height])
+                moment = wrench[3:] - np.cross(below, force)
+                x, y = -moment[1] / force[2], moment[0] / force[2]
+                room = (geometry.l_foot / 2 - abs(x), geometry.w_foot / 2 - abs(y))
+                nearest = min(nearest, *room)
+                assert min(room) > 0.0, (height, pitch, assist, x, y)
+                assert force[2] > 0.3 * oracle.masses(robot)[1] * oracle.GRAVITY
+                assert np.hypot(force[0], force[1]) < 0.5 * force[2]  # rubber on a poor floor
+    print(f"nearest to an edge: {1e3 * nearest:.1f} mm")  # noqa: T201  # shown by pytest -rP
+    assert nearest > 0.01
+
+
+def K_p(robot: RobotConfig) -> Array:  # noqa: N802 - the paper's letter
+    return np.diag(np.array(robot.law.K_p) * (1.0 - np.array(robot.law.S)))
+
+
+@pytest.fixture
+def exact_ik(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the inverse kinematics go on until nothing is left to do."""
+    monkeypatch.setattr(inverse_kinematics, "TOLERANCE", 1e-13)
+    for module in (inverse_kinematics, reference):
+        monkeypatch.setattr(module, "STEP_SURE", 1e-9)
+
+
+def torque_of(law: Hocca) -> Callable[[Array, Array], Array]:
+    """Return (q, v) -> total torque (12,) of a tick at standing time, nothing remembered."""
+
+    def total(q: Array, v: Array) -> Array:
+        return torque(law.tick(q, v, 0.0, 0.0), q, v)
+
+    return total
+
+
+@pytest.mark.usefixtures("exact_ik")
+def test_it_feels_like_k_p_where_it_balances_or_free(robot: RobotConfig, posed: Array) -> None:
+    """With the real S, references moving: -dQ/dp = (K_fail + K_c) S_perp, Q all forces."""
+    law = Hocca(robot)
+    law.tick(posed, STILL, 0.0, 0.0, align=True)
+    total, q_of = torque_of(law), oracle.closed_chain(robot, posed)
+
+    def felt(p: Array) -> Array:
+        q_near = q_of(p)
+        out_of_balance = total(q_near, STILL) - weight_and_load(robot, q_near, 0.0)
+        return np.asarray(oracle.feasible(robot, q_near).T @ out_of_balance, float)
+
+    slope = oracle.derivative(felt, oracle.pose(robot, posed), 1e-4)
+    S_perp = np.diag(1.0 - np.array(robot.law.S))
+    at_ref = law.tick(posed, STILL, 0.0, 0.0)
+    T, D = oracle.feasible(robot, posed), at_ref.local.D
+    # T_ref has them at the law's own damping of its inverse
+    K_fail = law._split.certificate.failsafe_stiffness(D)
+    K_c, _ = law._terms._uncoupled.at(K_fail, (T.T * at_ref.local.D_B) @ T)
+    wanted = (K_fail + K_c) @ S_perp
+    np.testing.assert_allclose(-slope, wanted, rtol=2e-3, atol=3.0)
+    closed = np.flatnonzero(np.diag(S_perp))
+    left = -slope[np.ix_(closed, closed)] - K_p(robot)[np.ix_(closed, closed)]
+    assert np.linalg.eigvalsh(0.5 * (left + left.T)).min() > -3.0
+
+
+@pytest.mark.usefixtures("exact_ik")
+def test_motion_is_damped_where_it_balances_or_free(robot: RobotConfig, posed: Array) -> None:
+    law = Hocca(robot)
+    law.tick(posed, STILL, 0.0, 0.0, align=True)
+    total, T = torque_of(law), oracle.feasible(robot, posed)
+    slope = oracle.derivative(lambda pdot: T.T @ total(posed, T @ pdot), np.zeros(6), 1e-4)
+    S_perp = np.diag(1.0 - np.array(robot.law.S))
+    local = law.tick(posed, STILL, 0.0, 0.0).local
+    B_local = (T.T * local.D_B) @ T
+    _, B_c = law._terms._uncoupled.at(law._split.certificate.failsafe_stiffness(local.D), B_local)
+    wanted = (B_local + B_c) @ S_perp
+    np.testing.assert_allclose(-slope, wanted, rtol=2e-3, atol=0.5)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -18,10 +19,19 @@ from tests.planner.oracle import Array
 KNEES = (3, 9)
 
 
+HIGH = np.array([0.0, 0.0, 1.5, 0.0, 0.0, 0.0])
+"""Out of reach: the stand is 0.63 m off."""
+
+
 def true_residual(robot: RobotConfig, q: Array, p_ref: Array) -> float:
     """Return the largest error in p or in the closure by the oracle, m or rad."""
     errors = (oracle.pose(robot, q) - p_ref, oracle.closure(robot, q))
     return float(max(np.abs(error).max() for error in errors))
+
+
+def assert_reached(robot: RobotConfig, ik: InverseKinematics, p_ref: Array, limits: Array) -> None:
+    assert true_residual(robot, ik.q, p_ref) <= 2 * TOLERANCE, p_ref
+    assert_within(ik.q, limits)
 
 
 def counted(monkeypatch: pytest.MonkeyPatch, ik: InverseKinematics) -> list[int]:
@@ -47,33 +57,19 @@ def test_the_stand_converges_to_any_pose_of_the_workspace(
     """Torso 0.85..1.20 m with every offset; nearer the ends a leg cannot reach them all."""
     rng = np.random.default_rng(11)
     stand = closed(1.188)
+    poses = []
     for _ in range(100):
         x, y = rng.uniform(-0.06, 0.06, 2)
         roll, yaw = rng.uniform(-0.1, 0.1, 2)
         height, pitch = rng.uniform(0.85, 1.20), rng.uniform(-0.2, 1.2)
-        p_ref = p_at(robot, height, x=x, y=y, roll=roll, pitch=pitch, yaw=yaw)
+        poses.append(p_at(robot, height, x=x, y=y, roll=roll, pitch=pitch, yaw=yaw))
+    ends = itertools.product((0.80, 1.25), (0.0, 1.2))
+    for p_ref in (*poses, *(p_at(robot, height, pitch=pitch) for height, pitch in ends)):
         ik.q[:] = stand
-        result = ik.solve(p_ref, iterations_max=60)
-        assert result.converged, f"{p_ref}: {result}"
-        assert true_residual(robot, ik.q, p_ref) <= 2 * TOLERANCE, f"{p_ref}: {result}"
+        assert ik.solve(p_ref, iterations_max=60).converged, p_ref
+        assert_reached(robot, ik, p_ref, limits)
         assert ik.q[list(KNEES)].max() <= -0.2  # bent backwards, as the limits have it
-        assert_within(ik.q, limits)
-
-
-@pytest.mark.parametrize(("height", "pitch"), [(0.80, 0.0), (0.80, 1.2), (1.25, 0.0), (1.25, 1.2)])
-def test_the_ends_of_the_workspace_are_reached(
-    robot: RobotConfig,
-    ik: InverseKinematics,
-    limits: Array,
-    closed: Closed,
-    height: float,
-    pitch: float,
-) -> None:
-    p_ref = p_at(robot, height, pitch=pitch)
-    ik.q[:] = closed(1.188)
-    assert ik.solve(p_ref, iterations_max=60).converged
-    assert true_residual(robot, ik.q, p_ref) <= 2 * TOLERANCE
-    assert_within(ik.q, limits)
+        assert np.abs(ik.kinematics.p - p_ref).max() < 2e-3, "left a step before it at most"
 
 
 def test_a_squat_takes_at_most_two_iterations_a_tick(
@@ -96,50 +92,24 @@ def test_a_tick_computes_the_kinematics_twice_in_a_squat_and_three_times_out_of_
     """Warm, without a search; at a limit the third takes back a step that led nowhere."""
     ik.q[:] = closed(1.188)
     count = counted(monkeypatch, ik)
-    high = np.array([0.0, 0.0, 1.5, 0.0, 0.0, 0.0])
     squat = [p_at(robot, height) for height in np.linspace(1.188, 0.948, 600)]
-    for poses, most in ((squat, 2), ([high] * 10, 5), ([high] * 100, 3)):
+    for poses, most in ((squat, 2), ([HIGH] * 10, 5), ([HIGH] * 100, 3)):
         for p_ref in poses:
             before = count[0]
             ik.solve(p_ref)
             assert count[0] - before <= most
 
 
-def test_an_unreachable_pose_keeps_the_limits_and_is_reported(
+def test_an_unreachable_pose_keeps_the_limits_is_reported_and_ends_no_worse_than_it_began(
     robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed
 ) -> None:
     ik.q[:] = closed(1.188)
-    p_ref = np.array([0.0, 0.0, 1.5, 0.0, 0.0, 0.0])
+    at_start = true_residual(robot, ik.q, HIGH)
     for _ in range(50):
-        result = ik.solve(p_ref)
+        assert not ik.solve(HIGH).converged
         assert np.isfinite(ik.q).all()
         assert_within(ik.q, limits)
-        assert not result.converged
-
-
-def test_an_unreachable_pose_does_not_make_it_worse_than_where_it_started(
-    robot: RobotConfig, ik: InverseKinematics, closed: Closed
-) -> None:
-    """Does not diverge: the stand itself is 0.63 m off."""
-    ik.q[:] = closed(1.188)
-    p_ref = np.array([0.0, 0.0, 1.5, 0.0, 0.0, 0.0])
-    at_start = true_residual(robot, ik.q, p_ref)
-    for _ in range(50):
-        ik.solve(p_ref)
-    assert true_residual(robot, ik.q, p_ref) <= at_start
-
-
-def test_a_pose_just_out_of_reach_and_back_ends_where_it_began(
-    robot: RobotConfig, ik: InverseKinematics, closed: Closed
-) -> None:
-    """The COM led 1 mm above what the knees' limit allows (0.9269 m), and down again."""
-    stand = closed(1.188)
-    low = float(oracle.pose(robot, stand)[2])
-    ik.q[:] = stand
-    up = np.linspace(low, 0.928, 250)
-    for z in (*up, *([0.928] * 250), *up[::-1]):
-        ik.solve(np.array([0.0, 0.0, z, 0.0, 0.0, 0.0]))
-    assert np.abs(ik.q - stand).max() < 1e-4
+    assert true_residual(robot, ik.q, HIGH) <= at_start
 
 
 def test_the_residual_is_true_where_a_limit_stops_the_step(
@@ -154,15 +124,6 @@ def test_the_residual_is_true_where_a_limit_stops_the_step(
         if result.converged:
             assert true_residual(robot, ik.q, p_ref) <= 10 * TOLERANCE, f"z = {z:.5f}: {result}"
     assert ik.q[KNEES[0]] == pytest.approx(-0.2, abs=1e-3)  # the limit was met
-
-
-def test_the_kinematics_are_left_at_the_solution(
-    robot: RobotConfig, ik: InverseKinematics, closed: Closed
-) -> None:
-    p_ref = p_at(robot, 1.0, pitch=0.3)
-    ik.q[:] = closed(1.188)
-    ik.solve(p_ref, iterations_max=60)
-    assert np.abs(ik.kinematics.p - p_ref).max() < 1e-3
 
 
 def test_stand_pose_is_level_with_its_com_over_the_ankles(robot: RobotConfig) -> None:
@@ -210,19 +171,17 @@ def test_every_reachable_pose_is_reached_from_any_start_inside_the_limits(
             ik.q[:] = rng.uniform(limits[:, 0], limits[:, 1])
             reach = ik.solve_from_anywhere(p_ref)
             assert reach.converged, describe(reach, p_ref, limits)
-            assert true_residual(robot, ik.q, p_ref) <= 2 * TOLERANCE
-            assert_within(ik.q, limits)
+            assert_reached(robot, ik, p_ref, limits)
 
 
-def test_a_pose_beyond_the_fold_is_reached(
+def test_a_pose_beyond_the_fold_is_reached_and_reported_so(
     robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed
 ) -> None:
     """Made with a left knee twisted by -0.535 rad; every stand ends 0.35 mm short of it."""
     p_ref = np.array([-0.07247, 0.06702, 0.90433, -0.03099, 0.82851, 0.13846])
     ik.q[:] = closed(1.188)
-    assert ik.solve_from_anywhere(p_ref).converged
-    assert true_residual(robot, ik.q, p_ref) <= 2 * TOLERANCE
-    assert_within(ik.q, limits)
+    assert describe(ik.solve_from_anywhere(p_ref), p_ref, limits) == "p_ref is reached"
+    assert_reached(robot, ik, p_ref, limits)
 
 
 UNREACHABLE = {
@@ -280,9 +239,7 @@ def test_out_of_reach_no_small_move_of_the_closed_chain_comes_nearer(
         assert nearer <= 2e-6 or np.abs(C @ move).max() > 1e-9
 
 
-def test_out_of_reach_it_is_not_worse_than_where_it_started(
-    robot: RobotConfig, ik: InverseKinematics
-) -> None:
+def test_out_of_reach_it_gets_no_worse(robot: RobotConfig, ik: InverseKinematics) -> None:
     """A start near the best pose there is, where all other starts end 8 mm further away."""
     right, left = [0.1676, 0.1146, -0.5614, -0.5274, 0.3547], [0.0495, 0.0588, -0.2621, -0.9647]
     ik.q[:] = np.array([*right, 1.5819, *left, 0.2394, 2.0868])
@@ -291,52 +248,40 @@ def test_out_of_reach_it_is_not_worse_than_where_it_started(
     assert np.linalg.norm(ik.solve_from_anywhere(p_ref).error) <= at_start
 
 
+TOO_HIGH = np.array([0.0, 0.0, 1.31, 0.0, 0.0, 0.0])
+
+
 def test_too_high_names_how_far_it_goes_and_which_joints_stop_it(
     robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed
 ) -> None:
-    p_ref = np.array([0.0, 0.0, 1.31, 0.0, 0.0, 0.0])
     ik.q[:] = closed(1.188)
-    reach = ik.solve_from_anywhere(p_ref)
+    reach = ik.solve_from_anywhere(TOO_HIGH)
     assert reach.outcome is IkEnding.JOINT_LIMIT
     assert reach.stopped == (0, 0, 0, 1, 0, 0, 0, 0, 0, 1, 0, 0)
-    assert describe(reach, p_ref, limits) == (
+    assert describe(reach, TOO_HIGH, limits) == (
         "p_ref cannot be reached: COM z 1.31 m wanted, 0.93 m is the closest: "
         "knee_right_theta at its limit -0.2 rad, knee_left_theta at its limit -0.2 rad"
     )
-
-
-def test_beyond_straight_legs_no_joint_limit_is_blamed(robot: RobotConfig, limits: Array) -> None:
     wide = limits.copy()
     wide[list(KNEES), 1] = 0.3
-    ik = InverseKinematics(Kinematics(robot), wide)
-    ik.q[:] = stand_pose(robot, 1.188)
-    p_ref = np.array([0.0, 0.0, 1.31, 0.0, 0.0, 0.0])
-    reach = ik.solve_from_anywhere(p_ref)
-    assert reach.outcome is IkEnding.OUT_OF_REACH
-    assert set(reach.stopped) == {0}
-    assert describe(reach, p_ref, wide).endswith("reach no further, no joint is at its limit")
+    beyond = InverseKinematics(Kinematics(robot), wide)
+    beyond.q[:] = stand_pose(robot, 1.188)
+    reach = beyond.solve_from_anywhere(TOO_HIGH)
+    assert (reach.outcome, set(reach.stopped)) == (IkEnding.OUT_OF_REACH, {0}), "straight legs"
+    assert describe(reach, TOO_HIGH, wide).endswith("reach no further, no joint is at its limit")
 
 
 def test_a_configuration_on_the_way_is_not_called_the_nearest(
     ik: InverseKinematics, limits: Array, closed: Closed
 ) -> None:
-    p_ref = np.array([0.0, 0.0, 1.31, 0.0, 0.0, 0.0])
     ik.q[:] = closed(1.0)
-    reach = ik.examine(p_ref)
+    reach = ik.examine(TOO_HIGH)
     assert reach.outcome is IkEnding.UNFINISHED
-    assert describe(reach, p_ref, limits).startswith("p_ref was not reached: COM z 1.31 m wanted")
-    ik.solve_from_anywhere(p_ref)  # its knees now stand at their limit, and can come off it
+    said = describe(reach, TOO_HIGH, limits)
+    assert said.startswith("p_ref was not reached: COM z 1.31 m wanted")
+    ik.solve_from_anywhere(TOO_HIGH)  # its knees now stand at their limit, and can come off it
     reach = ik.examine(np.array([0.0, 0.0, 0.8, 0.0, 0.0, 0.0]))
-    assert reach.outcome is IkEnding.UNFINISHED
-    assert set(reach.stopped) == {0}
-
-
-def test_a_reached_pose_is_reported_reached(
-    robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed
-) -> None:
-    ik.q[:] = closed(1.188)
-    p_ref = p_at(robot, 1.0, pitch=0.3)
-    assert describe(ik.solve_from_anywhere(p_ref), p_ref, limits) == "p_ref is reached"
+    assert (reach.outcome, set(reach.stopped)) == (IkEnding.UNFINISHED, {0})
 
 
 def test_the_same_start_and_pose_give_the_same_bits(

@@ -1,15 +1,23 @@
-"""p, J, closure and load sharing against the paper's equations; test_hessian.py has the rest."""
+"""p, J, closure, load sharing and sum_i H_i F_i against the paper's equations and differences."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
+import msgspec
 import numpy as np
 import pytest
 
+from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.kinematics import Kinematics
+from shared.config.gain_schedule import inputs_of
 from shared.config.robot_config import RobotConfig
+from shared.robot.robot_model import stand_pose
 from tests.planner import oracle
 from tests.planner.conftest import SQUAT, Closed
 from tests.planner.oracle import LEFT, RIGHT, Array
+from tests.planner.stands import Stand
+from tools.lab.design.push_limit import LoadedStand
 
 POSES = (
     {"height": 1.188},
@@ -55,9 +63,7 @@ def test_closure_is_the_legs_disagreement_when_they_are_open(
     np.testing.assert_allclose(kinematics.closure, oracle.closure(robot, q_open), atol=1e-9)
 
 
-def test_an_open_pose_lies_between_the_poses_of_the_legs(
-    robot: RobotConfig, averaging: Kinematics, q: Array
-) -> None:
+def test_an_open_pose_is_in_between(robot: RobotConfig, averaging: Kinematics, q: Array) -> None:
     q_open = q + 1e-3 * np.random.default_rng(5).normal(size=12)
     averaging.update(q_open)
     middle = 0.5 * (oracle.pose(robot, q_open, RIGHT) + oracle.pose(robot, q_open, LEFT))
@@ -67,27 +73,17 @@ def test_an_open_pose_lies_between_the_poses_of_the_legs(
 @pytest.mark.parametrize(
     ("matrix", "vector"), [("J", "p"), ("C", "closure"), ("J_harness", "r_harness")]
 )
-def test_jacobians_are_slopes_where_the_legs_agree(
-    kinematics: Kinematics, q: Array, matrix: str, vector: str
-) -> None:
-    kinematics.update(q)
-    got = np.array(getattr(kinematics, matrix))
-    np.testing.assert_allclose(got, slope(kinematics, vector, q), atol=1e-7)
-
-
-@pytest.mark.parametrize(
-    ("matrix", "vector"), [("J", "p"), ("C", "closure"), ("J_harness", "r_harness")]
-)
-@pytest.mark.parametrize("opening", [1e-4, 1e-3, 1e-2])
-def test_jacobians_err_by_no_more_than_the_opening_of_the_legs(
+@pytest.mark.parametrize("opening", [0.0, 1e-4, 1e-3, 1e-2])
+def test_jacobians_are_slopes_and_err_by_no_more_than_the_opening_of_the_legs(
     kinematics: Kinematics, q: Array, matrix: str, vector: str, opening: float
 ) -> None:
     """To first order in the closure: J mixes twists, p mixes a rotation vector."""
     q_open = q + opening * np.random.default_rng(5).normal(size=12)
     kinematics.update(q_open)
     got, D_left = np.array(getattr(kinematics, matrix)), kinematics.D_left.copy()
-    opened = np.abs(kinematics.closure).max()
-    np.testing.assert_allclose(got, slope(kinematics, vector, q_open, D_left), atol=1.5 * opened)
+    most = 1.5 * np.abs(kinematics.closure).max() if opening else 1e-7
+    held = D_left if opening else None
+    np.testing.assert_allclose(got, slope(kinematics, vector, q_open, held), atol=most)
 
 
 def test_the_legs_shares_sum_to_one(robot: RobotConfig, kinematics: Kinematics, q: Array) -> None:
@@ -129,20 +125,23 @@ def up_at_torso(robot: RobotConfig, kinematics: Kinematics) -> Array:
 def test_load_sharing_asks_each_foot_for_less_than_its_edge_gives_and_average_for_more(
     robot: RobotConfig, kinematics: Kinematics, averaging: Kinematics, closed: Closed
 ) -> None:
+    """Lifted at the torso, and under its own weight."""
     force = oracle.masses(robot)[1] * oracle.GRAVITY
+    weight = np.array([0.0, 0.0, force, 0.0, 0.0, 0.0])
     asked: dict[str, list[float]] = {"load_sharing": [], "average": []}
     capacity = []
     for height in SQUAT:
         q = closed(height)
         for name, model in (("load_sharing", kinematics), ("average", averaging)):
             model.update(q)
-            lift = up_at_torso(robot, model)
+            lift, bears = up_at_torso(robot, model), model.J.T @ weight
             for side in (RIGHT, LEFT):
-                foot = force * ankle_roll_moment(robot, lift, side, q)
-                edge = foot[2] * robot.geometry.w_foot / 2
-                asked[name].append(abs(foot[3]))
-                capacity.append(edge)
-                assert (abs(foot[3]) < edge) == (name == "load_sharing")
+                lifted = force * ankle_roll_moment(robot, lift, side, q)
+                for foot in (lifted, oracle.foot_wrench(robot, side, q, bears)):
+                    edge = foot[2] * robot.geometry.w_foot / 2
+                    assert (abs(foot[3]) < edge) == (name == "load_sharing")
+                asked[name].append(abs(lifted[3]))
+                capacity.append(lifted[2] * robot.geometry.w_foot / 2)
     figures = (
         f"roll moment per foot under {force:.0f} N: load sharing {max(asked['load_sharing']):.1f},"
         f" average {max(asked['average']):.1f}, edge {min(capacity):.1f} N m"
@@ -152,15 +151,177 @@ def test_load_sharing_asks_each_foot_for_less_than_its_edge_gives_and_average_fo
     assert min(capacity) == pytest.approx(23, abs=0.5)
 
 
-def test_under_its_own_weight_load_sharing_stays_within_the_edge_and_average_does_not(
-    robot: RobotConfig, kinematics: Kinematics, averaging: Kinematics, closed: Closed
+WEIGHT = np.array([0.0, 0.0, 731.6, 0.0, 0.0, 0.0])
+
+
+NO_FORCE = np.zeros(3)
+
+
+STEP = 1e-4
+"""m and rad; of the second differences."""
+
+
+class Load(NamedTuple):
+    """What the law asks of the joints: along p, and at the harness point."""
+
+    F: Array
+    F_harness: Array
+
+
+def unit(index: int, size: float) -> Array:
+    return np.asarray(size * np.eye(6)[index], float)
+
+
+LOADS = {
+    "weight": Load(WEIGHT, NO_FORCE),
+    "force x": Load(unit(0, 100.0), NO_FORCE),
+    "force y": Load(unit(1, 100.0), NO_FORCE),
+    "roll": Load(unit(3, 50.0), NO_FORCE),
+    "pitch": Load(unit(4, 50.0), NO_FORCE),
+    "yaw": Load(unit(5, 50.0), NO_FORCE),
+    "harness x": Load(np.zeros(6), np.array([100.0, 0.0, 0.0])),
+    "harness y": Load(np.zeros(6), np.array([0.0, 100.0, 0.0])),
+    "harness z": Load(np.zeros(6), np.array([0.0, 0.0, 200.0])),
+    "all": Load(
+        np.array([30.0, -20.0, 731.6, 10.0, -15.0, 5.0]), np.array([30.0, -60.0, 200.0])
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("mixed", ["load_sharing", "average"])
+def test_hessian_is_exact_along_the_closed_chain(
+    robot: RobotConfig, kinematics: Kinematics, averaging: Kinematics, q: Array, mixed: str
 ) -> None:
-    weight = np.array([0.0, 0.0, oracle.masses(robot)[1] * oracle.GRAVITY, 0.0, 0.0, 0.0])
-    for height in SQUAT:
-        q = closed(height)
-        for name, model in (("load_sharing", kinematics), ("average", averaging)):
-            model.update(q)
-            for side in (RIGHT, LEFT):
-                foot = oracle.foot_wrench(robot, side, q, model.J.T @ weight)
-                edge = foot[2] * robot.geometry.w_foot / 2
-                assert (abs(foot[3]) < edge) == (name == "load_sharing")
+    """T^T H T is the curvature by p of F_h . r_harness - tau . q(p), tau = J^T F + J_h^T F_h held.
+
+    F . p itself does not curve. All kinds of load are told apart, to 5e-5 of the largest.
+    """
+    model = kinematics if mixed == "load_sharing" else averaging
+    model.update(q)
+    held = np.array([w.F @ model.J + w.F_harness @ model.J_harness for w in LOADS.values()])
+    forces = np.array([w.F_harness for w in LOADS.values()])
+    hessians = {name: model.hessian_times(*load).copy() for name, load in LOADS.items()}
+    q_of, p = oracle.closed_chain(robot, q), oracle.pose(robot, q)
+
+    def energy(p_near: Array) -> Array:
+        q_near = q_of(p_near)
+        return np.asarray(forces @ oracle.harness(robot, q_near) - held @ q_near, float)
+
+    curvature = oracle.second_derivative(energy, p, STEP)
+    T = oracle.feasible(robot, q)
+    for index, (name, hessian) in enumerate(hessians.items()):
+        got, want = T.T @ hessian @ T, curvature[index]
+        largest = np.abs(want).max()
+        assert largest > 5.0, name
+        np.testing.assert_allclose(got, want, atol=5e-5 * largest, err_msg=name)
+
+
+def test_hessian_is_symmetric_and_each_leg_has_its_own(kinematics: Kinematics, q: Array) -> None:
+    kinematics.update(q)
+    for load in LOADS.values():
+        hessian = kinematics.hessian_times(*load)
+        assert np.abs(hessian).max() > 5.0
+        np.testing.assert_allclose(hessian, hessian.T, atol=1e-9)
+        np.testing.assert_array_equal(hessian[:6, 6:], 0.0)
+        np.testing.assert_array_equal(hessian[6:, :6], 0.0)
+
+
+def test_hessian_is_linear_in_the_load(kinematics: Kinematics, q: Array) -> None:
+    kinematics.update(q)
+    one, other = LOADS["all"], LOADS["yaw"]
+    parts = [2.0 * kinematics.hessian_times(*one).copy(), kinematics.hessian_times(*other).copy()]
+    whole = kinematics.hessian_times(2.0 * one.F + other.F, 2.0 * one.F_harness)
+    np.testing.assert_allclose(whole, sum(parts), atol=1e-9)
+
+
+def torque_slope(kinematics: Kinematics, q: Array, F: Array) -> Array:
+    """Return d(J^T F)/dq (12, 12) by differences, the shares held."""
+    kinematics.update(q)
+    D_left = kinematics.D_left.copy()
+
+    def torque(q_near: Array) -> Array:
+        kinematics.update(q_near, D_left)
+        return np.asarray(kinematics.J.T @ F, float)
+
+    return oracle.derivative(torque, q)
+
+
+@pytest.mark.parametrize("force", [(0, 0, 731.6), (50, 0, 0), (0, 50, 0), (30, -20, 731)])
+def test_hessian_of_a_force_is_the_slopes_symmetric_part(
+    kinematics: Kinematics, q: Array, force: tuple[float, float, float]
+) -> None:
+    """Off the closed chain too, where the legs are pulled apart."""
+    F = np.array([*force, 0.0, 0.0, 0.0])
+    want = torque_slope(kinematics, q, F)
+    kinematics.update(q)
+    hessian = kinematics.hessian_times(F, NO_FORCE)
+    np.testing.assert_allclose(hessian, 0.5 * (want + want.T), atol=1e-5)
+
+
+def test_holding_the_shares_changes_internal_torques_only(
+    robot: RobotConfig, kinematics: Kinematics, q: Array
+) -> None:
+    """The slope with the shares let free differs a lot, but not along what the robot can do."""
+
+    def torque(q_near: Array) -> Array:
+        kinematics.update(q_near)
+        return np.asarray(kinematics.J.T @ WEIGHT, float)
+
+    free = oracle.derivative(torque, q)
+    error = free - torque_slope(kinematics, q, WEIGHT)
+    T = oracle.feasible(robot, q)
+    assert np.abs(error).max() > 10.0
+    np.testing.assert_allclose(T.T @ error @ T, 0.0, atol=1e-3)
+
+
+PLACE = (0.08, -0.05, 0.15)
+
+
+@pytest.fixture(scope="module")
+def laden(robot: RobotConfig) -> RobotConfig:
+    return msgspec.structs.replace(
+        robot, mass=msgspec.structs.replace(robot.mass, payload_com=PLACE)
+    )
+
+
+@pytest.fixture(scope="module", params=[0.0, 0.6], ids=["upright", "pitched"])
+def laden_q(request: pytest.FixtureRequest, laden: RobotConfig) -> Array:
+    """Return a closed stand that leans and turns."""
+    ik = InverseKinematics(Kinematics(laden), np.array(laden.joint_limits()))
+    ik.q[:] = stand_pose(laden, 1.0)
+    p = np.array([0.02, -0.02, 0.86, 0.05, request.param, 0.06])
+    assert ik.solve_from_anywhere(p).converged
+    return ik.q.copy()
+
+
+def test_a_payload_beside_is_in_pose_and_jacobian(laden: RobotConfig, laden_q: Array) -> None:
+    kinematics = Kinematics(laden)
+    kinematics.update(laden_q)
+    np.testing.assert_allclose(kinematics.p, oracle.pose(laden, laden_q), atol=1e-7)
+    T = oracle.feasible(laden, laden_q)
+    np.testing.assert_allclose(kinematics.J @ T, np.eye(6), atol=1e-6)
+
+
+def test_a_payload_beside_is_balanced_and_certified(laden: RobotConfig, laden_q: Array) -> None:
+    stand = Stand(laden, laden_q, assist=80.0)
+    D = np.tile([900.0, 1500.0, 3000.0, 3000.0, 3000.0, 900.0], 2)
+    felt = stand.stiffness_felt(D)  # asserts balance
+    np.testing.assert_allclose(
+        stand.certificate.failsafe_stiffness(D), felt, atol=1e-4 * np.abs(felt).max()
+    )
+
+
+def test_the_push_limits_knees_weigh_the_same_wherever_the_payload_is(
+    robot: RobotConfig, laden: RobotConfig, laden_q: Array
+) -> None:
+    knees = []
+    for config in (robot, laden):
+        kinematics = Kinematics(config)
+        kinematics.update(laden_q)
+        knees.append(LoadedStand(config, kinematics, np.zeros((12, 6)), np.zeros((12, 12))))
+    np.testing.assert_allclose(knees[0]._tau_knees, knees[1]._tau_knees, atol=1e-6)
+
+
+def test_a_centred_payload_leaves_the_schedule(robot: RobotConfig, laden: RobotConfig) -> None:
+    assert "mass.payload_com" not in inputs_of(robot)
+    assert inputs_of(laden)["mass.payload_com"] == list(PLACE)

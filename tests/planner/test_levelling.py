@@ -1,3 +1,5 @@
+""""""
+
 from __future__ import annotations
 
 import math
@@ -18,7 +20,11 @@ from tests.planner.conftest import Closed
 from tools.lab.design.torque_breakdown import torque_breakdown
 
 LEVEL = np.zeros(3)
+
+
 DT = 0.004
+
+
 slopes = st.tuples(*[st.floats(-0.14, 0.14)] * 2)
 
 
@@ -77,16 +83,6 @@ def test_without_the_imu_the_last_slope_stands_and_with_none_ever_the_floor_is_l
     assert levelling.slope == pytest.approx((0.05, 0.0))
 
 
-def test_a_memory_goes_on_bit_for_bit() -> None:
-    first, second = Levelling(1.0), Levelling(1.0)
-    first.advance(told((0.05, 0.01)), LEVEL, DT, jump=True)
-    second.restore(first.snapshot())
-    for each in (first, second):
-        each.advance(told((0.02, 0.0), (0.1, 0.2, 0.0)), np.array((0.1, 0.2, 0.0)), DT)
-    assert first.slope == second.slope
-    assert np.array_equal(first.up, second.up)
-
-
 FLOORS = [(0.0873, 0.0), (-0.0873, 0.0), (0.0, 0.0873), (0.05, -0.05)]
 
 
@@ -110,9 +106,7 @@ def test_on_a_slope_feedforward_holds_the_weight_along_every_closed_motion(
     )
 
 
-def test_a_tick_is_laid_open_with_the_slope_that_it_took(
-    robot: RobotConfig, closed: Closed
-) -> None:
+def test_a_tick_is_laid_open_with_its_slope(robot: RobotConfig, closed: Closed) -> None:
     law, q, still = Hocca(with_imu(robot)), closed(1.0), np.zeros(12)
     output = law.tick(q, still, 0.0, DT, align=True, up_torso=told((0.0873, -0.03)))
     found = torque_breakdown(robot, q, still, output.q_ref, output.v_ref, 0.0, output.slope)
@@ -135,9 +129,7 @@ def test_the_com_is_led_to_where_gravity_puts_it_over_the_ankles(
     assert np.abs(output.p_ref[3:6:2]).max() < 1e-7
 
 
-def test_an_imu_that_comes_up_while_the_robot_is_led_makes_no_step(
-    robot: RobotConfig, closed: Closed
-) -> None:
+def test_an_imu_that_joins_a_led_robot_makes_no_step(robot: RobotConfig, closed: Closed) -> None:
     """Taken at once, 5 degrees moved the ankles' reference by 0.08 rad in one tick: 125 N m."""
     law, q = Hocca(with_imu(robot)), closed(1.0)
     law.tick(q, np.zeros(12), 0.0, DT, align=True)

@@ -47,9 +47,7 @@ def test_states_that_come_every_period_wait_for_no_longer_than_a_poll(robot: Rob
 
 
 @pytest.mark.parametrize("held_up_ns", [NS_PER_MS, 2 * NS_PER_MS, 3 * NS_PER_MS, 8 * NS_PER_MS])
-def test_after_a_tick_that_was_held_up_the_ticks_are_soon_in_time_again(
-    robot: RobotConfig, held_up_ns: int
-) -> None:
+def test_after_a_late_tick_they_are_soon_in_time(robot: RobotConfig, held_up_ns: int) -> None:
     looking = Looking(robot)
     for tick in range(100):
         late_ns = looking.tick_at(NS_PER_S + tick * PERIOD_NS, held_up_ns if tick == 50 else 0)
@@ -57,9 +55,7 @@ def test_after_a_tick_that_was_held_up_the_ticks_are_soon_in_time_again(
 
 
 @pytest.mark.parametrize("busy_ns", [NS_PER_MS, 3 * NS_PER_MS // 2])
-def test_a_planner_that_its_joint_services_keep_from_looking_does_not_stay_a_period_late(
-    robot: RobotConfig, busy_ns: int
-) -> None:
+def test_kept_from_looking_it_does_not_stay_late(robot: RobotConfig, busy_ns: int) -> None:
     """They run for a while before the states are complete; it then found those of a period ago."""
     loop = Looking(robot).loop
     complete = [NS_PER_S + tick * PERIOD_NS for tick in range(100)]

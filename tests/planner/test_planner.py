@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import msgspec
 import numpy as np
 import pytest
@@ -10,75 +12,24 @@ from services.planner.intents import OperatorRequest
 from services.planner.law.certificate import Margins
 from services.planner.planner import EARLY_FRACTION, LATE_FRACTION, TICK_GAP_MAX_S, Planner
 from services.planner.watch.engagement_fsm import WAITS_NS
-from shared.bus.messages import (
-    DriveStatus,
-    JointCommand,
-    JointState,
-    Mode,
-    PlannerMode,
-    SplitSource,
-    Tare,
-    Wrench,
-)
+from shared.bus.messages import Attitude, JointCommand, Mode, PlannerMode, SplitSource
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import gain_schedule
 from shared.config.robot_config import RobotConfig
 from shared.joints import N_MODULES
-from tests.planner.conftest import Closed, standing_torque
+from tests.imu.robots import with_imu
+from tests.planner.conftest import Closed
 from tests.planner.oracle import Array
-
-SESSION = 4711
-START_NS = 10**12
-
-
-@pytest.fixture
-def planner(robot: RobotConfig) -> Planner:
-    return Planner(robot, SESSION)
-
-
-@pytest.fixture
-def q(closed: Closed) -> Array:
-    return closed(1.188, x=0.01, pitch=0.1)
-
-
-def state(module: int, q: Array, seq: int = 1, **changes: object) -> JointState:
-    """Return the state of a module of a robot that stands on its feet."""
-    tau = standing_torque(tuple(q.tolist())) if np.isfinite(q).all() else np.zeros(12)
-    fields: dict[str, object] = {
-        "t_ns": 1000 * (module + 1) + seq,
-        "seq": seq,
-        "q": (float(q[2 * module]), float(q[2 * module + 1])),
-        "v": (0.0, 0.0),
-        "tau": (float(tau[2 * module]), float(tau[2 * module + 1])),
-        "mode": int(Mode.TRACK),
-        "cause": 0,
-        "ready": True,
-        "age_ns": 4_000_000,
-        "session": SESSION,
-        "command_seq": -1,
-        "cycle": 0,
-        "late": 0,
-        "dropouts": 0,
-        "refused": 0,
-        "drive": DriveStatus.ARMED,
-        "drive_error": 0,
-    }
-    return JointState(**(fields | changes))  # type: ignore[arg-type]
-
-
-def receive_all(planner: Planner, q: Array, now_ns: int, seq: int = 1, **changes: object) -> None:
-    for module in range(N_MODULES):
-        planner.receive_state(module, state(module, q, seq, **changes), now_ns)
-
-
-def lead(planner: Planner, q: Array, now_ns: int = START_NS) -> int:
-    """Bring the planner to lead; return the time of its last tick."""
-    for tick in range(3):
-        now_ns += 4 * NS_PER_MS
-        receive_all(planner, q, now_ns, seq=tick)
-        planner.tick(now_ns)
-    assert planner.status(now_ns, 0.0).mode == PlannerMode.LEADING
-    return now_ns
+from tests.planner.states import (
+    SESSION,
+    START_NS,
+    TICK_NS,
+    lead,
+    receive_all,
+    receive_but,
+    state,
+    wrench,
+)
 
 
 def joined(commands: list[JointCommand], name: str) -> Array:
@@ -103,32 +54,26 @@ def test_each_command_echoes_its_own_modules_stamp(planner: Planner, q: Array) -
     stamps = [command.echo_t_ns for command in planner.tick(START_NS)]
     assert stamps == [1000 * (module + 1) + 1 for module in range(N_MODULES)]
     planner.receive_state(3, state(3, q, seq=7), START_NS + 1)
-    stamps = [command.echo_t_ns for command in planner.tick(START_NS + 4 * NS_PER_MS)]
+    stamps = [command.echo_t_ns for command in planner.tick(START_NS + TICK_NS)]
     assert stamps == [1001, 2001, 3001, 4007, 5001, 6001]
 
 
 def test_commands_count_up_and_name_the_session(planner: Planner, q: Array) -> None:
-    seen = []
     for tick in range(5):
-        now = START_NS + tick * 4 * NS_PER_MS
+        now = START_NS + tick * TICK_NS
         receive_all(planner, q, now, seq=tick)
-        commands = planner.tick(now)
-        assert {command.session for command in commands} == {SESSION}
-        assert {command.t_ns for command in commands} == {now}
-        assert len({command.seq for command in commands}) == 1
-        seen.append(commands[0].seq)
-        assert planner.status(now, 0.0).seq == commands[0].seq
-    assert seen == [1, 2, 3, 4, 5]
+        told = {(each.session, each.t_ns, each.seq) for each in planner.tick(now)}
+        assert told == {(SESSION, now, tick + 1)}
+        assert planner.status(now, 0.0).seq == tick + 1
 
 
 def test_all_hold_until_all_are_ready(planner: Planner, q: Array) -> None:
     for tick in range(5):
-        now = START_NS + tick * 4 * NS_PER_MS
-        receive_all(planner, q, now, seq=tick)
-        planner.receive_state(2, state(2, q, seq=tick, ready=False), now)
+        now = START_NS + tick * TICK_NS
+        receive_but(planner, 2, q, now, tick, ready=False)
         assert all(command.hold for command in planner.tick(now))
     receive_all(planner, q, now, seq=9)
-    assert not any(command.hold for command in planner.tick(now + 4 * NS_PER_MS))
+    assert not any(command.hold for command in planner.tick(now + TICK_NS))
 
 
 @pytest.mark.parametrize("silent", range(N_MODULES))
@@ -156,9 +101,7 @@ def test_commands_carry_each_modules_part_of_the_law(planner: Planner, q: Array)
     assert joined(commands, "k_d").min() > 0.0
 
 
-def test_leading_again_starts_from_the_measured_height_and_pitch_and_from_the_middle(
-    planner: Planner, q: Array, closed: Closed
-) -> None:
+def test_it_leads_again_from_where_it_is(planner: Planner, q: Array, closed: Closed) -> None:
     now = lead(planner, q) + NS_PER_S
     elsewhere = closed(1.0, x=-0.03, y=0.02, roll=0.04, pitch=0.4)
     receive_all(planner, elsewhere, now, seq=90)
@@ -174,14 +117,14 @@ def test_leading_again_starts_from_the_measured_height_and_pitch_and_from_the_mi
     )
 
 
-def test_six_new_states_are_due_after_half_a_period(
-    robot: RobotConfig, planner: Planner, q: Array
-) -> None:
+def test_six_new_states_are_due_once(robot: RobotConfig, planner: Planner, q: Array) -> None:
     last = lead(planner, q)
     half = round(EARLY_FRACTION * NS_PER_S / robot.planner.rate_hz)
     receive_all(planner, q, last + 1, seq=50)
     assert not planner.is_due(last + half - 1)
     assert planner.is_due(last + half)
+    planner.tick(last + 3 * NS_PER_MS)
+    assert not planner.is_due(last + 6 * NS_PER_MS), "3 ms later, none new"
 
 
 @pytest.mark.parametrize("heard", [0, 5])
@@ -197,72 +140,40 @@ def test_fewer_than_six_are_due_after_a_period_and_a_quarter(
     assert planner.is_due(last + late)
 
 
-def test_a_tick_uses_states_up(planner: Planner, q: Array) -> None:
-    last = lead(planner, q)
-    receive_all(planner, q, last + 1, seq=50)
-    planner.tick(last + 3 * NS_PER_MS)
-    assert not planner.is_due(last + 6 * NS_PER_MS)  # 3 ms later, none new
-
-
-def test_a_long_gap_is_not_integrated(robot: RobotConfig, planner: Planner, q: Array) -> None:
-    """A planner stopped for 5 s raises the assist by one bounded step only."""
-    last = lead(planner, q)
-    planner.receive_request(OperatorRequest(200.0))
-    now = last + 5 * NS_PER_S
-    receive_all(planner, q, now, seq=50)
-    planner.tick(now)
-    assist = planner.status(now, 0.0).assist_n
-    assert 0.0 < assist <= robot.assist.rate_max * TICK_GAP_MAX_S + 1e-9
-
-
-def test_assist_rises_by_the_time_between_ticks(
-    robot: RobotConfig, planner: Planner, q: Array
+@pytest.mark.parametrize(
+    ("ticks", "gap_ns", "seconds"),
+    [(10, TICK_NS, 0.04), (1, 5 * NS_PER_S, TICK_GAP_MAX_S)],
+    ids=["tick by tick", "after 5 s: one bounded step"],
+)
+def test_assist_rises_by_the_time_between_ticks_and_a_long_gap_is_not_integrated(
+    robot: RobotConfig, planner: Planner, q: Array, ticks: int, gap_ns: int, seconds: float
 ) -> None:
-    last = lead(planner, q)
+    now = lead(planner, q)
     planner.receive_request(OperatorRequest(200.0))
-    for tick in range(1, 11):
-        now = last + tick * 4 * NS_PER_MS
+    for tick in range(ticks):
+        now += gap_ns
         receive_all(planner, q, now, seq=50 + tick)
         planner.tick(now)
-    assert planner.status(now, 0.0).assist_n == pytest.approx(robot.assist.rate_max * 0.04)
+    assist = planner.status(now, 0.0).assist_n
+    assert assist == pytest.approx(robot.assist.rate_max * seconds)
 
 
 def test_a_status_holds_what_the_tick_saw(planner: Planner, q: Array) -> None:
     receive_all(planner, q, START_NS, seq=7)
-    planner.receive_wrench(
-        Wrench(
-            t_ns=1,
-            seq=33,
-            force=(0.0, 0.0, 0.0),
-            moment=(0.0, 0.0, 0.0),
-            valid=True,
-            saturated=False,
-            tare=Tare.DONE,
-            age_ns=0,
-        ),
-        START_NS + 1,
-    )
+    planner.receive_wrench(wrench(seq=33), START_NS + 1)
     planner.tick(START_NS + 2)
     status = planner.status(START_NS + 2, 123.0)
-    assert status.t_ns == START_NS + 2
-    assert status.session == SESSION
-    assert status.mode == PlannerMode.ALIGNING
-    assert status.hold
-    assert status.state_seq == (7,) * 6
-    assert status.state_age_ns == (2,) * 6
-    assert status.wrench_seq == 33
-    assert status.tick_us == 123.0
-    assert status.p[0] == pytest.approx(0.01, abs=1e-6)
-    assert status.p[4] == pytest.approx(0.1, abs=1e-6)
+    assert (status.t_ns, status.session, status.tick_us) == (START_NS + 2, SESSION, 123.0)
+    assert (status.mode, status.hold) == (PlannerMode.ALIGNING, True)
+    assert (status.state_seq, status.state_age_ns, status.wrench_seq) == ((7,) * 6, (2,) * 6, 33)
+    assert (status.p[0], status.p[4]) == pytest.approx((0.01, 0.1), abs=1e-6)
     assert status.p_ref == pytest.approx(status.p, abs=1e-9)
     assert status.closure == pytest.approx((0.0,) * 6, abs=1e-6)
     assert status.pdot == (0.0,) * 6
     assert status.ik_residual < 1e-6
 
 
-def test_commands_and_status_hold_both_margins_and_where_the_gains_come_from(
-    robot: RobotConfig, planner: Planner, q: Array
-) -> None:
+def test_both_margins_are_told(robot: RobotConfig, planner: Planner, q: Array) -> None:
     now = lead(planner, q)
     receive_all(planner, q, now, seq=50)
     commands = planner.tick(now + 4 * NS_PER_MS)
@@ -274,9 +185,7 @@ def test_commands_and_status_hold_both_margins_and_where_the_gains_come_from(
     assert status.margin_onboard >= robot.certificate.onboard_margin_min
 
 
-def test_gains_that_would_not_stand_ask_for_hold_in_that_very_tick(
-    robot: RobotConfig, planner: Planner, q: Array
-) -> None:
+def test_gains_that_fall_hold_at_once(robot: RobotConfig, planner: Planner, q: Array) -> None:
     """The mode follows a tick later; when the gains stand again it waits as after a drop-out."""
     now = lead(planner, q)
     split = planner._law._split
@@ -323,9 +232,7 @@ def test_a_robot_that_nothing_holds_is_never_lead(robot: RobotConfig, q: Array) 
     assert status.margin < robot.certificate.margin_min
 
 
-def test_a_stale_state_counts_before_uncertified_gains(
-    robot: RobotConfig, planner: Planner, q: Array
-) -> None:
+def test_staleness_counts_before_gains(robot: RobotConfig, planner: Planner, q: Array) -> None:
     now = lead(planner, q)
     planner._law._split._margins_min = Margins(1e9, 1e9)
     for silence_ms in (4, 200):
@@ -336,8 +243,54 @@ def test_a_stale_state_counts_before_uncertified_gains(
 
 def test_a_status_before_any_state_is_finite(planner: Planner) -> None:
     status = planner.status(START_NS, 0.0)
-    assert status.mode == PlannerMode.WAITING
-    assert status.hold
-    assert status.wrench_seq == -1
+    assert (status.mode, status.hold, status.wrench_seq) == (PlannerMode.WAITING, True, -1)
     assert status.state_seq == status.state_age_ns == (-1,) * 6
     assert np.isfinite([*status.p, *status.p_ref, *status.closure]).all()
+
+
+def attitude(roll: float, seq: int, *, valid: bool = True) -> Attitude:
+    up = (0.0, math.sin(roll), math.cos(roll))
+    return Attitude(t_ns=0, seq=seq, up=up, rate=(0.0, 0.0, 0.0), valid=valid, age_ns=0)
+
+
+@pytest.mark.parametrize(
+    ("valid", "late_ms", "heeded"),
+    [(True, 0.0, True), (True, 99.0, True), (True, 101.0, False), (False, 0.0, False)],
+)
+def test_an_attitude_is_heeded_while_it_is_fresh_and_valid(
+    robot: RobotConfig, closed: Closed, valid: bool, late_ms: float, heeded: bool
+) -> None:
+    q = closed(1.188)
+    planner = Planner(with_imu(robot, stale_ms=100.0), SESSION)
+    receive_all(planner, q, START_NS)
+    planner.receive_attitude(attitude(0.0, 1), START_NS)
+    planner.tick(START_NS)
+    before = planner.status(START_NS, 0.0)
+    assert before.attitude_seq == 1
+    planner.receive_attitude(attitude(0.05, 2, valid=valid), START_NS + 1)
+    later = START_NS + 1 + round(late_ms * NS_PER_MS)
+    receive_all(planner, q, later, seq=2)
+    planner.tick(later)
+    after = planner.status(later, 0.0)
+    assert after.attitude_seq == 2
+    assert (after.slope != before.slope) is heeded
+
+
+def test_an_old_wrench_eases_nothing(robot: RobotConfig, closed: Closed) -> None:
+    """A hand that pulled with 60 N as the harness fell silent would pull for ever."""
+    q = closed(1.188)
+    heard, deaf = Planner(robot, SESSION), Planner(robot, SESSION)
+    now_ns = lead(heard, q)
+    assert lead(deaf, q) == now_ns
+    heard.receive_wrench(wrench(60.0, t_ns=now_ns), now_ns)
+    eased = []
+    for seq in range(5, 400):
+        now_ns += TICK_NS
+        torques = []
+        for planner in (heard, deaf):
+            receive_all(planner, q, now_ns, seq)
+            torques.append([c.tau_coupled for c in planner.tick(now_ns)])
+        eased.append(float(np.abs(np.subtract(*torques)).max()))
+    assert max(eased[:5]) > 0.1, "it was heard at first"
+    assert eased[-1] < 1e-6
+    assert now_ns - START_NS > NS_PER_S

@@ -11,14 +11,12 @@ from hypothesis import strategies as st
 
 from services.planner.planner import Planner
 from services.planner.watch.plausible import BEYOND_RAD, SPEED_MAX, Plausible
-from shared.bus.messages import Attitude, Mode, PlannerMode, Tare, Vector3, Wrench
-from shared.clock import NS_PER_MS
+from shared.bus.messages import Attitude, PlannerMode, Vector3
 from shared.config.robot_config import RobotConfig
 from shared.joints import N_JOINTS, N_MODULES
 from tests.planner.conftest import Closed
-from tests.planner.test_planner import SESSION, START_NS, lead, receive_all, state
+from tests.planner.states import SESSION, START_NS, TICK_NS, lead, receive_all, state, wrench
 
-STEP_NS = 4 * NS_PER_MS
 ANY = st.one_of(
     st.sampled_from([math.nan, math.inf, -math.inf, 1e308, 64.0, -64.0, 0.0, math.pi / 2]),
     st.floats(-4.0, 4.0),
@@ -56,15 +54,12 @@ def test_a_speed_that_is_none_is_no_state(robot: RobotConfig, speed: float) -> N
 
 
 @pytest.mark.parametrize("angle", [math.nan, 1e308, 64.0])
-def test_a_module_that_sends_only_such_angles_goes_stale_and_the_planner_holds(
-    robot: RobotConfig, closed: Closed, angle: float
-) -> None:
-    planner, q = Planner(robot, SESSION), closed(1.188)
+def test_absurd_angles_alone_are_silence(planner: Planner, closed: Closed, angle: float) -> None:
+    q = closed(1.188)
     now_ns, wrong = lead(planner, q), q.copy()
     wrong[4] = angle
-    commands = []
     for seq in range(10, 40):
-        now_ns += STEP_NS
+        now_ns += TICK_NS
         receive_all(planner, wrong, now_ns, seq)
         commands = planner.tick(now_ns)
     assert all(command.hold for command in commands)
@@ -82,11 +77,11 @@ def test_whatever_angles_come_no_tick_ends_and_it_leads_again_by_good_ones(
     planner, good = Planner(robot, SESSION), closed(1.188)
     now_ns = lead(planner, good) if led else START_NS
     for seq in range(10, 14):
-        now_ns += STEP_NS
+        now_ns += TICK_NS
         receive_all(planner, np.array(angles), now_ns, seq, v=(speed, 0.0))
         planner.tick(now_ns)
     for seq in range(20, 2600):
-        now_ns += STEP_NS
+        now_ns += TICK_NS
         receive_all(planner, good, now_ns, seq)
         commands = planner.tick(now_ns)
         if seq > 22 and not commands[0].hold:
@@ -95,18 +90,11 @@ def test_whatever_angles_come_no_tick_ends_and_it_leads_again_by_good_ones(
     assert all(math.isfinite(value) for command in commands for value in command.tau_coupled)
 
 
-def wrench(seq: int, force: float, moment: float = 0.0) -> Wrench:
-    return Wrench(
-        t_ns=seq, seq=seq, force=(0.0, 0.0, force), moment=(0.0, moment, 0.0), valid=True,
-        saturated=False, tare=int(Tare.DONE), age_ns=0,
-    )  # fmt: skip
-
-
 def test_a_wrench_is_taken_up_to_what_the_cells_together_can_carry(robot: RobotConfig) -> None:
     plausible, most = Plausible(robot), 6.0 * robot.harness.leg_force_max
     for force, taken in ((most, True), (-most, True), (1.001 * most, False), (-1e300, False)):
-        assert plausible.is_wrench(wrench(1, force)) is taken
-    assert not plausible.is_wrench(wrench(1, 0.0, moment=-1e300))
+        assert plausible.is_wrench(wrench(force)) is taken
+    assert not plausible.is_wrench(wrench(moment=(0.0, -1e300, 0.0)))
     assert plausible.refused == 3
 
 
@@ -131,15 +119,15 @@ def test_an_attitude_is_a_direction_and_a_rate_that_a_torso_can_turn_at(
 
 @pytest.mark.parametrize("force", [1e300, 8999.0])
 def test_a_second_of_an_absurd_wrench_leaves_no_trace(
-    robot: RobotConfig, closed: Closed, force: float
+    robot: RobotConfig, planner: Planner, closed: Closed, force: float
 ) -> None:
     """1e300 N left a load of 300 digits behind: MISLOADED until the planner was killed."""
-    planner, q = Planner(robot, SESSION), closed(1.188)
+    q = closed(1.188)
     now_ns = lead(planner, q)
     for seq in range(10, 2500):
-        now_ns += STEP_NS
-        receive_all(planner, q, now_ns, seq, mode=int(Mode.TRACK))
-        planner.receive_wrench(wrench(seq, force if seq < 260 else 0.0), now_ns)
+        now_ns += TICK_NS
+        receive_all(planner, q, now_ns, seq)
+        planner.receive_wrench(wrench(force if seq < 260 else 0.0, seq=seq), now_ns)
         commands = planner.tick(now_ns)
         if seq > 300 and planner.status(now_ns, 0.0).mode == PlannerMode.LEADING:
             break

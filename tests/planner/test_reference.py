@@ -28,9 +28,7 @@ def solved(robot: RobotConfig, reference: Reference, q: Array, p_ref: Array) -> 
 
 
 @pytest.mark.parametrize("away", [1e-5, 2e-4, 0.02, 0.05])
-def test_it_finds_what_the_solver_finds_near_by_and_far_away(
-    robot: RobotConfig, closed: Closed, away: float
-) -> None:
+def test_it_finds_what_the_solver_does(robot: RobotConfig, closed: Closed, away: float) -> None:
     q = closed(1.0, pitch=0.3)
     there = Kinematics(robot)
     there.update(q)
@@ -44,9 +42,7 @@ def test_it_finds_what_the_solver_finds_near_by_and_far_away(
 
 
 @pytest.mark.parametrize("rate", [0.005, 0.05, 0.2, 0.6])
-def test_led_beyond_a_joint_limit_its_angles_stay_inside(
-    robot: RobotConfig, closed: Closed, rate: float
-) -> None:
+def test_led_beyond_it_stays_inside(robot: RobotConfig, closed: Closed, rate: float) -> None:
     """The solver takes a start for granted; one beyond the limits let q_ref creep to 0.17 rad."""
     limits = np.array(robot.joint_limits())
     law, ik = Hocca(robot), InverseKinematics(Kinematics(robot), NOWHERE)
@@ -68,9 +64,7 @@ def test_led_beyond_a_joint_limit_its_angles_stay_inside(
 
 
 @pytest.mark.parametrize("rate", [-50.0, 50.0])
-def test_the_next_begins_inside_the_limits_wherever_it_goes(
-    robot: RobotConfig, closed: Closed, rate: float
-) -> None:
+def test_the_next_begins_inside(robot: RobotConfig, closed: Closed, rate: float) -> None:
     reference = Reference(robot)
     solved(robot, reference, closed(1.0), np.zeros(6))
     reference.v[:] = rate
@@ -91,9 +85,7 @@ def test_its_kinematics_are_those_of_its_own_arrays(robot: RobotConfig, closed: 
     np.testing.assert_array_equal(kinematics.J_harness, reference.J_harness)
 
 
-def test_of_what_is_no_number_nothing_is_found_and_the_next_is_found_again(
-    robot: RobotConfig, closed: Closed
-) -> None:
+def test_of_nan_nothing_is_found_but_the_next_is(robot: RobotConfig, closed: Closed) -> None:
     q = closed(1.0)
     there = Kinematics(robot)
     there.update(q)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.planner.law.certificate import Certificate
+from services.planner.law.certificate import Certificate, Margins
 from services.planner.law.gains import JointGains
 from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.kinematics import Kinematics
@@ -19,15 +19,24 @@ from shared.bus.messages import SplitSource
 from shared.config.gain_schedule import digest_of, inputs_of
 from shared.config.gain_table import GainSchedule
 from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.config.sections import CertificateConfig
 from shared.exceptions import ConfigError
 from shared.robot.robot_model import stand_pose
 from tests.planner.conftest import Closed
 from tests.planner.oracle import Array
 from tests.planner.stands import Stand
+from tests.planner.states import with_law
 
 POSES = ((1.188, 0.0), (0.948, 0.0), (0.85, 0.6), (0.80, 1.2))
+
+
 MARGIN, MARGIN_ONBOARD = 0.9, 0.45
 """Of what is required; asked for at the nodes are 1 and 0.5."""
+RowsOfGains = tuple[tuple[tuple[float, float, float, float, float, float], ...], ...]
+
+
+def is_enough(margins: Margins, least: CertificateConfig) -> bool:
+    return margins.service >= least.margin_min and margins.onboard >= least.onboard_margin_min
 
 
 @pytest.fixture(
@@ -46,21 +55,12 @@ def schedule(robot: RobotConfig) -> GainSchedule:
     return robot.gain_schedule
 
 
-def with_law(robot: RobotConfig, **changes: object) -> RobotConfig:
-    return msgspec.structs.replace(robot, law=msgspec.structs.replace(robot.law, **changes))
-
-
 def with_table(robot: RobotConfig, scale: float) -> RobotConfig:
     """Return the robot with its schedule's D scaled; what it was made from is kept."""
     schedule = robot.gain_schedule
     assert schedule is not None
-    table = (scale * np.array(schedule.D)).tolist()
-    D = msgspec.convert(
-        table, tuple[tuple[tuple[float, float, float, float, float, float], ...], ...]
-    )
-    return msgspec.structs.replace(
-        robot, gain_schedule=msgspec.structs.replace(schedule, D=D)
-    )  # fmt: skip
+    D = msgspec.convert((scale * np.array(schedule.D)).tolist(), type=RowsOfGains)
+    return msgspec.structs.replace(robot, gain_schedule=msgspec.structs.replace(schedule, D=D))
 
 
 def requiring(robot: RobotConfig, **changes: object) -> RobotConfig:
@@ -72,9 +72,6 @@ def requiring(robot: RobotConfig, **changes: object) -> RobotConfig:
     inputs = inputs_of(changed)
     fitting = msgspec.structs.replace(schedule, inputs=inputs, digest=digest_of(inputs))
     return msgspec.structs.replace(changed, gain_schedule=fitting)
-
-
-# -- the schedule, live ----------------------------------------------------------------
 
 
 def made_of(function: object, z: list[float], pitch: list[float]) -> GainSchedule:
@@ -117,9 +114,7 @@ def halved(nodes: tuple[float, ...]) -> Array:
     return np.sort(np.concatenate([nodes, 0.5 * (np.array(nodes[1:]) + np.array(nodes[:-1]))]))
 
 
-def test_the_schedule_is_certified_at_every_node_and_half_way_between(
-    robot: RobotConfig, schedule: GainSchedule
-) -> None:
+def test_the_schedule_is_certified_throughout(robot: RobotConfig, schedule: GainSchedule) -> None:
     """Both margins, without and with the full assist, wherever the robot can stand."""
     kinematics, certificate = Kinematics(robot), Certificate(robot)
     ik = InverseKinematics(kinematics, np.array(robot.joint_limits()))
@@ -148,23 +143,18 @@ def test_the_schedule_is_certified_at_every_node_and_half_way_between(
 
 
 def test_in_the_squat_and_the_crawl_the_schedule_is_enough(
-    robot: RobotConfig, stand: Stand
+    robot: RobotConfig, schedule: GainSchedule, stand: Stand
 ) -> None:
     local = stand.split(GainSplit(robot))
     assert local.source is SplitSource.SCHEDULE
     assert local.margins.service >= MARGIN
     assert local.margins.onboard >= MARGIN_ONBOARD
-    schedule = robot.gain_schedule
-    assert schedule is not None
-    np.testing.assert_array_equal(
-        local.D, ScheduledGains(schedule).at(float(stand.p[2]), float(stand.p[4]))
-    )
+    own = ScheduledGains(schedule).at(float(stand.p[2]), float(stand.p[4]))
+    np.testing.assert_array_equal(local.D, own)
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_off_centre_leaning_and_twisted_the_schedule_is_still_enough(
-    robot: RobotConfig, closed: Closed, seed: int
-) -> None:
+def test_off_centre_the_schedule_is_enough(robot: RobotConfig, closed: Closed, seed: int) -> None:
     """What a push leaves: up to 4 cm, 0.04 rad of roll and of yaw."""
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(-0.04, 0.04, 2)
@@ -174,17 +164,13 @@ def test_off_centre_leaning_and_twisted_the_schedule_is_still_enough(
     assert local.source is SplitSource.SCHEDULE
 
 
-def test_the_published_margins_are_the_certificates_of_what_is_sent(
-    robot: RobotConfig, stand: Stand
-) -> None:
+def test_the_margins_told_are_of_what_is_sent(robot: RobotConfig, stand: Stand) -> None:
     for changed in (robot, with_table(robot, 0.0), with_law(robot, split="diagonal")):
         local = stand.split(GainSplit(changed))
         assert local.margins == pytest.approx(stand.certificate.margins(local.D))
 
 
-def test_scheduled_gains_are_far_softer_than_the_papers_where_the_person_leads(
-    robot: RobotConfig, stand: Stand
-) -> None:
+def test_scheduled_gains_are_softer_where_a_person_leads(robot: RobotConfig, stand: Stand) -> None:
     """docs/law.md#gain-split: along z; diag(K_q) gives 2-3e5 N/m there."""
     soft = stand.split(GainSplit(robot)).D
     stiff = stand.split(GainSplit(with_law(robot, split="diagonal"))).D
@@ -192,73 +178,40 @@ def test_scheduled_gains_are_far_softer_than_the_papers_where_the_person_leads(
     assert K_z[0] < 0.35 * K_z[1]
 
 
-# -- where the margin is not met -------------------------------------------------------
-
-
-def test_gains_that_would_fall_are_stiffened_until_they_stand(
-    robot: RobotConfig, stand: Stand
-) -> None:
-    limp = with_table(robot, 0.0)
-    assert stand.certificate.margins(np.zeros(12)).service < 0.0
-    local = stand.split(GainSplit(limp))
-    assert local.source is SplitSource.STIFFENED
-    assert local.margins.service >= robot.certificate.margin_min
-    assert local.margins.onboard >= robot.certificate.onboard_margin_min
-
-
-def test_of_stiffer_gains_the_nearest_that_stand_are_taken(
-    robot: RobotConfig, stand: Stand
-) -> None:
+def test_gains_that_fall_are_stiffened_no_further(robot: RobotConfig, stand: Stand) -> None:
     """A quarter of the way less would not have stood."""
-    limp = stand.split(GainSplit(with_table(robot, 0.0)))
+    assert stand.certificate.margins(np.zeros(12)).service < 0.0
+    local = stand.split(GainSplit(with_table(robot, 0.0)))
+    assert local.source is SplitSource.STIFFENED
+    assert is_enough(local.margins, robot.certificate)
     stiff = stand.split(GainSplit(requiring(robot, K_required=(1e5,) * 6))).D
-    assert np.all(stiff - limp.D >= -1e-9)
-    softer = limp.D - 0.25 * stiff
+    assert np.all(stiff - local.D >= -1e-9)
+    softer = local.D - 0.25 * stiff
     assert softer.min() >= -1e-9
-    margins = stand.certificate.margins(softer)
-    least = robot.certificate
-    assert margins.service < least.margin_min or margins.onboard < least.onboard_margin_min
+    assert not is_enough(stand.certificate.margins(softer), robot.certificate)
 
 
-def test_either_margin_alone_is_enough_to_be_stiffened(robot: RobotConfig, stand: Stand) -> None:
-    scheduled = stand.split(GainSplit(robot))
-    service = requiring(robot, margin_min=min(1.0, scheduled.margins.service + 0.01))
-    onboard = requiring(robot, onboard_margin_min=min(1.0, scheduled.margins.onboard + 0.01))
-    for changed in (service, onboard):
-        local = stand.split(GainSplit(changed))
-        least = changed.certificate
-        lacking = (
-            scheduled.margins.service < least.margin_min
-            or scheduled.margins.onboard < least.onboard_margin_min
-        )
-        assert lacking == (local.source is not SplitSource.SCHEDULE)
-        if local.source is SplitSource.STIFFENED:
-            assert local.margins.service >= least.margin_min
-            assert local.margins.onboard >= least.onboard_margin_min
+@pytest.mark.parametrize("name", ["service", "onboard"])
+def test_either_margin_alone_stiffens(robot: RobotConfig, stand: Stand, name: str) -> None:
+    scheduled = stand.split(GainSplit(robot)).margins
+    key = "margin_min" if name == "service" else "onboard_margin_min"
+    changed = requiring(robot, **{key: min(1.0, getattr(scheduled, name) + 0.01)})
+    local, least = stand.split(GainSplit(changed)), changed.certificate
+    assert is_enough(scheduled, least) == (local.source is SplitSource.SCHEDULE)
+    assert local.source is not SplitSource.STIFFENED or is_enough(local.margins, least)
 
 
-def test_a_split_without_a_foot_on_the_ground_is_reported(robot: RobotConfig, stand: Stand) -> None:
-    impossible = requiring(robot, K_required=(1e5,) * 6)
-    local = stand.split(GainSplit(impossible))
+def test_uncertified_gains_are_the_stiffest_allowed(robot: RobotConfig, stand: Stand) -> None:
+    local = stand.split(GainSplit(requiring(robot, K_required=(1e5,) * 6)))
     assert local.source is SplitSource.UNCERTIFIED
     assert local.margins.service < robot.certificate.margin_min
-    assert local.D.min() >= 0.0
-
-
-def test_uncertified_gains_are_the_stiffest_that_are_allowed(
-    robot: RobotConfig, stand: Stand
-) -> None:
-    D = stand.split(GainSplit(requiring(robot, K_required=(1e5,) * 6))).D
     own = stand.split(GainSplit(robot)).D
-    power_up = np.tile(
-        [*robot.stand.ankle.k_p, *robot.stand.knee.k_p, *robot.stand.hip.k_p], 2
-    )  # fmt: skip
+    one = robot.stand
+    power_up = np.tile([*one.ankle.k_p, *one.knee.k_p, *one.hip.k_p], 2)
     share = robot.certificate.k_q_fraction_max
-    for least in (own, power_up, share * np.diagonal(stand.gains().K_q)):
-        np.testing.assert_array_less(np.minimum(least, robot.joint_service.k_p_max), D + 1e-9)
-
-
-# -- damping and limits ----------------------------------------------------------------
+    for least in (np.zeros(12), own, power_up, share * np.diagonal(stand.gains().K_q)):
+        within = np.minimum(least, robot.joint_service.k_p_max)
+        np.testing.assert_array_less(within, local.D + 1e-9)
 
 
 def test_damping_is_the_schedule_s_whatever_the_stiffness(robot: RobotConfig, stand: Stand) -> None:
@@ -295,26 +248,15 @@ def test_gains_are_never_negative_nor_over_the_limits(
         assert gains.max() <= limit
 
 
-# -- the paper's split -----------------------------------------------------------------
-
-
-def test_the_papers_split_is_the_diagonal_and_needs_no_schedule(
-    robot: RobotConfig, stand: Stand
-) -> None:
+def test_the_papers_split_is_the_diagonal(robot: RobotConfig, stand: Stand) -> None:
     bare = msgspec.structs.replace(with_law(robot, split="diagonal"), gain_schedule=None)
-    local = stand.split(GainSplit(bare))
-    K_q, B_q = stand.gains()
+    local, (K_q, B_q), service = stand.split(GainSplit(bare)), stand.gains(), bare.joint_service
     share = robot.law.local_damping_fraction
     assert local.source is SplitSource.DIAGONAL
-    np.testing.assert_array_equal(
-        local.D, np.clip(np.diagonal(K_q), 0.0, bare.joint_service.k_p_max)
-    )
-    expected = np.clip(share * np.diagonal(B_q), 0.0, bare.joint_service.k_d_max)
-    np.testing.assert_allclose(local.D_B, expected)
+    np.testing.assert_array_equal(local.D, np.clip(np.diagonal(K_q), 0.0, service.k_p_max))
+    damping = np.clip(share * np.diagonal(B_q), 0.0, service.k_d_max)
+    np.testing.assert_allclose(local.D_B, damping)
     assert local.D_B.max() > 1.0
-
-
-# -- no schedule -----------------------------------------------------------------------
 
 
 def test_a_certified_split_without_its_schedule_is_refused(robot: RobotConfig) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import msgspec
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -10,8 +9,6 @@ import pytest
 from services.planner.law.hocca import Hocca
 from services.planner.law.kinematics import Kinematics, Measured
 from services.planner.law.stance import FOLLOW_S, Stance
-from services.planner.planner import Planner
-from shared.bus.messages import PlannerMode
 from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
 from tests.planner.conftest import Closed
@@ -26,8 +23,14 @@ STANCES = (
     (-0.1, 0.12, -0.02, 0.02, -0.03, -0.3),
 )
 """The right foot against the left: ahead, wider and on a step, turned in, and all at once."""
+
+
 LARGEST = (0.12, 0.14, 0.04, 0.06, 0.06, 0.33)
+
+
 DT = 0.004
+
+
 STILL = np.zeros(12)
 
 
@@ -124,9 +127,7 @@ def test_each_sole_is_asked_for_little_moment_where_it_stands(
         assert abs(pitch_moment) < 0.01 * 500.0, "less than a centimetre of lever"
 
 
-def test_align_makes_no_step_where_the_feet_stand_astray(
-    robot: RobotConfig, closed: Closed
-) -> None:
+def test_feet_astray_make_no_step_at_align(robot: RobotConfig, closed: Closed) -> None:
     """What the legs disagree by is how the feet stand: it is taken, not fought."""
     q = closed(1.0, pitch=0.3) + 1e-2 * np.random.default_rng(4).normal(size=12)
     output = Hocca(robot).tick(q, STILL, 0.0, DT, align=True)
@@ -135,9 +136,7 @@ def test_align_makes_no_step_where_the_feet_stand_astray(
     np.testing.assert_allclose(output.closure, 0.0, atol=1e-6)
 
 
-def test_while_it_leads_it_keeps_the_stance_and_in_hold_it_follows_slowly(
-    robot: RobotConfig, closed: Closed
-) -> None:
+def test_led_it_keeps_the_stance_held_it_follows(robot: RobotConfig, closed: Closed) -> None:
     """A joint that gives is not a foot that has moved; one that stays moved is."""
     q = closed(1.0, pitch=0.3)
     law = Hocca(robot)
@@ -175,18 +174,15 @@ def test_a_foot_ahead_lets_it_bear_a_harder_push_forwards(robot: RobotConfig) ->
 @pytest.mark.parametrize("row", range(6))
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_a_stance_is_taken_up_to_the_limit_and_refused_beyond_it(row: int, sign: float) -> None:
-    held = Stance(LARGEST)
-    measured = np.zeros(6)
-    measured[row] = sign * LARGEST[row]
-    held.take(measured)
-    assert not held.refused
-    np.testing.assert_array_equal(held.taken, measured)
-    measured[row] = np.nextafter(measured[row], sign)
-    held.take(measured)
-    assert held.refused
-    assert "law.stance_max" in held.refusal()
-    held.take(0.5 * measured)
-    assert not held.refused, "put back"
+    held, at_limit = Stance(LARGEST), np.zeros(6)
+    at_limit[row] = sign * LARGEST[row]
+    beyond = at_limit.copy()
+    beyond[row] = np.nextafter(at_limit[row], sign)
+    for measured, refused in ((at_limit, False), (beyond, True), (0.5 * at_limit, False)):
+        held.take(measured)
+        assert held.refused is refused
+        assert ("law.stance_max" in held.refusal()) is refused
+        np.testing.assert_array_equal(held.taken, at_limit if refused else measured)
 
 
 def test_what_was_refused_for_long_leaves_no_trace_and_a_moved_foot_is_led_once_followed() -> None:
@@ -254,13 +250,3 @@ def test_without_limits_the_feet_are_where_the_robot_file_has_them() -> None:
     held.take(np.full(6, 0.5))
     assert not held.refused
     np.testing.assert_array_equal(held.taken, 0.0)
-
-
-def test_a_planner_that_is_recalled_goes_on_in_the_stance_it_had(robot: RobotConfig) -> None:
-    planner, again = Planner(robot, 1), Planner(robot, 1)
-    memory = planner.snapshot()
-    stance = (0.05, -0.02, 0.0, 0.0, 0.01, 0.1)
-    law = msgspec.structs.replace(memory.law, stance=(stance, False), aligned=True, has_led=True)
-    again.restore(msgspec.structs.replace(memory, law=law))
-    assert again.snapshot().law.stance == (stance, False)
-    assert again.status(1, 0.0).mode == PlannerMode.WAITING

@@ -12,17 +12,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.planner.state_phases import (
-    COMPARED_TICKS,
-    EVERY_TICKS,
-    SOON_TICKS,
-    StatePhases,
-)
+from services.planner.state_phases import COMPARED_TICKS, EVERY_TICKS, SOON_TICKS, StatePhases
 from shared.bus.messages import JointState
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.joints import N_MODULES
 from shared.state import copied
-from tests.planner.test_planner import state
+from tests.planner.states import state
 
 RATE_HZ, STATE_HZ = 500.0, 250.0
 CYCLE_NS = round(NS_PER_S / RATE_HZ)
@@ -79,9 +74,7 @@ def run(phases: StatePhases, modules: Modules, ticks: int, *, heard: bool = True
     counts=st.lists(st.integers(0, 9), min_size=6, max_size=6),
     n=st.sampled_from([2, 3, 4]),
 )
-def test_after_one_comparison_all_states_come_within_a_cycle(
-    begin: list[int], counts: list[int], n: int
-) -> None:
+def test_after_one_comparison_all_are_close(begin: list[int], counts: list[int], n: int) -> None:
     phases = StatePhases(RATE_HZ, RATE_HZ / n)
     spreads = run(phases, Modules(begin, counts, n=n), COMPARED_TICKS + 20)
     assert max(spreads[-10:]) <= 1.0 + 2 * 0.15 + 1e-9
@@ -198,9 +191,7 @@ def test_after_a_module_was_silent_it_is_compared_again_in_a_second() -> None:
 
 
 @pytest.mark.parametrize(("behind", "phase"), [(0.6, 0), (-0.6, 0), (0.7, 1), (-0.7, 1)])
-def test_a_module_moves_if_it_is_behind_by_more_than_half_a_period_and_a_bit(
-    behind: float, phase: int
-) -> None:
+def test_a_module_behind_by_half_a_period_and_a_bit_moves(behind: float, phase: int) -> None:
     begin = [round(CYCLE_NS * (10.0 + behind * (module == 2))) for module in range(N_MODULES)]
     phases = StatePhases(RATE_HZ, STATE_HZ)
     run(phases, Modules(begin, [0] * N_MODULES), COMPARED_TICKS)

@@ -22,11 +22,20 @@ from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
 from tests.planner.conftest import Closed
 from tests.planner.oracle import Array
+from tests.planner.states import with_law
 
 KNEES = [3, 9]
+
+
 OTHERS = [joint for joint in range(12) if joint not in KNEES]
+
+
 WEIGHT = np.array([0.0, 0.0, 731.6, 0.0, 0.0, 0.0])
+
+
 ASSIST = np.array([0.0, 0.0, 200.0])
+
+
 STEP = 0.005
 """rad; of the knees along the path."""
 
@@ -87,8 +96,7 @@ def changes(values: list[Array]) -> list[float]:
 
 def damped_null_spaces(path: Path) -> list[Array]:
     """Return N (12, 12) along the path as the law uses it: with no K_p, K_q = N K_0."""
-    law = msgspec.structs.replace(path.robot.law, K_p=(0.0,) * 6, K_0=1.0)
-    gains = GainLaw(msgspec.structs.replace(path.robot, law=law))
+    gains = GainLaw(with_law(path.robot, K_p=(0.0,) * 6, K_0=1.0))
     kinematics, found = Kinematics(path.robot), []
     for q in path.q:
         kinematics.update(q)
@@ -120,36 +128,28 @@ def test_undamped_the_null_space_jumps_at_straight_upright_legs(upright: Path) -
 def test_the_gains_go_through_straight_knees_without_a_jump(path: Path) -> None:
     """No change is more than its slope (per rad of knee) allows; K_q itself is 4400 at most."""
     law, kinematics = GainLaw(path.robot), Kinematics(path.robot)
-    K_q, B_q = [], []
+    gains = []
     for q in path.q:
         kinematics.update(q)
-        gains = law.gains(kinematics, kinematics.hessian_times(WEIGHT, ASSIST))
-        K_q.append(gains.K_q)
-        B_q.append(gains.B_q)
-    assert np.isfinite(K_q).all()
-    assert np.isfinite(B_q).all()
-    assert max(changes(K_q)) <= 1000.0 * STEP
-    assert max(changes(B_q)) <= 120.0 * STEP
+        gains.append(law.gains(kinematics, kinematics.hessian_times(WEIGHT, ASSIST)))
+    for values, slope in (([g.K_q for g in gains], 1000.0), ([g.B_q for g in gains], 120.0)):
+        assert np.isfinite(values).all()
+        assert max(changes(values)) <= slope * STEP
 
 
 @pytest.mark.parametrize("split", ["certified", "diagonal"])
-def test_the_local_gains_go_through_straight_knees_without_a_jump(
-    leaning: Path, limits: Array, split: str
-) -> None:
+def test_local_gains_pass_straight_knees_smoothly(leaning: Path, limits: Array, split: str) -> None:
     robot = leaning.robot
-    law = msgspec.structs.replace(robot.law, split=split)
-    splitting, gain_law = GainSplit(msgspec.structs.replace(robot, law=law)), GainLaw(robot)
+    splitting, gain_law = GainSplit(with_law(robot, split=split)), GainLaw(robot)
     ik = InverseKinematics(Kinematics(robot), limits)
-    D, D_B = [], []
+    local = []
     for q in leaning.q:
         T = per_p(ik, q)
         hessian_F = ik.kinematics.hessian_times(WEIGHT, ASSIST).copy()
-        body = gain_law.gains(ik.kinematics, hessian_F)
-        p = ik.kinematics.p
-        local = splitting.split(lambda body=body: body, float(p[2]), float(p[4]), T, hessian_F)
-        D.append(local.D)
-        D_B.append(local.D_B)
-    for values, slope in ((D, 4000.0), (D_B, 400.0)):
+        body, p = gain_law.gains(ik.kinematics, hessian_F), ik.kinematics.p
+        z, pitch = float(p[2]), float(p[4])
+        local.append(splitting.split(lambda body=body: body, z, pitch, T, hessian_F))
+    for values, slope in (([x.D for x in local], 4000.0), ([x.D_B for x in local], 400.0)):
         assert np.isfinite(values).all()
         assert np.abs(np.diff(values, axis=0)).max() <= slope * STEP
 
@@ -161,9 +161,7 @@ def per_p(ik: InverseKinematics, q: Array) -> Array:
     return ik.solve_rates(np.eye(12)[:, :6])
 
 
-def test_rates_that_follow_the_robots_own_motion_are_never_larger_than_it(
-    leaning: Path, limits: Array
-) -> None:
+def test_rates_never_exceed_the_motion_they_follow(leaning: Path, limits: Array) -> None:
     """The robot led through straight knees: v_ref = T S J v."""
     ik = InverseKinematics(Kinematics(leaning.robot), limits)
     S = np.array(leaning.robot.law.S)

@@ -1,4 +1,4 @@
-"""What the planner trips on: in time, for as long as it lasts, and on nothing unknown."""
+"""What the planner trips on, and how far it drifts without a hand: in time, and nothing unknown."""
 
 from __future__ import annotations
 
@@ -10,16 +10,22 @@ import pytest
 from services.planner.law.hocca import LawOutput
 from services.planner.law.kinematics import Kinematics, Measured
 from services.planner.watch.trips import CALM_NS, PlannerTrips, values_of
-from shared.bus.messages import Trip
+from services.planner.watch.unattended import ARM, HAND_LOST_NS, HAND_MIN, Unattended
+from shared.bus.messages import Pair, Trip
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 from shared.robot.trip_table import JOINT_TRIPS, PLANNER_TRIPS
-from shared.state import copied
 from tests.planner.conftest import Closed
 
 T0 = 5_000_000_000
+
+
 TICK_NS = 4 * NS_PER_MS
+
+
 CALM = (0.0, 0.0, 0.0, 200.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
 TRIPS = list(PLANNER_TRIPS)
 
 
@@ -39,6 +45,15 @@ def led(robot: RobotConfig) -> PlannerTrips:
     return trips
 
 
+def go_on(
+    trips: PlannerTrips, values: tuple[float, ...], ticks: range, *, leads: bool = True
+) -> PlannerTrips:
+    """Go on with these values; one that has tripped leads no more."""
+    for tick in ticks:
+        trips.advance(T0 + tick * TICK_NS, values, leads=leads and trips.tripped is Trip.NONE)
+    return trips
+
+
 def test_table_robot_file_and_enumerations_name_the_same(robot: RobotConfig) -> None:
     keys = [row.key for row in (*JOINT_TRIPS.values(), *PLANNER_TRIPS.values())]
     assert sorted(keys) == sorted(robot.trips.__struct_fields__)
@@ -49,90 +64,50 @@ def test_table_robot_file_and_enumerations_name_the_same(robot: RobotConfig) -> 
 def test_each_trips_once_it_has_lasted(robot: RobotConfig, trip: Trip) -> None:
     trips, values = led(robot), beyond(robot, trip)
     lasted_ns = round(getattr(robot.trips, PLANNER_TRIPS[trip].key).after_ms * NS_PER_MS)
-    trips.advance(T0, values, leads=True)
-    trips.advance(T0 + lasted_ns - 1, values, leads=True)
-    assert trips.tripped is Trip.NONE
-    trips.advance(T0 + lasted_ns, values, leads=True)
-    assert trips.tripped is trip
+    for at_ns, tripped in ((0, Trip.NONE), (lasted_ns - 1, Trip.NONE), (lasted_ns, trip)):
+        trips.advance(T0 + at_ns, values, leads=True)
+        assert trips.tripped is tripped
     assert PLANNER_TRIPS[trip].measured in trips.why
     assert PLANNER_TRIPS[trip].unit in trips.why
 
 
 @pytest.mark.parametrize("trip", TRIPS)
 def test_what_comes_back_in_between_does_not(robot: RobotConfig, trip: Trip) -> None:
-    trips, values = led(robot), beyond(robot, trip)
+    trips = led(robot)
     for tick in range(1000):
-        now = CALM if tick % 3 == 2 else values
-        trips.advance(T0 + tick * TICK_NS, now, leads=True)
+        go_on(trips, CALM if tick % 3 == 2 else beyond(robot, trip), range(tick, tick + 1))
     assert trips.tripped is Trip.NONE
+
+
+@pytest.mark.parametrize("trip", TRIPS)
+def test_at_its_limit_nothing_trips_yet(robot: RobotConfig, trip: Trip) -> None:
+    assert go_on(led(robot), beyond(robot, trip, by=1.0), range(1000)).tripped is Trip.NONE
 
 
 @pytest.mark.parametrize("trip", TRIPS)
 def test_a_planner_that_does_not_lead_trips_on_nothing(robot: RobotConfig, trip: Trip) -> None:
-    trips = PlannerTrips(robot)
-    for tick in range(1000):
-        trips.advance(T0 + tick * TICK_NS, beyond(robot, trip), leads=False)
-    assert trips.tripped is Trip.NONE
+    trips = go_on(PlannerTrips(robot), beyond(robot, trip), range(1000), leads=False)
+    assert go_on(trips, beyond(robot, trip), range(1000, 1001)).tripped is Trip.NONE
 
 
-def test_what_is_not_known_is_no_reason(robot: RobotConfig) -> None:
-    trips = PlannerTrips(robot)
-    for tick in range(1000):
-        trips.advance(T0 + tick * TICK_NS, (math.nan,) * len(CALM), leads=True)
-    assert trips.tripped is Trip.NONE
+def test_what_is_not_known_is_no_reason_nor_a_leg_on_the_hoist(robot: RobotConfig) -> None:
+    for values in ((math.nan,) * len(CALM), beyond(robot, Trip.UNLOADED)):
+        assert go_on(PlannerTrips(robot), values, range(1000)).tripped is Trip.NONE
 
 
+@pytest.mark.parametrize("known", [True, False], ids=["it lasts", "it is not known"])
 @pytest.mark.parametrize("trip", TRIPS)
-def test_it_ends_after_a_second_within_all_limits(robot: RobotConfig, trip: Trip) -> None:
-    trips, values = led(robot), beyond(robot, trip)
-    for tick in range(1000):
-        trips.advance(T0 + tick * TICK_NS, values, leads=trips.tripped is Trip.NONE)
-    assert trips.tripped is trip, "it goes on as long as it lasts"
-    other = beyond(robot, Trip.LEGS if trip is Trip.REACH else Trip.REACH)
-    calm_from = T0 + 1000 * TICK_NS
-    trips.advance(calm_from - TICK_NS, other, leads=False)
-    trips.advance(calm_from, CALM, leads=False)
-    trips.advance(calm_from + CALM_NS - 1, CALM, leads=False)
-    assert trips.tripped is trip
-    trips.advance(calm_from + CALM_NS, CALM, leads=False)
-    assert (trips.tripped, trips.why) == (Trip.NONE, "")
-
-
-@pytest.mark.parametrize("trip", TRIPS)
-def test_it_goes_on_while_what_tripped_is_not_known(robot: RobotConfig, trip: Trip) -> None:
+def test_it_ends_after_a_calm_second(robot: RobotConfig, trip: Trip, known: bool) -> None:
     """A harness that falls silent takes no load off the person."""
-    trips, values = led(robot), beyond(robot, trip)
-    for tick in range(1000):
-        trips.advance(T0 + tick * TICK_NS, values, leads=trips.tripped is Trip.NONE)
-    unknown = list(CALM)
-    unknown[TRIPS.index(trip)] = math.nan
+    trips = go_on(led(robot), beyond(robot, trip), range(1000))
+    other = beyond(robot, Trip.LEGS if trip is Trip.REACH else Trip.REACH)
+    unknown = tuple(math.nan if each is trip else x for each, x in zip(TRIPS, CALM, strict=True))
+    go_on(trips, other if known else unknown, range(1000, 3000), leads=False)
     calm_from = T0 + 3000 * TICK_NS
-    for tick in range(1000, 3000):
-        trips.advance(T0 + tick * TICK_NS, tuple(unknown), leads=False)
-    trips.advance(calm_from, CALM, leads=False)
-    trips.advance(calm_from + CALM_NS - 1, CALM, leads=False)
-    assert trips.tripped is trip
-    trips.advance(calm_from + CALM_NS, CALM, leads=False)
-    assert trips.tripped is Trip.NONE
-
-
-def test_on_the_hoist_no_leg_is_missed(robot: RobotConfig) -> None:
-    trips, hanging = PlannerTrips(robot), beyond(robot, Trip.UNLOADED)
-    for tick in range(1000):
-        trips.advance(T0 + tick * TICK_NS, hanging, leads=True)
-    assert trips.tripped is Trip.NONE
-
-
-def test_it_goes_on_from_a_memory(robot: RobotConfig) -> None:
-    trips, other, values = PlannerTrips(robot), PlannerTrips(robot), beyond(robot, Trip.LEGS)
-    for tick in range(11):
-        trips.advance(T0 + tick * TICK_NS, values, leads=True)
-    other.state = copied(trips.state)
-    for each in (trips, other):
-        for tick in range(11, 14):
-            each.advance(T0 + tick * TICK_NS, values, leads=True)
-    assert other.state == trips.state
-    assert other.tripped is Trip.LEGS
+    for at_ns, tripped in ((0, trip), (CALM_NS - 1, trip), (CALM_NS, Trip.NONE)):
+        trips.advance(calm_from + at_ns, CALM, leads=False)
+        assert trips.tripped is tripped
+    assert trips.why == ""
 
 
 def test_a_legs_load_is_the_force_that_its_torques_hold(
@@ -179,7 +154,11 @@ def output_of(assist: float) -> LawOutput:
 
 
 HARNESS = TRIPS.index(Trip.HARNESS)
+
+
 UNLOADED = TRIPS.index(Trip.UNLOADED)
+
+
 SAGGING = TRIPS.index(Trip.SAGGING)
 
 
@@ -227,22 +206,11 @@ def test_sagging_is_the_power_of_a_load_beyond_assist_and_lead_as_it_sinks(
 
 def test_a_hand_that_was_held_up_may_catch_up(robot: RobotConfig) -> None:
     """It presses from the first tick on; once it has not, the same load is a person who sags."""
-    trips, values = PlannerTrips(robot), beyond(robot, Trip.SAGGING)
-    for tick in range(100):
-        trips.advance(T0 + tick * TICK_NS, values, leads=True)
+    sagging = beyond(robot, Trip.SAGGING)
+    trips = go_on(PlannerTrips(robot), sagging, range(100))
     assert trips.tripped is Trip.NONE
-    trips.advance(T0 + 100 * TICK_NS, CALM, leads=True)
-    for tick in range(101, 200):
-        trips.advance(T0 + tick * TICK_NS, values, leads=True)
-    assert trips.tripped is Trip.SAGGING
-
-
-def test_what_lasted_before_it_led_does_not_count(robot: RobotConfig) -> None:
-    trips, values = PlannerTrips(robot), beyond(robot, Trip.HARNESS)
-    for tick in range(500):
-        trips.advance(T0 + tick * TICK_NS, values, leads=False)
-    trips.advance(T0 + 500 * TICK_NS, values, leads=True)
-    assert trips.tripped is Trip.NONE
+    go_on(trips, CALM, range(100, 101))
+    assert go_on(trips, sagging, range(101, 200)).tripped is Trip.SAGGING
 
 
 @pytest.mark.parametrize("loads", [(math.nan, 5.0), (5.0, math.nan)])
@@ -251,49 +219,31 @@ def test_with_one_leg_unknown_none_is_unloaded(loads: tuple[float, float]) -> No
     assert math.isnan(values[UNLOADED])
 
 
-@pytest.mark.parametrize("trip", TRIPS)
-def test_at_its_limit_nothing_trips_yet(robot: RobotConfig, trip: Trip) -> None:
-    trips, values = led(robot), beyond(robot, trip, by=1.0)
-    for tick in range(1000):
-        trips.advance(T0 + tick * TICK_NS, values, leads=True)
-    assert trips.tripped is Trip.NONE
-
-
 def test_one_that_was_put_back_on_the_hoist_misses_no_leg(robot: RobotConfig) -> None:
     trips, hanging = led(robot), beyond(robot, Trip.UNLOADED)
     trips.advance(T0, hanging, leads=False)
-    for tick in range(1, 1000):
-        trips.advance(T0 + tick * TICK_NS, hanging, leads=True)
-    assert trips.tripped is Trip.NONE
+    assert go_on(trips, hanging, range(1, 1000)).tripped is Trip.NONE
 
 
 @pytest.mark.parametrize("trip", TRIPS)
 def test_one_that_stood_as_it_tripped_is_not_led_on_one_leg(robot: RobotConfig, trip: Trip) -> None:
-    trips = led(robot)
-    for tick in range(500):
-        trips.advance(T0 + tick * TICK_NS, beyond(robot, trip), leads=True)
-    for tick in range(500, 1500):
-        trips.advance(T0 + tick * TICK_NS, beyond(robot, Trip.UNLOADED), leads=False)
+    trips = go_on(led(robot), beyond(robot, trip), range(500))
+    go_on(trips, beyond(robot, Trip.UNLOADED), range(500, 1500), leads=False)
     assert trips.tripped is trip
 
 
 def test_both_legs_have_borne_it_once_each_bears_three_times_the_least(robot: RobotConfig) -> None:
     least = robot.trips.unloaded.limit
     for borne, tripped in ((3.0 * least, Trip.NONE), (3.0 * least + 0.1, Trip.UNLOADED)):
-        trips, values = PlannerTrips(robot), list(CALM)
+        values = list(CALM)
         values[UNLOADED] = borne
-        trips.advance(T0, tuple(values), leads=True)
-        for tick in range(1, 500):
-            trips.advance(T0 + tick * TICK_NS, beyond(robot, Trip.UNLOADED), leads=True)
-        assert trips.tripped is tripped
+        trips = go_on(PlannerTrips(robot), tuple(values), range(1))
+        assert go_on(trips, beyond(robot, Trip.UNLOADED), range(1, 500)).tripped is tripped
 
 
 def test_the_first_trip_is_reported(robot: RobotConfig) -> None:
-    trips = led(robot)
-    for tick in range(100):
-        trips.advance(T0 + tick * TICK_NS, beyond(robot, Trip.LEGS), leads=True)
-    for tick in range(100, 200):
-        trips.advance(T0 + tick * TICK_NS, beyond(robot, Trip.REACH), leads=True)
+    trips = go_on(led(robot), beyond(robot, Trip.LEGS), range(100))
+    go_on(trips, beyond(robot, Trip.REACH), range(100, 200))
     assert trips.tripped is Trip.LEGS
     assert PLANNER_TRIPS[Trip.LEGS].measured in trips.why
 
@@ -308,13 +258,57 @@ def test_each_value_is_the_tables(joint: int, sign: float) -> None:
         closure=np.array((0.01, -0.02, 0.02, 9.0, 9.0, 9.0)), ik_residual=0.004, pdot=pdot
     )
     values = values_of(output, q, (90.0, 80.0), None, 0.0, 0.07, leads=True)
-    by_name = dict(zip(TRIPS, values, strict=True))
-    assert by_name[Trip.LEGS] == pytest.approx(0.03)
-    assert by_name[Trip.REACH] == 0.004
-    assert by_name[Trip.TRACKING] == pytest.approx(0.2)
-    assert by_name[Trip.UNLOADED] == 80.0
-    assert by_name[Trip.SINKING] == pytest.approx(0.3)
-    assert by_name[Trip.TURNING] == pytest.approx(0.5)
-    assert math.isnan(by_name[Trip.HARNESS])
-    assert math.isnan(by_name[Trip.SAGGING])
-    assert by_name[Trip.UNATTENDED] == 0.07
+    expected = {
+        Trip.LEGS: 0.03, Trip.REACH: 0.004, Trip.TRACKING: 0.2, Trip.UNLOADED: 80.0,
+        Trip.SINKING: 0.3, Trip.TURNING: 0.5, Trip.HARNESS: math.nan, Trip.SAGGING: math.nan,
+        Trip.UNATTENDED: 0.07,
+    }  # fmt: skip
+    assert values == pytest.approx([expected[trip] for trip in TRIPS], nan_ok=True)
+
+
+HERE: Pair = (0.8, 0.1)
+
+
+def left(at: Pair = HERE) -> Unattended:
+    """Return one that a hand has left."""
+    found = Unattended()
+    assert found.drift(T0, at, 2.0 * HAND_MIN[0], 0.0) == 0.0
+    assert found.drift(T0 + HAND_LOST_NS, at, 0.0, 0.0) == 0.0
+    return found
+
+
+@pytest.mark.parametrize(
+    ("pose", "drift"),
+    [((0.83, 0.1), 0.03), ((0.75, 0.1), 0.05), ((0.8, 0.3), 0.2 * ARM), ((0.79, -1.9), 2.0 * ARM)],
+)
+def test_drift_is_measured_from_where_the_hand_left_it(pose: Pair, drift: float) -> None:
+    assert left().drift(T0 + HAND_LOST_NS + 1, pose, 0.0, 0.0) == pytest.approx(drift)
+
+
+def test_a_force_below_what_is_felt_is_no_hand() -> None:
+    drift = left().drift(T0 + HAND_LOST_NS + 1, (0.84, 0.1), 0.99 * HAND_MIN[0], 0.99 * HAND_MIN[1])
+    assert drift == pytest.approx(0.04)
+
+
+@pytest.mark.parametrize(
+    ("force", "moment"),
+    [
+        (HAND_MIN[0], 0.0),
+        (-HAND_MIN[0], 0.0),
+        (0.0, HAND_MIN[1]),
+        (0.0, -HAND_MIN[1]),
+        (math.nan, math.nan),
+    ],
+)
+def test_with_a_hand_on_it_or_unknown_nothing_drifts(force: float, moment: float) -> None:
+    hand = left()
+    for tick in range(1000):
+        pose = (0.8 + 0.001 * tick, 0.1)
+        assert hand.drift(T0 + HAND_LOST_NS + tick + 1, pose, force, moment) == 0.0
+
+
+def test_a_hand_that_is_not_felt_for_a_moment_has_not_let_go() -> None:
+    hand = Unattended()
+    hand.drift(T0, HERE, 2.0 * HAND_MIN[0], 0.0)
+    assert hand.drift(T0 + HAND_LOST_NS, (0.9, 0.1), 0.0, 0.0) == 0.0
+    assert hand.drift(T0 + HAND_LOST_NS + 1, (0.95, 0.1), 0.0, 0.0) == pytest.approx(0.05)

@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.joint.failsafe import Event, Failsafe, Timing, timing_of
-from shared.bus.messages import Mode, Refusal
+from services.joint.controller import JointController
+from services.joint.failsafe import RETIRED_SESSIONS_KEPT, Event, Failsafe, Timing, timing_of
+from shared.bus.messages import Cause, Mode, Refusal
 from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config.gain_schedule import believing
 from shared.config.robot_config import RobotConfig
-from tests.joint.helpers import SESSION, T0, command
+from tests.joint.helpers import SESSION, T0, Bench, command
 
 OTHER = 8
+
+
 THIRD = 9
-
-
-@pytest.fixture(scope="module")
-def timing(robot: RobotConfig) -> Timing:
-    return timing_of(robot)
 
 
 def taken(timing: Timing, **changes: object) -> Failsafe:
@@ -37,25 +37,19 @@ def test_the_limit_is_fifty_milliseconds(timing: Timing) -> None:
 @pytest.mark.parametrize(
     ("off_ns", "refusal"), [(-1, Refusal.NONE), (0, Refusal.NONE), (1, Refusal.TOO_OLD)]
 )
-def test_a_command_is_taken_up_to_the_limit_to_the_nanosecond(
-    off_ns: int, refusal: Refusal, timing: Timing
-) -> None:
+def test_a_command_is_taken_to_a_nanosecond(off_ns: int, refusal: Refusal, timing: Timing) -> None:
     sent = command(echo_t_ns=T0 - timing.max_command_age_ns - off_ns)
     assert Failsafe().offer(sent, T0, timing) is refusal
 
 
 @pytest.mark.parametrize(("off_ns", "usable"), [(-1, True), (0, True), (1, False)])
-def test_a_taken_command_is_usable_up_to_the_limit_to_the_nanosecond(
-    off_ns: int, usable: bool, timing: Timing
-) -> None:
+def test_a_command_is_usable_to_a_nanosecond(off_ns: int, usable: bool, timing: Timing) -> None:
     failsafe = taken(timing)
     assert failsafe.is_fresh(T0 + timing.max_command_age_ns + off_ns, timing) is usable
 
 
 @pytest.mark.parametrize(("off_ns", "mode"), [(-1, Mode.TRACK), (0, Mode.TRACK), (1, Mode.HOLD)])
-def test_track_is_left_one_nanosecond_past_the_limit(
-    off_ns: int, mode: Mode, timing: Timing
-) -> None:
+def test_track_is_left_a_nanosecond_after(off_ns: int, mode: Mode, timing: Timing) -> None:
     failsafe = taken(timing)
     failsafe.mode = Mode.TRACK
     failsafe.fresh_since_ns = T0
@@ -72,9 +66,7 @@ def test_track_is_left_one_nanosecond_past_the_limit(
         (1 << 62, Refusal.FROM_THE_FUTURE),
     ],
 )
-def test_a_stamp_this_module_has_not_given_yet_is_refused(
-    ahead_ns: int, refusal: Refusal, timing: Timing
-) -> None:
+def test_a_stamp_not_given_yet_is_refused(ahead_ns: int, refusal: Refusal, timing: Timing) -> None:
     assert Failsafe().offer(command(echo_t_ns=T0 + ahead_ns), T0, timing) is refusal
 
 
@@ -131,9 +123,7 @@ def test_a_retired_session_never_comes_back(timing: Timing) -> None:
     assert failsafe.session == THIRD
 
 
-def test_the_command_that_brings_a_new_session_must_itself_be_within_limits(
-    timing: Timing,
-) -> None:
+def test_the_command_that_brings_a_new_session_must_itself_be_within_limits(timing: Timing) -> None:
     failsafe = taken(timing)
     now_ns = T0 + timing.max_command_age_ns + 1
     bad = command(session=OTHER, echo_t_ns=now_ns, k_p=(math.nan, 1.0))
@@ -260,9 +250,7 @@ def test_the_step_of_a_number_may_be_500_and_not_one_more(timing: Timing) -> Non
 
 
 @pytest.mark.parametrize("away_s", [0.0, 1.0, 60.0, 3600.0])
-def test_a_planner_that_was_not_heard_for_a_while_is_heard_again(
-    timing: Timing, away_s: float
-) -> None:
+def test_a_planner_unheard_for_a_while_is_heard_again(timing: Timing, away_s: float) -> None:
     """It ticks on at 250 Hz, or at any rate up to 1 kHz, while its link is cut."""
     failsafe = taken(timing, seq=10)
     now_ns = T0 + round(away_s * NS_PER_S)
@@ -271,9 +259,7 @@ def test_a_planner_that_was_not_heard_for_a_while_is_heard_again(
 
 
 @given(ahead=st.integers(1, 2**62), away_ns=st.integers(0, 3600 * NS_PER_S))
-def test_no_message_locks_the_planner_out_for_longer_than_it_was_away(
-    ahead: int, away_ns: int
-) -> None:
+def test_no_message_locks_a_planner_out_longer_than_away(ahead: int, away_ns: int) -> None:
     """Whatever was accepted, a planner of 250 Hz has counted beyond it soon after."""
     timing = Timing(
         max_command_age_ns=50 * NS_PER_MS, engage_after_ns=1, engage_after_max_ns=1,
@@ -295,3 +281,76 @@ def test_the_newest_refusal_is_told_for_a_second_and_of_whom_it_came(timing: Tim
     failsafe.offer(command(session=OTHER, seq=11), T0, timing)
     assert failsafe.newest_refusal(T0 + NS_PER_S) == (Refusal.FOREIGN_SESSION, OTHER)
     assert failsafe.newest_refusal(T0 + NS_PER_S + 1) == (Refusal.NONE, 0)
+
+
+def test_commands_from_before_the_drive_was_armed_do_not_count(timing: Timing) -> None:
+    failsafe, now_ns = Failsafe(), T0
+    for seq in range(1000):
+        now_ns += 2 * NS_PER_MS
+        failsafe.offer(command(seq=seq, echo_t_ns=now_ns), now_ns, timing)
+        failsafe.advance(now_ns, timing, Event.NONE, estop=False)
+    assert failsafe.fresh_since_ns == -1
+    failsafe.advance(now_ns, timing, Event.DRIVE_ARMED, estop=False)
+    armed_ns, seq = now_ns, 1000
+    while failsafe.mode is not Mode.TRACK:
+        assert failsafe.mode is Mode.HOLD
+        now_ns, seq = now_ns + 2 * NS_PER_MS, seq + 1
+        failsafe.offer(command(seq=seq, echo_t_ns=now_ns), now_ns, timing)
+        failsafe.advance(now_ns, timing, Event.NONE, estop=False)
+    assert now_ns - armed_ns >= timing.engage_after_ns
+
+
+@pytest.mark.parametrize(("age_ms", "taken"), [(49, True), (51, False)])
+def test_a_drive_is_taken_over_on_the_commands_gains_only_while_the_command_is_usable(
+    robot: RobotConfig, age_ms: int, *, taken: bool
+) -> None:
+    controller = JointController(believing(robot), "knee_right")
+    bench = Bench(robot)
+    told = command(hold=True, k_p=(600.0, 12.0), k_d=(40.0, 3.0), echo_t_ns=T0)
+    controller.failsafe.offer(told, T0, controller.timing)
+    bench.now_ns = T0 + age_ms * NS_PER_MS
+    reading = msgspec.structs.replace(bench.reading(), torque=(1.0, -1.0))
+    controller.step(bench.now_ns, reading, None, estop=False)
+    assert controller.failsafe.mode is Mode.HOLD
+    assert (controller.setpoint.k_p == told.k_p) is taken
+
+
+def test_a_clock_that_starts_at_nought_is_a_clock(timing: Timing) -> None:
+    failsafe = Failsafe(mode=Mode.HOLD, fresh_since_ns=0)
+    assert failsafe.ready(timing.engage_after_ns, timing)
+    assert not failsafe.ready(timing.engage_after_ns - 1, timing)
+
+
+def test_the_last_256_sessions_never_become_current_again(timing: Timing) -> None:
+    failsafe, now_ns = Failsafe(), T0
+    for session in range(1, RETIRED_SESSIONS_KEPT + 4):
+        now_ns += timing.max_command_age_ns + 1
+        told = command(session=session, echo_t_ns=now_ns)
+        assert failsafe.offer(told, now_ns, timing) is Refusal.NONE
+    assert failsafe.retired == tuple(range(3, RETIRED_SESSIONS_KEPT + 3))
+
+
+def test_the_failsafes_times_and_limits_are_the_robot_files(robot: RobotConfig) -> None:
+    service = robot.joint_service
+    assert timing_of(robot) == Timing(
+        max_command_age_ns=round(1e6 * service.max_command_age_ms),
+        engage_after_ns=round(1e6 * service.engage_after_ms),
+        engage_after_max_ns=round(1e6 * service.engage_after_max_ms),
+        dropout_forget_ns=round(1e9 * service.dropout_forget_s),
+        dropouts_max=5,  # 100 ms, doubled five times, are the 3.2 s at most
+        k_p_max=service.k_p_max,
+        k_d_max=service.k_d_max,
+        v_max=service.v_max,
+        tau_max=4.0 * robot.joint.tau_module_max,
+    )
+
+
+def test_at_the_first_instant_of_a_clock_commands_are_fresh_as_at_any_other(timing: Timing) -> None:
+    failsafe = Failsafe(mode=Mode.HOLD)
+    for seq in range(3):
+        failsafe.offer(command(seq=seq, echo_t_ns=seq), seq, timing)
+        failsafe.advance(seq, timing, Event.NONE, estop=False)
+        assert failsafe.fresh_since_ns == 0
+    tracking = Failsafe(mode=Mode.TRACK, session=SESSION, fresh_since_ns=0)
+    tracking.offer(command(echo_t_ns=1), 1, timing)
+    assert tracking.advance(1, timing, Event.NONE, estop=False) is not Cause.COMMAND_STALE

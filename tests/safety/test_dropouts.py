@@ -17,11 +17,6 @@ from tests.joint.helpers import T0, command
 CYCLE_NS = 2 * NS_PER_MS
 
 
-@pytest.fixture(scope="module")
-def timing(robot: RobotConfig) -> Timing:
-    return timing_of(robot)
-
-
 class Module:
     """A failsafe in HOLD, cycled; a command in any cycle may echo the cycle before."""
 
@@ -101,9 +96,7 @@ def test_drop_outs_are_forgotten_one_at_a_time(timing: Timing) -> None:
     assert left == [2, 1, 0, 0]
 
 
-def test_steady_tracking_halves_the_wait_however_many_drop_outs_there_were(
-    timing: Timing,
-) -> None:
+def test_steady_tracking_halves_the_wait_however_many_drop_outs_there_were(timing: Timing) -> None:
     """robot.toml: dropout_forget_s of TRACK without a drop-out halves it again."""
     module = Module(timing)
     for _ in range(8):
@@ -129,9 +122,7 @@ def test_hold_asked_by_the_planner_is_no_drop_out(timing: Timing) -> None:
     assert module.failsafe.dropouts.count == 0
 
 
-def test_ready_is_reported_in_hold_so_that_all_six_can_start_together(
-    timing: Timing,
-) -> None:
+def test_ready_is_reported_in_hold_so_that_all_six_can_start_together(timing: Timing) -> None:
     module = Module(timing)
     for _ in range(2 * timing.engage_after_ns // CYCLE_NS):
         module.cycle(fresh=True, hold=True)
@@ -192,7 +183,11 @@ def brute_force(arrivals: dict[int, Arrival], cycles: int, timing: Timing) -> li
 
 # mostly fresh commands, sometimes an old one or a gap that is too long
 ages = st.one_of(st.integers(0, 3), st.integers(0, 3), st.integers(0, 8))
+
+
 gaps = st.one_of(*[st.integers(1, 3)] * 8, st.integers(1, 9))
+
+
 streams = st.lists(st.tuples(gaps, ages, st.sampled_from([False] * 19 + [True])), max_size=80)
 
 

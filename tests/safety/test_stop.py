@@ -54,9 +54,7 @@ def test_emergency_stop_leads_from_any_mode_to_damp(bench: Bench, before: Mode) 
 
 @pytest.mark.parametrize("before", [Mode.HOLD, Mode.TRACK])
 @pytest.mark.parametrize("module", ["knee_right", "hip_left"])
-def test_the_axes_that_sink_have_no_stiffness_in_damp(
-    robot: RobotConfig, before: Mode, module: str
-) -> None:
+def test_what_sinks_has_no_stiffness(robot: RobotConfig, before: Mode, module: str) -> None:
     bench = at_rest(robot, module)
     bench.to(before)
     bench.cycle(estop=True)
@@ -69,9 +67,7 @@ def test_the_axes_that_sink_have_no_stiffness_in_damp(
 @pytest.mark.parametrize(
     ("module", "axis"), [("ankle_left", 0), ("ankle_left", 1), ("knee_right", 0), ("hip_right", 0)]
 )
-def test_ankles_and_frontal_axes_keep_holding_in_damp(
-    robot: RobotConfig, module: str, axis: int
-) -> None:
+def test_ankles_and_frontal_axes_hold_in_damp(robot: RobotConfig, module: str, axis: int) -> None:
     """With every stiffness off, an inverted pendulum is left: it toppled."""
     bench = at_rest(robot, module)
     bench.to_hold()
@@ -84,33 +80,21 @@ def test_ankles_and_frontal_axes_keep_holding_in_damp(
     assert bench.run(5)[-1].tau[axis] == pytest.approx(-0.01 * stand)
 
 
-def test_damp_fades_the_sinking_feedforward_to_zero_in_its_time(
-    robot: RobotConfig, bench: Bench
-) -> None:
-    bench.to_track(tau_ff=(3.0, -25.0))
-    bench.cycle(estop=True)
-    cycles = round(robot.joint_service.damp_fade_s * robot.joint_service.rate_hz)
-    theta = np.abs([result.tau[1] for result in bench.run(cycles)])
-    assert np.all(np.diff(theta) <= 0.0)
-    assert theta[-2] > 0.0
-    assert bench.controller.tau[1] == 0.0
-
-
-def test_torque_in_damp_is_what_is_left_of_the_feedforward(
+def test_torque_in_damp_is_the_feedforward_left_until_what_sinks_has_none(
     robot: RobotConfig, bench: Bench
 ) -> None:
     bench.to_track(tau_ff=(3.0, -25.0), tau_coupled=(12.0, -9.0))
     bench.cycle(estop=True)
-    entered_ns, fade_ns = bench.now_ns, robot.joint_service.damp_fade_s * NS_PER_S
-    for cycle in range(2400):
+    entered_ns, service = bench.now_ns, robot.joint_service
+    for cycle in range(round(service.damp_fade_s * service.rate_hz) + 100):
         tau = bench.cycle(bench.fresh()).tau  # a planner that has not heard changes nothing
         since_ns = bench.now_ns - entered_ns
-        left = 1.0 - since_ns / fade_ns
-        coupled = max(0.0, 1.0 - since_ns / (robot.joint_service.coupled_ramp_ms * NS_PER_MS))
+        left = max(0.0, 1.0 - since_ns / (service.damp_fade_s * NS_PER_S))
+        coupled = max(0.0, 1.0 - since_ns / (service.coupled_ramp_ms * NS_PER_MS))
         if cycle:
             expected = (3.0 + 12.0 * coupled, -25.0 * left - 9.0 * coupled)
             np.testing.assert_allclose(tau, expected, atol=1e-9)
-    assert left > 0.0
+    assert (left, tau[1]) == (0.0, 0.0)
 
 
 def test_damp_resists_motion(robot: RobotConfig, bench: Bench) -> None:
@@ -121,22 +105,7 @@ def test_damp_resists_motion(robot: RobotConfig, bench: Bench) -> None:
     assert settled.tau[1] == pytest.approx(robot.joint_service.damp_k_d * 0.3)
 
 
-def test_a_knee_is_caught_before_it_folds_so_far_that_the_robot_topples(
-    robot: RobotConfig,
-) -> None:
-    bench = Bench(robot, "knee_left")
-    bench.to_hold()
-    bench.cycle(estop=True)
-    bench.run(3000)
-    stop = robot.joint_service.damp_knee_stop
-    bench.move((bench.q[0], stop - 0.02))
-    caught = bench.run(5)[-1].tau[1]
-    assert caught == pytest.approx(0.02 * robot.stand_gains("knee_left").k_p[1])
-
-
-def test_emergency_stop_never_drops_the_load_that_the_springs_carried(
-    bench: Bench, robot: RobotConfig
-) -> None:
+def test_a_stop_never_drops_what_springs_carried(bench: Bench, robot: RobotConfig) -> None:
     """A slow sink, never a drop: a stand without a planner has no feedforward to fade."""
     bench.to_hold()
     bench.q = (0.02, -1.02)
@@ -146,3 +115,68 @@ def test_emergency_stop_never_drops_the_load_that_the_springs_carried(
     bench.cycle(estop=True)
     bench.run(5)
     assert bench.controller.tau[1] > 0.9 * carried
+
+
+GENTLE = (3.0, -5.0)
+"""N m"""
+
+
+@pytest.mark.parametrize("module", ["ankle_left", "knee_left", "hip_right"])
+def test_in_damp_the_rest_comes_to_the_stand_gains(robot: RobotConfig, module: str) -> None:
+    bench = Bench(robot, module)
+    soft = {"k_p": (100.0, 90.0), "k_d": (5.0, 4.0), "tau_ff": GENTLE}
+    bench.to_track(**soft)
+    bench.cycle(estop=True)
+    bench.run(round(robot.joint_service.damp_fade_s * robot.joint_service.rate_hz) + 50)
+    setpoint, stand = bench.controller.setpoint, robot.stand_gains(module)
+    sinks = kind_of(module) in robot.joint_service.damp_sinks
+    for axis in (0,) if sinks else (0, 1):
+        assert setpoint.k_p[axis] == pytest.approx(max(stand.k_p[axis], soft["k_p"][axis]))
+        assert setpoint.k_d[axis] == pytest.approx(max(stand.k_d[axis], soft["k_d"][axis]))
+
+
+@pytest.mark.parametrize("carried", [(200.0, 0.0), (-90.0, 90.0), (1e4, -1e4)])
+def test_what_a_drive_carried_in_a_gap_goes_on_within_the_motors_limits(
+    robot: RobotConfig, carried: tuple[float, float]
+) -> None:
+    bench = Bench(robot)
+    bench.to_hold()
+    phi, theta = bench.controller.resume(bench.now_ns, carried)
+    most = robot.joint.tau_module_max + 1e-9
+    assert abs(phi + theta) <= most
+    assert abs(theta - phi) <= most
+    assert np.sign(theta) == np.sign(carried[1]) or carried[1] == 0.0
+
+
+@pytest.fixture
+def sunk(robot: RobotConfig) -> Bench:
+    """Return a knee in DAMP, all of whose load has faded."""
+    bench = Bench(robot, "knee_left")
+    bench.to_hold()
+    bench.cycle(estop=True)
+    bench.run(3000)
+    return bench
+
+
+def test_a_knee_is_caught_and_damped_before_it_topples(robot: RobotConfig, sunk: Bench) -> None:
+    stand = robot.stand_gains("knee_left")
+    sunk.move((sunk.q[0], robot.joint_service.damp_knee_stop - 0.02))
+    still = sunk.run(5)[-1].tau[1]
+    assert still == pytest.approx(0.02 * stand.k_p[1])
+    sunk.v = (0.0, -0.1)
+    moving = sunk.run(200)[-1].tau[1]
+    assert moving - still == pytest.approx(0.1 * stand.k_d[1], rel=0.05)
+
+
+def test_a_knee_that_is_lower_than_the_stop_is_caught_where_it_is(robot: RobotConfig) -> None:
+    """Not pushed up to the stop: the robot would rise by itself after an emergency stop."""
+    bench = Bench(robot, "knee_left")
+    low = robot.joint_service.damp_knee_stop - 0.1
+    bench.q = (0.02, low)
+    bench.to_hold()
+    bench.cycle(estop=True)
+    bench.run(3000)
+    assert bench.cycle().tau[1] == pytest.approx(0.0, abs=1e-6)
+    bench.move((0.02, low - 0.01))
+    caught = bench.run(5)[-1].tau[1]
+    assert caught == pytest.approx(0.01 * robot.stand_gains("knee_left").k_p[1], rel=1e-3)

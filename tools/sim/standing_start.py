@@ -2,8 +2,8 @@
 
 To stand up takes 3.6 s of each run. Where many runs of one robot on one plant follow each other, it
 is stood up once in each process, and each run goes on from there. How it stands up is what
-`tests/lockstep/test_power_up.py` and the sweeps over drawn plants are about: those begin on the
-hoist.
+`tests/lockstep/test_dead_services.py` and the sweeps over drawn plants are about: they begin on
+the hoist.
 """
 
 from __future__ import annotations

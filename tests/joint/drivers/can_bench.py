@@ -108,24 +108,34 @@ class Bench:
         self.wait(ms * 1e-3)
         return self.driver.read(0.0)
 
-    def receive(self, state: int | None = AxisState.IDLE, error: int = 0) -> DriveReading | None:
+    def seen(self, ms: float) -> DriveReading:
+        """Read so much later what is there for sure."""
+        reading = self.after(ms)
+        assert reading is not None
+        return reading
+
+    def send(self, node: int, command: int, data: bytes = b"", **kwargs: bool) -> None:
+        """Have a node send a frame."""
+        self.bus.waiting.append(frame(node, command, data, **kwargs))
+
+    def beat(self, node: int, state: int, error: int = 0) -> None:
+        """Have a node send a heartbeat."""
+        heartbeat = Heartbeat(error, state, False, False, False, trajectory_done=True)
+        self.send(node, Command.HEARTBEAT, pack_heartbeat(heartbeat))
+
+    def receive(self, state: int | None = AxisState.IDLE, error: int = 0) -> DriveReading:
         """Have both axes send an estimate, and a heartbeat if there is a state, and read them."""
         for node in NODES:
             if state is not None:
-                heartbeat = Heartbeat(error, state, False, False, False, trajectory_done=True)
-                self.bus.waiting.append(frame(node, Command.HEARTBEAT, pack_heartbeat(heartbeat)))
-            self.bus.waiting.append(
-                frame(node, Command.GET_ENCODER_ESTIMATES, pack_two_floats(node, 0.0))
-            )
-        return self.after(1)
+                self.beat(node, state, error)
+            self.send(node, Command.GET_ENCODER_ESTIMATES, pack_two_floats(node, 0.0))
+        return self.seen(1)
 
     def armed(self, *, onboard: bool = True) -> None:
         self.receive()
         self.driver.arm(onboard=onboard)
         self.wait(2e-3 * ARM_GRACE_MS)
-        reading = self.receive(AxisState.CLOSED_LOOP_CONTROL)
-        assert reading is not None
-        assert reading.status is DriveStatus.ARMED
+        assert self.receive(AxisState.CLOSED_LOOP_CONTROL).status is DriveStatus.ARMED
         self.bus.sent.clear()
 
     def commands(self) -> list[int]:

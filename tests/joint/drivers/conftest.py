@@ -11,7 +11,7 @@ import pytest
 
 from services.joint.drivers.odrive_can import OdriveCan
 from tests.joint.drivers.can_bench import Bench
-from tests.joint.drivers.rig import Rig, connected
+from tests.joint.drivers.rig import Rig, Shed
 
 
 @pytest.fixture
@@ -23,19 +23,23 @@ def path() -> Iterator[Path]:
 
 
 @pytest.fixture
-def rig(path: Path) -> Iterator[Rig]:
-    """Return an emulated drive on a bus."""
-    rig = Rig(path)
-    yield rig
-    rig.hub.close()
+def shed(path: Path) -> Iterator[Shed]:
+    """Return what makes emulated drives and drivers."""
+    shed = Shed(path)
+    yield shed
+    shed.close()
 
 
 @pytest.fixture
-def driver(rig: Rig, path: Path) -> Iterator[OdriveCan]:
+def rig(shed: Shed) -> Rig:
+    """Return an emulated drive on a bus."""
+    return shed.rig()
+
+
+@pytest.fixture
+def driver(rig: Rig, shed: Shed) -> OdriveCan:
     """Return a driver that has found the rig's drive."""
-    driver = connected(rig, path)
-    yield driver
-    driver.close()
+    return shed.connected(rig)
 
 
 @pytest.fixture

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -43,15 +45,14 @@ class Rig:
         watchdog: bool = False,
         dialect: DialectName = "0.5",
         hub: type[UnixCanHub] = UnixCanHub,
+        nodes: Sequence[int] = NODES,
     ) -> None:
+        """Put the drive's axes on nodes of the same numbers."""
         self.hub = hub(path)
         self.bank = AxisBank(DRIVE, encoder_counts_per_turn=16384, watchdog=watchdog)
+        axes = [{node: node for node in nodes}]
         self.front = CanSimpleFront(
-            self.bank,
-            [self.hub],
-            [dict(zip(NODES, AXES, strict=True))],
-            heartbeat_period_ms=1,
-            dialect=dialect,
+            self.bank, [self.hub], axes, heartbeat_period_ms=1, dialect=dialect
         )
         self.pos = np.zeros(12)
         self.vel = np.zeros(12)
@@ -68,18 +69,51 @@ class Rig:
     def cycle(self, driver: OdriveCan) -> DriveReading:
         """Step, read twice what the step sent, so that its heartbeats are in, and return it."""
         self.step()
-        first = driver.read(0.5)
-        assert first is not None
+        read(driver)
         self.step()
-        second = driver.read(0.5)
-        assert second is not None
-        return second
+        return read(driver)
+
+
+def read(driver: OdriveCan, timeout_s: float = 0.5) -> DriveReading:
+    """Return the reading that is there for sure."""
+    reading = driver.read(timeout_s)
+    assert reading is not None
+    return reading
 
 
 def make_driver(path: Path) -> OdriveCan:
     """Return a driver of the bus at a socket, which need not be there."""
     config = CanConfig(interface="xrl_unix", channel=str(path))
     return OdriveCan(config, NODES, DRIVE, encoder_counts_per_turn=16384)
+
+
+class Shed:
+    """Makes emulated drives and drivers of one socket, and closes them in the end."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.rigs: list[Rig] = []
+        self.drivers: list[OdriveCan] = []
+
+    def rig(self, **how: Any) -> Rig:
+        self.rigs.append(Rig(self.path, **how))
+        return self.rigs[-1]
+
+    def driver(self) -> OdriveCan:
+        self.drivers.append(make_driver(self.path))
+        return self.drivers[-1]
+
+    def connected(self, rig: Rig) -> OdriveCan:
+        """Return a driver that has found the drive."""
+        driver = self.driver()
+        assert rig.cycle(driver).status == DriveStatus.IDLE
+        return driver
+
+    def close(self) -> None:
+        for driver in self.drivers:
+            driver.close()
+        for rig in self.rigs:
+            rig.hub.close()
 
 
 def arm(rig: Rig, driver: OdriveCan, *, onboard: bool = False) -> None:
@@ -89,10 +123,3 @@ def arm(rig: Rig, driver: OdriveCan, *, onboard: bool = False) -> None:
     reading = rig.cycle(driver)
     assert reading.status == DriveStatus.ARMED
     assert reading.error == 0
-
-
-def connected(rig: Rig, path: Path) -> OdriveCan:
-    """Return a driver that has found the drive."""
-    driver = make_driver(path)
-    assert rig.cycle(driver).status == DriveStatus.IDLE
-    return driver

@@ -1,9 +1,10 @@
-"""What a heartbeat says in either dialect of CANSimple, and which dialect it is in."""
+"""What a drive's registers and heartbeats say of a module, in either dialect of CANSimple."""
 
 from __future__ import annotations
 
 import pytest
 
+from services.joint.drivers.axes_status import AxesStatus
 from services.joint.drivers.base import DriveStatus
 from services.joint.drivers.firmware import (
     OTHER_ERROR,
@@ -20,6 +21,8 @@ from shared.can.cansimple import AxisError, AxisState, Heartbeat
 from shared.can.cansimple_06 import DriveError06, Heartbeat06, ProcedureResult
 
 CLOSED, IDLE = AxisState.CLOSED_LOOP_CONTROL, AxisState.IDLE
+
+
 VERSION = cansimple_06.pack_version(VERSION_06)
 
 
@@ -44,9 +47,6 @@ def report_of(*pairs: tuple[int, bytes], armed: bool = False) -> AxesReport:
     return report
 
 
-# ---- which dialect
-
-
 @pytest.mark.parametrize(
     ("heartbeat", "dialect"),
     [
@@ -61,9 +61,7 @@ def report_of(*pairs: tuple[int, bytes], armed: bool = False) -> AxesReport:
         (new(IDLE, result=ProcedureResult.NOT_CALIBRATED, done=False), "0.6"),
     ],
 )
-def test_a_heartbeat_shows_its_dialect_only_where_the_other_could_not_have_sent_it(
-    heartbeat: bytes, dialect: Dialect
-) -> None:
+def test_a_heartbeat_only_one_dialect_can_send_shows_it(heartbeat: bytes, dialect: Dialect) -> None:
     assert dialect_of(heartbeat) == dialect
 
 
@@ -103,9 +101,6 @@ def test_what_is_forgotten_is_found_out_anew() -> None:
     assert (report.dialect, report.status) == ("0.6", DriveStatus.ERROR)
 
 
-# ---- what an error is
-
-
 @pytest.mark.parametrize("bit", range(32))
 def test_no_error_of_0_6_looks_like_none(bit: int) -> None:
     assert errors_from_06(1 << bit) != 0
@@ -117,14 +112,11 @@ def test_no_error_of_0_6_looks_like_none(bit: int) -> None:
     assert report.errors != 0
 
 
-def test_no_error_of_0_6_is_none_of_ours() -> None:
-    assert errors_from_06(0) == 0
-
-
 def test_every_named_error_of_0_6_has_one_of_0_5() -> None:
+    assert errors_from_06(0) == 0
+    assert errors_from_06(0x8000_0000) == OTHER_ERROR
     for error in DriveError06:
         assert errors_from_06(error) < OTHER_ERROR
-    assert errors_from_06(0x8000_0000) == OTHER_ERROR
 
 
 def test_the_watchdog_has_its_own_bit_in_each_dialect_and_the_other_one_is_something_else() -> None:
@@ -140,9 +132,7 @@ def test_the_watchdog_has_its_own_bit_in_each_dialect_and_the_other_one_is_somet
     ("dialect", "heartbeat"),
     [("0.5", old(IDLE, 0x800)), ("0.6", new(IDLE, 0x0100_0000, ProcedureResult.DISARMED))],
 )
-def test_a_watchdog_that_ran_out_before_the_first_write_is_no_error(
-    dialect: Dialect, heartbeat: bytes
-) -> None:
+def test_a_watchdog_out_before_any_write_is_no_error(dialect: Dialect, heartbeat: bytes) -> None:
     assert judged(dialect, heartbeat, wanted_armed=False) == (IDLE, 0)
     assert judged(dialect, heartbeat, wanted_armed=True)[1] != 0
 
@@ -168,9 +158,7 @@ def test_a_failed_motor_of_0_5_is_an_error_even_before_its_dialect_is_known() ->
 
 
 @pytest.mark.parametrize("result", [ProcedureResult.NOT_CALIBRATED, ProcedureResult.INVALID_STATE])
-def test_closed_loop_that_0_6_refuses_is_an_error_only_if_it_was_asked_for(
-    result: ProcedureResult,
-) -> None:
+def test_closed_loop_refused_by_0_6_is_an_error_if_asked_for(result: ProcedureResult) -> None:
     refused = new(IDLE, result=result)
     assert judged("0.6", refused, wanted_armed=True) == (IDLE, AxisError.INVALID_STATE)
     assert judged("0.6", refused, wanted_armed=False) == (IDLE, 0)
@@ -185,11 +173,53 @@ def test_closed_loop_that_0_6_refuses_is_an_error_only_if_it_was_asked_for(
         (new(CLOSED, result=ProcedureResult.BUSY), new(AxisState.UNDEFINED)),
     ],
 )
-def test_an_axis_that_left_closed_loop_without_an_error_bit_is_an_error(
-    closed: bytes, left: bytes
-) -> None:
+def test_leaving_closed_loop_without_an_error_is_one(closed: bytes, left: bytes) -> None:
     report = report_of((0, closed), (1, closed))
     statuses = [report.status]
     report.receive(1, left)
     statuses.append(report.status)
     assert statuses == [DriveStatus.ARMED, DriveStatus.ERROR]
+
+
+NONE = (0,) * 8
+
+
+@pytest.mark.parametrize(
+    ("states", "error", "status"),
+    [
+        ((IDLE, IDLE), 0, DriveStatus.IDLE),
+        ((CLOSED, IDLE), 0, DriveStatus.IDLE),
+        ((IDLE, CLOSED), 0, DriveStatus.IDLE),
+        ((CLOSED, CLOSED), 0, DriveStatus.ARMED),
+        ((CLOSED, CLOSED), 1, DriveStatus.ERROR),
+    ],
+)
+def test_a_module_is_armed_when_both_axes_are_without_an_error(
+    states: tuple[int, int], error: int, status: DriveStatus
+) -> None:
+    assert AxesStatus().judge(states, error) is status
+
+
+@pytest.mark.parametrize("first", [0, 4])
+@pytest.mark.parametrize(
+    ("register", "value", "error"),
+    [
+        (0, AxisError.OVER_TEMP, AxisError.OVER_TEMP),
+        (1, 0x8, AxisError.MOTOR_FAILED),
+        (1, 1 << 40, AxisError.MOTOR_FAILED),
+        (2, 0x4, AxisError.ENCODER_FAILED),
+        (3, 0x1, AxisError.CONTROLLER_FAILED),
+    ],
+)
+def test_every_register_of_either_axis_shows(
+    first: int, register: int, value: int, error: int
+) -> None:
+    registers = list(NONE)
+    registers[first + register] = value
+    assert AxesStatus.errors(registers, wanted_armed=True) == error
+
+
+@pytest.mark.parametrize(("wanted_armed", "seen"), [(True, True), (False, False)])
+def test_a_watchdog_counts_only_where_armed_is_wanted(wanted_armed: bool, seen: bool) -> None:
+    registers = [AxisError.WATCHDOG_TIMER_EXPIRED, *NONE[1:]]
+    assert bool(AxesStatus.errors(registers, wanted_armed=wanted_armed)) == seen

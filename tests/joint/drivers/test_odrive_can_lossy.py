@@ -1,9 +1,15 @@
-"""The CAN driver on a bus that loses frames both ways: the drive ends up as it was told to be."""
+"""A bus that loses frames both ways: the drive ends up as it was told to be, and jerks for none.
+
+Then each frame is lost, one after the other: what motors do beyond what they should. A drive is
+armed, holds, and is put into DAMP's law: every spring is gone at once, and its torque comes as
+feedforward. The joint stands still, so that each difference is the lost frame's.
+"""
 
 from __future__ import annotations
 
+import itertools
 import random
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +26,11 @@ from shared.clock import NS_PER_MS
 from tests.joint.drivers.rig import AXES, DRIVE, MS, TARGET, Rig, make_driver
 
 LOSS = 0.3
+
+
 STEP_MS = 4
+
+
 ASK_EVERY_MS = 500
 """How often a joint service repeats a request that has shown no effect."""
 
@@ -109,35 +119,30 @@ def bench(
     bench.hub.close()
 
 
-def test_modes_limits_gains_and_targets_arrive(
-    bench: Bench,
-) -> None:
-    bench.run(100)
-    assert bench.until_armed(onboard=True)
-    bench.run(1200, TARGET)
+@pytest.mark.parametrize("onboard", [True, False])
+def test_modes_limits_gains_and_targets_arrive(bench: Bench, onboard: bool) -> None:
     bank, axes = bench.rig.bank, list(AXES)
-    assert [bank.state[axis] for axis in axes] == [AxisState.CLOSED_LOOP_CONTROL] * 2
-    assert list(bank.control_mode[axes]) == [ControlMode.POSITION] * 2
-    np.testing.assert_allclose(bank.vel_limit[axes], DRIVE.vel_limit)
-    np.testing.assert_allclose(bank.current_lim[axes], DRIVE.current_lim)
-    np.testing.assert_allclose(bank.pos_gain[axes], TARGET.pos_gain, rtol=1e-6)
-    np.testing.assert_allclose(bank.vel_gain[axes], TARGET.vel_gain, rtol=1e-6)
-    assert not bank.vel_integrator_gain[axes].any()
-    np.testing.assert_allclose(bank.input_pos[axes], TARGET.pos_turns)
-    assert bench.status is DriveStatus.ARMED
-
-
-def test_modes_and_limits_arrive_with_torques_too(bench: Bench) -> None:
-    bench.rig.bank.control_mode[:] = ControlMode.POSITION
+    bank.control_mode[:] = ControlMode.POSITION
     bench.run(100)
-    assert bench.until_armed(onboard=False)
+    assert bench.until_armed(onboard=onboard)
     for _ in range(1200 // STEP_MS):
         bench.cycle()
-        bench.driver.write_torque((0.25, -0.5))
-    bank, axes = bench.rig.bank, list(AXES)
-    assert list(bank.control_mode[axes]) == [ControlMode.TORQUE] * 2
+        bench.driver.write(TARGET) if onboard else bench.driver.write_torque((0.25, -0.5))
+    assert [bank.state[axis] for axis in axes] == [AxisState.CLOSED_LOOP_CONTROL] * 2
+    mode = ControlMode.POSITION if onboard else ControlMode.TORQUE
+    assert list(bank.control_mode[axes]) == [mode] * 2
     np.testing.assert_allclose(bank.vel_limit[axes], DRIVE.vel_limit)
-    assert list(bank.input_torque[axes]) == [0.25, -0.5]
+    np.testing.assert_allclose(bank.current_lim[axes], DRIVE.current_lim)
+    if onboard:
+        np.testing.assert_allclose(bank.pos_gain[axes], TARGET.pos_gain, rtol=1e-6)
+        np.testing.assert_allclose(bank.vel_gain[axes], TARGET.vel_gain, rtol=1e-6)
+        assert not bank.vel_integrator_gain[axes].any()
+        np.testing.assert_allclose(bank.input_pos[axes], TARGET.pos_turns)
+        np.testing.assert_allclose(bank.input_vel[axes], TARGET.vel_turns)
+        np.testing.assert_allclose(bank.input_torque[axes], TARGET.torque)
+    else:
+        assert list(bank.input_torque[axes]) == [0.25, -0.5]
+    assert bench.status is DriveStatus.ARMED
 
 
 def test_a_drive_that_is_idled_until_it_is_idle_ends_idle(bench: Bench) -> None:
@@ -166,3 +171,168 @@ def test_an_axis_that_disarms_shows_though_heartbeats_are_lost(bench: Bench) -> 
     bench.rig.bank.inject("hip_right.axis1", "DISARM")
     bench.run(100, TARGET)
     assert bench.status is DriveStatus.ERROR
+
+
+HERE = (0.1, -0.2)
+
+
+HOLD = MotorTarget((0.15, -0.15), (0.0, 0.0), (0.2, -0.1), (60.0, 40.0), (0.2, 0.3))
+
+
+SPRING = np.array([60.0 * 0.2 * 0.05, 40.0 * 0.3 * 0.05])
+
+
+DAMP = MotorTarget((0.15, -0.15), (0.0, 0.0), (0.8, 0.5), (0.0, 0.0), (0.4, 0.4))
+"""With HOLD's spring, at this position, as torque."""
+
+
+HOLD_MS, DAMP_MS = 40, 40
+
+
+CYCLE_MS = 2
+
+
+LISTEN_MS = 20
+
+
+EXCESS_MAX = 1.02 * 0.4 / 0.2
+"""Of the spring: HOLD's pos_gain, if it is DAMP's that was lost, with DAMP's vel_gain."""
+
+
+ENTERING = 14
+"""Frames of the order to arm."""
+
+
+class DroppingHub(UnixCanHub):
+    """A bus that loses chosen frames to the drive, by their number since `start`."""
+
+    lost: frozenset[int] = frozenset()
+    count = -(1 << 30)
+
+    def poll(self) -> list[Frame]:
+        kept = []
+        for frame in super().poll():
+            if self.count not in self.lost:
+                kept.append(frame)
+            self.count += 1
+        return kept
+
+
+class Clock:
+    """The time of the rig that runs."""
+
+    rig: Rig | None = None
+
+    def now_ns(self) -> int:
+        return NS_PER_MS + (round(self.rig.now_s * 1e9) if self.rig is not None else 0)
+
+
+class Run:
+    """One run with some frames lost, in its own time.
+
+    Attributes:
+        torques: of both motors, in each millisecond since arming was asked for.
+        frames: how many went to the drive.
+        held_ms: when HOLD was first written.
+    """
+
+    def __init__(self, folder: Path, lost: Iterable[int], clock: Clock) -> None:
+        path = folder / "can.sock"
+        self.rig = clock.rig = Rig(path, hub=DroppingHub)
+        hub = self.rig.hub
+        assert isinstance(hub, DroppingHub)
+        bank = self.rig.bank
+        bank.vel_limit[:], bank.current_lim[:] = 2.0, 10.0  # as shipped
+        bank.pos_gain[:], bank.vel_gain[:], bank.vel_integrator_gain[:] = 20.0, 1 / 6, 1 / 3
+        self.rig.pos[list(AXES)] = HERE
+        self.torques: list[np.ndarray] = []
+        self.status = DriveStatus.LOST
+        self.held_ms = 0
+        self.driver = make_driver(path)
+        self._cycle(None, LISTEN_MS)
+        self.torques.clear()
+        self.rig.front.receive()  # where it is, which was asked before: no frame of an order
+        hub.lost, hub.count = frozenset(lost), 0
+        self.driver.arm(onboard=True)
+        for _ in range(200):
+            if self.status is DriveStatus.ARMED:
+                break
+            self._cycle(None, CYCLE_MS)
+        else:
+            self.driver.arm(onboard=True)  # as the joint service does, 500 ms later
+            self._cycle(None, LISTEN_MS)
+        self.held_ms = len(self.torques)
+        self._cycle(HOLD, HOLD_MS)
+        self._cycle(DAMP, DAMP_MS)
+        self.frames = hub.count
+        self.driver.close()
+        hub.close()
+
+    def _cycle(self, target: MotorTarget | None, ms: int) -> None:
+        for _ in range(ms // CYCLE_MS):
+            for _ in range(CYCLE_MS):
+                self.torques.append(self.rig.step()[list(AXES)].copy())
+            reading = self.driver.read(0.0)
+            if reading is not None:
+                self.status = reading.status
+            if target is not None:
+                self.driver.write(target)
+
+
+Runner = Callable[[Iterable[int]], Run]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, path: Path) -> Runner:
+    """Return how to make a run in which frames are lost."""
+    clock = Clock()
+    for module in (odrive_can, can_link):
+        monkeypatch.setattr(module, "now_ns", clock.now_ns)
+    return lambda lost: Run(path.parent, lost, clock)
+
+
+def excess(torques: list[np.ndarray]) -> np.ndarray:
+    """Return by how much motors pull beyond HOLD's torque, the largest that is ever asked for."""
+    wanted = np.array(HOLD.torque) + SPRING
+    return np.maximum(0.0, np.abs(np.array(torques)) - np.abs(wanted)) / SPRING
+
+
+def test_without_loss_the_drive_does_what_is_commanded(run: Runner) -> None:
+    whole = run(())
+    assert excess(whole.torques).max() < 1e-3
+    wanted = np.array(HOLD.torque) + SPRING
+    np.testing.assert_allclose(whole.torques[-1], wanted, atol=2e-3)
+    np.testing.assert_allclose(whole.torques[-DAMP_MS - 10], wanted, atol=2e-3)
+    assert not np.array(whole.torques[: whole.held_ms]).any()
+
+
+def test_no_single_lost_frame_is_felt_for_longer_than_three_cycles(run: Runner) -> None:
+    whole = run(())
+    for lost in range(ENTERING, whole.frames):
+        torques = run((lost,)).torques
+        differs = np.abs(np.array(torques) - np.array(whole.torques)).max(axis=1) > 2e-3
+        assert np.count_nonzero(differs) <= 3 * CYCLE_MS, f"frame {lost}"
+        assert excess(torques).max() < EXCESS_MAX, f"frame {lost}"
+        assert not differs[-1], f"frame {lost}"
+
+
+def test_no_lost_frame_of_arming_gives_a_torque_before_a_target(run: Runner) -> None:
+    for lost in range(ENTERING):
+        each = run((lost,))
+        before = np.array(each.torques[: each.held_ms])
+        assert np.abs(before).max() < 1e-3, f"frame {lost}"
+        assert each.status is DriveStatus.ARMED, f"frame {lost}"
+        assert [each.rig.bank.state[axis] for axis in AXES] == [AxisState.CLOSED_LOOP_CONTROL] * 2
+        np.testing.assert_allclose(each.torques[-1], np.array(HOLD.torque) + SPRING, atol=2e-3)
+
+
+def test_no_pair_of_lost_frames_adds_more_or_lasts(run: Runner) -> None:
+    frames = run(()).frames
+    pairs = list(itertools.combinations(range(min(frames, 60)), 2))
+    pairs += list(itertools.combinations(range(frames - 55, frames - 25), 2))
+    for lost in random.Random(0).sample(pairs, 40):
+        each = run(lost)
+        assert excess(each.torques).max() < EXCESS_MAX, f"frames {lost}"
+        np.testing.assert_allclose(
+            each.torques[-1], np.array(HOLD.torque) + SPRING, atol=2e-3, err_msg=f"frames {lost}"
+        )

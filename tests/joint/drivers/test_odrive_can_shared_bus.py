@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,87 +11,65 @@ import pytest
 
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.drivers.odrive_can import ARM_GRACE_MS, OdriveCan
-from services.simulator.drives.axis_bank import AxisBank
-from services.simulator.fronts.cansimple_front import CanSimpleFront
-from services.simulator.fronts.unix_can_hub import UnixCanHub
 from shared.can.cansimple import AxisState, Command, arbitration_id, pack_two_floats
 from shared.config.sections import CanConfig
-from tests.joint.drivers.rig import DRIVE, MS
+from tests.joint.drivers.rig import DRIVE, MS, Rig, read
 
 MODULES = 3
+
+
 NODES = [(0, 1), (2, 3), (4, 5)]
-CPR = 16384
 
 
-class Leg:
+class Leg(Rig):
     """Three emulated drives on one bus, and a driver of each."""
 
     def __init__(self, path: Path) -> None:
-        self.hub = UnixCanHub(path)
-        self.bank = AxisBank(DRIVE, encoder_counts_per_turn=CPR, watchdog=False)
-        nodes = {node: node for pair in NODES for node in pair}
-        self.front = CanSimpleFront(self.bank, [self.hub], [nodes], heartbeat_period_ms=1)
+        super().__init__(path, nodes=range(2 * MODULES))
         self.pos = np.arange(12.0)
-        self.now_s = 0.0
         config = CanConfig(interface="xrl_unix", channel=str(path))
         self.drivers = [OdriveCan(config, pair, DRIVE) for pair in NODES]
 
-    def step(self) -> None:
-        self.front.receive()
-        self.bank.step(self.now_s, self.pos, np.zeros(12))
-        self.front.send_encoders()
-        self.front.send_heartbeats(self.now_s)
-        self.now_s += MS
-
-    def cycle(self) -> list[DriveReading]:
-        readings: list[DriveReading] = []
+    def cycles(self) -> list[DriveReading]:
+        """Step twice, and return what each driver then reads."""
         for _ in range(2):
             self.step()
-            readings = []
-            for driver in self.drivers:
-                reading = driver.read(0.5)
-                assert reading is not None
-                readings.append(reading)
+            readings = [read(driver) for driver in self.drivers]
         return readings
 
-    def arm(self, *which: int) -> list[DriveReading]:
+    def arm(self, *which: int) -> list[DriveStatus]:
         for index in which:
             self.drivers[index].arm(onboard=True)
         time.sleep((ARM_GRACE_MS + 5) * MS)
-        return self.cycle()
+        return [reading.status for reading in self.cycles()]
 
 
 @pytest.fixture
-def leg() -> Iterator[Leg]:
-    directory = Path(tempfile.mkdtemp(dir="/tmp"))
-    leg = Leg(directory / "leg.sock")
+def leg(path: Path) -> Iterator[Leg]:
+    leg = Leg(path)
     yield leg
     for driver in leg.drivers:
         driver.close()
     leg.hub.close()
-    shutil.rmtree(directory)
 
 
 def test_each_driver_reads_its_own_two_axes(leg: Leg) -> None:
     leg.bank.connected[:] = 1.0  # as after a first closed loop: before it 0.5.6 says zeros
-    readings = leg.cycle()
+    readings = leg.cycles()
     assert [reading.pos_turns for reading in readings] == [(0.0, 1.0), (2.0, 3.0), (4.0, 5.0)]
     assert [reading.status for reading in readings] == [DriveStatus.IDLE] * MODULES
 
 
 def test_arming_one_module_leaves_its_neighbours_alone(leg: Leg) -> None:
-    leg.cycle()
-    statuses = [reading.status for reading in leg.arm(1)]
-    assert statuses == [DriveStatus.IDLE, DriveStatus.ARMED, DriveStatus.IDLE]
-    closed = AxisState.CLOSED_LOOP_CONTROL
-    assert [state == closed for state in leg.bank.state[:6]] == [False] * 2 + [True] * 2 + [
-        False
-    ] * 2
+    leg.cycles()
+    assert leg.arm(1) == [DriveStatus.IDLE, DriveStatus.ARMED, DriveStatus.IDLE]
+    closed = [state == AxisState.CLOSED_LOOP_CONTROL for state in leg.bank.state[:6]]
+    assert closed == [False, False, True, True, False, False]
 
 
 def test_each_module_does_what_its_own_driver_writes(leg: Leg) -> None:
-    leg.cycle()
-    assert {reading.status for reading in leg.arm(0, 1, 2)} == {DriveStatus.ARMED}
+    leg.cycles()
+    assert set(leg.arm(0, 1, 2)) == {DriveStatus.ARMED}
     for index, driver in enumerate(leg.drivers):
         at = float(index)
         driver.write(MotorTarget((at, -at), (0.0, 0.0), (0.0, 0.0), (1.0 + at,) * 2, (0.1,) * 2))
@@ -103,15 +79,15 @@ def test_each_module_does_what_its_own_driver_writes(leg: Leg) -> None:
 
 
 def test_a_fault_of_one_module_is_no_fault_of_another(leg: Leg) -> None:
-    leg.cycle()
+    leg.cycles()
     leg.arm(0, 1, 2)
     leg.bank.inject("knee_right.axis0", "OVERSPEED")
-    statuses = [reading.status for reading in leg.cycle()]
+    statuses = [reading.status for reading in leg.cycles()]
     assert statuses == [DriveStatus.ARMED, DriveStatus.ERROR, DriveStatus.ARMED]
 
 
 def test_a_silent_module_is_lost_though_its_neighbours_go_on(leg: Leg) -> None:
-    leg.cycle()
+    leg.cycles()
     leg.bank.conditions.link(1, up=False)
     until = time.monotonic() + 2.0 * DRIVE.watchdog_timeout
     status = DriveStatus.IDLE
@@ -123,7 +99,7 @@ def test_a_silent_module_is_lost_though_its_neighbours_go_on(leg: Leg) -> None:
 
 
 def test_frames_of_other_modules_make_no_sample_and_do_not_prolong_the_wait(leg: Leg) -> None:
-    leg.cycle()
+    leg.cycles()
     driver = leg.drivers[0]
     while driver.read(0.0) is not None:
         pass

@@ -1,28 +1,27 @@
-"""Replies of a drive to requests: where its motors are, and what they hold."""
+"""What a drive sends: estimates that make a sample, where its motors are, what they hold."""
 
 from __future__ import annotations
+
+import math
+import random
 
 import pytest
 
 from services.joint.drivers.base import DriveReading
-from services.joint.drivers.odrive_can import (
-    REBOOT_MS,
-    RETRY_MS,
-    OdriveCan,
-)
+from services.joint.drivers.encoder_pair import EncoderPair
+from services.joint.drivers.odrive_can import REBOOT_MS, RETRY_MS, OdriveCan
 from shared.bus.messages import Pair
-from shared.can.cansimple import (
-    AxisState,
-    Command,
-    pack_two_floats,
-    pack_two_ints,
-)
+from shared.can.cansimple import AxisState, Command, pack_two_floats, pack_two_ints
 from shared.config.sections import CanConfig
-from tests.joint.drivers.can_bench import Bench, frame, receiving_fails
+from tests.joint.drivers.can_bench import Bench, receiving_fails
 from tests.joint.drivers.rig import DRIVE, NODES, Rig, arm
 
 COUNTS_PER_TURN = 1000
+
+
 ZERO = (0.0, 0.0)
+
+
 COUNTED = (0.5, -64.25)
 
 
@@ -42,11 +41,8 @@ def counting(bench: Bench) -> Bench:
 def receive_estimates(bench: Bench, turns: Pair) -> DriveReading:
     """Have both axes send an estimate, without velocity, and read them."""
     for node, pos in zip(NODES, turns, strict=True):
-        data = pack_two_floats(pos, 0.0)
-        bench.bus.waiting.append(frame(node, Command.GET_ENCODER_ESTIMATES, data))
-    reading = bench.after(1)
-    assert reading is not None
-    return reading
+        bench.send(node, Command.GET_ENCODER_ESTIMATES, pack_two_floats(pos, 0.0))
+    return bench.seen(1)
 
 
 def renew_the_link(bench: Bench) -> None:
@@ -59,12 +55,10 @@ def renew_the_link(bench: Bench) -> None:
 def receive_counts(bench: Bench) -> None:
     for node, turns in zip(NODES, COUNTED, strict=True):
         data = pack_two_ints(round(turns * COUNTS_PER_TURN), 0)
-        bench.bus.waiting.append(frame(node, Command.GET_ENCODER_COUNT, data))
+        bench.send(node, Command.GET_ENCODER_COUNT, data)
 
 
-def test_a_drive_whose_estimates_are_zero_is_asked_for_its_counts(
-    counting: Bench,
-) -> None:
+def test_a_drive_whose_estimates_are_zero_is_asked_for_its_counts(counting: Bench) -> None:
     counting.commands()
     assert receive_estimates(counting, ZERO).pos_turns == ZERO
     assert counting.commands().count(Command.GET_ENCODER_COUNT) == 2
@@ -98,35 +92,110 @@ def test_a_count_is_forgotten_with_the_link_and_in_a_long_silence(counting: Benc
     assert receive_estimates(counting, ZERO).pos_turns == ZERO
 
 
+def receive_currents(bench: Bench, *currents: float) -> Pair | None:
+    """Have axes send their current; return the torques that are read with the next sample."""
+    for node, current in zip(NODES, currents, strict=False):
+        bench.send(node, Command.GET_IQ, pack_two_floats(current, 0.0))
+    return bench.receive(None).torque
+
+
 def test_the_current_is_asked_for_again_over_a_new_link(bench: Bench) -> None:
     bench.receive(AxisState.CLOSED_LOOP_CONTROL)
-    for node in NODES:
-        bench.bus.waiting.append(frame(node, Command.GET_IQ, pack_two_floats(2.0, 0.0)))
-    reading = bench.receive(None)
-    assert reading is not None
-    assert reading.torque == pytest.approx((2.0 * DRIVE.torque_constant,) * 2)
+    held = pytest.approx((2.0 * DRIVE.torque_constant,) * 2)
+    assert receive_currents(bench, 2.0, 2.0) == held
     renew_the_link(bench)
     bench.commands()
-    reading = bench.receive(AxisState.CLOSED_LOOP_CONTROL)
-    assert reading is not None
-    assert reading.torque is None
+    assert bench.receive(AxisState.CLOSED_LOOP_CONTROL).torque is None
     assert Command.GET_IQ in bench.commands()
 
 
 def test_a_current_that_is_no_number_is_no_reply(bench: Bench) -> None:
     bench.receive(AxisState.CLOSED_LOOP_CONTROL)
-    for node, current in zip(NODES, (float("nan"), 1.0), strict=True):
-        bench.bus.waiting.append(frame(node, Command.GET_IQ, pack_two_floats(current, 0.0)))
-    reading = bench.receive(None)
-    assert reading is not None
-    assert reading.torque is None
-    bench.bus.waiting.append(frame(NODES[0], Command.GET_IQ, pack_two_floats(2.0, 0.0)))
-    reading = bench.receive(None)
-    assert reading is not None
-    assert reading.torque is not None
+    assert receive_currents(bench, float("nan"), 1.0) is None
+    assert receive_currents(bench, 2.0) is not None
 
 
 def test_a_drive_armed_by_this_driver_reports_no_torques(rig: Rig, driver: OdriveCan) -> None:
     arm(rig, driver, onboard=True)
     for _ in range(10):
         assert rig.cycle(driver).torque is None
+
+
+PERIOD_NS = 2_000_000
+
+
+BEHIND_NS = 130_000
+"""Axis1's frame comes after axis0's, back to back on a bus of 1 Mbit/s."""
+
+
+def run(
+    cycles: int,
+    lost: set[tuple[int, int]],
+    phase_ns: int = BEHIND_NS,
+    jitter_ns: int = 0,
+    period_ns: tuple[int, int] = (PERIOD_NS, PERIOD_NS),
+) -> list[tuple[float, float]]:
+    """Return the samples, as cycle numbers of (axis0, axis1); `lost` names (cycle, axis)."""
+    dice = random.Random(1)
+    frames = [
+        (10**9 + k * period_ns[axis] + axis * phase_ns + dice.randint(0, jitter_ns), k, axis)
+        for k in range(cycles)
+        for axis in (0, 1)
+        if (k, axis) not in lost
+    ]
+    pair = EncoderPair()
+    samples = []
+    for now_ns, k, axis in sorted(frames):
+        pair.take(axis, (float(k), 0.0), now_ns)
+        if pair.complete():
+            (a, _), (b, _) = pair.estimates
+            samples.append((a, b))
+    return samples
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("cycle", [3, 4])
+def test_after_a_lost_frame_the_axes_are_of_the_same_period_again(cycle: int, axis: int) -> None:
+    samples = run(20, {(cycle, axis)})
+    torn = [sample for sample in samples if sample[0] != sample[1]]
+    assert len(torn) <= 1
+    assert samples[-10:] == [(float(k), float(k)) for k in range(10, 20)]
+
+
+def test_without_loss_every_period_makes_one_sample() -> None:
+    assert run(50, set()) == [(float(k), float(k)) for k in range(50)]
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.45, 0.5, 0.55, 0.7, 0.95])
+def test_axes_out_of_step_make_as_many_samples_and_the_tightest(share: float) -> None:
+    """As two boards of firmware 0.6 are, each with its own clock."""
+    samples = run(200, set(), round(share * PERIOD_NS), jitter_ns=PERIOD_NS // 50)
+    assert len(samples) >= 190
+    if share < 0.4:
+        assert all(a == b for a, b in samples[5:])
+    if share > 0.6:
+        assert all(a == b + 1 for a, b in samples[5:])
+
+
+def test_axes_whose_clocks_drift_past_each_other_never_stop_making_samples() -> None:
+    slow = round(1.01 * PERIOD_NS)
+    assert len(run(1000, set(), period_ns=(PERIOD_NS, slow))) >= 970
+
+
+def test_frames_that_waited_together_make_a_sample_of_the_newest() -> None:
+    pair = EncoderPair()
+    for k in range(5):
+        for axis in (0, 1):
+            pair.take(axis, (float(k), 0.0), 10**9)
+    assert pair.complete()
+    assert not pair.complete()
+    assert pair.estimates == [(4.0, 0.0), (4.0, 0.0)]
+
+
+@pytest.mark.parametrize("bad", [(math.nan, 0.0), (0.0, math.inf)])
+def test_what_is_no_number_is_no_estimate(bad: tuple[float, float]) -> None:
+    pair = EncoderPair()
+    pair.take(0, (1.0, 2.0), 10**9)
+    pair.take(1, bad, 10**9)
+    assert not pair.complete()
+    assert pair.estimates == [(1.0, 2.0), (0.0, 0.0)]

@@ -1,20 +1,23 @@
-"""Which modes, limits and gains go to a drive along with its targets, how often, in which order."""
+"""What goes to a drive, when and in which order, on a full bus too: orders, modes, gains."""
 
 from __future__ import annotations
 
+import itertools
 import time
 
-import numpy as np
+import can
 import pytest
 
 from services.joint.drivers.base import MotorTarget
-from services.joint.drivers.odrive_can import OdriveCan
+from services.joint.drivers.can_link import COMMANDS_MS, RETRY_MS
 from services.joint.drivers.resend_policy import DRIFT_MS, GAINS_MS, SETTLE_MS
 from shared.can.cansimple import AxisState, Command, split_id
 from tests.joint.drivers.can_bench import Bench
-from tests.joint.drivers.rig import AXES, MS, NODES, TARGET, Rig, arm
+from tests.joint.drivers.rig import NODES, TARGET
 
 GAINS: list[int] = [Command.SET_POS_GAIN, Command.SET_VEL_GAINS, Command.SET_INPUT_POS]
+
+
 INPUTS: list[int] = [Command.SET_INPUT_POS]
 
 
@@ -108,9 +111,7 @@ def test_gains_that_the_queue_had_no_room_for_are_sent_again(bench: Bench) -> No
     assert bench.commands().count(Command.SET_POS_GAIN) == 2
 
 
-def test_limits_and_modes_are_sent_for_a_while_after_arming_and_then_no_more(
-    bench: Bench,
-) -> None:
+def test_limits_and_modes_are_sent_for_a_while_after_arming_and_then_no_more(bench: Bench) -> None:
     bench.armed()
     modes = []
     for _ in range(0, 3 * SETTLE_MS, 10):
@@ -155,17 +156,83 @@ def test_an_axis_gets_its_target_right_after_its_mode(bench: Bench) -> None:
         assert ids[at + 1] == (node, Command.SET_INPUT_POS)
 
 
-# ---- on an emulated drive
+def test_arming_goes_on_as_the_queue_empties_closed_loop_last(bench: Bench) -> None:
+    bench.receive()
+    bench.commands()
+    bench.bus.room = 1 << 30
+    bench.driver.arm(onboard=True)
+    whole = bench.commands()
+    bench.bus.room = 5
+    bench.driver.arm(onboard=True)
+    bits = [bench.commands()]
+    for _ in range(3):
+        bench.bus.room = 4
+        bench.after(2)
+        bits.append(bench.commands())
+    assert [len(each) for each in bits] == [5, 4, 4, len(whole) - 13]
+    assert list(itertools.chain(*bits)) == whole
+    assert whole[-2:] == [Command.SET_AXIS_STATE] * 2
 
 
-def test_gains_that_were_lost_are_sent_again(rig: Rig, driver: OdriveCan) -> None:
-    arm(rig, driver, onboard=True)
-    driver.write(TARGET)
-    rig.step()
-    axes = list(AXES)
-    for wait_ms in (DRIFT_MS, GAINS_MS):
-        rig.bank.pos_gain[axes] = 1.0  # as if the frames had been lost
-        time.sleep((wait_ms + 5) * MS)
-        driver.write(TARGET)
-        rig.step()
-        np.testing.assert_allclose(rig.bank.pos_gain[axes], TARGET.pos_gain, rtol=1e-6)
+def test_nothing_overtakes_an_order_that_waits(bench: Bench) -> None:
+    bench.armed()
+    bench.bus.room = 1
+    bench.driver.idle()
+    bench.driver.write_torque((1.0, 1.0))
+    bench.driver.write(TARGET)
+    assert bench.commands() == [Command.SET_INPUT_TORQUE]
+    assert bench.driver.write_failures == 2
+    bench.bus.room = 100
+    bench.driver.write_torque((1.0, 1.0))
+    assert bench.commands() == [
+        Command.SET_INPUT_TORQUE, *[Command.SET_AXIS_STATE] * 2, *[Command.SET_INPUT_TORQUE] * 2,
+    ]  # fmt: skip
+
+
+def test_an_order_takes_the_place_of_one_that_waits(bench: Bench) -> None:
+    bench.receive()
+    bench.commands()
+    bench.bus.room = 0
+    bench.driver.arm(onboard=True)
+    bench.driver.idle()
+    bench.bus.room = 100
+    bench.after(1)
+    assert bench.commands() == [*[Command.SET_INPUT_TORQUE] * 2, *[Command.SET_AXIS_STATE] * 2]
+
+
+def test_an_order_that_waited_too_long_is_given_up(bench: Bench) -> None:
+    """A drive must not arm long after it was asked to."""
+    bench.receive()
+    bench.commands()
+    bench.bus.room = 0
+    bench.driver.arm(onboard=True)
+    bench.wait(1e-3 * COMMANDS_MS + 1e-3)
+    bench.bus.room = 100
+    bench.after(1)
+    assert bench.commands() == []
+
+
+def test_an_order_does_not_go_to_the_next_bus(bench: Bench) -> None:
+    bench.wait(1e-3 * RETRY_MS)
+    bench.receive()
+    bench.bus.room = 0
+    bench.driver.arm(onboard=True)
+    bench.bus.waiting.append(can.CanOperationError("Failed to receive"))
+    bench.after(1)
+    bench.after(1)
+    assert bench.driver.connections == 2, "at once: it had been open for long"
+    assert Command.SET_AXIS_STATE not in bench.commands()
+
+
+def test_closing_waits_for_the_order_to_idle(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench.armed()
+    bench.bus.room = 0
+    bench.driver.idle()
+
+    def drain(seconds: float) -> None:
+        bench.wait(seconds)
+        bench.bus.room = 2
+
+    monkeypatch.setattr(time, "sleep", drain)
+    bench.driver.close()
+    assert bench.commands()[-2:] == [Command.SET_AXIS_STATE] * 2

@@ -11,6 +11,8 @@ from services.joint.drivers.wired_drive import MotorFrame, WiredDrive
 from shared.bus.messages import Pair
 
 MARK = 64.0
+
+
 TARGET = MotorTarget((0.5, -1.5), (1.0, 2.0), (0.1, 0.2), (20.0, 20.0), (0.3, 0.3))
 
 
@@ -52,6 +54,14 @@ def inner() -> Recorder:
     return Recorder()
 
 
+def status_by(inner: Recorder, frame: MotorFrame, reading: DriveReading) -> DriveStatus:
+    """Return the status of a reading as it comes through."""
+    inner.reading = reading
+    found = WiredDrive(inner, frame).read(0.0)
+    assert found is not None
+    return found.status
+
+
 def test_positions_are_counted_from_the_mark_both_ways(inner: Recorder) -> None:
     drive: Drive = WiredDrive(inner, MotorFrame(MARK))
     inner.reading = at((MARK + 3.0, MARK - 4.0))
@@ -69,23 +79,21 @@ def test_positions_are_counted_from_the_mark_both_ways(inner: Recorder) -> None:
 
 @pytest.mark.parametrize("pos", [(0.0, MARK), (MARK, 0.97), (31.9, MARK), (MARK, 96.1)])
 @pytest.mark.parametrize("status", [DriveStatus.IDLE, DriveStatus.ARMED, DriveStatus.ERROR])
-def test_a_drive_that_counts_far_from_the_mark_is_unzeroed(
+def test_a_count_far_from_the_mark_is_no_zero(
     inner: Recorder, pos: Pair, status: DriveStatus
 ) -> None:
-    inner.reading = at(pos, status)
-    reading = WiredDrive(inner, MotorFrame(MARK)).read(0.0)
-    assert reading is not None
-    assert reading.status is DriveStatus.UNZEROED
+    assert status_by(inner, MotorFrame(MARK), at(pos, status)) is DriveStatus.UNZEROED
 
 
-def test_a_lost_drive_is_lost_wherever_it_was(inner: Recorder) -> None:
-    inner.reading = at((0.0, 0.0), DriveStatus.LOST)
-    reading = WiredDrive(inner, MotorFrame(MARK)).read(0.0)
-    assert reading is not None
-    assert reading.status is DriveStatus.LOST
+@pytest.mark.parametrize("signs", [(-1, 1), (-1, -1)])
+def test_so_it_is_with_signs(inner: Recorder, signs: tuple[int, int]) -> None:
+    assert status_by(inner, MotorFrame(MARK, signs), at((0.97, 0.5))) is DriveStatus.UNZEROED
 
 
-def test_silence_stays_silence(inner: Recorder) -> None:
+def test_a_lost_drive_is_lost_wherever_it_was_and_silence_stays_silence(inner: Recorder) -> None:
+    lost = at((0.0, 0.0), DriveStatus.LOST)
+    assert status_by(inner, MotorFrame(MARK), lost) is DriveStatus.LOST
+    inner.reading = None
     assert WiredDrive(inner, MotorFrame(MARK)).read(0.0) is None
 
 
@@ -116,9 +124,7 @@ def test_a_read_only_drive_is_sent_nothing_at_all(inner: Recorder) -> None:
 
 
 @pytest.mark.parametrize("status", DriveStatus)
-def test_a_read_only_drive_reports_all_but_a_foreign_arming(
-    inner: Recorder, status: DriveStatus
-) -> None:
+def test_a_read_only_drive_hides_a_foreign_arming(inner: Recorder, status: DriveStatus) -> None:
     inner.reading = at((1.0, 2.0), status)
     reading = WiredDrive(inner, MotorFrame(), read_only=True).read(0.0)
     assert reading is not None
@@ -156,12 +162,3 @@ def test_a_motor_that_counts_down_is_the_same_joint(pos: Pair, signs: tuple[int,
     )
     assert (sent.pos_gain, sent.vel_gain) == (TARGET.pos_gain, TARGET.vel_gain)
     assert torque == sent.torque
-
-
-@pytest.mark.parametrize("signs", [(-1, 1), (-1, -1)])
-def test_a_drive_with_signs_that_lost_power_is_unzeroed(signs: tuple[int, int]) -> None:
-    inner = Recorder()
-    inner.reading = at((0.97, 0.5))
-    reading = WiredDrive(inner, MotorFrame(MARK, signs)).read(0.0)
-    assert reading is not None
-    assert reading.status is DriveStatus.UNZEROED

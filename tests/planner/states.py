@@ -1,0 +1,83 @@
+"""What a planner receives: states of six modules, wrenches; and how it comes to lead by them."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import msgspec
+import numpy as np
+
+from services.planner.law.kinematics import Kinematics
+from services.planner.planner import Planner
+from shared.bus.messages import DriveStatus, JointState, Mode, PlannerMode, Tare, Wrench
+from shared.clock import NS_PER_MS
+from shared.config import files as config_file
+from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.joints import N_MODULES
+from tests.conftest import ROBOT_FILE
+from tests.planner.oracle import Array
+
+SESSION = 4711
+START_NS = 10**12
+TICK_NS = 4 * NS_PER_MS
+
+
+def with_law(robot: RobotConfig, **changes: object) -> RobotConfig:
+    """Return the robot with some keys of [law] changed."""
+    return msgspec.structs.replace(robot, law=msgspec.structs.replace(robot.law, **changes))
+
+
+@cache
+def standing_torque(q: tuple[float, ...]) -> Array:
+    """Return the torques (12,) of the shipped robot's stand at q (12,), rad; N m."""
+    robot = config_file.load(ROBOT_FILE)
+    kinematics = Kinematics(robot)
+    kinematics.update(np.array(q))
+    return np.asarray(robot.total_mass * GRAVITY * kinematics.J[2])
+
+
+def state(module: int, q: Array, seq: int = 1, **changes: object) -> JointState:
+    """Return the state of a module of a robot that stands on its feet."""
+    tau = standing_torque(tuple(q.tolist())) if np.isfinite(q).all() else np.zeros(12)
+    fields: dict[str, object] = {
+        "t_ns": 1000 * (module + 1) + seq, "seq": seq,
+        "q": (float(q[2 * module]), float(q[2 * module + 1])), "v": (0.0, 0.0),
+        "tau": (float(tau[2 * module]), float(tau[2 * module + 1])),
+        "mode": int(Mode.TRACK), "cause": 0, "ready": True, "age_ns": 4_000_000,
+        "session": SESSION, "command_seq": -1, "cycle": 0, "late": 0, "dropouts": 0,
+        "refused": 0, "drive": DriveStatus.ARMED, "drive_error": 0,
+    }  # fmt: skip
+    return JointState(**(fields | changes))  # type: ignore[arg-type]
+
+
+def receive_all(planner: Planner, q: Array, now_ns: int, seq: int = 1, **changes: object) -> None:
+    for module in range(N_MODULES):
+        planner.receive_state(module, state(module, q, seq, **changes), now_ns)
+
+
+def receive_but(
+    planner: Planner, module: int, q: Array, now_ns: int, seq: int, **changes: object
+) -> None:
+    """Have six states received, one of them with fields changed."""
+    for index in range(N_MODULES):
+        own = changes if index == module else {}
+        planner.receive_state(index, state(index, q, seq, **own), now_ns)
+
+
+def lead(planner: Planner, q: Array, now_ns: int = START_NS) -> int:
+    """Bring the planner to lead; return the time of its last tick."""
+    for tick in range(3):
+        now_ns += TICK_NS
+        receive_all(planner, q, now_ns, seq=tick)
+        planner.tick(now_ns)
+    assert planner.status(now_ns, 0.0).mode == PlannerMode.LEADING
+    return now_ns
+
+
+def wrench(force_z: float = 0.0, **changes: object) -> Wrench:
+    """Return a reading of the harness, valid unless told otherwise."""
+    fields: dict[str, object] = {
+        "t_ns": 1, "seq": 1, "force": (0.0, 0.0, force_z), "moment": (0.0, 0.0, 0.0),
+        "valid": True, "saturated": False, "tare": int(Tare.DONE), "age_ns": 0,
+    }  # fmt: skip
+    return Wrench(**(fields | changes))  # type: ignore[arg-type]
