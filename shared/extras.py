@@ -1,4 +1,4 @@
-"""The optional packages: which extra of pyproject.toml brings each, and how an absent one is told.
+"""The optional packages: which extra of pyproject.toml brings each, and how its absence is said.
 
 `pip install xrl` brings what a robot in service needs. A verb of an owner's desk calls `require`
 before it begins; a module that uses such a package takes it by `late`, so that it can be imported

@@ -154,7 +154,7 @@ def _record(
         if roster is not None:
             roster.put_if_due(now, tuple(filter(None, (recording.trouble, host.trouble))))
         recording.cycle(now)
-        host.look_if_due(now)
+        host.check_if_due(now)
         time.sleep(DRAIN_PERIOD_S)
     recording.close()
     time.sleep(LAST_WORDS_S)

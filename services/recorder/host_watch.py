@@ -1,4 +1,4 @@
-"""What the recorder tells beside the record: who is linked, what goes wrong on its host.
+"""What the recorder says beside the record: who is linked, what goes wrong on its host.
 
 No other service has the time to look for floods of the bus's ports and for a disk that fills.
 """
@@ -25,39 +25,39 @@ _AGAIN_NS: Final = 10 * NS_PER_S
 
 
 class HostWatch:
-    """Looks every two seconds."""
+    """Checks every two seconds."""
 
     def __init__(
         self, arrivals: Arrivals, run_dir: Path, logger: logging.Logger, now_ns: int
     ) -> None:
         self._arrivals, self._run_dir, self._logger = arrivals, run_dir, logger
         self._guard = SpaceGuard(RUN_DIR_MIN_MIB)
-        self._look = Deadline(_EVERY_NS, now_ns)
+        self._due = Deadline(_EVERY_NS, now_ns)
         self._say_at_ns = now_ns
         self.trouble = ""
         """What is wrong with the run directory's disk, in words; empty if nothing is."""
 
-    def look_if_due(self, now_ns: int) -> None:
-        """Look, if it is time to, and say what there is to say."""
-        if not self._look.passed(now_ns):
+    def check_if_due(self, now_ns: int) -> None:
+        """Check what is due, and warn of what is found."""
+        if not self._due.passed(now_ns):
             return
         flood = self._arrivals.flood(now_ns)
         if flood and now_ns >= self._say_at_ns:
             self._say_at_ns = now_ns + _AGAIN_NS
             self._logger.warning("%s", flood)
-        self._look_at_disk()
+        self._check_disk()
 
-    def _look_at_disk(self) -> None:
+    def _check_disk(self) -> None:
         try:
             free = free_bytes_at(self._run_dir)
         except OSError as error:
             self.trouble = f"{self._run_dir}: {error.strerror}"
             return
         change = self._guard.feed(free)
-        told = f"{self._run_dir}: {free // MIB} MiB free"
-        self.trouble = "" if self._guard.enough else f"{told}: logs lose lines; free some space"
+        left = f"{self._run_dir}: {free // MIB} MiB free"
+        self.trouble = "" if self._guard.enough else f"{left}: logs lose lines; free some space"
         if change in (DiskChange.LOW, DiskChange.FULL):
-            self._logger.warning("%s: logs lose lines when it is full; free some space", told)
+            self._logger.warning("%s: logs lose lines when it is full; free some space", left)
 
 
 NEWS_NS: Final = 100 * NS_PER_MS
@@ -65,7 +65,7 @@ NEWS_NS: Final = 100 * NS_PER_MS
 
 
 class Roster:
-    """Tells twice a second, and at each change, who is linked and why nothing is recorded.
+    """Sends twice a second, and at each change, who is linked and why nothing is recorded.
 
     For `xrl status` and the log. Every tool dials the recorder, so it knows all that are linked.
     """
@@ -73,17 +73,17 @@ class Roster:
     def __init__(self, session: Session) -> None:
         self._watch = session.linked_tools()
         self._publisher = session.publisher(topics.TOOLS, ToolRoster)
-        self._told: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
-        self._told_ns = self._due_ns = 0
+        self._sent: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
+        self._sent_ns = self._due_ns = 0
         self._seq = 0
 
     def put_if_due(self, now_ns: int, trouble: tuple[str, ...]) -> None:
-        """Say who is linked and what is wrong, if that is news or due again; never blocks."""
-        told = self._watch.names(), trouble
-        is_news = told != self._told and now_ns >= self._told_ns + NEWS_NS
+        """Send who is linked and what is wrong, if that is news or due again; never blocks."""
+        news = self._watch.names(), trouble
+        is_news = news != self._sent and now_ns >= self._sent_ns + NEWS_NS
         if not is_news and now_ns < self._due_ns:
             return
-        self._told_ns = now_ns
-        self._told, self._due_ns = told, now_ns + round(NS_PER_S / topics.TOOLS.rate_hz)
+        self._sent_ns = now_ns
+        self._sent, self._due_ns = news, now_ns + round(NS_PER_S / topics.TOOLS.rate_hz)
         self._seq += 1
-        self._publisher.put(ToolRoster(t_ns=now_ns, seq=self._seq, tools=told[0], trouble=trouble))
+        self._publisher.put(ToolRoster(t_ns=now_ns, seq=self._seq, tools=news[0], trouble=trouble))

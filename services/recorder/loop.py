@@ -73,7 +73,7 @@ class Recorder:
         """Files that somebody removed while they were written, and what was in them."""
         self._why_next = ""
         """Why a file is to be begun as soon as one can be; "" if none is."""
-        self._told_unwritable = False
+        self._reported_unwritable = False
         self.trouble = ""
         """Why nothing is recorded now, in words; "" if it is."""
         self._watch_space(now_ns)
@@ -142,11 +142,11 @@ class Recorder:
         try:
             self._begin(now_ns, {"why": self._why_next})
         except RunError as error:
-            if not self._told_unwritable:
+            if not self._reported_unwritable:
                 self._logger.error("%s; it is tried again", error)
-            self._told_unwritable, self.trouble = True, f"not recorded: {error}"
+            self._reported_unwritable, self.trouble = True, f"not recorded: {error}"
             return
-        self._why_next, self._told_unwritable, self.trouble = "", False, ""
+        self._why_next, self._reported_unwritable, self.trouble = "", False, ""
         left_out = self._writer.left_out
         self._logger.warning(
             "recording goes on in %s; %d messages were left out", self._writer.path, left_out

@@ -83,7 +83,7 @@ class SnapshotRing:
             if row is not None:
                 item = (row[0], payload, received_ns)  # one string for all messages of a key
                 if key in special:
-                    self._look(row[1], item)
+                    self._watch(row[1], item)
             ring.append(item)
             self._bytes += len(payload) + OVERHEAD
         self._drop_what_does_not_fit()
@@ -118,7 +118,7 @@ class SnapshotRing:
         self._bytes -= len(item[1]) + OVERHEAD
         return item
 
-    def _look(self, topic: Topic, item: tuple[str, bytes, int]) -> None:
+    def _watch(self, topic: Topic, item: tuple[str, bytes, int]) -> None:
         key, payload, received_ns = item
         if topic is topics.ESTOP:
             self.trigger("emergency stop", received_ns)

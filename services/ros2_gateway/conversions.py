@@ -67,12 +67,7 @@ class Conversions:
         self._prefix = f"{config.ros2.namespace}/" if config.ros2.namespace else ""
 
     def joint_states(self, ns: int, states: Mapping[str, JointState]) -> bytes:
-        """Return `sensor_msgs/msg/JointState`: rad, rad/s, N m.
-
-        Args:
-            ns: time.
-            states: newest state of each module that knows where it is.
-        """
+        """Return `sensor_msgs/msg/JointState` of modules that know where they are: rad, N m."""
         modules = [name for name in MODULES if name in states]
         q, v, tau = (
             np.array([value for name in modules for value in getattr(states[name], part)], float)
@@ -134,14 +129,9 @@ class Conversions:
         wrench: Wrench | None,
         gateway: Mapping[str, object],
     ) -> bytes:
-        """Return `diagnostic_msgs/msg/DiagnosticArray`: one row for each process.
+        """Return `diagnostic_msgs/msg/DiagnosticArray`: a row for each process, silent ones too.
 
-        Args:
-            ns: time.
-            states: newest state of each module that is not silent.
-            status: of the planner; None: it is silent.
-            wrench: of the harness; None: it is silent.
-            gateway: figures of the gateway itself.
+        `gateway` has the figures of the gateway itself.
         """
         rows = [self._module_row(name, states.get(name)) for name in MODULES]
         rows += [self._planner_row(status), self._harness_row(wrench)]

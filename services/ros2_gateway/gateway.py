@@ -96,12 +96,7 @@ class Gateway:
         self._newest[topic, module] = now_ns, message
 
     def due(self, now_ns: int, unix_ns: int) -> list[Outgoing]:
-        """Return what is to be sent now.
-
-        Args:
-            now_ns: clock of `receive`.
-            unix_ns: the same moment as ROS 2 is told, ns since 1970.
-        """
+        """Return what is to be sent now: at `unix_ns` for ROS 2, by the clock of `receive` here."""
         found = []
         for topic, period_ns, make in self._sends:
             due_ns = self._next_ns.get(topic, now_ns)

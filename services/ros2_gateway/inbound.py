@@ -50,12 +50,7 @@ def acceptable(words: str) -> tuple[str, ...]:
 
 
 class Inbound:
-    """Requests from ROS 2, within the robot file's limits.
-
-    Attributes:
-        refused: messages that were none, or asked for what cannot be given.
-        not_stopped: the last stop was given up before every module had stopped.
-    """
+    """Requests from ROS 2, within the robot file's limits."""
 
     def __init__(self, config: RobotConfig) -> None:
         self._topics = inbound_topics(config.ros2.namespace)
@@ -64,7 +59,9 @@ class Inbound:
         self._stop_since_ns: int | None = None
         self._next_stop_ns = 0
         self.refused = 0
+        """Messages that were none, or asked for what cannot be given."""
         self.not_stopped = False
+        """The last stop was given up before every module had stopped."""
 
     def receive(self, topic: RosTopic, message: Any | None, now_ns: int) -> None:
         """Take a message of one of `inbound_topics`; None: it could not be read."""

@@ -163,15 +163,15 @@ class RosLink:
             self.session.close()
 
     def _dial(self) -> None:
-        told = False
+        reported = False
         while not self._left.is_set():
             try:
                 self.session = self._open()
                 return
             except (BusError, zenoh.ZError) as error:
-                if not told:
+                if not reported:
                     self._failed(error)
-                told = True
+                reported = True
                 self._left.wait(_AGAIN_S)
 
 

@@ -105,7 +105,7 @@ def listener(endpoint: str) -> str:
 def allow_robots_hosts(robot: RobotConfig, listening: Sequence[str]) -> None:
     """Under `mtls`, have this process hear the hosts of the endpoints and of `allow` only.
 
-    A host whose name is not known now is left out, and told: its own link fails, and no other.
+    A host whose name is not known now is left out, with a warning: only its own link fails.
     Raises BusError if the kernel takes no filter.
     """
     if robot.bus.security.mode != "mtls":

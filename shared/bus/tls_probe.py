@@ -104,7 +104,7 @@ class LinkWatch:
     ) -> None:
         self._own, self._dialled, self._is_linked = own, dialled, is_linked
         self._every_s = every_s
-        self._told: dict[str, str] = {}
+        self._reported: dict[str, str] = {}
         self._ended = threading.Event()
         threading.Thread(target=self._run, daemon=True, name="link-watch").start()
 
@@ -117,10 +117,10 @@ class LinkWatch:
         while not self._ended.wait(self._every_s):
             for peer, endpoint in self._dialled.items():
                 why = "" if self._is_linked(endpoint) else refusal(self._own, endpoint)
-                if why != self._told.get(peer, "") and not self._ended.is_set():
-                    self._told[peer] = why
-                    told = f"no link with {peer} at {endpoint}: {why}"
-                    log.get("xrl").warning("%s", told if why else f"link with {peer} is there")
+                if why != self._reported.get(peer, "") and not self._ended.is_set():
+                    self._reported[peer] = why
+                    report = f"no link with {peer} at {endpoint}: {why}"
+                    log.get("xrl").warning("%s", report if why else f"link with {peer} is there")
 
 
 def _client(own: Credentials) -> ssl.SSLContext:

@@ -52,11 +52,8 @@ def unpack_frames(packet: bytes) -> list[Frame]:
 class UnixCanBus(can.BusABC):
     """Client of a `UnixCanHub`, declared to python-can as interface `xrl_unix`.
 
-    Unlike most interfaces, `send` drops and counts a frame when the socket is full, and does not
-    raise: a control loop has a newer one in a millisecond.
-
-    Attributes:
-        dropped: frames that were not sent because the socket was full.
+    Unlike most interfaces, `send` drops a frame when the socket is full, counts it in `dropped`,
+    and does not raise: a control loop has a newer one in a millisecond.
     """
 
     def __init__(

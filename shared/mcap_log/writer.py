@@ -22,7 +22,7 @@ import contextlib
 import copy
 import os
 import secrets
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from enum import Enum
 from pathlib import Path
 from typing import Annotated, BinaryIO, Final, Protocol
@@ -192,9 +192,6 @@ class RunWriter:
         self._writer = Writer(
             self._file, chunk_size=self._chunk_size, compression=CompressionType.ZSTD
         )
-        # mcap leaves these two without annotations
-        self._flush_writer: Callable[[], None] = self._writer.flush
-        self._finish_writer: Callable[[], None] = self._writer.finish
         try:
             with self._as_run_error("cannot be written"):
                 self._start(self._file, note or {})
@@ -242,13 +239,13 @@ class RunWriter:
         """Hand everything to the kernel: it then survives a kill of this process."""
         if self._file is not None:
             with self._as_run_error("cannot be written"):
-                self._flush_writer()
+                self._writer.flush()  # type: ignore[no-untyped-call]  # mcap's
 
     def sync(self) -> None:
         """Flush, and have it brought to the disk meanwhile: it then survives a loss of power."""
         if self._file is not None:
             with self._as_run_error("cannot be written"):
-                self._flush_writer()
+                self._writer.flush()  # type: ignore[no-untyped-call]  # mcap's
                 self._syncer.request(self._file.fileno())
 
     def finish(self) -> None:
@@ -256,13 +253,14 @@ class RunWriter:
         if self._file is None:
             return
         with self._as_run_error("cannot be finished"):
-            self._flush_writer()  # the counts go behind the last messages
+            # the counts go behind the last messages
+            self._writer.flush()  # type: ignore[no-untyped-call]  # mcap's
             counts = {
                 key: msgspec.json.encode(_since(self._before[key], count)).decode()
                 for key, count in self.counts.items()
             }
             self._writer.add_metadata(COUNTS, counts)
-            self._finish_writer()
+            self._writer.finish()  # type: ignore[no-untyped-call]  # mcap's
             self._file.flush()  # finish() leaves the end of a stream that was passed in unwritten
             self._syncer.request(self._file.fileno(), last=True)
         self._close_as_it_is()
@@ -278,7 +276,7 @@ class RunWriter:
             media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
             self._writer.add_attachment(0, 0, name, media_type, content)
         self._register(file)
-        self._flush_writer()
+        self._writer.flush()  # type: ignore[no-untyped-call]  # mcap's
         file.flush()
         self._syncer.request(file.fileno())
 
@@ -297,8 +295,7 @@ class RunWriter:
             channel_id = self._writer.register_channel(key, encoding, schemas[name], about)
             Channel(channel_id, key, encoding, about, schemas[name]).write(early)
             self._channels[key] = (channel_id, self.counts[key])
-        records: Callable[[], bytes] = early.end
-        file.write(records())
+        file.write(early.end())  # type: ignore[no-untyped-call]  # mcap's
 
     def _leave_out(self, source: MessageSource, at_most: int) -> int:
         taken = 0

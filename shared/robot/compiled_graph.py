@@ -33,10 +33,7 @@ class CompiledGraph:
     """A graph with fixed memory for its arguments and results.
 
     `arguments` are written, the object is called, `results` are read; all are arrays of
-    the graph's shapes, column-major.
-
-    Attributes:
-        translated: True if C translated from the graph computes the results.
+    the graph's shapes, column-major. `translated`: C translated from the graph computes them.
     """
 
     def __init__(self, function: ca.Function) -> None:

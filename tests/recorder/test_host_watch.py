@@ -32,7 +32,7 @@ def test_a_run_directory_whose_disk_fills_is_told_until_there_is_space(
     def look(free_mib: int) -> str:
         nonlocal now_ns
         free[0], now_ns = free_mib, now_ns + 3 * NS_PER_S
-        watch.look_if_due(now_ns)
+        watch.check_if_due(now_ns)
         return watch.trouble
 
     assert look(100 * RUN_DIR_MIN_MIB) == ""
