@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from services.simulator.drives.axis_bank import AxisBank
 from services.simulator.drives.axis_calibration import ENCODER_S, MOTOR_S
@@ -22,13 +23,20 @@ def uncalibrated() -> AxisBank:
     return bank
 
 
-def test_closed_loop_of_an_uncalibrated_axis_is_an_invalid_state() -> None:
+@pytest.mark.parametrize(
+    "state",
+    [AxisState.CLOSED_LOOP_CONTROL, AxisState.ENCODER_OFFSET_CALIBRATION],
+    ids=["closed loop", "the encoder's calibration before the motor's"],
+)
+def test_an_uncalibrated_axis_refuses_a_state_as_invalid_and_its_sibling_does_not(
+    state: AxisState,
+) -> None:
     bank = uncalibrated()
-    bank.request_state(2, AxisState.CLOSED_LOOP_CONTROL)
+    bank.request_state(2, state)
     assert bank.state[2] == AxisState.IDLE
     assert bank.faults[2].axis == AxisError.INVALID_STATE
-    bank.request_state(3, AxisState.CLOSED_LOOP_CONTROL)
-    assert bank.state[3] == AxisState.CLOSED_LOOP_CONTROL, "its sibling is calibrated"
+    bank.request_state(3, state)
+    assert bank.state[3] == state
 
 
 def test_the_full_sequence_takes_its_time_and_then_closed_loop_is_granted() -> None:
@@ -42,13 +50,6 @@ def test_the_full_sequence_takes_its_time_and_then_closed_loop_is_granted() -> N
     assert bank.state[2] == AxisState.IDLE
     bank.request_state(2, AxisState.CLOSED_LOOP_CONTROL)
     assert bank.state[2] == AxisState.CLOSED_LOOP_CONTROL
-
-
-def test_the_encoders_calibration_wants_the_motors_first() -> None:
-    bank = uncalibrated()
-    bank.request_state(2, AxisState.ENCODER_OFFSET_CALIBRATION)
-    assert bank.state[2] == AxisState.IDLE
-    assert bank.faults[2].axis == AxisError.INVALID_STATE
 
 
 def test_under_a_load_the_encoders_calibration_fails_and_leaves_the_axis_uncalibrated() -> None:

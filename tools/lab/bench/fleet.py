@@ -55,6 +55,8 @@ PATIENCE_S: Final = 600.0
 ENDING_S: Final = 30.0
 """Time for an interrupted run to end its fleet."""
 
+FIRST_USE: Final = "first_use_ms"
+"""Ages of commands, which this bench reads from the record."""
 LAST_LINES: Final = 3
 """Lines of a failed run's output that the error quotes."""
 
@@ -71,17 +73,19 @@ class Figure(NamedTuple):
     unit: str
     most: float | None
     """Target of docs/results.md#targets at pace 1; None: none."""
+    path: tuple[str, ...]
+    """Where it stands in the run's summary, or below `FIRST_USE`."""
 
 
 FIGURES: Final = (
-    Figure("tick_us", "tick, median", "us", 300.0),
-    Figure("tick_p99_us", "tick, p99", "us", None),
-    Figure("cpu_pct", "CPU, all processes", "%", 110.0),
-    Figure("late_pct", "PD cycles late", "%", 0.5),
-    Figure("first_use_ms", "age at first use, median", "ms", None),
-    Figure("first_use_p99_ms", "age at first use, p99", "ms", 3.0),
-    Figure("hand_n", "hand's peak", "N", 40.0),
-    Figure("com_x_mm", "COM x, led", "mm", 20.0),
+    Figure("tick_us", "tick, median", "us", 300.0, ("planner_tick_us", "median")),
+    Figure("tick_p99_us", "tick, p99", "us", None, ("planner_tick_us", "p99")),
+    Figure("cpu_pct", "CPU, all processes", "%", 110.0, ("fleet_cpu_pct",)),
+    Figure("late_pct", "PD cycles late", "%", 0.5, ("pd_cycles_late_pct",)),
+    Figure("first_use_ms", "age at first use, median", "ms", None, (FIRST_USE, "median")),
+    Figure("first_use_p99_ms", "age at first use, p99", "ms", 3.0, (FIRST_USE, "p99")),
+    Figure("hand_n", "hand's peak", "N", 40.0, ("operator_peak_n",)),
+    Figure("com_x_mm", "COM x, led", "mm", 20.0, ("alive_com_x_max_mm",)),
 )
 
 
@@ -127,20 +131,17 @@ def _lead(tree: Path, words: Sequence[str]) -> tuple[int, str]:
 
 def figures(summary: Mapping[str, Any], first_use: Array) -> Turn:
     """Return a run's figures, from its summary.json and `first_use_ms`."""
-    tick = summary.get("planner_tick_us") or {}
-    found: Turn = {
-        "tick_us": tick.get("median"),
-        "tick_p99_us": tick.get("p99"),
-        "cpu_pct": summary.get("fleet_cpu_pct"),
-        "late_pct": summary.get("pd_cycles_late_pct"),
-        "first_use_ms": None,
-        "first_use_p99_ms": None,
-        "hand_n": summary.get("operator_peak_n"),
-        "com_x_mm": summary.get("alive_com_x_max_mm"),
-    }
+    ages: dict[str, float] = {}
     if first_use.size:
-        middle, most = np.percentile(first_use, [50.0, 99.0]).tolist()
-        found |= {"first_use_ms": middle, "first_use_p99_ms": most}
+        ages["median"], ages["p99"] = np.percentile(first_use, [50.0, 99.0]).tolist()
+    known = {**summary, FIRST_USE: ages}
+    return {figure.name: _at(known, figure.path) for figure in FIGURES}
+
+
+def _at(known: Any, path: Sequence[str]) -> float | None:
+    for key in path:
+        known = known.get(key) if known else None
+    found: float | None = known
     return found
 
 
