@@ -19,18 +19,13 @@ from shared.config.scenarios import Inject
 from shared.exceptions import ConfigError
 from shared.links import DIRECTIONS
 from tests.lockstep.runs import still
+from tests.tools.live.test_experiment import parse
 from tools.judge import verdict
 from tools.live import describe_inject, experiment
 from tools.logs.run_log import RunLog, read_run
 from tools.sim.lockstep import Lockstep
 from tools.sim.network import BASE
 from tools.sim.recorded_lockstep import simulate
-
-
-def parse(*words: str) -> argparse.Namespace:
-    parser = argparse.ArgumentParser()
-    experiment.add_flags(parser)
-    return parser.parse_args(words)
 
 
 @pytest.mark.parametrize(
