@@ -2,7 +2,7 @@
 
 Every namespace is anonymous: it is there for as long as a process is in it. Each of those made
 here is held open by a process whose input ends with this one, however that ends: a `cat` for
-a host, `tests.system.switch` for the switch. This process itself has to be started in a
+a host, this module as a program for the switch. This process itself has to be started in a
 namespace of its own (`isolation`), which becomes the first of the hosts: the machine's own
 network is never touched.
 """
@@ -19,12 +19,18 @@ from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Self
+from typing import Any, Final, Self
+
+from pyroute2 import IPRoute
+from pyroute2.netlink.exceptions import NetlinkError
 
 _SUBNET: Final = "10.0.0"
 _ENDING_S: Final = 10.0
 """A process that holds a namespace and is still there so long after its input's end hangs."""
 
+_BRIDGE: Final = "switch"
+_CARD: Final = "eth0"
+"""Every host's network card."""
 _NONLOCAL_BIND: Final = Path("/proc/sys/net/ipv4/ip_nonlocal_bind")
 
 _ISOLATIONS: Final = (("unshare", "--net"), ("unshare", "--user", "--map-root-user", "--net"))
@@ -79,7 +85,7 @@ class Network:
         with contextlib.ExitStack() as stack:
             for host in self._hosts[1:]:
                 self._pids[host] = stack.enter_context(_held("cat")).pid
-            command = (sys.executable, "-m", "tests.system.switch")
+            command = (sys.executable, "-m", "tests.system.namespaces")
             self._switch = stack.enter_context(_held(*command))
             self._order(*(["join", h, self._pids[h], self.address(h)] for h in self._hosts))
             self._stack = stack.pop_all()
@@ -124,7 +130,7 @@ class Network:
         self._order(["set", host, "forwarded", forwarded])
 
     def _order(self, *orders: list[object]) -> None:
-        """Have the switch carry out orders (`tests.system.switch`), and wait until it has."""
+        """Have the switch carry out orders (`_obey`), and wait until it has."""
         assert self._switch.stdin is not None
         assert self._switch.stdout is not None
         self._switch.stdin.write(json.dumps(orders) + "\n")
@@ -157,3 +163,69 @@ def _held(*command: str) -> Iterator[subprocess.Popen[str]]:
 
 def _path(pid: int) -> str:
     return f"/proc/{pid}/ns/net"
+
+
+class Switch:
+    """A bridge in this process's own namespace.
+
+    It speaks netlink by pyroute2, which forks to enter another namespace; so it is a small process
+    without threads and signal handlers. A line on its input is a list of orders in JSON, and is
+    answered by a line: `null`, or what was wrong. It ends at the end of its input.
+    """
+
+    def __init__(self, route: IPRoute) -> None:
+        self._route = route
+        route.link("add", ifname=_BRIDGE, kind="bridge")
+        self._bridge = _index(route, _BRIDGE)
+        route.link("set", index=self._bridge, state="up")
+
+    def join(self, host: str, pid: int, address: str) -> None:
+        """Lay a cable, a veth pair, to the namespace that a process is in."""
+        route = self._route
+        peer = {"ifname": _CARD, "net_ns_pid": pid}
+        route.link("add", ifname=host, kind="veth", peer=peer)
+        route.link("set", index=_index(route, host), master=self._bridge, state="up")
+        with IPRoute(netns=f"/proc/{pid}/ns/net") as inside:
+            for card in ("lo", _CARD):
+                inside.link("set", index=_index(inside, card), state="up")
+            inside.addr("add", index=_index(inside, _CARD), address=address, prefixlen=24)
+
+    def set_port(self, host: str, what: str, *, on: bool) -> None:
+        """Set whether a host's cable is plugged in, or whether its frames are forwarded."""
+        port = _index(self._route, host)
+        if what == "plugged":
+            self._route.link("set", index=port, state="up" if on else "down")
+        else:
+            self._route.link("set", index=port, master=self._bridge if on else 0)
+
+
+def _index(route: IPRoute, name: str) -> int:
+    (index,) = route.link_lookup(ifname=name)
+    return int(index)
+
+
+def _obey(switch: Switch, order: Sequence[Any]) -> None:
+    match order:
+        case ["join", host, pid, address]:
+            switch.join(host, pid, address)
+        case ["set", host, what, on]:
+            switch.set_port(host, what, on=on)
+
+
+def main() -> None:
+    """Be the switch until the end of the input."""
+    with IPRoute() as route:
+        switch = Switch(route)
+        for line in sys.stdin:
+            fault = None
+            try:
+                for order in json.loads(line):
+                    _obey(switch, order)
+            except NetlinkError as error:
+                fault = str(error)
+            sys.stdout.write(json.dumps(fault) + "\n")
+            sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()

@@ -175,6 +175,10 @@ def spans(led: Led) -> list[tuple[Cut, int]]:
     return list(zip(led.report.cuts, ends, strict=True))
 
 
+def states_of(led: Led, module: str) -> list[JointState]:
+    return led.log.messages(topics.JOINT_STATE, module)
+
+
 def reached(cut: Cut) -> tuple[str, ...]:
     """Return the modules that the planner still reaches."""
     return () if cut.host == BODY else tuple(m for m in MODULES if m not in LEGS[cut.host])
@@ -230,7 +234,7 @@ def test_the_robot_stands_through_every_cut_and_leads_again(led: Led) -> None:
     for cut, end_ns in spans(led):
         assert 0 < cut.down_ns < cut.up_ns < end_ns
         for module in MODULES:
-            states: list[JointState] = led.log.messages(topics.JOINT_STATE, module)
+            states = states_of(led, module)
             tracking = [s for s in states if s.mode == Mode.TRACK and cut.up_ns < s.t_ns < end_ns]
             assert tracking, f"{module} did not track again after {cut}"
 
@@ -240,7 +244,7 @@ def test_the_modules_of_a_cut_off_leg_hold_by_themselves(led: Led, robot: RobotC
     seen = 0
     for cut, _ in spans(led):
         for module in set(MODULES) - set(reached(cut)):
-            states: list[JointState] = led.log.messages(topics.JOINT_STATE, module)
+            states = states_of(led, module)
             # No echo is younger than the cut, so no command is usable beyond its age limit.
             alone = [s for s in states if cut.down_ns + patience_ns < s.t_ns < cut.up_ns]
             assert {s.mode for s in alone} <= {Mode.HOLD}
@@ -287,7 +291,7 @@ def test_nothing_passes_a_cut_until_it_is_mended(led: Led) -> None:
     late = 0
     for cut, _ in spans(led):
         for module in set(MODULES) - set(reached(cut)):
-            states: list[JointState] = led.log.messages(topics.JOINT_STATE, module)
+            states = states_of(led, module)
             received_ns = led.log.received_ns(topics.JOINT_STATE, module)
             meanwhile = [
                 received

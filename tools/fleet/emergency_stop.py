@@ -69,6 +69,7 @@ class BusStop:
     """The way over the bus, on a session that is open: nothing is dialled when it is asked for."""
 
     def __init__(self, robot: RobotConfig, session: Session, here: Path | None) -> None:
+        """Subscribe; `here` is the run directory of this robot's services on this host, if any."""
         self._robot, self._here = robot, here
         self._publisher = session.publisher(topics.ESTOP, Estop)
         self._states = {m: session.latest(topics.JOINT_STATE, JointState, m) for m in MODULES}
@@ -112,7 +113,7 @@ class BusStop:
 
 
 def stop_all(robot: RobotConfig, run_dir: Path, *, here: bool) -> list[str]:
-    """Open a session and publish the stop until all six modules have stopped."""
+    """Stop over the bus, in a new session; `here`: its services are in this run directory."""
     with open_session(robot, "estop", run_dir) as session:
         return BusStop(robot, session, run_dir if here else None).stop()
 

@@ -178,7 +178,7 @@ class SupervisedFleet:
 
         Each gets its own signal first, a suspended one too, and SIGKILL if it does not end in its
         time. Without a fleet it does nothing. Only the logs, if wanted, and files that are not the
-        fleet's remain in the run directory.
+        fleet's remain in the run directory; with `keep_stops` also an emergency stop.
         """
         self._end()
         if not self.run.is_marked:

@@ -39,6 +39,7 @@ class KeyTraffic:
     """
 
     def __init__(self, key: TopicKey, *, here: bool = True) -> None:
+        """Count from now on; `here`: the sender is on this host, and has its clock."""
         self.key = key
         self._here = here
         self._counted = KeyCount(several=several_may_write(f"xrl/robot/{key.name}"))

@@ -90,7 +90,7 @@ class StallFinder:
     """Finds the stalls of a live run, each once, whatever shows it."""
 
     def __init__(self, cores: int, gaps: Callable[[], Sequence[Gap]]) -> None:
-        """Take what watches."""
+        """Take how many threads watch a core of their own, and what gives their new gaps."""
         self._cores, self._gaps = cores, gaps
         self._services, self._world = CommonSilence(), Silence(TRUTH_NS)
         self._pending: list[Stall] = []

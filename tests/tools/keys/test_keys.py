@@ -57,8 +57,8 @@ def made(place: Place) -> Place:
     return place
 
 
-def files(folder: Path) -> set[str]:
-    return {path.name for path in folder.iterdir()}
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 def test_every_file_is_its_owners_alone(made: Place) -> None:
@@ -92,18 +92,18 @@ def test_a_bundle_holds_what_its_host_runs_and_never_the_authoritys_key(
     with tarfile.open(out) as tar:
         assert {entry.mode for entry in tar} == {0o600}
         tar.extractall(tmp_path / "host", filter="data")
-    assert files(tmp_path / "host" / "keys") == {
+    assert set(contents(tmp_path / "host" / "keys")) == {
         "authority.pem", "names.toml",
         "knee_left.pem", "knee_left.key", "hip_left.pem", "hip_left.key",
     }  # fmt: skip
-    assert "authority.key" in files(made.authority)
-    assert "authority.key" not in files(made.keys)
+    assert "authority.key" in contents(made.authority)
+    assert "authority.key" not in contents(made.keys)
 
 
 def test_a_second_authority_is_refused_and_the_first_stays(made: Place, capsys: object) -> None:
-    before = {path.name: path.read_bytes() for path in made.authority.iterdir()}
+    before = contents(made.authority)
     assert made.xrl("make") == 2
-    assert {path.name: path.read_bytes() for path in made.authority.iterdir()} == before
+    assert contents(made.authority) == before
 
 
 def test_a_robot_without_tls_endpoints_gets_no_authority_at_all(
@@ -132,20 +132,22 @@ def test_renewing_keeps_the_generation_and_revoking_goes_on_to_the_next(made: Pl
     assert made.check() == 0
 
 
+def _place(place: Place, issued: Issued) -> None:
+    (place.keys / "planner.pem").write_bytes(issued.certificate)
+    (place.keys / "planner.key").write_bytes(issued.key)
+
+
 def _issue(place: Place, name: str, host: str, later_days: int, days: int) -> None:
     authority = Authority(place.authority)
     signer = Issued(authority.certificate, (place.authority / "authority.key").read_bytes())
     now = dt.datetime.now(dt.UTC) + dt.timedelta(days=later_days)
-    issued = certificates.issue(signer, name, (host,), now, days)
-    (place.keys / "planner.pem").write_bytes(issued.certificate)
-    (place.keys / "planner.key").write_bytes(issued.key)
+    _place(place, certificates.issue(signer, name, (host,), now, days))
 
 
 def _another_authority(place: Place) -> None:
-    signer = certificates.make_authority("xrl", dt.datetime.now(dt.UTC))
-    issued = certificates.issue(signer, "planner.1", ("127.0.0.1",), dt.datetime.now(dt.UTC))
-    (place.keys / "planner.pem").write_bytes(issued.certificate)
-    (place.keys / "planner.key").write_bytes(issued.key)
+    now = dt.datetime.now(dt.UTC)
+    signer = certificates.make_authority("xrl", now)
+    _place(place, certificates.issue(signer, "planner.1", ("127.0.0.1",), now))
 
 
 def _another_key(place: Place) -> None:
@@ -190,13 +192,13 @@ def test_check_tells_what_is_wrong(
 def test_what_cannot_be_done_is_one_line_and_changes_nothing(
     made: Place, order: str, words: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    before = {path.name: path.read_bytes() for path in made.authority.iterdir()}
+    before = contents(made.authority)
     capsys.readouterr()
     assert made.xrl(order, *words) == 2
     error = capsys.readouterr().err
     assert said in error
     assert error.count("\n") == 1
-    assert {path.name: path.read_bytes() for path in made.authority.iterdir()} == before
+    assert contents(made.authority) == before
 
 
 def test_an_authority_that_is_not_there_or_another_robots_is_refused(

@@ -19,19 +19,13 @@ from shared.config.scenarios import Inject
 from shared.exceptions import ConfigError
 from shared.links import DIRECTIONS
 from tests.lockstep.runs import still
-from tools.flags import add_flags, read_flags
+from tests.tools.live.test_experiment import parse
 from tools.judge import verdict
 from tools.live import describe_inject, experiment
 from tools.logs.run_log import RunLog, read_run
 from tools.sim.lockstep import Lockstep
 from tools.sim.network import BASE
 from tools.sim.recorded_lockstep import simulate
-
-
-def parse(*words: str) -> experiment.ExperimentFlags:
-    parser = argparse.ArgumentParser()
-    add_flags(parser, experiment.ExperimentFlags)
-    return read_flags(experiment.ExperimentFlags, parser.parse_args(words))
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -100,6 +101,11 @@ PADS = {
 }  # fmt: skip
 
 
+def _close(*descriptors: int) -> None:
+    for descriptor in descriptors:
+        os.close(descriptor)
+
+
 class FakePad:
     """A pad; a pipe makes it readable. It begins as the kernel does: every axis at 0."""
 
@@ -109,6 +115,7 @@ class FakePad:
             bustype=5, vendor=seen.vendor, product=seen.product, version=0x903
         )
         self._read, self._write = os.pipe()
+        self.close = weakref.finalize(self, _close, self._read, self._write)
         self._events: list[SimpleNamespace] = []
         self._gone = False
         self.at = dict.fromkeys(seen.axes, 0)
@@ -145,10 +152,6 @@ class FakePad:
     def unplug(self) -> None:
         self._gone = True
         os.write(self._write, b"x")
-
-    def close(self) -> None:
-        os.close(self._read)
-        os.close(self._write)
 
     def at_share(self, axis: int, share: float) -> int:
         """Return the value of an axis at a share of its range, 0 to 1."""

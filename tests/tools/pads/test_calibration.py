@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 import pytest
@@ -22,11 +22,9 @@ MOVES = {"lefty": (1, 0.0), "righty": (5, 1.0), "lefttrigger": (10, 1.0), "right
 
 
 @pytest.fixture
-def device(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[FakePad]:
+def device(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakePad:
     monkeypatch.setenv("HOME", str(tmp_path))
-    pad = FakePad(UNKNOWN)
-    yield pad
-    pad.close()
+    return FakePad(UNKNOWN)
 
 
 def person(device: FakePad, clumsy: Collection[str] = ()) -> Callable[[str], None]:

@@ -30,24 +30,22 @@ def _no_mappings_of_this_user(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mappings, "given_lines", lambda: iter(()))
 
 
-def pad_of(seen: Seen) -> tuple[FakePad, Gamepad]:
-    """Return a pad whose rest is learnt."""
+def fresh(seen: Seen) -> tuple[FakePad, Gamepad]:
+    """Return a pad that has not reported yet."""
     device = FakePad(seen)
     mapping = known_mapping(device)
     assert mapping is not None
-    pad = Gamepad(device, mapping)
+    return device, Gamepad(device, mapping)
+
+
+def pad_of(seen: Seen) -> tuple[FakePad, Gamepad]:
+    """Return a pad whose rest is learnt."""
+    device, pad = fresh(seen)
     device.report_rest()
     device.press(seen.shoulder)
     pad.wait(0.1)
     assert pad.settle() == ""
     return device, pad
-
-
-@pytest.fixture
-def xbox() -> Iterator[tuple[FakePad, Gamepad]]:
-    device, pad = pad_of(XBOX)
-    yield device, pad
-    device.close()
 
 
 @pytest.mark.parametrize("seen", PADS.values(), ids=PADS)
@@ -75,10 +73,20 @@ def test_each_control_of_a_known_pad_leads_what_it_is_there_for(seen: Seen) -> N
     device.press(seen.east)
     pad.wait(0.1)
     assert pad.stopped
-    device.close()
 
 
 EVENT = st.tuples(st.integers(0, 40), st.integers(-40_000, 70_000))
+
+
+def inputs_of(
+    seen: Seen, events: list[tuple[int, int]], but: int = -1
+) -> Iterator[tuple[int, int, int]]:
+    """Yield what a pad can send, whatever the numbers are, but for one control."""
+    inputs = [(EV_ABS, axis) for axis in seen.axes] + [(EV_KEY, key) for key in seen.buttons]
+    inputs = [one for one in inputs if one[1] != but]
+    for which, value in events:
+        kind, code = inputs[which % len(inputs)]
+        yield kind, code, value if kind == EV_ABS else value % 2
 
 
 @given(st.sampled_from(sorted(PADS)), st.lists(EVENT, max_size=30), st.floats(-0.15, 0.15))
@@ -87,10 +95,8 @@ def test_whatever_came_a_pad_at_rest_leads_nowhere(
 ) -> None:
     seen = PADS[name]
     device, pad = pad_of(seen)
-    inputs = [(EV_ABS, axis) for axis in seen.axes] + [(EV_KEY, key) for key in seen.buttons]
-    for which, value in events:
-        kind, code = inputs[which % len(inputs)]
-        device.send(kind, code, value if kind == EV_ABS else value % 2)
+    for event in inputs_of(seen, events):
+        device.send(*event)
     for key in seen.buttons:
         device.send(EV_KEY, key, 0)
     for axis in seen.axes:
@@ -98,22 +104,17 @@ def test_whatever_came_a_pad_at_rest_leads_nowhere(
     pad.wait(0.1)
     pilot = Pilot(1.0, 0.1, 150.0)
     assert pilot.integrate(pad.deflection, 1.0) == (1.0, 0.1, 0.0)
-    device.close()
 
 
 @given(st.sampled_from(sorted(PADS)), st.lists(EVENT, min_size=1, max_size=30))
 def test_only_the_right_trigger_raises_the_assist(name: str, events: list[tuple[int, int]]) -> None:
     seen = PADS[name]
     device, pad = pad_of(seen)
-    inputs = [(EV_ABS, axis) for axis in seen.axes] + [(EV_KEY, key) for key in seen.buttons]
-    inputs = [(kind, code) for kind, code in inputs if code != seen.triggers[1]]
     pilot = Pilot(1.0, 0.1, 150.0)
-    for which, value in events:
-        kind, code = inputs[which % len(inputs)]
-        device.send(kind, code, value if kind == EV_ABS else value % 2)
+    for event in inputs_of(seen, events, but=seen.triggers[1]):
+        device.send(*event)
         pad.wait(0.1)
         assert pilot.integrate(pad.deflection, 0.1).assist_n == 0.0
-    device.close()
 
 
 @pytest.mark.parametrize("seen", [XBOX, SIGNED, SIGNED_8], ids=["0..255", "16 bits", "8 bits"])
@@ -124,13 +125,11 @@ def test_a_trigger_that_was_tapped_asks_for_nothing_more(seen: Seen, trigger: in
         device.move(seen.triggers[trigger], share)
     pad.wait(0.1)
     assert pad.deflection.assist == 0.0
-    device.close()
 
 
 @pytest.mark.parametrize("drift", [-0.15, 0.15])
 def test_a_worn_sticks_rest_is_learnt(drift: float) -> None:
-    device = FakePad(XBOX)
-    pad = Gamepad(device, mapping_of(device))
+    device, pad = fresh(XBOX)
     device.report_rest()
     device.move(1, 0.5 + 0.5 * drift)
     device.press(XBOX.shoulder)
@@ -143,7 +142,6 @@ def test_a_worn_sticks_rest_is_learnt(drift: float) -> None:
     device.move(1, 1.0)
     pad.wait(0.1)
     assert pad.deflection.height == pytest.approx(-1.0)
-    device.close()
 
 
 @pytest.mark.parametrize(
@@ -154,8 +152,7 @@ def test_a_worn_sticks_rest_is_learnt(drift: float) -> None:
 def test_a_pad_that_is_held_begins_only_once_it_is_let_go_of(
     axis: int, share: float, told: str
 ) -> None:
-    device = FakePad(XBOX)
-    pad = Gamepad(device, mapping_of(device))
+    device, pad = fresh(XBOX)
     device.report_rest()
     device.move(axis, share)
     device.press(XBOX.shoulder)
@@ -169,15 +166,11 @@ def test_a_pad_that_is_held_begins_only_once_it_is_let_go_of(
     device.send(EV_KEY, XBOX.shoulder, 0)
     pad.wait(0.1)
     assert pad.settle() == ""
-    device.close()
 
 
 @given(st.floats(-1.0, 1.0))
 def test_a_stick_held_while_rest_is_learnt_leads_nowhere_once_it_is_let_go(held: float) -> None:
-    device = FakePad(XBOX)
-    mapping = known_mapping(device)
-    assert mapping is not None
-    pad = Gamepad(device, mapping)
+    device, pad = fresh(XBOX)
     device.report_rest()
     device.move(1, 0.5 + 0.5 * held)
     device.press(XBOX.shoulder)
@@ -186,18 +179,15 @@ def test_a_stick_held_while_rest_is_learnt_leads_nowhere_once_it_is_let_go(held:
         device.move(1, 0.5)
         pad.wait(0.1)
         assert abs(pad.deflection.height) <= DEAD_ZONE
-    device.close()
 
 
 def test_before_its_first_report_a_pad_is_asked_for_one() -> None:
     """The kernel says 0 for an axis that was not reported: of 0..65535 that is an end."""
-    device = FakePad(PEDALS)
-    pad = Gamepad(device, mapping_of(device))
+    device, pad = fresh(PEDALS)
     assert "left stick (100 %)" in pad.settle()
     device.report_rest()
     pad.wait(0.1)
     assert "press the dead man's button" in pad.settle()
-    device.close()
 
 
 @pytest.mark.parametrize("seen", [XBOX._replace(product=0xB0B), PEDALS._replace(product=0x28E)])
@@ -206,7 +196,6 @@ def test_a_pad_without_mapping_is_refused(seen: Seen) -> None:
     device = FakePad(seen)
     with pytest.raises(FleetError, match=rf"a pad \(045e:{seen.product:04x}\).*--calibrate"):
         mapping_of(device)
-    device.close()
 
 
 def test_every_pad_of_the_table_has_a_capability_table_or_shares_a_layout_that_has() -> None:
@@ -214,7 +203,6 @@ def test_every_pad_of_the_table_has_a_capability_table_or_shares_a_layout_that_h
     for seen in PADS.values():
         device = FakePad(seen)
         tested |= {id(a.mapping) for a in LAYOUTS[seen.vendor, seen.product] if a.fits(device)}
-        device.close()
     assert {id(a.mapping) for layouts in LAYOUTS.values() for a in layouts} <= tested
 
 
@@ -223,13 +211,10 @@ def test_a_button_that_the_mapping_lacks_is_refused() -> None:
     mapping = {name: at for name, at in mapping_of(device).items() if name != "b"}
     with pytest.raises(FleetError, match="its mapping has no b"):
         Gamepad(device, mapping)
-    device.close()
 
 
-def test_after_a_loss_of_events_the_dead_mans_button_is_to_be_pressed_again(
-    xbox: tuple[FakePad, Gamepad],
-) -> None:
-    device, pad = xbox
+def test_after_a_loss_of_events_the_dead_mans_button_is_to_be_pressed_again() -> None:
+    device, pad = pad_of(XBOX)
     device.send(EV_KEY, XBOX.shoulder, 1)
     device.move(1, 0.0)
     pad.wait(0.1)
@@ -243,16 +228,14 @@ def test_after_a_loss_of_events_the_dead_mans_button_is_to_be_pressed_again(
 
 
 def test_the_stop_counts_before_rest_is_learnt_however_short_it_is_pressed() -> None:
-    device = FakePad(XBOX)
-    pad = Gamepad(device, mapping_of(device))
+    device, pad = fresh(XBOX)
     device.press(XBOX.east)
     pad.wait(0.1)
     assert pad.stopped
-    device.close()
 
 
-def test_a_pad_that_is_lost_lets_go(xbox: tuple[FakePad, Gamepad]) -> None:
-    device, pad = xbox
+def test_a_pad_that_is_lost_lets_go() -> None:
+    device, pad = pad_of(XBOX)
     device.send(EV_KEY, XBOX.shoulder, 1)
     pad.wait(0.1)
     assert pad.held
@@ -282,8 +265,6 @@ def test_of_several_pads_the_first_known_one_is_taken(monkeypatch: pytest.Monkey
     assert open_pad(None) is known
     del pads["1"]
     assert open_pad(None) is unknown, "to say which pad is not known"
-    unknown.close()
-    known.close()
 
 
 def test_the_codes_are_the_kernels() -> None:
@@ -299,4 +280,3 @@ def test_the_codes_are_the_kernels() -> None:
     device = FakePad(PADS["DualSense"])
     codes = {name: control.code for name, control in mapping_of(device).items()}
     assert codes == {name: getattr(ecodes, code) for name, code in kernels.items()}
-    device.close()

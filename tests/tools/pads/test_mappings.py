@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -27,10 +26,8 @@ BASIC = "lefty:a1,righty:a3,lefttrigger:a5,righttrigger:a4,a:b0,b:b1,rightshould
 
 
 @pytest.fixture
-def device() -> Iterator[FakePad]:
-    pad = FakePad(UNKNOWN, "a, pad")
-    yield pad
-    pad.close()
+def device() -> FakePad:
+    return FakePad(UNKNOWN, "a, pad")
 
 
 @pytest.fixture(autouse=True)
@@ -82,7 +79,6 @@ def test_what_is_written_is_read_again(seen: object) -> None:
     mapping = dict(known_mapping(pad) or {})
     mapping["righty"] = mapping["righty"]._replace(inverted=True)
     assert mapping_from(GivenLine("here", line_for(pad, mapping)), pad) == mapping
-    pad.close()
 
 
 def test_the_environment_comes_first_and_then_the_users_own_file(
