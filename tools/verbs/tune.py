@@ -327,7 +327,7 @@ def _tune_module(args: argparse.Namespace, console: Console) -> int:
     with drive_access.drives_to_ourselves(
         robot, path, args.run_dir, console.print, lifted=module_motion.LIFTED
     ):
-        moved = module_motion.look_ask_and_move(args, robot, joint, plan_of, interrupts, console)
+        moved = module_motion.ask_and_move(args, robot, joint, plan_of, interrupts, console)
     if moved is None:
         return 0
     if isinstance(moved, module_motion.Stopped):

@@ -28,7 +28,7 @@ from tests.tools.bringup.moved_module import (
 from tools.bringup import motion_runner
 from tools.bringup.jog import JogPlan, ThereAndBack, judge
 from tools.bringup.motion import APART_MAX, Sample, limit_drives
-from tools.bringup.motion_runner import Interrupts, MotionResult, look_at
+from tools.bringup.motion_runner import Interrupts, MotionResult, hanging_angles
 
 ANKLE = "ankle_left"
 
@@ -132,7 +132,7 @@ def test_a_drive_that_is_somebodys_or_has_no_zero_is_not_looked_at_further(
 ) -> None:
     drive.status = status
     with pytest.raises(DriveError, match=f"{MODULE}: .*{words}"):
-        look_at({MODULE: drive}, robot, Interrupts(), drive.clock)
+        hanging_angles({MODULE: drive}, robot, Interrupts(), drive.clock)
     assert drive.largest == 0.0
 
 
@@ -204,9 +204,9 @@ def test_a_leg_that_swings_is_waited_for_but_not_for_ever(
     hung.world.data.qvel[6:] = 0.5
     monkeypatch.setattr(motion_runner, "STILL_WAIT_S", 1.0)
     with pytest.raises(DriveError, match="swings"):
-        look_at(leg_drives(hung, ANKLE), robot, interrupts, hung.clock)
+        hanging_angles(leg_drives(hung, ANKLE), robot, interrupts, hung.clock)
     interrupts.number = 2
-    assert look_at(leg_drives(hung, ANKLE), robot, interrupts, hung.clock) is None
+    assert hanging_angles(leg_drives(hung, ANKLE), robot, interrupts, hung.clock) is None
 
 
 def run_ankle(
