@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from enum import IntFlag
 from typing import Final, NamedTuple, Protocol
 
+from shared.can.cansimple import AxisError, ControllerError, EncoderError, MotorError
 from shared.can.drive_settings import AXES
 from shared.exceptions import DriveError
 
@@ -17,7 +19,10 @@ FIRMWARE: Final = (0, 5, 6)
 OLDEST: Final = (0, 5, 4)
 """Before it, the CAN settings, the board's error register and the heartbeat are other ones."""
 
-AXIS_ERRORS: Final = ("error", "motor.error", "encoder.error", "controller.error")
+AXIS_ERRORS: Final[dict[str, type[IntFlag]]] = {
+    "error": AxisError, "motor.error": MotorError, "encoder.error": EncoderError,
+    "controller.error": ControllerError,
+}  # fmt: skip
 """An axis's error registers; any may be set while the others are 0."""
 _AXIS_STATUS: Final = (
     *AXIS_ERRORS,

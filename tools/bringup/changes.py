@@ -91,7 +91,7 @@ def against_backup(module: str, saved: Mapping[str, Value], board: Board) -> lis
         else:
             inhibit = ""
         fits, before = partial(equal, value), settings.get(name)
-        changes.append(SettingChange(module, name, before, value, "", inhibit, fits))
+        changes.append(SettingChange(module, name, before, value, "", inhibit=inhibit, fits=fits))
     return changes
 
 

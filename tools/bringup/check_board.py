@@ -7,31 +7,16 @@ from enum import IntFlag
 from typing import Final
 
 from services.joint.differential import joint_from_motor
-from shared.can.cansimple import (
-    AxisError,
-    AxisState,
-    ControllerError,
-    EncoderError,
-    MotorError,
-    OdriveError,
-)
+from shared.can.cansimple import AxisError, AxisState, OdriveError
 from shared.can.drive_settings import AXES, WantedSetting, describe_value
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
 from shared.joints import AXES as JOINT_AXES
 from shared.joints import MODULE_INDEX
-from tools.bringup.boards import FIRMWARE, Value, describe_firmware, is_known, number
+from tools.bringup.boards import AXIS_ERRORS, FIRMWARE, Value, describe_firmware, is_known, number
 from tools.bringup.findings import Finding, advised, judged, ok, warning, wrong
 
 Values = Mapping[str, Value]
-
-REGISTERS: Final[tuple[tuple[str, type[IntFlag]], ...]] = (
-    ("error", AxisError),
-    ("motor.error", MotorError),
-    ("encoder.error", EncoderError),
-    ("controller.error", ControllerError),
-)
-"""An axis's error registers, in the order of `boards.AXIS_ERRORS`."""
 
 OVERVOLTAGE_SHARE: Final = 0.95
 """Fraction of the trip level; a supply closer to it leaves braking legs no room."""
@@ -40,6 +25,7 @@ TEMPERATURES: Final = (-10.0, 70.0)
 """C; of an output stage that is idle."""
 _DIRECTION: Final = "encoder.config.direction"
 
+FIND_CAUSE: Final = "find what caused it; `xrl up` clears it at arming, power off and on does too"
 CALIBRATE: Final = (
     "unload the joint, `odrivetool`: requested_state = AXIS_STATE_FULL_CALIBRATION_SEQUENCE, "
     "then pre_calibrated = True on motor and encoder"
@@ -108,19 +94,17 @@ def error_rows(module: str, values: Values) -> list[Finding]:
 
     Arming clears them all, so a watchdog that expired while no service ran is no fault.
     """
-    fix = "find what caused it; `xrl up` clears it at arming, power off and on does too"
     rows = []
-    error = int(number(values, "error"))
-    if error:
+    if error := int(number(values, "error")):
         found = describe_flags(OdriveError, error)
-        rows.append(wrong(module, "error", found, "none", fix, "both axes disarm"))
+        rows.append(wrong(module, "error", found, "none", FIND_CAUSE, "both axes disarm"))
     for axis in AXES:
-        for name, kind in REGISTERS:
+        for name, kind in AXIS_ERRORS.items():
             bits = int(number(values, f"{axis}.{name}"))
             benign = kind is AxisError and bits == AxisError.WATCHDOG_TIMER_EXPIRED
             if bits and not benign:
                 found = describe_flags(kind, bits)
-                rows.append(wrong(f"{module}.{axis}", name, found, "none", fix))
+                rows.append(wrong(f"{module}.{axis}", name, found, "none", FIND_CAUSE))
     return rows or [ok(module, "errors", "none", "none")]
 
 
@@ -175,10 +159,8 @@ def position_rows(module: str, turns: tuple[float, float], robot: RobotConfig) -
     q = joint_from_motor((a, b), robot.joint.gear_ratio)
     rows = [ok(module, "zero", "known", "known")]
     limits = robot.joint_limits()[2 * MODULE_INDEX[module] :][:2]
-    fix, why = (
-        f"move it there by hand; if it is there, {again}",
-        "it is not armed outside of its limits",
-    )
+    fix = f"move it there by hand; if it is there, {again}"
+    why = "it is not armed outside of its limits"
     for name, angle, (low, high) in zip(JOINT_AXES, q, limits, strict=True):
         inside, found, wanted = low <= angle <= high, f"{angle:.2f} rad", f"{low:g} to {high:g}"
         rows.append(judged(inside, f"{module}.{name}", "angle", found, wanted, fix, why))

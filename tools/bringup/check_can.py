@@ -11,7 +11,7 @@ from shared.can.drive_settings import AXES
 from shared.config.robot_config import RobotConfig
 from tools.bringup.boards import describe_firmware
 from tools.bringup.can_monitor import BusTraffic, NodeTraffic, SensorTraffic, mean_ms, period_ms
-from tools.bringup.check_board import describe_flags, state_row
+from tools.bringup.check_board import FIND_CAUSE, describe_flags, state_row
 from tools.bringup.check_socketcan import up_command
 from tools.bringup.findings import Finding, advised, judged, warning, wrong
 from tools.fleet.process_table import SIMULATED_CAN
@@ -156,12 +156,11 @@ def _axis_rows(
     # Errors by the flags too: `axis_error` alone can stay 0.
     errors = traffic.heartbeat.errors & ~AxisError.WATCHDOG_TIMER_EXPIRED
     words = describe_flags(AxisError, errors) if errors else "none"
-    fix = "find what caused it; `xrl up` clears it at arming, power off and on does too"
     beats, estimates = traffic.heartbeats_s, traffic.estimates_s
     return [
         _period(subject, "heartbeat", beats, drive.heartbeat_period_ms, "heartbeat_rate_ms"),
         _period(subject, "encoder frames", estimates, drive.encoder_period_ms, "encoder_rate_ms"),
-        judged(not errors, subject, "errors", words, "none", fix),
+        judged(not errors, subject, "errors", words, "none", FIND_CAUSE),
         state_row(subject, traffic.heartbeat.axis_state, services_up=services_up),
     ]
 

@@ -71,12 +71,12 @@ def ok(subject: str, what: str, found: str, wanted: str = "") -> Finding:
 
 def warning(subject: str, what: str, found: str, wanted: str, fix: str, why: str = "") -> Finding:
     """Return a row that somebody should know of."""
-    return Finding(subject, what, found, wanted, FindingKind.WARNING, fix, why)
+    return Finding(subject, what, found, wanted, FindingKind.WARNING, fix=fix, why=why)
 
 
 def wrong(subject: str, what: str, found: str, wanted: str, fix: str, why: str = "") -> Finding:
     """Return a row that keeps the robot in its hoist."""
-    return Finding(subject, what, found, wanted, FindingKind.WRONG, fix, why)
+    return Finding(subject, what, found, wanted, FindingKind.WRONG, fix=fix, why=why)
 
 
 def judged(

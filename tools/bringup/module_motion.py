@@ -29,7 +29,7 @@ from tools.bringup.motion import (
     why_out_of_reach,
     within_stops,
 )
-from tools.bringup.motion_runner import NOT_IDLE, Interrupts, look_at, run_motion
+from tools.bringup.motion_runner import NOT_IDLE, Interrupts, hanging_angles, run_motion
 from tools.flags import MotionFlags
 from tools.terminal import Console, marked
 
@@ -79,7 +79,7 @@ def refuse_services(robot: RobotConfig, modules: Sequence[str], run_dir: Path) -
         refuse_service(robot, name, run_dir)
 
 
-def look_ask_and_move(
+def ask_and_move(
     flags: MotionFlags,
     robot: RobotConfig,
     joint: tuple[str, int],
@@ -108,7 +108,7 @@ def look_ask_and_move(
         interrupts.kept(),
         console.status("looking" if alone else "waiting until the leg hangs still"),
     ):
-        q = look_at(drives, robot, interrupts, until_still=not alone)
+        q = hanging_angles(drives, robot, interrupts, until_still=not alone)
     if q is None:
         return Stopped("nothing was moved yet")
     plan = plan_of(q)

@@ -117,7 +117,7 @@ def idle_reading(drive: Drive, clock: Clock = now_ns) -> DriveReading:
     return reading
 
 
-def look_at(
+def hanging_angles(
     drives: Mapping[str, Drive],
     robot: RobotConfig,
     interrupts: Interrupts,

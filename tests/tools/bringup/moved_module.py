@@ -13,7 +13,7 @@ from tools.bringup.hanging_leg import HangingJoint, hanging_joint, leg_of
 from tools.bringup.identify.sines import SinePlan, plan_for
 from tools.bringup.jog import JogPlan, ThereAndBack
 from tools.bringup.motion import AnyPlan, Sample, limit_drives, within_stops
-from tools.bringup.motion_runner import Interrupts, MotionResult, look_at, run_motion
+from tools.bringup.motion_runner import Interrupts, MotionResult, hanging_angles, run_motion
 
 MODULE = "knee_left"
 PLAN = JogPlan(axis=1, course=ThereAndBack(0.05, 2.0, 2), torque_limit=10.0)
@@ -67,7 +67,7 @@ def hanging(
 ) -> tuple[MotionResult, SinePlan, HangingJoint]:
     """Return how sines of a joint ended, its leg's other modules held."""
     leg = leg_drives(hung, module)
-    q = look_at(leg, robot, Interrupts(), hung.clock)
+    q = hanging_angles(leg, robot, Interrupts(), hung.clock)
     assert q is not None
     joint = hanging_joint(robot, q, module, axis)
     plan = plan_for(axis, 15.0, robot.joint.armature, joint)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 from collections.abc import Callable
 
@@ -28,7 +29,7 @@ from tests.tools.bringup.moved_module import (
 from tools.bringup import motion_runner
 from tools.bringup.jog import JogPlan, ThereAndBack, judge
 from tools.bringup.motion import APART_MAX, Sample, limit_drives
-from tools.bringup.motion_runner import Interrupts, MotionResult, look_at
+from tools.bringup.motion_runner import Interrupts, MotionResult, hanging_angles
 
 ANKLE = "ankle_left"
 
@@ -62,45 +63,30 @@ def test_a_free_joint_follows_and_comes_back_and_is_idle(
     assert len(seen) > 8
 
 
-def test_a_jammed_joint_is_given_up_at_the_torque_limit(
-    drive: BenchDrive, limited: RobotConfig
-) -> None:
-    drive.jammed = True
-    result = on_bench(drive, limited, jog_by(0.12))
-    assert "torque limit of 10 N m" in result.trouble
-    assert drive.largest == pytest.approx(PLAN.torque_limit, abs=0.01)
-    assert result.not_idle == ()
+FAULTS: dict[str, tuple[dict[str, object], JogPlan, str]] = {
+    "a jammed joint": ({"jammed": True}, jog_by(0.12), "at the torque limit of 10 N m"),
+    "motors that push the wrong way": ({"reversed": True}, PLAN, "apart|torque limit"),
+    "a drive that disarms": ({"fails_at_s": 1.2}, PLAN, "the drive is ERROR"),
+    "a drive that does not arm": ({"never_arms": True}, PLAN, "does not arm: IDLE"),
+    "a drive that falls silent": ({"silent_at_s": 1.2}, PLAN, "no sample of the drive"),
+    "a drive that stays armed": ({"deaf": True}, PLAN, "^$"),
+}
 
 
-def test_motors_that_push_the_wrong_way_stop_within_the_torque_limit(
-    drive: BenchDrive, limited: RobotConfig
-) -> None:
-    drive.reversed = True
-    result = on_bench(drive, limited)
-    assert "apart" in result.trouble or "torque limit" in result.trouble
-    assert drive.largest <= PLAN.torque_limit + 1e-9
-    strayed = max(abs(a - b) for a, b in zip(result.samples[-1].q, START, strict=True))
-    assert strayed < 1.5 * APART_MAX
-    assert drive.status is DriveStatus.IDLE
-
-
-@pytest.mark.parametrize(
-    ("fault", "words"),
-    [
-        ({"fails_at_s": 1.2}, "the drive is ERROR"),
-        ({"never_arms": True}, "does not arm: IDLE"),
-        ({"silent_at_s": 1.2}, "no sample of the drive"),
-    ],
-)
-def test_a_drive_that_fails_stops_it(
-    drive: BenchDrive, limited: RobotConfig, fault: dict[str, float], words: str
+@pytest.mark.parametrize(("fault", "plan", "words"), FAULTS.values(), ids=FAULTS.keys())
+def test_a_fault_stops_it_within_the_torque_limit_and_the_drive_is_idled(
+    drive: BenchDrive, limited: RobotConfig, fault: dict[str, object], plan: JogPlan, words: str
 ) -> None:
     for name, value in fault.items():
         setattr(drive, name, value)
-    result = on_bench(drive, limited)
-    assert words in result.trouble
+    result = on_bench(drive, limited, plan)
+    assert re.search(words, result.trouble)
+    assert drive.largest <= PLAN.torque_limit + 1e-9
     assert drive.idles >= 3
-    assert bool(result.not_idle) == ("silent_at_s" in fault), "a silent drive proves nothing"
+    # a silent drive proves nothing
+    assert bool(result.not_idle) == bool({"silent_at_s", "deaf"} & set(fault))
+    for sample in result.samples:
+        assert max(abs(a - b) for a, b in zip(sample.q, START, strict=True)) < 1.5 * APART_MAX
 
 
 def test_samples_that_come_too_seldom_end_it(
@@ -110,13 +96,6 @@ def test_samples_that_come_too_seldom_end_it(
     result = on_bench(drive, limited)
     assert "the drive's samples come too seldom" in result.trouble
     assert drive.status is DriveStatus.IDLE
-
-
-def test_a_drive_that_stays_armed_is_not_reported_idle(
-    drive: BenchDrive, limited: RobotConfig
-) -> None:
-    drive.deaf = True
-    assert on_bench(drive, limited).not_idle == (MODULE,)
 
 
 @pytest.mark.parametrize(
@@ -132,7 +111,7 @@ def test_a_drive_that_is_somebodys_or_has_no_zero_is_not_looked_at_further(
 ) -> None:
     drive.status = status
     with pytest.raises(DriveError, match=f"{MODULE}: .*{words}"):
-        look_at({MODULE: drive}, robot, Interrupts(), drive.clock)
+        hanging_angles({MODULE: drive}, robot, Interrupts(), drive.clock)
     assert drive.largest == 0.0
 
 
@@ -159,25 +138,19 @@ def test_a_drive_is_not_armed_after_an_interrupt(drive: BenchDrive, limited: Rob
     assert armed == []
 
 
-def test_an_error_of_our_own_idles_the_drive_too(drive: BenchDrive, limited: RobotConfig) -> None:
-    def broken(_sample: Sample) -> None:
-        raise BrokenPipeError
-
-    with pytest.raises(BrokenPipeError):
-        on_bench(drive, limited, progress=broken)
-    assert drive.status is DriveStatus.IDLE
-
-
-def test_a_drive_that_stays_armed_after_an_error_is_named_in_it(
-    drive: BenchDrive, limited: RobotConfig
+@pytest.mark.parametrize("deaf", [False, True])
+def test_an_error_of_our_own_idles_the_drive_or_says_that_it_did_not(
+    drive: BenchDrive, limited: RobotConfig, deaf: bool
 ) -> None:
     def broken(_sample: Sample) -> None:
         raise BrokenPipeError
 
-    drive.deaf = True
+    drive.deaf = deaf
     with pytest.raises(BrokenPipeError) as raised:
         on_bench(drive, limited, progress=broken)
-    assert "CUT ITS POWER" in raised.value.__notes__[0]
+    assert (drive.status is DriveStatus.IDLE) != deaf
+    notes = "".join(getattr(raised.value, "__notes__", []))
+    assert ("CUT ITS POWER" in notes) == deaf
 
 
 @pytest.mark.parametrize(
@@ -204,9 +177,9 @@ def test_a_leg_that_swings_is_waited_for_but_not_for_ever(
     hung.world.data.qvel[6:] = 0.5
     monkeypatch.setattr(motion_runner, "STILL_WAIT_S", 1.0)
     with pytest.raises(DriveError, match="swings"):
-        look_at(leg_drives(hung, ANKLE), robot, interrupts, hung.clock)
+        hanging_angles(leg_drives(hung, ANKLE), robot, interrupts, hung.clock)
     interrupts.number = 2
-    assert look_at(leg_drives(hung, ANKLE), robot, interrupts, hung.clock) is None
+    assert hanging_angles(leg_drives(hung, ANKLE), robot, interrupts, hung.clock) is None
 
 
 def run_ankle(

@@ -115,7 +115,7 @@ def _measure(
         console.print(_described(name, plan))
         return plan
 
-    moved = module_motion.look_ask_and_move(flags, robot, joint, plan_of, interrupts, console)
+    moved = module_motion.ask_and_move(flags, robot, joint, plan_of, interrupts, console)
     if not isinstance(moved, module_motion.Moved):
         return moved
     fit = fit_sines(moved.samples, moved.plan)

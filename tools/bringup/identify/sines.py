@@ -191,14 +191,9 @@ def fit_sines(samples: Sequence[Sample], plan: SinePlan) -> JointFit | None:
     viscous_sd = math.hypot(viscous_sd, k_p * TIME_SD)
     dry_sd = math.hypot(dry_sd, DRY_SD)
     return JointFit(
-        (inertia, inertia_sd),
-        (viscous, viscous_sd),
-        (dry, dry_sd),
-        (stiffness, stiffness_sd),
-        q,
-        tau,
-        regressors @ x,
-    )
+        inertia=(inertia, inertia_sd), viscous=(viscous, viscous_sd), dry=(dry, dry_sd),
+        stiffness=(stiffness, stiffness_sd), q=q, tau=tau, fitted=regressors @ x,
+    )  # fmt: skip
 
 
 def _steady(

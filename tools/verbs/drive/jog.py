@@ -19,8 +19,8 @@ from tools.bringup.jog import JogPlan, ThereAndBack, judge, what_to_see
 from tools.bringup.module_motion import (
     Moved,
     Stopped,
+    ask_and_move,
     exit_if_interrupted,
-    look_ask_and_move,
     tell_stopped,
 )
 from tools.bringup.motion import limit_drives
@@ -97,7 +97,7 @@ def run(flags: JogFlags) -> int:
     with drive_access.drives_to_ourselves(robot, path, flags.run_dir, console.print) as started:
         if started:
             console.print(f"its soles rest on the floor: a leg needs --torque-limit {EMULATED:g}")
-        moved = look_ask_and_move(
+        moved = ask_and_move(
             flags, robot, (module, plan.axis), introduce, interrupts, console, alone=True
         )
     if moved is None:

@@ -316,7 +316,7 @@ def _tune_module(flags: TuneFlags, console: Console) -> int:
     with drive_access.drives_to_ourselves(
         robot, path, flags.run_dir, console.print, lifted=module_motion.LIFTED
     ):
-        moved = module_motion.look_ask_and_move(flags, robot, joint, plan_of, interrupts, console)
+        moved = module_motion.ask_and_move(flags, robot, joint, plan_of, interrupts, console)
     if moved is None:
         return 0
     if isinstance(moved, module_motion.Stopped):
