@@ -102,7 +102,13 @@ class _TopParser(argparse.ArgumentParser):
 
 def whole_parser() -> argparse.ArgumentParser:
     """Return the parser with every verb complete; takes a second or two."""
-    return _parser([], whole=True)
+    parsers = [_parser([], whole=True)]
+    for parser in parsers:
+        parser.format_help()  # a study's parser has its flags once it is used
+        for action in parser._actions:  # noqa: SLF001 - argparse has no other list of them
+            if isinstance(action, argparse._SubParsersAction):  # noqa: SLF001
+                parsers += dict.fromkeys(action.choices.values())
+    return parsers[0]
 
 
 def _parser(arguments: Sequence[str], *, whole: bool = False) -> argparse.ArgumentParser:

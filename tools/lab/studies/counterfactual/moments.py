@@ -28,7 +28,7 @@ T = TypeVar("T")
 EARLY_S: Final = 0.5 / topics.SIM_STATE.rate_hz
 """A state so long before a moment is the nearest one."""
 NEAR_NS: Final = 12 * NS_PER_MS
-"""A service whose last cycle lies further before a moment is taken for dead in it."""
+"""A service whose last cycle lies further before a moment counts as dead in it."""
 
 
 class Moment(msgspec.Struct):

@@ -27,13 +27,13 @@ UNSAFE: Final = (Mode.FAULT, Mode.DAMP, Mode.DISARMED)
 """What no module that was not hit may come to."""
 
 
-class Heard(NamedTuple):
+class CrashMessages(NamedTuple):
     """Messages of a run."""
 
     truth: Sequence[SimTruth]
     events: Sequence[tuple[str, JointEvent]]
     """With the module, in the order of each module."""
-    said: Sequence[RunEvent]
+    actions: Sequence[RunEvent]
     """Actions on the run."""
     modes: Sequence[str]
     """The modules at the end, as in `scenario_runner.LiveSnapshot`."""
@@ -83,13 +83,13 @@ def unjudged(reason: str) -> CrashResult:
     return CrashResult(verdict=CrashVerdict.UNJUDGED, remarks=(reason,))
 
 
-def measure(case: CrashCase, heard: Heard, robot: RobotConfig) -> CrashResult:
+def measure(case: CrashCase, messages: CrashMessages, robot: RobotConfig) -> CrashResult:
     """Return what came of a run."""
-    truth = [row for row in heard.truth if row.scenario_s >= 0.0]
+    truth = [row for row in messages.truth if row.scenario_s >= 0.0]
     if not truth:
         return unjudged("the scenario never began")
     zero_ns = truth[0].t_ns - round(truth[0].scenario_s * NS_PER_S)
-    crash_s = _crash_s(case, heard.said)
+    crash_s = _crash_s(case, messages.actions)
     if crash_s is None:
         return unjudged("its moment never came: the modules did not track again in time")
     after = [row for row in truth if row.scenario_s >= crash_s]
@@ -97,10 +97,10 @@ def measure(case: CrashCase, heard: Heard, robot: RobotConfig) -> CrashResult:
         return unjudged(f"ended at {truth[-1].scenario_s:.1f} s, before the crash")
     crash_ns = zero_ns + round(crash_s * NS_PER_S)
     request_ns = zero_ns + round(REQUEST_S * NS_PER_S)
-    reaction = [(name, e) for name, e in heard.events if crash_ns <= e.t_ns < request_ns]
-    safe_ms = _safe_ms(case, heard.events, crash_ns, request_ns)
+    reaction = [(name, e) for name, e in messages.events if crash_ns <= e.t_ns < request_ns]
+    safe_ms = _safe_ms(case, messages.events, crash_ns, request_ns)
     holds = [e for name, e in reaction if name in case.others and e.mode_after == Mode.HOLD]
-    later = [event for _, event in heard.events if event.t_ns >= request_ns]
+    later = [event for _, event in messages.events if event.t_ns >= request_ns]
     fell_at = next((row.scenario_s for row in truth if row.fallen), None)
     standing = [row for row in after if not row.fallen] or after[:1]
     scenario = scenario_of(case)
@@ -119,14 +119,14 @@ def measure(case: CrashCase, heard: Heard, robot: RobotConfig) -> CrashResult:
     elif sank > SANK_M:
         verdict = CrashVerdict.SANK
     remarks += _remarks(case, safe_ms, reaction)
-    remarks += [f"{name} ended by itself" for name in heard.died]
-    leads = all(mode == "T" for mode in heard.modes)
+    remarks += [f"{name} ended by itself" for name in messages.died]
+    leads = all(mode == "T" for mode in messages.modes)
     if verdict is not CrashVerdict.FELL and not leads and case.leads_again:
-        remarks.append(f"does not lead again: {''.join(heard.modes)}")
+        remarks.append(f"does not lead again: {''.join(messages.modes)}")
     tracks = [event.t_ns for event in later if event.mode_after == Mode.TRACK]
     backs = [
         row.t_ns
-        for row in heard.said
+        for row in messages.actions
         if row.kind == RunEventKind.RESTARTED and row.scenario_s >= REQUEST_S
     ]
     x, y = ([1e3 * row.over[axis] for row in standing] for axis in (0, 1))
@@ -146,11 +146,11 @@ def measure(case: CrashCase, heard: Heard, robot: RobotConfig) -> CrashResult:
     )
 
 
-def _crash_s(case: CrashCase, said: Sequence[RunEvent]) -> float | None:
+def _crash_s(case: CrashCase, actions: Sequence[RunEvent]) -> float | None:
     """Return the scenario time of the crash, s: of the triggered kill, if there is one."""
     kills = [
         row.scenario_s
-        for row in said
+        for row in actions
         if row.kind == RunEventKind.KILLED and row.scenario_s < REQUEST_S - END_TOLERANCE_S
     ]
     if case.triggered_kill is not None:

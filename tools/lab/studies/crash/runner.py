@@ -21,7 +21,13 @@ from shared.joints import MODULES
 from tools.fleet.supervise import SupervisedFleet
 from tools.fleet.supervisor_client import ServiceInfo
 from tools.lab.studies.crash.cases import CrashCase, CrashVerdict, scenario_of
-from tools.lab.studies.crash.outcome import CrashResult, Heard, as_expected, measure, unjudged
+from tools.lab.studies.crash.outcome import (
+    CrashMessages,
+    CrashResult,
+    as_expected,
+    measure,
+    unjudged,
+)
 from tools.live.live import run_live
 from tools.live.scenario_runner import LiveSnapshot, ScenarioRunner
 
@@ -94,13 +100,13 @@ def _run_once(case: CrashCase, robot: RobotConfig, out: Path, show: Show, seed: 
     scenario = scenario_of(case)
     down = {row.service for row in scenario.kill}
 
-    def lead(fleet: SupervisedFleet, session: Session) -> Heard:
+    def lead(fleet: SupervisedFleet, session: Session) -> CrashMessages:
         witness = Witness(session, show)
         conductor = ScenarioRunner(fleet, session, scenario, witness.see, case.triggered_kill)
         conductor.run()
         witness.listen()
         died = died_of(fleet.info(), conductor.said)
-        return Heard(witness.truth, witness.events, conductor.said, witness.modes, died)
+        return CrashMessages(witness.truth, witness.events, conductor.said, witness.modes, died)
 
     try:
         run = run_live(
@@ -119,9 +125,9 @@ def _run_once(case: CrashCase, robot: RobotConfig, out: Path, show: Show, seed: 
     return measure(case, run, robot)
 
 
-def died_of(services: Sequence[ServiceInfo], said: Sequence[RunEvent]) -> list[str]:
+def died_of(services: Sequence[ServiceInfo], actions: Sequence[RunEvent]) -> list[str]:
     """Return the services that ended without a request, by their states and the actions on them."""
-    last = {row.subject: row.kind for row in said}
+    last = {row.subject: row.kind for row in actions}
     return [
         service.name
         for service in services

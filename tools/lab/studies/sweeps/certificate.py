@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from services.simulator.physics.plant import IDEAL
 from shared.config import files as config_file
-from shared.config.robot_config import RobotConfig
 from shared.exceptions import FELL_EXIT_CODE
 from tools.lab.studies.sweeps import certificate_trial
 from tools.lab.studies.sweeps.certificate_trial import (
@@ -50,14 +50,6 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="with the joints' dry friction, which holds up what is a little too soft",
     )
-
-
-def cases(
-    args: argparse.Namespace, robot: RobotConfig
-) -> tuple[int, Callable[[int], CertificateCase]]:
-    """Return how many cases there are, and which has a number."""
-    drawn = CertificateCases(robot)
-    return args.n, lambda number: drawn.draw(args.seed, number)
 
 
 def _options(args: argparse.Namespace) -> dict[str, Any]:
@@ -118,12 +110,8 @@ STUDY: Final = Study[CertificateCase](
     n=200,
     add_flags=add_flags,
     load=lambda args: config_file.load(args.config),
-    cases=cases,
-    inputs=lambda args: {
-        "seed": str(args.seed),
-        "rigid": str(args.rigid),
-        "friction": str(args.friction),
-    },
+    cases=lambda args, robot: partial(CertificateCases(robot).draw, args.seed),
+    decided_by=("seed", "rigid", "friction"),
     row=certificate_trial.row_of,
     words=lambda case: f"margin {case.weakest.margin:.3g}",
     figures=CertificateResult,

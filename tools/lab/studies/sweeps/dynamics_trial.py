@@ -218,7 +218,7 @@ def run_trial(trial: DynamicsTrial, robot: RobotConfig) -> DynamicsResult:
             if row.fallen:
                 return UNREADY
         if predicted is None and row.scenario_s >= TAKEN_OVER_S:
-            predicted = _said(fleet, other, trial)
+            predicted = _predicted(fleet, other, trial)
             if predicted is None:
                 return UNREADY
             _take_over(fleet, other)
@@ -252,7 +252,7 @@ def _take_over(fleet: Lockstep, robot: RobotConfig) -> None:
     fleet.planner.restore(before.snapshot())
 
 
-def _said(fleet: Lockstep, robot: RobotConfig, trial: DynamicsTrial) -> DynamicsResult | None:
+def _predicted(fleet: Lockstep, robot: RobotConfig, trial: DynamicsTrial) -> DynamicsResult | None:
     """Ask the certificate about where the robot is now; None: no level stand is near."""
     assert fleet.planner is not None  # noqa: S101 - nobody kills it
     schedule = robot.gain_schedule

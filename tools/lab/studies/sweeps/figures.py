@@ -54,7 +54,7 @@ def exit_code(endings: Iterable[str]) -> int:
     return FAULT_EXIT_CODE if not_stood else 0
 
 
-def that_count(
+def rows_that_count(
     run: Iterable[SimTruth], from_s: float, watch: Watch, after_fall_s: float
 ) -> Iterator[SimTruth]:
     """Run to the end or to the fall; yield what counts of it, a fall included.

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from typing import Final
 
 from rich.table import Table
 
 from shared.config.robot_config import RobotConfig
 from tools.lab.studies.sweeps import kill_picture, kill_trial, plants, push_range
-from tools.lab.studies.sweeps.figures import Ending, exit_code, with_payload
+from tools.lab.studies.sweeps.figures import Ending, with_payload
 from tools.lab.studies.sweeps.kill_trial import PUSHES_MAX, KillCase, KillCases, KillResult
 from tools.lab.studies.sweeps.report import parted, show_falls, show_share
 from tools.lab.studies.sweeps.study import CaseLog, Finished, Study, bar
@@ -50,12 +51,6 @@ def load(args: argparse.Namespace) -> RobotConfig:
     """Check the flags and return the robot."""
     push_range.check(args)
     return experiment.make_robot(args)
-
-
-def cases(args: argparse.Namespace, robot: RobotConfig) -> tuple[int, Callable[[int], KillCase]]:
-    """Return how many cases there are, and which has a number."""
-    drawn = KillCases(robot, args.push)
-    return args.n, lambda number: drawn.draw(args.seed, number)
 
 
 def _robots(
@@ -136,18 +131,13 @@ STUDY: Final = Study[KillCase](
     only="run this case alone and print all of it; exit code 1 if it fell",
     add_flags=add_flags,
     load=load,
-    cases=cases,
-    inputs=lambda args: {
-        "seed": str(args.seed),
-        "push": f"{args.push:g}",
-        "ranges": plants.digest(),
-    },
+    cases=lambda args, robot: partial(KillCases(robot, args.push).draw, args.seed),
+    decided_by=("seed", "push"),
+    inputs=lambda _args: {"ranges": plants.digest()},
     row=kill_trial.row_of,
     figures=KillResult,
     trial=kill_trial.run_case,
     robots=_robots,
     log=CaseLog(kill_trial.scenario_of, kill_trial.plant_of, _metadata),
-    fell=lambda row: row["ending"] is not Ending.STOOD,
     report=report,
-    exit_code=lambda rows: exit_code(row["ending"] for row in rows),
 )

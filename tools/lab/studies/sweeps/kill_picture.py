@@ -107,14 +107,14 @@ def _draw_pushes(axis: Any, rows: Sequence[Row], norm: colors.BoundaryNorm) -> N
     axis.set_xticks(
         [0.0, math.pi / 2, math.pi, 3 * math.pi / 2], ["forward", "left", "back", "right"]
     )
-    looks: Sequence[Any] = (
+    styles: Sequence[Any] = (
         ("stood, hand on", "o", "full", "#555555"),
         ("stood, hand off", "o", "none", "#555555"),
         ("fell (on the edge), with its number", "x", "full", FALL_COLOUR),
     )
     handles = [
         lines.Line2D([], [], ls="", marker=marker, fillstyle=fill, color=colour, label=words)
-        for words, marker, fill, colour in looks
+        for words, marker, fill, colour in styles
     ]
     axis.legend(handles=handles, loc="lower left", bbox_to_anchor=(-0.3, -0.12), fontsize=8)
 

@@ -39,9 +39,9 @@ from tools.lab.studies.sweeps.figures import (
     ending_of,
     event_steps_nm,
     operator_peak_n,
+    rows_that_count,
     scalars,
     sole_tilt_max_rad,
-    that_count,
     unwatched,
     with_payload,
 )
@@ -103,10 +103,10 @@ class KillCase(msgspec.Struct, frozen=True, kw_only=True):
     moving: bool
     """True: killed on the way to the last pose; False: after it has been reached."""
     way_end_s: float
-    """When the operator is at the last pose, if he holds on."""
+    """When the operator is at the last pose, with the hand on."""
     kill_s: float
     let_go_s: float | None
-    """When the operator takes the hand off; None: never. The weight he rests stays."""
+    """When the operator takes the hand off; None: never. The rested weight stays."""
     delay_ms: float
     pushes: tuple[Push, ...]
 
@@ -338,12 +338,12 @@ def run_case(
     rows: list[SimTruth] = []
     loads: list[float] = []
 
-    def see(row: SimTruth) -> None:
+    def let_go_in_time(row: SimTruth) -> None:
         if case.let_go_s is not None and row.scenario_s >= case.let_go_s:
             fleet.world.let_go()
         watch(row)
 
-    for row in that_count(fleet.run(), 0.0, see, after_fall_s):
+    for row in rows_that_count(fleet.run(), 0.0, let_go_in_time, after_fall_s):
         rows.append(row)
         loads.append(min(feet.read()))
     return measure(case, rows, loads, fleet.events, monitor, robot)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import product
 from typing import Final
 
@@ -13,7 +14,6 @@ import msgspec
 from shared.config.robot_config import RobotConfig
 from shared.toml_file import check_ranges
 from tools.lab.studies.sweeps import latency_picture, latency_report, latency_trial, plants
-from tools.lab.studies.sweeps.figures import Ending, exit_code
 from tools.lab.studies.sweeps.latency_trial import (
     CONTROLS,
     LatencyResult,
@@ -22,7 +22,7 @@ from tools.lab.studies.sweeps.latency_trial import (
     robot_of,
 )
 from tools.lab.studies.sweeps.study import CaseLog, Finished, Study
-from tools.lab.studies.sweeps.table import DECIMALS, plain
+from tools.lab.studies.sweeps.table import DECIMALS
 from tools.live import experiment
 from tools.number_arguments import count, finite
 from tools.terminal import Console
@@ -119,25 +119,21 @@ def load(args: argparse.Namespace) -> RobotConfig:
     return robot
 
 
-def cases(
-    args: argparse.Namespace, _robot: RobotConfig | None = None
-) -> tuple[int, Callable[[int], LatencyTrial]]:
-    """Return how many trials there are, and which has a number.
+def grid_of(args: argparse.Namespace) -> list[tuple[Network, str]]:
+    """Return each network with each control."""
+    networks = [Network(d, j, p) for p, j, d in product(args.loss, args.jitter, args.delay)]
+    return list(product(networks, args.control))
+
+
+def trial_of(grid: Sequence[tuple[Network, str]], seed: int, number: int) -> LatencyTrial:
+    """Return the trial of a number.
 
     The whole grid comes once, then again: an interrupted study has trials of each network, and a
     resumed one may have more trials.
     """
-    networks = [Network(d, j, p) for p, j, d in product(args.loss, args.jitter, args.delay)]
-    grid = list(product(networks, args.control))
-
-    def trial(number: int) -> LatencyTrial:
-        repeat, place = divmod(number, len(grid))
-        network, control = grid[place]
-        return LatencyTrial(
-            number=number, repeat=repeat, seed=args.seed, control=control, network=network
-        )
-
-    return args.trials * len(grid), trial
+    repeat, place = divmod(number, len(grid))
+    network, control = grid[place]
+    return LatencyTrial(number=number, repeat=repeat, seed=seed, control=control, network=network)
 
 
 def _robots(
@@ -145,13 +141,6 @@ def _robots(
 ) -> list[RobotConfig]:
     by_control = {name: robot_of(robot, name) for name in CONTROLS}
     return [by_control[trial.control] for trial in trials]
-
-
-def _inputs(args: argparse.Namespace) -> dict[str, str]:
-    names = ("delay", "jitter", "loss")
-    lists = {name: ",".join(map(plain, getattr(args, name))) for name in names}
-    control = ",".join(args.control)
-    return {"seed": str(args.seed), **lists, "control": control, "ranges": plants.digest()}
 
 
 def _report(finished: Finished) -> None:
@@ -171,8 +160,10 @@ STUDY: Final = Study[LatencyTrial](
     "distributed fell)",
     add_flags=add_flags,
     load=load,
-    cases=cases,
-    inputs=_inputs,
+    total=lambda args: args.trials * len(grid_of(args)),
+    cases=lambda args, _robot: partial(trial_of, grid_of(args), args.seed),
+    decided_by=("seed", "delay", "jitter", "loss", "control"),
+    inputs=lambda _args: {"ranges": plants.digest()},
     row=latency_trial.row_of,
     figures=LatencyResult,
     trial=latency_trial.run_trial,
@@ -182,8 +173,6 @@ STUDY: Final = Study[LatencyTrial](
         latency_trial.plant_of,
         lambda trial, command: {"lockstep": command, "control": trial.control},
     ),
-    fell=lambda row: row["ending"] is not Ending.STOOD,
     report=_report,
     counts=lambda row: row["control"] == "distributed",
-    exit_code=lambda rows: exit_code(row["ending"] for row in rows),
 )

@@ -53,7 +53,7 @@ class LineStyle(NamedTuple):
     """Offset of a delay's place, so that nothing hides another."""
 
 
-LOOKS: Final = {
+STYLES: Final = {
     "distributed": LineStyle("#1b7f4b", "o", -0.12),
     "diagonal": LineStyle("#c77700", "s", 0.0),
     "centralised": LineStyle("#7b3fa0", "^", 0.12),
@@ -139,16 +139,16 @@ def _draw_shares(axis: Any, rows: Sequence[Row]) -> None:
     """Share of falls over the delay, all losses together, with its 95 % band."""
     delays = values_in(rows, "delay_ms")
     for name in controls_in(rows):
-        look = LOOKS[name]
+        style = STYLES[name]
         counted = [falls(chosen(rows, name, delay_ms=delay)) for delay in delays]
-        places = [x + look.shift for x, count in enumerate(counted) if count.of]
+        places = [x + style.shift for x, count in enumerate(counted) if count.of]
         counted = [count for count in counted if count.of]
         shares = np.array([100 * count.fallen / count.of for count in counted])
         low, high = 100 * np.transpose([count.bounds for count in counted])
-        axis.fill_between(places, low, high, color=look.colour, alpha=0.13, lw=0)
+        axis.fill_between(places, low, high, color=style.colour, alpha=0.13, lw=0)
         spread = np.maximum(0.0, (shares - low, high - shares))
         axis.errorbar(
-            places, shares, yerr=spread, color=look.colour, marker=look.marker, ms=6, lw=1.6,
+            places, shares, yerr=spread, color=style.colour, marker=style.marker, ms=6, lw=1.6,
             elinewidth=1.2, capsize=3, label=name,
         )  # fmt: skip
     axis.set_xticks(range(len(delays)), [f"{delay:g}" for delay in delays], fontsize=8)
@@ -207,8 +207,8 @@ def _draw_effort(rows: Sequence[Row], force_max: float, what: str, path: Path) -
 
 
 def _draw_control(effort: Any, hold: Any, rows: Sequence[Row], name: str) -> None:
-    look = LOOKS[name]
-    line = {"color": look.colour, "lw": 1.6}
+    style = STYLES[name]
+    line = {"color": style.colour, "lw": 1.6}
     held: list[tuple[float, float]] = []
     points: list[tuple[float, float, float, float]] = []
     for x, delay in enumerate(values_in(rows, "delay_ms")):
@@ -216,16 +216,16 @@ def _draw_control(effort: Any, hold: Any, rows: Sequence[Row], name: str) -> Non
         forces, shares = figures(own, "operator_peak_n"), figures(own, "hold_share")
         if not forces:
             continue
-        place, middle, share = x + look.shift, median(forces), median(shares)
+        place, middle, share = x + style.shift, median(forces), median(shares)
         points.append((place, min(forces), middle, max(forces)))
         held.append((place, 100 * share))
-        face = "white" if share > HOLDS else look.colour
-        effort.plot(place, middle, look.marker, ms=6, mfc=face, color=look.colour, zorder=4)
+        face = "white" if share > HOLDS else style.colour
+        effort.plot(place, middle, style.marker, ms=6, mfc=face, color=style.colour, zorder=4)
         if falls(own).fallen:
             effort.plot(place, middle, "x", color="#222222", ms=9, mew=1.8, zorder=5)
     if not points:
         return
     places, low, middles, high = zip(*points, strict=True)
-    effort.fill_between(places, low, high, color=look.colour, alpha=0.15, lw=0)
-    effort.plot(places, middles, label=name, marker=look.marker, ms=6, **line)
-    hold.plot(*zip(*held, strict=True), marker=look.marker, ms=6, **line)
+    effort.fill_between(places, low, high, color=style.colour, alpha=0.15, lw=0)
+    effort.plot(places, middles, label=name, marker=style.marker, ms=6, **line)
+    hold.plot(*zip(*held, strict=True), marker=style.marker, ms=6, **line)

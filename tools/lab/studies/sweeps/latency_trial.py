@@ -41,9 +41,9 @@ from tools.lab.studies.sweeps.figures import (
     ending_of,
     event_steps_nm,
     operator_peak_n,
+    rows_that_count,
     sole_tilt_max_rad,
     step_nm,
-    that_count,
     unwatched,
 )
 from tools.lab.studies.sweeps.push_range import SHARE, PushRange, uniform
@@ -254,7 +254,7 @@ def run_trial(
     monitor = LatencyRecorder(record, impaired_from_s)
     fleet = fleet_of(trial, robot, monitor)
     rows: list[SimTruth] = []
-    for row in that_count(fleet.run(), impaired_from_s, watch, after_fall_s):
+    for row in rows_that_count(fleet.run(), impaired_from_s, watch, after_fall_s):
         rows.append(row)
         monitor.fallen = row.fallen
     return measure(rows, fleet.events, monitor, robot)

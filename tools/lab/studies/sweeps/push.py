@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any, Final
@@ -14,7 +14,6 @@ from rich.table import Table as Printed
 
 from services.simulator.physics import plant as plants
 from services.simulator.physics.plant import plant_from
-from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from tools.lab.studies.sweeps import push_trial
 from tools.lab.studies.sweeps.push_trial import MODES, POSES, PushResult, PushTrial
@@ -64,25 +63,20 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     experiment.add_plant(parser)
 
 
-def cases(
-    args: argparse.Namespace, _robot: RobotConfig | None = None
-) -> tuple[int, Callable[[int], PushTrial]]:
-    """Return how many points are selected, and which has a number."""
+def trials_of(args: argparse.Namespace) -> list[PushTrial]:
+    """Return the selected points."""
     durations = tuple(args.duration or DURATIONS_S)
     if min(durations) <= 0.0:
         raise RunError(f"--duration {min(durations):g}: must be more than 0 s")
-    grid = list(product(args.pose or POSES, durations, args.angle or ANGLES_DEG, MODES))
-
-    def point(number: int) -> PushTrial:
-        pose, duration, angle, mode = grid[number]
-        return PushTrial(number=number, pose=pose, angle_deg=angle, duration_s=duration, mode=mode)
-
-    return len(grid), point
+    grid = product(args.pose or POSES, durations, args.angle or ANGLES_DEG, MODES)
+    return [
+        PushTrial(number=number, pose=pose, angle_deg=angle, duration_s=duration, mode=mode)
+        for number, (pose, duration, angle, mode) in enumerate(grid)
+    ]
 
 
 def _inputs(args: argparse.Namespace) -> dict[str, str]:
-    total, point = cases(args)
-    grid = repr([msgspec.structs.astuple(point(number)) for number in range(total)])
+    grid = repr([msgspec.structs.astuple(trial) for trial in trials_of(args)])
     return {"plant": plants.to_toml(plant_from(args.plant)), "grid": grid}
 
 
@@ -120,13 +114,13 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     for number, (duration, pose) in enumerate(product(durations, poses)):
         axis: Any = figure.add_subplot(len(durations), len(poses), number + 1, projection="polar")
         axis.set_theta_zero_location("N")
-        for mode, column, colour, style, words in CURVES:
+        for mode, column, colour, line, words in CURVES:
             points = sorted(
                 (row["angle_deg"], row[column])
                 for row in rows
                 if (row["pose"], row["duration_s"], row["mode"]) == (pose, duration, mode)
             )
-            _draw_curve(axis, points, style, color=colour, label=words, markersize=4)
+            _draw_curve(axis, points, line, color=colour, label=words, markersize=4)
         axis.set_thetagrids(range(0, 360, 45), SIDES_DEG)
         axis.set_title(f"{pose}, {duration:g} s, N")
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
@@ -134,13 +128,13 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     save_figure(figure, path)
 
 
-def _draw_curve(axis: Any, points: Sequence[tuple[int, float]], style: str, **look: object) -> None:
+def _draw_curve(axis: Any, points: Sequence[tuple[int, float]], line: str, **style: object) -> None:
     """Draw a curve and its mirror image."""
     mirrored = [(-angle, force) for angle, force in reversed(points) if 0 < angle < 180]
     closing = points[:1] if len(points) > 2 else []
     around = [*points, *mirrored, *closing]
     angles = [math.radians(angle) for angle, _ in around]
-    axis.plot(angles, [force for _, force in around], style, **look)
+    axis.plot(angles, [force for _, force in around], line, **style)
 
 
 STUDY: Final = Study[PushTrial](
@@ -150,12 +144,15 @@ STUDY: Final = Study[PushTrial](
     pictures=(PICTURE,),
     code=("tools.lab.studies.sweeps.push_trial",),
     add_flags=add_flags,
-    cases=cases,
+    total=lambda args: len(trials_of(args)),
+    cases=lambda args, _robot: trials_of(args).__getitem__,
     inputs=_inputs,
     row=msgspec.structs.asdict,
     words=lambda point: point.words,
     figures=PushResult,
     trial=push_trial.run_trial,
     options=_options,
+    fell=lambda _row: False,
     report=_report,
+    exit_code=lambda _rows: 0,
 )

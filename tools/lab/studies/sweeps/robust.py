@@ -14,7 +14,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.extras import late
 from tools.lab.studies.sweeps import plants, push_range, robust_trial
-from tools.lab.studies.sweeps.figures import Ending, exit_code
+from tools.lab.studies.sweeps.figures import Ending
 from tools.lab.studies.sweeps.push_range import PushRange
 from tools.lab.studies.sweeps.report import FALL_COLOUR, parted, show_falls, show_share
 from tools.lab.studies.sweeps.robust_trial import RobustResult, RobustTrial
@@ -72,12 +72,9 @@ def load(args: argparse.Namespace) -> RobotConfig:
     return experiment.load_robot(args.config, imu=args.imu)
 
 
-def cases(args: argparse.Namespace, robot: RobotConfig) -> tuple[int, Callable[[int], RobustTrial]]:
-    """Return how many trials there are, and which has a number."""
+def _cases(args: argparse.Namespace, robot: RobotConfig) -> Callable[[int], RobustTrial]:
     pushes = PushRange(robot, args.push)
-    return args.n, lambda number: robust_trial.draw(
-        pushes, args.seed, number, args.beyond, args.slope
-    )
+    return lambda number: robust_trial.draw(pushes, args.seed, number, args.beyond, args.slope)
 
 
 def ranking(rows: Sequence[Row]) -> list[tuple[str, float]]:
@@ -137,8 +134,8 @@ def draw(rows: Sequence[Row], title: str, path: Path) -> None:
     left.set_xlabel("rank correlation with the COM's excursion while led")
     few = f" ({len(rows)} trials: too few to tell)" if len(rows) < RANKED_LEAST else ""
     left.set_title(f"Which error takes most of the margin{few}")
-    looks = ("stood", "o", "#1f5f8b"), ("fell", "x", FALL_COLOUR)
-    for some, (label, marker, colour) in zip(parted(rows), looks, strict=True):
+    styles = ("stood", "o", "#1f5f8b"), ("fell", "x", FALL_COLOUR)
+    for some, (label, marker, colour) in zip(parted(rows), styles, strict=True):
         x = [row["drivetrain.stiffness"] for row in some]
         y = [min(200.0, _excursion(row)) for row in some]
         right.scatter(x, y, marker=marker, color=colour, s=18, label=label)
@@ -164,19 +161,12 @@ STUDY: Final = Study[RobustTrial](
     only="run this trial alone and print all of it; exit code 1 if it fell",
     add_flags=add_flags,
     load=load,
-    cases=cases,
-    inputs=lambda args: {
-        "seed": str(args.seed),
-        "beyond": f"{args.beyond:g}",
-        "slope": f"{args.slope:g}",
-        "push": f"{args.push:g}",
-        "ranges": plants.digest(),
-    },
+    cases=_cases,
+    decided_by=("seed", "beyond", "slope", "push"),
+    inputs=lambda _args: {"ranges": plants.digest()},
     row=robust_trial.row_of,
     figures=RobustResult,
     trial=robust_trial.run_trial,
     log=CaseLog(robust_trial.scenario_of, robust_trial.plant_of, _metadata),
-    fell=lambda row: row["ending"] is not Ending.STOOD,
     report=report,
-    exit_code=lambda rows: exit_code(row["ending"] for row in rows),
 )

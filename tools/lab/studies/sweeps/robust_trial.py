@@ -20,9 +20,9 @@ from tools.lab.studies.sweeps.figures import (
     ending_of,
     event_steps_nm,
     operator_peak_n,
+    rows_that_count,
     scalars,
     sole_tilt_max_rad,
-    that_count,
     unwatched,
 )
 from tools.lab.studies.sweeps.push_range import PushRange, uniform
@@ -141,7 +141,7 @@ def run_trial(
         record=record,
         plant=plant_of(trial),
     )
-    rows = list(that_count(fleet.run(), 0.0, watch, after_fall_s))
+    rows = list(rows_that_count(fleet.run(), 0.0, watch, after_fall_s))
     if not rows or rows[0].scenario_s < 0.0:
         return RobustResult(ending=Ending.FELL if rows else Ending.UNREADY)
     last = rows[-1]

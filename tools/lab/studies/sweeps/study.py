@@ -26,6 +26,7 @@ from shared.config.scenarios import Scenario
 from shared.exceptions import RunError
 from shared.places import DEFAULT_CONFIG
 from tools.lab.studies.sweeps import pool
+from tools.lab.studies.sweeps.figures import Ending, exit_code
 from tools.lab.studies.sweeps.table import CaseTable, Row, code_digest, code_of, plain
 from tools.live import experiment
 from tools.number_arguments import count, natural
@@ -69,6 +70,10 @@ class CaseLog(NamedTuple, Generic[C]):
     """By the case and its command, as for `record_run`."""
 
 
+def _load(args: argparse.Namespace) -> RobotConfig:
+    return experiment.load_robot(args.config)
+
+
 class Study(msgspec.Struct, Generic[C], frozen=True, kw_only=True):
     """What one study has of its own."""
 
@@ -86,14 +91,16 @@ class Study(msgspec.Struct, Generic[C], frozen=True, kw_only=True):
     only: str = ""
     """What `--only` does, for its help; empty: there is none."""
     add_flags: Callable[[argparse.ArgumentParser], None] = lambda _parser: None
-    load: Callable[[argparse.Namespace], RobotConfig] = lambda args: experiment.load_robot(
-        args.config
-    )
+    load: Callable[[argparse.Namespace], RobotConfig] = _load
     """Checks the flags and returns the robot."""
-    cases: Callable[[argparse.Namespace, RobotConfig], tuple[int, Callable[[int], C]]]
-    """How many there are, and which has a number."""
-    inputs: Callable[[argparse.Namespace], Mapping[str, str]]
-    """Parameters of the rows, beside robot and code; a folder with others is refused."""
+    total: Callable[[argparse.Namespace], int] = lambda args: int(args.n)
+    """How many cases there are."""
+    cases: Callable[[argparse.Namespace, RobotConfig], Callable[[int], C]]
+    """Returns what draws the case of a number, whatever was drawn before."""
+    decided_by: tuple[str, ...] = ()
+    """Flags that decide the rows, beside robot and code; a folder of others is refused."""
+    inputs: Callable[[argparse.Namespace], dict[str, str]] = lambda _args: {}
+    """What else decides them."""
     row: Callable[[C], dict[str, object]]
     """The draws of a case by column, its number first."""
     words: Callable[[C], str] = lambda _case: ""
@@ -109,12 +116,14 @@ class Study(msgspec.Struct, Generic[C], frozen=True, kw_only=True):
     """The robot of each case, prepared by so many processes."""
     log: CaseLog[C] | None = None
     """None: a case alone has no log."""
-    fell: Callable[[Row], bool] = lambda _row: False
+    fell: Callable[[Row], bool] = lambda row: row["ending"] is not Ending.STOOD
     report: Callable[[Finished], None]
     """Prints what came of it and draws the pictures."""
     counts: Callable[[Row], bool] = lambda _row: True
     """True for a row of the study that decides its exit code."""
-    exit_code: Callable[[Sequence[Row]], int] = lambda _rows: 0
+    exit_code: Callable[[Sequence[Row]], int] = lambda rows: exit_code(
+        row["ending"] for row in rows
+    )
 
 
 def add_flags(parser: argparse.ArgumentParser, study: Study[Any]) -> None:
@@ -160,56 +169,68 @@ def run(study: Study[C], args: argparse.Namespace) -> int:
     if args.cluster is not None and only is not None:
         raise RunError("--only runs here, in one process; leave --cluster out")
     robot = study.load(args)
-    total, case_of = study.cases(args, robot)
+    case_of = study.cases(args, robot)
     console, command = Console(), command_of(study, args)
     if only is not None:
         return _run_alone(study, args, robot, case_of(only), f"{command} --only {only}", console)
-    drawn = [case_of(number) for number in range(total)]
-    begins = [study.row(case) for case in drawn]
+    drawn = [case_of(number) for number in range(study.total(args))]
     out = args.out or Path("out") / time.strftime(f"sweep-{study.name}-%Y%m%d-%H%M%S")
     code = code_of(*study.code)
     inputs = {
         "study": study.name,
+        **{name: _text(getattr(args, name)) for name in study.decided_by},
         **study.inputs(args),
         "robot": digest_of(robot),
         "code": code_digest(code),
     }
-    with CaseTable(out / study.table, begins, study.figures, inputs) as table:
+    with CaseTable(out / study.table, list(map(study.row, drawn)), study.figures, inputs) as table:
         try:
-            done = table.rows
-            if done:
-                console.print(f"{len(done)} of {total} cases are done already")
-            missing = [case for case in drawn if case.number not in table.numbers]
-            workers = args.workers or pool.cores()
-            robots = study.robots(missing, robot, workers, console)
-            tasks = list(zip(missing, robots, strict=True))
-            results = pool.results(
-                partial(_run_task, partial(study.trial, **study.options(args))),
-                tasks,
-                pool.Cluster(args.cluster, code) if args.cluster else workers,
-                lambda task: _name_of(study, task[0], command),
-            )
-            begin, fallen = time.monotonic(), sum(map(study.fell, done))
-            text = "{task.completed} of {task.total} cases, {task.fields[fallen]} fell"
-            with bar(text, console) as shown:
-                line = shown.add_task("", total=total, completed=len(done), fallen=fallen)
-                for (case, _), figures in results:
-                    fallen += study.fell(table.add(study.row(case), figures))
-                    shown.update(line, advance=1, fallen=fallen)
+            case_s = _fill(table, study, args, robot, drawn, code, console)
         except (KeyboardInterrupt, SystemExit, RunError):
-            if table.numbers:
+            if done := len(table.numbers):
                 many = [f"--{name} {getattr(args, name)}" for name in HOW_MANY if name in args]
                 many += [f"--cluster {args.cluster}"] if args.cluster else []
                 again = " ".join([command, *many, f"--out {shlex.quote(str(out))}"])
-                words = f"{len(table.numbers)} cases are in {out}; resume with: {again}"
-                console.print(words, soft_wrap=True)
+                console.print(f"{done} cases are in {out}; resume with: {again}", soft_wrap=True)
             raise
-        rows, took_s = table.rows, time.monotonic() - begin
+        rows = table.rows
+    pace = f"; {case_s:.2f} s a {study.case}" if case_s else ""
     study.report(Finished(args, robot, rows, out, command, console))
-    pace = f"; {took_s / len(tasks):.2f} s a {study.case}" if tasks else ""
     files = ", ".join((study.table, *study.pictures))
     console.print(f"{out}/{files}{pace}", style="dim", soft_wrap=True)
     return study.exit_code([row for row in rows if study.counts(row)])
+
+
+def _fill(
+    table: CaseTable,
+    study: Study[C],
+    args: argparse.Namespace,
+    robot: RobotConfig,
+    drawn: Sequence[C],
+    code: tuple[str, ...],
+    console: Console,
+) -> float:
+    """Run the cases that a table lacks into it; return the wall time for each, s."""
+    done, workers = table.rows, args.workers or pool.cores()
+    if done:
+        console.print(f"{len(done)} of {len(drawn)} cases are done already")
+    missing = [case for case in drawn if case.number not in table.numbers]
+    robots = study.robots(missing, robot, workers, console)
+    command, fallen = command_of(study, args), sum(map(study.fell, done))
+    results = pool.results(
+        partial(_run_task, partial(study.trial, **study.options(args))),
+        list(zip(missing, robots, strict=True)),
+        pool.Cluster(args.cluster, code) if args.cluster else workers,
+        lambda task: _name_of(study, task[0], command),
+    )
+    text = "{task.completed} of {task.total} cases, {task.fields[fallen]} fell"
+    begin = time.monotonic()
+    with bar(text, console) as shown:
+        line = shown.add_task("", total=len(drawn), completed=len(done), fallen=fallen)
+        for (case, _), figures in results:
+            fallen += study.fell(table.add(study.row(case), figures))
+            shown.update(line, advance=1, fallen=fallen)
+    return (time.monotonic() - begin) / len(missing) if missing else 0.0
 
 
 def _run_task(trial: Callable[..., msgspec.Struct], task: tuple[C, RobotConfig]) -> msgspec.Struct:
@@ -255,8 +276,8 @@ def _run_alone(
                     robot,
                     out,
                     asked.metadata(case, command),
-                    lambda record, look: trial(
-                        record=record, watch=look, after_fall_s=AFTER_FALL_S
+                    lambda record, watched: trial(
+                        record=record, watch=watched, after_fall_s=AFTER_FALL_S
                     ),
                     watch,
                     asked.plant(case),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import product
 from typing import Final
 
@@ -45,16 +45,10 @@ def load(args: argparse.Namespace) -> RobotConfig:
     return robot
 
 
-def cases(args: argparse.Namespace, _robot: RobotConfig) -> tuple[int, Callable[[int], TripTrial]]:
-    """Return how many trials there are, and which has a number."""
-    grid = _grid(args)
-    return len(grid), lambda number: TripTrial(
-        number=number, trouble=grid[number][0], on=grid[number][1]
-    )
-
-
-def _grid(args: argparse.Namespace) -> list[tuple[str, str]]:
-    return list(product(args.trouble or TROUBLES, args.on or PLANTS))
+def trials_of(args: argparse.Namespace) -> list[TripTrial]:
+    """Return the selected troubles on the selected plants."""
+    grid = product(args.trouble or TROUBLES, args.on or PLANTS)
+    return [TripTrial(number=n, trouble=trouble, on=on) for n, (trouble, on) in enumerate(grid)]
 
 
 def exit_code(rows: Sequence[Row]) -> int:
@@ -124,8 +118,10 @@ STUDY: Final = Study[TripTrial](
     code=("tools.lab.studies.sweeps.trips_trial",),
     add_flags=add_flags,
     load=load,
-    cases=cases,
-    inputs=lambda args: {"grid": repr(_grid(args)), "seed": str(args.seed)},
+    total=lambda args: len(trials_of(args)),
+    cases=lambda args, _robot: trials_of(args).__getitem__,
+    decided_by=("seed",),
+    inputs=lambda args: {"grid": ", ".join(trial.words for trial in trials_of(args))},
     row=msgspec.structs.asdict,
     words=lambda trial: trial.words,
     figures=TripResult,

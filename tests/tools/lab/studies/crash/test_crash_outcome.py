@@ -21,7 +21,7 @@ from tools.lab.studies.crash.cases import (
     CrashVerdict,
     scenario_of,
 )
-from tools.lab.studies.crash.outcome import Heard, as_expected, measure
+from tools.lab.studies.crash.outcome import CrashMessages, as_expected, measure
 
 BY_NAME = {case.name: case for case in CASES}
 PLANNER = BY_NAME["kill-planner"]
@@ -86,13 +86,13 @@ def heard(
     world: Callable[[float], SimTruth] = truth,
     end: float = DURATION_S,
     modes: str = "TTTTTT",
-) -> Heard:
+) -> CrashMessages:
     rows = [world(index / 100) for index in range(round(end * 100) + 1)]
     marks = [said(0.0, RunEventKind.STARTED)]
     scenario = scenario_of(case)
     marks += [said(row.at, RunEventKind.KILLED, row.service) for row in scenario.kill]
     marks += [said(row.at, RunEventKind.RESTARTED, row.service) for row in scenario.restart]
-    return Heard(rows, list(events), marks, tuple(modes))
+    return CrashMessages(rows, list(events), marks, tuple(modes))
 
 
 def test_a_robot_that_goes_on_has_stood(robot: RobotConfig) -> None:
@@ -142,7 +142,7 @@ def test_a_run_that_broke_off_is_not_judged(robot: RobotConfig) -> None:
     outcome = measure(PLANNER, heard(PLANNER, holds(), end=6.0), robot)
     assert outcome.verdict is CrashVerdict.UNJUDGED
     assert "6.0 s" in outcome.remarks[0]
-    never = Heard([truth(-1.0)], [], [], ("D",) * 6)
+    never = CrashMessages([truth(-1.0)], [], [], ("D",) * 6)
     assert measure(PLANNER, never, robot).verdict is CrashVerdict.UNJUDGED
 
 
@@ -227,7 +227,7 @@ def test_a_chase_is_timed_by_its_own_kill(robot: RobotConfig) -> None:
     run = heard(case, [*holds(at=0.9), *holds(at=2.35)])
     missed = measure(case, run, robot)
     assert missed.verdict is CrashVerdict.UNJUDGED
-    run.said.append(said(2.3, RunEventKind.KILLED))  # type: ignore[attr-defined]
+    run.actions.append(said(2.3, RunEventKind.KILLED))  # type: ignore[attr-defined]
     tracked = [change(2.1, name, Mode.HOLD, Mode.TRACK) for name in MODULES]
     run = run._replace(events=[*holds(at=0.9), *tracked, *holds(at=2.35)])
     assert measure(case, run, robot).safe_ms == pytest.approx(50.0)

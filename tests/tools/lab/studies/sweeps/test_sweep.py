@@ -205,7 +205,7 @@ def test_the_verbs_help_imports_no_study() -> None:
         (("latency", "--delay", "0-200"), "FROM:TO:STEP"),
         (("latency", "--lead-easing", "2"), "lead_easing"),
     ],
-    ids=" ".join,
+    ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
 )  # fmt: skip
 def test_flags_that_make_no_sense_are_refused_and_nothing_is_written(
     flags: tuple[str, ...], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -47,8 +47,8 @@ def parsed(*flags: str) -> argparse.Namespace:
 
 
 def trials_of(args: argparse.Namespace) -> list[LatencyTrial]:
-    total, trial = latency.cases(args)
-    return [trial(number) for number in range(total)]
+    grid, total = latency.grid_of(args), latency.STUDY.total(args)
+    return [latency.trial_of(grid, args.seed, number) for number in range(total)]
 
 
 def trial(**changes: Any) -> LatencyTrial:
@@ -143,7 +143,6 @@ def test_the_command_is_of_this_study_whatever_its_numbers_are() -> None:
     again = parsed(*command.split()[3:])
     assert trials_of(again) == trials_of(args)
     assert again.lead_easing == args.lead_easing
-    assert latency.STUDY.inputs(args)["loss"] == "0.1234567,0.1234568"
     assert len({(t.draw, t.repeat) for t in trials_of(args)}) == 2 * 4
     assert {row_of(t)["delay_ms"] for t in trials_of(args)} == {"0.00001", "12345.67"}
 

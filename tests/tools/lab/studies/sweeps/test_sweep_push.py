@@ -30,8 +30,7 @@ def asked(**changes: object) -> argparse.Namespace:
 
 
 def trials_of(**changes: object) -> list[PushTrial]:
-    total, trial = push.cases(asked(**changes))
-    return [trial(number) for number in range(total)]
+    return push.trials_of(asked(**changes))
 
 
 def point(**changes: object) -> PushTrial:
