@@ -230,14 +230,14 @@ class RunLog:
 
     def _read(self, margin_ns: int) -> None:
         if self.is_whole:
-            self._take(0, _EVER)
+            self._sort(0, _EVER)
             return
         known = topics.all_keys(self.robot).items()
         events = frozenset(key for key, topic in known if not topic.rate_hz)
-        self._take(0, _EVER, events, others=False)
-        self._take(self.begin_ns - margin_ns, self.end_ns + margin_ns, events, others=True)
+        self._sort(0, _EVER, events, others=False)
+        self._sort(self.begin_ns - margin_ns, self.end_ns + margin_ns, events, others=True)
 
-    def _take(
+    def _sort(
         self,
         first_ns: int,
         last_ns: int,

@@ -198,8 +198,8 @@ class Newest:
         self._rows: dict[tuple[str, str], Any] = {}
         self._first_ns: int | None = None
 
-    def take(self, topic: Topic, module: str, message: Message) -> None:
-        """Take a message; those that no frame shows are ignored."""
+    def add(self, topic: Topic, module: str, message: Message) -> None:
+        """Add a message; those that no frame shows are ignored."""
         if not isinstance(message, RunEvent) or message.kind == RunEventKind.STALLED:
             self._rows[topic.name, module] = message
 

@@ -199,7 +199,7 @@ class LiveSource(Source):
             if message is not None:
                 # by its arrival: its own time is its host's, which may be another
                 message = msgspec.structs.replace(message, t_ns=now_ns())
-                self._newest.take(topic, module, message)
+                self._newest.add(topic, module, message)
         found = self._newest.frame(now_ns())
         if found is None:
             return None

@@ -59,7 +59,7 @@ class RecordSource(Source):
         for topic, module, messages in self._keys:
             message = messages.at(t_ns)
             if message is not None:
-                newest.take(topic, module, message)
+                newest.add(topic, module, message)
         found = newest.frame(t_ns)
         return None if found is None else msgspec.structs.replace(found, t_s=t_s)
 
