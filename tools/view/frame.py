@@ -36,6 +36,7 @@ from shared.robot.frames import ORIGIN
 from tools.fleet.fleet_status import module_status
 from tools.judge.reports import scene
 from tools.judge.stalls import STALL_SHOWN_NS, stalls_of
+from tools.topic_keys import every_key
 
 Array = NDArray[np.float64]
 
@@ -106,8 +107,12 @@ def _turn(axis: Array, angle: float) -> Array:
     return np.asarray(np.eye(3) + math.sin(angle) * K + (1.0 - math.cos(angle)) * (K @ K))
 
 
-SHOWN: Final = (topics.PLANNER_STATUS, topics.WRENCH, topics.SIM_TRUTH, topics.RUN_EVENT)
-SHOWN_OF_MODULES: Final = (topics.JOINT_STATE, topics.JOINT_COMMAND)
+_TOPICS: Final = (
+    topics.PLANNER_STATUS, topics.WRENCH, topics.SIM_TRUTH, topics.RUN_EVENT, topics.JOINT_STATE,
+    topics.JOINT_COMMAND,
+)  # fmt: skip
+SHOWN: Final = tuple(key for key in every_key() if key.topic in _TOPICS)
+"""Keys of the messages that a frame is made of."""
 STALE_NS: Final = NS_PER_S // 2
 """An older message is not shown: its sender is dead, stopped or cut off."""
 DIGITS: Final = 5

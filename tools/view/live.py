@@ -26,7 +26,7 @@ from tools.fleet.emergency_stop import BusStop, request_here
 from tools.fleet.fleet_status import impairments
 from tools.fleet.proxy_client import ProxyClient
 from tools.fleet.supervise import SupervisedFleet
-from tools.view.frame import SHOWN, SHOWN_OF_MODULES, Frame, Newest, ShownProcess
+from tools.view.frame import SHOWN, Frame, Newest, ShownProcess
 from tools.view.source import CUT_S, CUTS, HandOrders, Order, Source
 
 
@@ -171,9 +171,7 @@ class LiveSource(Source):
             return
         session = self._session = open_session(self.robot, "view", self._fleet.run.path)
         self._newest.clear()
-        wanted = [(topic, "") for topic in SHOWN]
-        wanted += [(t, m) for t in SHOWN_OF_MODULES for m in MODULES]
-        self._latest = [(t, m, session.latest(t, t.type, m)) for t, m in wanted]
+        self._latest = [(t, m, session.latest(t, t.type, m)) for t, m in SHOWN]
         if self._acting is not None:
             self._acting.begin(session)
         self._left.clear()
