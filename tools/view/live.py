@@ -116,7 +116,6 @@ class LiveOrders:
         self._tell(RunEventKind.RESTARTED, order.service, "")
 
     def _tell(self, kind: RunEventKind, subject: str, detail: str) -> None:
-        """Have it in the log."""
         events = self._events
         if events is not None:
             self._told += 1
@@ -131,7 +130,6 @@ class LiveOrders:
             events.put(event)
 
     def _cut(self, order: Order) -> None:
-        """Cut links for a while."""
         links = CUTS.get(order.service)
         if links is None:
             raise FleetError(f"{order.service!r}: one of {', '.join(CUTS)}")
