@@ -19,8 +19,8 @@ class Support(IntEnum):
     leg stands as a strut: none fell (`tests/lockstep/test_faults.py`), nor through pushes of 30 N.
     In the crawl, under the hand's 60 N m of pitch, it stands, with little left for a push forwards:
     20 N stood, 30 N fell. The hips then have gains of their own
-    (`joint_service.limp_leg_hip_theta`): on their stand gains the torso turned by up to 0.9 rad once the hand let go, and straight legs
-    fell.
+    (`joint_service.limp_leg_hip_theta`): on their stand gains the torso turned by up to 0.9 rad
+    once the hand let go, and straight legs fell.
 
     A limp ankle leaves one sole to stand on. Stiff hips would hand it the hand's 60 N m of pitch;
     stiff knees alone keep the legs from giving. Fell, of 12 each with and without pushes of 30 N:

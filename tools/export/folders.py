@@ -39,7 +39,6 @@ def whole_folder(out: Path, record: Path, *, force: bool) -> Iterator[Path]:
 
 
 def _check_replaceable(out: Path, *, force: bool) -> None:
-    """Refuse to replace what is not an export's."""
     if not force:
         raise RunError(f"{out}: exists already; remove it, give another name, or --force")
     if not out.is_dir() or out.is_symlink():

@@ -111,13 +111,14 @@ def _dress(axis: Any, label: str) -> None:
     axis.tick_params(labelsize=8)
 
 
-def _legend(axis: Any, handles: Sequence[Any] | None = None) -> None:
+def _legend(axis: Any, handles: Sequence[Any] | None = None, **more: Any) -> None:
     """Put the legend beside the panel, where no curve is."""
     found = axis.get_legend_handles_labels()[0] if handles is None else handles
-    axis.legend(
-        handles=found, loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8, frameon=False,
-        borderaxespad=0.2, handlelength=1.4,
-    )  # fmt: skip
+    usual = {
+        "loc": "upper left", "bbox_to_anchor": (1.0, 1.0), "fontsize": 8, "frameon": False,
+        "borderaxespad": 0.2, "handlelength": 1.4,
+    }  # fmt: skip
+    axis.legend(handles=found, **(usual | more))
 
 
 def _ages(axis: Any, log: RunLog, zero_ns: int) -> None:
@@ -138,11 +139,7 @@ def _ages(axis: Any, log: RunLog, zero_ns: int) -> None:
     )  # fmt: skip
     axis.set_ylim(0.0, AGE_REACH * most_ms)
     _dress(axis, "command age\nin ms")
-    handles = axis.get_legend_handles_labels()[0]
-    axis.legend(
-        handles=handles, loc="lower left", bbox_to_anchor=(1.0, 0.0), fontsize=8, frameon=False,
-        borderaxespad=0.1, handlelength=1.4, labelspacing=0.2,
-    )  # fmt: skip
+    _legend(axis, loc="lower left", bbox_to_anchor=(1.0, 0.0), borderaxespad=0.1, labelspacing=0.2)
 
 
 def _greatest_age_ms(log: RunLog) -> float:

@@ -230,14 +230,14 @@ class RunLog:
 
     def _read(self, margin_ns: int) -> None:
         if self.is_whole:
-            self._take(0, _EVER)
+            self._sort(0, _EVER)
             return
         known = topics.all_keys(self.robot).items()
         events = frozenset(key for key, topic in known if not topic.rate_hz)
-        self._take(0, _EVER, events, others=False)
-        self._take(self.begin_ns - margin_ns, self.end_ns + margin_ns, events, others=True)
+        self._sort(0, _EVER, events, others=False)
+        self._sort(self.begin_ns - margin_ns, self.end_ns + margin_ns, events, others=True)
 
-    def _take(
+    def _sort(
         self,
         first_ns: int,
         last_ns: int,
@@ -294,6 +294,16 @@ def read_part(index: RunIndex, part: RunPart, *, as_sent: bool = False) -> RunLo
     return RunLog(index, part, as_sent=as_sent)
 
 
+def divided(index: RunIndex, part: RunPart, longest_s: float, multiple: int = 1) -> list[RunPart]:
+    """Return a part of a run in pieces of one length; several are a multiple of so many."""
+    begin_s, end_s = max(part.begin_s, 0.0), min(part.end_s, index.length_s)
+    count = max(1, math.ceil((end_s - begin_s) / longest_s))
+    count = multiple * math.ceil(count / multiple) if count > 1 else 1
+    step_s = (end_s - begin_s) / count
+    edges = [*(begin_s + number * step_s for number in range(count)), part.end_s]
+    return [RunPart(*piece) for piece in pairwise(edges)]
+
+
 def parts_of(
     index: RunIndex,
     part: RunPart = WHOLE,
@@ -308,12 +318,8 @@ def parts_of(
     Each forgets its messages when the next is asked for; `margin_s` before and behind is read too.
     `done` takes how much of the run is behind, s.
     """
-    begin_s, end_s = max(part.begin_s, 0.0), min(part.end_s, index.length_s)
-    count = max(1, math.ceil((end_s - begin_s) / part_s))
-    step_s = (end_s - begin_s) / count
-    edges = [*(begin_s + number * step_s for number in range(count)), part.end_s]
-    for first_s, last_s in pairwise(edges):
-        log = RunLog(index, RunPart(first_s, last_s), margin_s, as_sent=as_sent)
+    for piece in divided(index, part, part_s):
+        log = RunLog(index, piece, margin_s, as_sent=as_sent)
         yield log
         log.forget()
         done((log.end_ns - log.began_ns()) / NS_PER_S)

@@ -35,6 +35,7 @@ from shared.robot.frames import ORIGIN, capture_point
 from tools.fleet.fleet_status import module_status
 from tools.judge.reports import scene
 from tools.judge.stalls import STALL_SHOWN_NS, stalls_of
+from tools.topic_keys import every_key
 
 Array = NDArray[np.float64]
 
@@ -105,8 +106,12 @@ def _turn(axis: Array, angle: float) -> Array:
     return np.asarray(np.eye(3) + math.sin(angle) * K + (1.0 - math.cos(angle)) * (K @ K))
 
 
-SHOWN: Final = (topics.PLANNER_STATUS, topics.WRENCH, topics.SIM_TRUTH, topics.RUN_EVENT)
-SHOWN_OF_MODULES: Final = (topics.JOINT_STATE, topics.JOINT_COMMAND)
+_TOPICS: Final = (
+    topics.PLANNER_STATUS, topics.WRENCH, topics.SIM_TRUTH, topics.RUN_EVENT, topics.JOINT_STATE,
+    topics.JOINT_COMMAND,
+)  # fmt: skip
+SHOWN: Final = tuple(key for key in every_key() if key.topic in _TOPICS)
+"""Keys of the messages that a frame is made of."""
 STALE_NS: Final = NS_PER_S // 2
 """An older message is not shown: its sender is dead, stopped or cut off."""
 DIGITS: Final = 5
@@ -197,8 +202,8 @@ class Newest:
         self._rows: dict[tuple[str, str], Any] = {}
         self._first_ns: int | None = None
 
-    def take(self, topic: Topic, module: str, message: Message) -> None:
-        """Take a message; those that no frame shows are ignored."""
+    def add(self, topic: Topic, module: str, message: Message) -> None:
+        """Add a message; those that no frame shows are ignored."""
         if not isinstance(message, RunEvent) or message.kind == RunEventKind.STALLED:
             self._rows[topic.name, module] = message
 

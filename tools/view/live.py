@@ -26,7 +26,7 @@ from tools.fleet.emergency_stop import BusStop, request_here
 from tools.fleet.fleet_status import impairments
 from tools.fleet.proxy_client import ProxyClient
 from tools.fleet.supervise import SupervisedFleet
-from tools.view.frame import SHOWN, SHOWN_OF_MODULES, Frame, Newest, ShownProcess
+from tools.view.frame import SHOWN, Frame, Newest, ShownProcess
 from tools.view.source import CUT_S, CUTS, HandOrders, Order, Source
 
 
@@ -116,7 +116,6 @@ class LiveOrders:
         self._tell(RunEventKind.RESTARTED, order.service, "")
 
     def _tell(self, kind: RunEventKind, subject: str, detail: str) -> None:
-        """Have it in the log."""
         events = self._events
         if events is not None:
             self._told += 1
@@ -131,7 +130,6 @@ class LiveOrders:
             events.put(event)
 
     def _cut(self, order: Order) -> None:
-        """Cut links for a while."""
         links = CUTS.get(order.service)
         if links is None:
             raise FleetError(f"{order.service!r}: one of {', '.join(CUTS)}")
@@ -171,9 +169,7 @@ class LiveSource(Source):
             return
         session = self._session = open_session(self.robot, "view", self._fleet.run.path)
         self._newest.clear()
-        wanted = [(topic, "") for topic in SHOWN]
-        wanted += [(t, m) for t in SHOWN_OF_MODULES for m in MODULES]
-        self._latest = [(t, m, session.latest(t, t.type, m)) for t, m in wanted]
+        self._latest = [(t, m, session.latest(t, t.type, m)) for t, m in SHOWN]
         if self._acting is not None:
             self._acting.begin(session)
         self._left.clear()
@@ -199,7 +195,7 @@ class LiveSource(Source):
             if message is not None:
                 # by its arrival: its own time is its host's, which may be another
                 message = msgspec.structs.replace(message, t_ns=now_ns())
-                self._newest.take(topic, module, message)
+                self._newest.add(topic, module, message)
         found = self._newest.frame(now_ns())
         if found is None:
             return None

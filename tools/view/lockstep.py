@@ -87,7 +87,7 @@ class LockstepSource(Source):
         scenario = Scenario(
             name="view", about="", duration=_FOREVER_S, keyframe=(Keyframe(at=0.0, height=height),)
         )
-        fleet = _Watched(robot, scenario, record=self._newest.take)
+        fleet = _Watched(robot, scenario, record=self._newest.add)
         begin_standing(fleet)
         hand = HandOrders()
         due = time.monotonic()
@@ -98,7 +98,7 @@ class LockstepSource(Source):
             while fleet.now_ns < end_ns:
                 fleet.advance()
             truth = fleet.world.truth(fleet.now_ns, 1.0, 0.0)
-            self._newest.take(topics.SIM_TRUTH, "", truth)
+            self._newest.add(topics.SIM_TRUTH, "", truth)
             found = self._newest.frame(fleet.now_ns)
             if found is not None:
                 network = fleet.network.active(fleet.world.scenario_s)

@@ -16,11 +16,10 @@ from shared.bus.messages import RunEventKind
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.joints import MODULES
 from tools.judge.reports.run_data import RunData
 from tools.judge.reports.timeline import timeline_events
 from tools.logs.run_log import NewestAt, RunLog
-from tools.view.frame import SHOWN, SHOWN_OF_MODULES, Frame, Newest
+from tools.view.frame import SHOWN, Frame, Newest
 from tools.view.source import FRAMES_S, PAGE, UPLOT, Mark, Model, Source
 
 
@@ -34,9 +33,7 @@ class RecordSource(Source):
         self.title = str(log.path)
         self._data = RunData(log)
         self._newest = Newest(robot)
-        wanted = [(topic, "") for topic in SHOWN if topic is not topics.RUN_EVENT]
-        wanted += [(topic, module) for topic in SHOWN_OF_MODULES for module in MODULES]
-        self._keys = [(topic, module, log.newest(topic, module)) for topic, module in wanted]
+        self._keys = [(t, m, log.newest(t, m)) for t, m in SHOWN if t is not topics.RUN_EVENT]
         stalls = [row for row in log.messages(topics.RUN_EVENT) if row.kind == RunEventKind.STALLED]
         stalls.sort(key=lambda row: row.t_ns)  # each tells when it ended, and is told later
         self._keys.append((topics.RUN_EVENT, "", NewestAt(stalls)))
@@ -59,7 +56,7 @@ class RecordSource(Source):
         for topic, module, messages in self._keys:
             message = messages.at(t_ns)
             if message is not None:
-                newest.take(topic, module, message)
+                newest.add(topic, module, message)
         found = newest.frame(t_ns)
         return None if found is None else msgspec.structs.replace(found, t_s=t_s)
 

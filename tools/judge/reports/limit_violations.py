@@ -81,8 +81,8 @@ class LimitViolations:
     def __init__(self) -> None:
         self._found: dict[tuple[str, str], Violation] = {}
 
-    def take(self, run: RunData) -> None:
-        """Take a run, or the next part of it."""
+    def add(self, run: RunData) -> None:
+        """Add a run, or the next part of it."""
         for look in (_world, *((_torques, _stops, _margins) if run.robot is not None else ())):
             for what, name, t, passed, values in look(run):
                 beyond = passed & run.inside(t)
@@ -121,7 +121,7 @@ def _shared(row: tuple[float, Violation]) -> tuple[str, str]:
 def limit_violations(run: RunData) -> list[TimelineEvent]:
     """Return the first violation of each limit of a whole run, in no order."""
     found = LimitViolations()
-    found.take(run)
+    found.add(run)
     return list(found.events())
 
 

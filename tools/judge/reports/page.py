@@ -70,8 +70,8 @@ class Page:
         self._judge = summary.Judge()
         self._losses = summary.MessageLosses()
 
-    def take(self, log: RunLog) -> None:
-        """Take a run, or the next part of it."""
+    def add(self, log: RunLog) -> None:
+        """Add a run, or the next part of it."""
         run = RunData(log, self._axis, self._armed_s)
         armed_s = run.armed_s()
         self._armed_s = armed_s if math.isfinite(armed_s) else None
@@ -85,9 +85,9 @@ class Page:
         for make in PANELS:
             for panel in make(run):
                 self._model.add(panel)
-        self._timeline.take(run)
-        self._judge.take(run)
-        self._losses.take(run)
+        self._timeline.add(run)
+        self._judge.add(run)
+        self._losses.add(run)
 
     def html(self) -> str:
         """Return the page."""
@@ -118,7 +118,7 @@ class Page:
 def render(log: RunLog) -> str:
     """Return the page of a run that is in memory."""
     page = Page()
-    page.take(log)
+    page.add(log)
     return page.html()
 
 
@@ -137,7 +137,7 @@ def render_parts(
     heard = False
     for log in parts_of(index, part, part_s=part_s, done=done):
         heard = heard or bool(log.keys())
-        page.take(log)
+        page.add(log)
     if not heard:
         raise RunError(f"{index.path}: has no message in this part; {SEE_INFO}")
     return page.html()

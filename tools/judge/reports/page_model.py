@@ -210,7 +210,6 @@ class _Gathered:
         return plot | choices[0] | {"reach": panel.reach if isinstance(panel, Plot) else None}
 
     def _is_zero(self) -> bool:
-        """Return True if no line ever leaves zero."""
         traces = self._traces[""].values()
         return not any(values.any() for trace in traces for _, values in trace.parts)
 

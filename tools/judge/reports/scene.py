@@ -159,13 +159,21 @@ def poses(log: RunLog, robot: RobotConfig) -> Iterator[RobotPose]:
         states_now: list[Any] = [one.at(row.t_ns) for one in newest]
         q = tuple(angle for state_now in states_now for angle in state_now.q)
         sensed = wrenches.at(row.t_ns)
-        force = sensed.force if sensed is not None and sensed.valid else (0.0, 0.0, 0.0)
-        modes = tuple(state_now.mode for state_now in states_now)
         if kinematics is None:
-            yield RobotPose(row.t_ns, row.torso, row.angles, row.com, q, modes, force, row.push)
-            continue
-        known = pose_of_legs(kinematics, q, statuses.at(row.t_ns))
-        yield RobotPose(row.t_ns, *known, q, modes, force, ORIGIN)
+            torso, angles, com, push = row.torso, row.angles, row.com, row.push
+        else:
+            torso, angles, com = pose_of_legs(kinematics, q, statuses.at(row.t_ns))
+            push = ORIGIN
+        yield RobotPose(
+            t_ns=row.t_ns,
+            torso=torso,
+            angles=angles,
+            com=com,
+            q=q,
+            modes=tuple(state_now.mode for state_now in states_now),
+            force=sensed.force if sensed is not None and sensed.valid else ORIGIN,
+            push=push,
+        )
 
 
 def pose_of_legs(

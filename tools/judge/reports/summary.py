@@ -61,8 +61,8 @@ class Judge:
         self._summaries: list[Summary] = []
         self._why_not = ""
 
-    def take(self, run: RunData) -> None:
-        """Take a run, or the next part of it."""
+    def add(self, run: RunData) -> None:
+        """Add a run, or the next part of it."""
         if run.course is None:
             self._why_not = self._why_not or run.without_course
             return
@@ -156,8 +156,8 @@ class MessageLosses:
         self.counts: dict[str, KeyCount] = {}
         self._times_ns: dict[str, tuple[int, int]] = {}
 
-    def take(self, run: RunData) -> None:
-        """Take a run, or the next part of it."""
+    def add(self, run: RunData) -> None:
+        """Add a run, or the next part of it."""
         log = run.log
         log.count_into(self.counts)
         for key in log.keys():  # noqa: SIM118 - a log is no mapping

@@ -54,8 +54,8 @@ class Timeline:
         self._silences = Silences()
         self._successive = Successive()
 
-    def take(self, run: RunData) -> None:
-        """Take a run, or the next part of it."""
+    def add(self, run: RunData) -> None:
+        """Add a run, or the next part of it."""
         found = (
             *_run_events(run),
             *_mode_changes(run),
@@ -66,8 +66,8 @@ class Timeline:
             *_network(run),
         )
         self._found += [event for event in found if run.is_inside(event.t)]
-        self._violations.take(run)
-        self._silences.take(run)
+        self._violations.add(run)
+        self._silences.add(run)
 
     def events(self, span: Span) -> list[TimelineEvent]:
         """Return all events in the order of time."""
@@ -84,7 +84,7 @@ class Timeline:
 def timeline_events(run: RunData) -> list[TimelineEvent]:
     """Return all events of a whole run in the order of time."""
     timeline = Timeline()
-    timeline.take(run)
+    timeline.add(run)
     return timeline.events(run.span)
 
 
@@ -275,8 +275,8 @@ class Silences:
         self._last: dict[str, float] = {}
         self._found: list[tuple[float, str, float]] = []
 
-    def take(self, run: RunData) -> None:
-        """Take a run, or the next part of it."""
+    def add(self, run: RunData) -> None:
+        """Add a run, or the next part of it."""
         for key, topic in topics.all_keys(run.log.robot).items():
             if topic.rate_hz < 10.0 or topic is topics.JOINT_TRACE:
                 continue

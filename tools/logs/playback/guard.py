@@ -64,7 +64,7 @@ class LiveRobotWatch:
         """Leave the bus."""
         self._session.close()
 
-    def look(self) -> str:
+    def find_live(self) -> str:
         """Return why a live drive is taken to be on the bus, in words; empty if it is not."""
         try:
             fleet = SupervisedFleet.attach(self._run_dir)
@@ -95,7 +95,7 @@ class LiveRobotWatch:
 
 
 def allowed(targets: Mapping[str, str], live: str, *, force: bool) -> dict[str, str]:
-    """Return the keys that may be published beside what `LiveRobotWatch.look` found.
+    """Return the keys that may be published beside what `LiveRobotWatch.find_live` found.
 
     `force` adds topics that a live robot acts on, but for those that move it (else FleetError).
     """

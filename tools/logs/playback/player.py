@@ -175,7 +175,6 @@ class Player:
         self._clock_seq += 1
 
     def _patience_s(self) -> float:
-        """Return how long there is nothing to do."""
         position = self.schedule.next_ns()
         if position is None or self._quit:
             return 0.0

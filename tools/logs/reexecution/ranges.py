@@ -7,7 +7,6 @@ range before it is held to.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Final, NamedTuple
 from tools.logs.reexecution.execution import Execution
 from tools.logs.reexecution.outcome import ReexecutionResult
 from tools.logs.run_index import RunIndex
-from tools.logs.run_log import MARGIN_S, NOTHING, RunLog, RunPart, parts_of, robot_of
+from tools.logs.run_log import MARGIN_S, NOTHING, RunLog, RunPart, divided, parts_of, robot_of
 
 RANGE_S: Final = 60.0
 """Length of a range; shorter ones spend more on their lead-in and on starting."""
@@ -43,12 +42,8 @@ def ranges_of(
     workers: int = 1,
 ) -> list[RangeTask]:
     """Return a part of a run in ranges, in their order."""
-    begin_s, end_s = max(part.begin_s, 0.0), min(part.end_s, index.length_s)
-    count = math.ceil((end_s - begin_s) / range_s)
-    count = workers * math.ceil(count / workers) if count > 1 else 1
-    edges = [begin_s + number * (end_s - begin_s) / count for number in range(count)]
-    parts = zip(edges, [*edges[1:], part.end_s], strict=True)
-    return [RangeTask(index.path, RunPart(*edge), services, tolerance) for edge in parts]
+    pieces = divided(index, part, range_s, workers)
+    return [RangeTask(index.path, piece, services, tolerance) for piece in pieces]
 
 
 def execute_range(task: RangeTask) -> list[ReexecutionResult]:

@@ -152,7 +152,7 @@ def schedule_of(
 def _permitted(
     targets: dict[str, str], watch: guard.LiveRobotWatch, console: Console, *, force: bool
 ) -> dict[str, str]:
-    live = watch.look()
+    live = watch.find_live()
     left = guard.allowed(targets, live, force=force)
     out = [target for key, target in targets.items() if key not in left]
     if out:

@@ -24,9 +24,8 @@ from tools.judge.run_parts import PartFlags, part_of
 from tools.lab.studies.sweeps.pool import cores, results
 from tools.live.experiment import ControllerFlags
 from tools.logs.reexecution import rewritten
-from tools.logs.reexecution.compare import size
+from tools.logs.reexecution.compare import likely_reason, size
 from tools.logs.reexecution.execution import Execution
-from tools.logs.reexecution.origin import likely_reason
 from tools.logs.reexecution.outcome import ReexecutionResult
 from tools.logs.reexecution.params import with_params
 from tools.logs.reexecution.ranges import RangeTask, execute_range, merged, ranges_of

@@ -1,4 +1,4 @@
-"""An export that is ended half-way leaves nothing that looks whole, and the next one works."""
+"""An export that finds nothing, or is ended half-way, leaves nothing that looks whole."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from pathlib import Path
 import pytest
 
 from tools import cli
+from tools.logs.reexecution import rewritten
+from tools.logs.run_index import RunIndex
+from tools.logs.run_log import NOTHING, RunLog
 
 WAIT_S = 60.0
 
@@ -66,3 +69,36 @@ def test_a_file_that_is_ended_half_way_leaves_the_one_that_was_there(
     assert cli.main(["log", "export", str(run_file), *words, "--force"]) == 130
     assert out.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [out]
+
+
+WRITERS = (
+    "report --open no -o OUT",
+    "export --ros2bag OUT",
+    "export --csv OUT",
+    "export --csv OUT --rate 10",
+    "export --gif OUT",
+    "export --scene -o OUT",
+    "view --html OUT",
+)
+READERS = ("explain", "resim", "whatif --kill planner", "play --wait 0 --run-dir OUT")
+
+
+@pytest.fixture(scope="module")
+def silent(run_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a run's file with all that is said about it, and without a message."""
+    log = RunLog(RunIndex(run_file), NOTHING)
+    log.forget()
+    path = tmp_path_factory.mktemp("silent") / "run.mcap"
+    assert rewritten.write(log, path, {}, {}) == 0
+    return path
+
+
+@pytest.mark.parametrize("words", [*WRITERS, *READERS])
+def test_a_run_without_a_message_is_exit_code_2_and_one_line(
+    silent: Path, tmp_path: Path, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    verb, *flags = words.replace("OUT", str(tmp_path / "out")).split()
+    assert cli.main([verb, str(silent), *flags]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+    assert list(silent.parent.iterdir()) == [silent]
