@@ -39,10 +39,12 @@ REQUIRED: Final = (
 )  # fmt: skip
 """Metadata that a verb computes with."""
 VERBS: Final = (
-    ("info",), ("info", "--full"), ("info", "--json"), ("explain",), ("report", "--open", "no"),
-    ("resim", "--service", "knee_left", "--until-first-difference"), ("recover", "--force"),
-    ("export", "--csv", "csv"), ("export", "--ros2bag", "bag"), ("view", "--html", "view.html"),
-    ("play", "--rate", "100", "--duration", "0.1"),
+    ("log info",), ("log info", "--full"), ("log info", "--json"), ("log explain",),
+    ("log report", "--open", "no"),
+    ("log resim", "--service", "knee_left", "--until-first-difference"), ("log recover", "--force"),
+    ("log export", "--csv", "csv"), ("log export", "--ros2bag", "bag"),
+    ("view", "--html", "view.html"),
+    ("log play", "--rate", "100", "--duration", "0.1"),
 )  # fmt: skip
 
 
@@ -88,8 +90,8 @@ def test_nothing_of_a_hostile_log_is_obeyed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)
-    codes = (0, 2, 3) if words[0] == "resim" else (0, 2)  # 3: another output than recorded
-    assert_harmless([words[0], hostile, *words[1:]], codes, capsys)
+    codes = (0, 2, 3) if words[0] == "log resim" else (0, 2)  # 3: another output than recorded
+    assert_harmless([*words[0].split(), hostile, *words[1:]], codes, capsys)
     for page in (*tmp_path.glob("*.html"), *Path(hostile).parent.glob("*.html")):
         assert SCRIPT not in page.read_text(encoding="utf-8")
         page.unlink()
@@ -101,8 +103,8 @@ def test_metadata_that_is_computed_with_is_checked(
     record: str, field: str, value: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = made_up(tmp_path / "run.mcap", {record: {field: value}})
-    for verb in (["info"], ["report", "--open", "no"]):
-        assert_harmless([verb[0], path, *verb[1:]], (0, 2), capsys)
+    for verb in (["log info"], ["log report", "--open", "no"]):
+        assert_harmless([*verb[0].split(), path, *verb[1:]], (0, 2), capsys)
 
 
 @pytest.mark.parametrize("value", ["fast", "nan", "0", "1e400"])

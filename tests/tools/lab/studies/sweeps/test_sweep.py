@@ -167,7 +167,7 @@ def test_a_study_and_the_verb_have_help_with_examples_that_are_right(
 ) -> None:
     for words in ((), (study_name,)):
         with pytest.raises(SystemExit) as left:
-            cli.main(["sweep", *words, "--help"])
+            cli.main(["study", "sweep", *words, "--help"])
         assert left.value.code == 0
         shown = capsys.readouterr().out
         assert f"\n  xrl study sweep {study_name}\n" in shown.partition("examples:")[2]
@@ -211,7 +211,7 @@ def test_flags_that_make_no_sense_are_refused_and_nothing_is_written(
     flags: tuple[str, ...], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    assert exit_code(["sweep", *flags, "--out", str(out)]) == 2
+    assert exit_code(["study", "sweep", *flags, "--out", str(out)]) == 2
     assert re.search(words, capsys.readouterr().err)
     assert not out.exists()
 
@@ -262,7 +262,7 @@ def test_a_study_that_is_stopped_keeps_its_rows_and_leaves_no_process(
     tmp_path: Path, number: signal.Signals, code: int
 ) -> None:
     """Ctrl-C goes to every process of the terminal; SIGKILL here to the first only."""
-    command = [sys.executable, "-m", "tools.cli", "sweep", *KILL]
+    command = [sys.executable, "-m", "tools.cli", "study", "sweep", *KILL]
     process = subprocess.Popen(
         [*command, "--n", "200", "--workers", "2", "--out", str(tmp_path)],
         start_new_session=True,
@@ -312,7 +312,7 @@ def test_the_digest_has_every_tool_that_decides_a_run_and_no_picture() -> None:
         (latency.STUDY, {f"{sweeps}/latency_trial.py", "tools/sim/centralised/control.py"}),
     ):
         code = code_of(*one.code)
-        runs = ("lockstep", "network", "virtual_drive", "virtual_harness", "virtual_network")
+        runs = ("lockstep", "network", "virtual_drive", "virtual_services", "virtual_time")
         assert {"services", "shared", *(f"tools/sim/{name}.py" for name in runs)} | own <= {*code}
         assert [part for part in code if "picture" in part or "report" in part] == []
 
