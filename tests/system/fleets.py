@@ -69,7 +69,7 @@ def xrl(
 
 def xrl_led(verb: str, out: Path, *flags: str | Path) -> subprocess.CompletedProcess[str]:
     """Run a verb that leads a fleet; skip the test if the machine stalled before it began."""
-    done = xrl(verb, "--out", out, *flags, timeout_s=220.0)
+    done = xrl(*verb.split(), "--out", out, *flags, timeout_s=220.0)
     if stalled_before_it_began(done.returncode, done.stdout + done.stderr, out):
         pytest.skip("this machine stalled so often that the scenario could not begin")
     return done

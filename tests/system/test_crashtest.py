@@ -19,7 +19,7 @@ pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 
 def test_the_robot_stands_when_a_knees_service_is_killed_in_the_squat(tmp_path: Path) -> None:
     with leaving_nothing():
-        done = xrl_led("crashtest", tmp_path, "--only", "kill-knee_left")
+        done = xrl_led("study crash", tmp_path, "--only", "kill-knee_left")
     assert done.returncode == 0, done.stdout + done.stderr
     document = json.loads((tmp_path / "results.json").read_text())
     assert document["complete"] is True
@@ -33,7 +33,7 @@ def test_the_robot_stands_when_a_knees_service_is_killed_in_the_squat(tmp_path: 
 def test_an_interrupted_matrix_leaves_nothing_behind(tmp_path: Path) -> None:
     with leaving_nothing() as mine:
         process = subprocess.Popen(
-            command("crashtest", "--only", "kill-*", "--out", tmp_path), cwd=CHECKOUT,
+            command("study", "crash", "--only", "kill-*", "--out", tmp_path), cwd=CHECKOUT,
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
         )  # fmt: skip
         while not mine():

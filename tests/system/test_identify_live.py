@@ -44,7 +44,7 @@ def test_a_live_robot_is_led_for_a_fit_and_probed_and_leads_on(
             assert moments.q[:, 5].max() - moments.q[:, 5].min() > 0.05, "the hips went down"
             stopped = body.go(SHORT, lambda *_: None, lambda: True)
             assert stopped.ended == "stopped"
-            applied = xrl("identify", "body", "--apply", run_dir=run_dir)
+            applied = xrl("drive", "identify", "body", "--apply", run_dir=run_dir)
             assert applied.returncode == 2
             assert "runs with it" in applied.stderr, "and nothing was led"
         with open_session(robot, "tune", run_dir) as session:

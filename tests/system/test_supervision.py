@@ -436,13 +436,13 @@ def test_kill_and_down_work_from_the_command_line(
 
 def test_top_hz_and_echo_show_what_the_services_send(start: Start, order: Order) -> None:
     fleet = start({"ankle_right": JOINT, "planner": SLEEPER})
-    code, said = order("hz", "joint/ankle_right/state", "--for", "1")
+    code, said = order("topic", "hz", "joint/ankle_right/state", "--for", "1")
     row = next(line for line in said.splitlines() if "ankle_right" in line)
     assert (code, row.split()[1].endswith("/250")) == (0, True), "the rate, and the nominal one"
     assert 20 < float(row.split()[1].removesuffix("/250")) < 150
-    assert order("hz", "planner/status", "--for", "0.2")[0] == 3, "nothing came"
+    assert order("topic", "hz", "planner/status", "--for", "0.2")[0] == 3, "nothing came"
 
-    words = ["echo", "joint/*/state", "--count", "2", "--field", "mode", "--field", "seq"]
+    words = ["topic", "echo", "joint/*/state", "--count", "2", "--field", "mode", "--field", "seq"]
     first, second = map(json.loads, order(*words, "--json")[1].splitlines())
     assert first["topic"] == "joint/ankle_right/state"
     assert second["seq"] == first["seq"] + 1, "none is lost"

@@ -53,7 +53,7 @@ def test_a_killed_services_successor_takes_over_and_an_unplugged_drive_holds(
 ) -> None:
     out = tmp_path / "out"
     cases = ("--only", "kill-knee_left", "--only", "unplugged-knee_left")
-    led("crashtest", out, "--config", robot_path, *cases)
+    led("study crash", out, "--config", robot_path, *cases)
     rows = {row["name"]: row for row in json.loads((out / "results.json").read_text())["cases"]}
     assert [row["verdict"] for row in rows.values()] == ["stood", "stood"]
     assert rows["kill-knee_left"]["leads_again_s"] is not None

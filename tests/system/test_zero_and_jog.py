@@ -90,7 +90,7 @@ def test_emulated_drives_are_zeroed_by_a_protractor_and_by_the_stand(
 def test_beside_its_joint_service_a_module_is_zeroed_only_while_that_is_disarmed(
     run_dir: Path, robot: RobotConfig
 ) -> None:
-    order = ("zero", MODULE, "--at", "0.03,-1.0", "--yes")
+    order = ("drive", "zero", MODULE, "--at", "0.03,-1.0", "--yes")
     with started(run_dir, "simulator", MODULE) as fleet, heard(robot, run_dir) as ear:
         ear.wait_for({MODULE: Mode.HOLD})
         held = xrl(*order, run_dir=run_dir)
@@ -123,12 +123,12 @@ def test_on_the_emulated_robot_a_small_limit_an_interrupt_and_a_service_stop_it(
     run_dir: Path, robot: RobotConfig
 ) -> None:
     with started(run_dir, "simulator", "ankle_left"):
-        weak = xrl("jog", MODULE, "--torque-limit", "4", "--yes", run_dir=run_dir)
+        weak = xrl("drive", "jog", MODULE, "--torque-limit", "4", "--yes", run_dir=run_dir)
         assert weak.returncode == 3, weak.stdout + weak.stderr
         assert "torque limit of 4 N m" in weak.stdout
         assert "both axes are idle" in weak.stdout
         process = subprocess.Popen(
-            command("jog", *LEG, "--cycles", "20", "--run-dir", run_dir),
+            command("drive", "jog", *LEG, "--cycles", "20", "--run-dir", run_dir),
             cwd=CHECKOUT,
             stdout=subprocess.PIPE,
             text=True,
@@ -149,7 +149,7 @@ def test_on_the_emulated_robot_a_small_limit_an_interrupt_and_a_service_stop_it(
         assert DriveStatus.IDLE in statuses
         assert DriveStatus.ARMED not in statuses
         for words, why in ((("ankle_left", "--yes"), "its joint service"), ((MODULE,), "--yes")):
-            refused = xrl("jog", *words, run_dir=run_dir)
+            refused = xrl("drive", "jog", *words, run_dir=run_dir)
             assert refused.returncode == 2
             assert why in refused.stderr
 
@@ -157,7 +157,7 @@ def test_on_the_emulated_robot_a_small_limit_an_interrupt_and_a_service_stop_it(
 def test_after_a_jog_the_doctor_finds_the_drive_as_it_was(run_dir: Path) -> None:
     """Its limits too: `drive configure --apply` would restart the board for them, zero and all."""
     with started(run_dir, "simulator"):
-        jogged = xrl("jog", MODULE, "--torque-limit", "4", "--yes", run_dir=run_dir)
+        jogged = xrl("drive", "jog", MODULE, "--torque-limit", "4", "--yes", run_dir=run_dir)
         assert "both axes are idle" in jogged.stdout, jogged.stdout + jogged.stderr
         report = json.loads(xrl("doctor", "--json", run_dir=run_dir).stdout)
     rows = [row for group in report["groups"].values() for row in group]

@@ -33,5 +33,5 @@ def page(log: RunLog) -> str:
 def shown(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run with its scene."""
     out = tmp_path_factory.mktemp("shown") / "shown.mcap"
-    assert cli.main(["export", str(made.path), "--scene", "-o", str(out)]) == 0
+    assert cli.main(["log", "export", str(made.path), "--scene", "-o", str(out)]) == 0
     return out

@@ -72,15 +72,20 @@ def test_a_file_that_is_ended_half_way_leaves_the_one_that_was_there(
 
 
 WRITERS = (
-    "report --open no -o OUT",
-    "export --ros2bag OUT",
-    "export --csv OUT",
-    "export --csv OUT --rate 10",
-    "export --gif OUT",
-    "export --scene -o OUT",
+    "log report --open no -o OUT",
+    "log export --ros2bag OUT",
+    "log export --csv OUT",
+    "log export --csv OUT --rate 10",
+    "log export --gif OUT",
+    "log export --scene -o OUT",
     "view --html OUT",
 )
-READERS = ("explain", "resim", "whatif --kill planner", "play --wait 0 --run-dir OUT")
+READERS = (
+    "log explain",
+    "log resim",
+    "log whatif --kill planner",
+    "log play --wait 0 --run-dir OUT",
+)
 
 
 @pytest.fixture(scope="module")
@@ -97,8 +102,9 @@ def silent(run_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_run_without_a_message_is_exit_code_2_and_one_line(
     silent: Path, tmp_path: Path, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    verb, *flags = words.replace("OUT", str(tmp_path / "out")).split()
-    assert cli.main([verb, str(silent), *flags]) == 2
+    verb, *flags = words.removeprefix("log ").replace("OUT", str(tmp_path / "out")).split()
+    noun = ["log"] if words.startswith("log ") else []
+    assert cli.main([*noun, verb, str(silent), *flags]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
     assert list(silent.parent.iterdir()) == [silent]

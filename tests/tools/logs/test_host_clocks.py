@@ -258,7 +258,7 @@ def test_a_record_with_nonsense_in_it_is_told_of_in_words(
     with writer_of(tmp_path, robot, text.encode()) as writer:
         key = topics.JOINT_STATE.key(robot.name, "knee_left")
         writer.take_from(Queue([(key, encode(sample(JointState, t_ns=t_ns, seq=1)), 7)]), 1)
-    assert exit_code(["info", writer.path]) == 0
+    assert exit_code(["log", "info", writer.path]) == 0
     assert read_run(writer.path).count(key) == 1
 
 
@@ -293,9 +293,9 @@ def test_joined_with_a_hosts_own_record_the_fleets_has_what_a_cut_network_kept_f
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     lost = [key for key in topics.all_keys("xrl") if "_left/" in key]
-    assert exit_code(["resim", with_a_gap, "--service", "knee_left"]) == 0
+    assert exit_code(["log", "resim", with_a_gap, "--service", "knee_left"]) == 0
     assert not re.search(r"knee_left +2810 +0 ", capsys.readouterr().out)
-    assert exit_code(["join", with_a_gap, of_the_leg, "--out", tmp_path / "joined"]) == 0
+    assert exit_code(["log", "join", with_a_gap, of_the_leg, "--out", tmp_path / "joined"]) == 0
     assert "xrl/xrl/joint/knee_left/state: 200" in capsys.readouterr().out
     whole, joined = (
         read_run(path, as_sent=True) for path in (record, tmp_path / "joined" / "run.mcap")
@@ -305,9 +305,9 @@ def test_joined_with_a_hosts_own_record_the_fleets_has_what_a_cut_network_kept_f
     for key in lost:
         times = zip(joined.raw(key), whole.raw(key), strict=True)
         assert all(abs(mine[0] - its[0]) < 3 * NS_PER_MS for mine, its in times)
-    assert exit_code(["resim", tmp_path / "joined", "--service", "knee_left"]) == 0
+    assert exit_code(["log", "resim", tmp_path / "joined", "--service", "knee_left"]) == 0
     assert re.search(r"knee_left +2810 +0 .*all equal", capsys.readouterr().out)
-    assert exit_code(["info", tmp_path / "joined" / "run.mcap"]) == 0
+    assert exit_code(["log", "info", tmp_path / "joined" / "run.mcap"]) == 0
 
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(0, 300), st.integers(0, 300)), max_size=30))
@@ -350,7 +350,7 @@ def test_what_is_no_hosts_record_is_not_joined(
         (of_the_leg, of_the_leg, "the fleet's comes first"),
         (record, tmp_path, "holds no .mcap file"),
     ):
-        assert exit_code(["join", first, second, "--out", tmp_path / "out"]) == 2
+        assert exit_code(["log", "join", first, second, "--out", tmp_path / "out"]) == 2
         assert why in capsys.readouterr().err
     assert not (tmp_path / "out" / "run.mcap").exists()
 
@@ -364,7 +364,7 @@ def test_a_record_of_another_time_is_not_joined(
 ) -> None:
     late = [(at_ns + 100 * NS_PER_S, *rest) for at_ns, *rest in sent]
     fleets = write_record(tmp_path, robot, late, BODY)  # type: ignore[arg-type]  # the same tuple
-    assert exit_code(["join", fleets, of_the_leg, "--out", tmp_path / "out"]) == 2
+    assert exit_code(["log", "join", fleets, of_the_leg, "--out", tmp_path / "out"]) == 2
     assert "of another time" in capsys.readouterr().err
 
 
@@ -382,7 +382,7 @@ def test_over_hours_of_drift_no_message_is_lost_or_doubled(
     ]
     fleets = write_record(tmp_path / "fleet", robot, late, BODY)  # type: ignore[arg-type]  # same
     own = write_record(tmp_path / "own", robot, sent, LEFT, of=LEG, clock=drifts)
-    assert exit_code(["join", fleets, own, "--out", tmp_path / "joined"]) == 0
+    assert exit_code(["log", "join", fleets, own, "--out", tmp_path / "joined"]) == 0
     assert f": {len(sent) - len(missed)} messages" in capsys.readouterr().out
     key = topics.JOINT_STATE.key("xrl", "knee_left")
     seqs = [
@@ -402,7 +402,7 @@ def test_a_hosts_record_of_hours_before_adds_a_second_at_most(
         tmp_path / "fleet", robot, [one for one in sent if one[0] > 1000 * NS_PER_S], BODY
     )
     own = write_record(tmp_path / "own", robot, sent, LEFT, of=LEG)
-    assert exit_code(["join", fleets, own, "--out", tmp_path / "joined"]) == 0
+    assert exit_code(["log", "join", fleets, own, "--out", tmp_path / "joined"]) == 0
     assert 20.0 < RunIndex(tmp_path / "joined").length_s < 21.2
 
 

@@ -284,7 +284,7 @@ def test_one_file_of_a_split_run_stands_for_itself(directory: Path) -> None:
 
 
 def test_a_new_file_with_a_parameter_goes_beside_the_first(directory: Path) -> None:
-    words = ["resim", str(directory), "--service", "planner", "--param", "gains.k_p_x=2000"]
+    words = ["log", "resim", str(directory), "--service", "planner", "--param", "gains.k_p_x=2000"]
     assert cli.main(words) == 0
     new = directory / "run.resim.mcap"
     try:

@@ -177,7 +177,7 @@ def test_a_study_and_the_verb_have_help_with_examples_that_are_right(
 
 def test_the_verbs_help_imports_no_study() -> None:
     code = (
-        "import sys\nfrom tools import cli\ntry:\n    cli.main(['sweep', '--help'])\n"
+        "import sys\nfrom tools import cli\ntry:\n    cli.main(['study', 'sweep', '--help'])\n"
         "except SystemExit:\n    pass\n"
         "assert not [name for name in sys.modules if name.startswith('tools.lab')]"
     )
