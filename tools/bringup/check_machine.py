@@ -25,7 +25,7 @@ from tools.graph_libraries import command, graphs_of
 SUBJECT: Final = "machine"
 CPUS_MIN: Final = 2
 CPUS_FOR_1_KHZ: Final = 4
-"""Two carry the fleet at 500 Hz (CHANGELOG.md)."""
+"""Two carry the fleet at 500 Hz (docs/results.md)."""
 CLOCKS: Final = ("tsc", "arch_sys_counter", "kvm-clock")
 """Clock sources that are read without a system call."""
 ODRIVE_VENDOR: Final = "1209"
