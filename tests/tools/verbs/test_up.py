@@ -1,4 +1,4 @@
-"""`xrl up` under `mtls`: keys by which no link comes are told before anything starts."""
+"""`xrl up`: keys by which no link comes and a record that cannot be, told before it starts."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import BusError
+from shared.exceptions import BusError, RunError
 from shared.places import DEFAULT_CONFIG
 from tests.certified import certified
 from tools import cli
@@ -49,3 +49,14 @@ def test_where_nobody_looks_on_the_services_start_and_wait_for_the_clock(
     assert "no link over TLS: " in capsys.readouterr().err
     with pytest.raises(BusError, match="set the clock"):
         up._check_keys(not_valid_yet, must=True)
+
+
+def test_where_nobody_looks_on_a_robot_starts_without_its_record(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    taken = tmp_path / "out"
+    taken.write_text("a file", encoding="utf-8")
+    up._make_record_folder(taken / "now", must=False)
+    assert "not recorded: " in capsys.readouterr().err
+    with pytest.raises(RunError, match="cannot be made"):
+        up._make_record_folder(taken / "now", must=True)
