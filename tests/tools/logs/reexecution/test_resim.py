@@ -227,7 +227,7 @@ def test_a_changed_gain_changes_what_comes_out_from_the_first_tick_with_an_error
     assert "planner, first at" in text
     assert "largest changes" in text
     new = read_run(out)
-    assert new.metadata["log", "resim"]["params"] == "gains.k_p_x=2000"
+    assert new.metadata["resim"]["params"] == "gains.k_p_x=2000"
     assert new.count(topics.SIM_TRUTH.key(log.robot)) == log.count(topics.SIM_TRUTH.key(log.robot))
     old_commands = log.messages(topics.JOINT_COMMAND, "ankle_left")
     new_commands = new.messages(topics.JOINT_COMMAND, "ankle_left")
