@@ -64,6 +64,8 @@ def test_first_motor_turns_both_axes_forward_and_the_second_turns_phi_back() -> 
     assert joint_from_motor((0.0, 1.0), 17.5) == pytest.approx((-turn, turn))
 
 
+# ---- the onboard loop
+
 N = 17.5
 
 

@@ -80,6 +80,9 @@ def test_each_due_period_passes_once_despite_losses(every: int, phase: int, rate
     assert abs(passed - 1200 / max(every, rate)) <= 2
 
 
+# ---- states are sent in the periods that the planner names
+
+
 def sent(
     robot: RobotConfig,
     commands: dict[int, JointCommand],

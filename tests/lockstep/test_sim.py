@@ -116,6 +116,8 @@ def test_a_stance_that_is_not_led_is_reported_in_words(
     assert "ahead of the left" in output
 
 
+# ---- two robots in one process
+
 CALM = still(1.5, height=1.1, push=(push(0.2, 20.0, 10.0, 0.0),))
 BROWN_OUT = Fault(module="hip_left", kind="brown_out", at=1.2)
 HARD = still(1.5, height=1.0, kill=kill(0.4), restart=restart(0.9), fault=(BROWN_OUT,))

@@ -121,6 +121,9 @@ def test_without_tau_coupled_sway_is_damped_as_well_as_in_hold(robot: RobotConfi
     assert swings[Mode.TRACK] < swings[Mode.HOLD] + 0.05
 
 
+# ---- a link that comes and goes
+
+
 def squats(seconds: float) -> tuple[Keyframe, ...]:
     heights = (1.188, 0.948)
     return tuple(Keyframe(at=2.5 * n, height=heights[n % 2]) for n in range(2 + int(seconds / 2.5)))

@@ -303,6 +303,8 @@ def test_numbers_that_are_not_valid_neither_begin_nor_end_it() -> None:
             assert overload.hold is before
 
 
+# ---- where it is stable, against loops simulated step by step
+
 STEP_S = 2e-4
 
 

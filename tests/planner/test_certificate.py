@@ -227,6 +227,8 @@ def test_a_stiffness_that_was_returned_stays_when_another_is_asked_for(robot: Ro
     np.testing.assert_array_equal(certificate.failsafe_stiffness(soft), kept)
 
 
+# ---- K_q = N K_0 + J^T K_p J - sum_i H_i F_i, B_q = N B_0 + J^T B_p J
+
 WEIGHT = np.array([0.0, 0.0, 731.6, 0.0, 0.0, 0.0])
 
 

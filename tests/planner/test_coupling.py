@@ -93,6 +93,9 @@ def test_it_forgets_on_reset() -> None:
     np.testing.assert_array_equal(filtered.advance(np.zeros(12), 0.004), 0.0)
 
 
+# ---- the matrices that it solves
+
+
 @given(seed=st.integers(0, 10_000), n=st.sampled_from([2, 6, 12]), columns=st.integers(0, 6))
 def test_it_solves_as_numpy_does_and_leaves_its_arguments(seed: int, n: int, columns: int) -> None:
     draw = np.random.default_rng(seed)

@@ -217,6 +217,9 @@ def test_each_good_while_makes_one_drop_out_forgotten() -> None:
 TICK_NS = 4 * NS_PER_MS
 
 
+# ---- how long it waits
+
+
 class Led:
     """An engagement with six modules that are always ready, and do as they are told."""
 

@@ -218,6 +218,8 @@ def test_two_laws_given_the_same_give_the_same_bits(robot: RobotConfig, closed: 
                 np.testing.assert_array_equal(a, b)
 
 
+# ---- standing still, exactly: what the feet carry, and the law's own slopes
+
 STANDS = (
     {"height": 1.188},
     {"height": 1.0, "x": 0.02, "y": -0.015, "roll": 0.03, "pitch": 0.3, "yaw": 0.04},

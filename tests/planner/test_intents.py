@@ -88,6 +88,8 @@ def test_what_is_no_number_is_no_intent(robot: RobotConfig, bad: float) -> None:
     assert intents.request(T0 + 3).assist_n == 80.0
 
 
+# ---- where the closed directions are asked to be
+
 LARGEST = (0.03, 0.04, 0.06, 0.12)
 
 
@@ -149,6 +151,8 @@ def test_it_rests_where_it_is_while_it_is_not_led() -> None:
 
 Array = NDArray[np.float64]
 
+
+# ---- a row of the reference that is probed
 
 MOST = (0.01, 0.01, 0.01, 0.02, 0.05, 0.0)
 

@@ -161,6 +161,9 @@ STEP = 1e-4
 """m and rad; of the second differences."""
 
 
+# ---- sum_i H_i F_i against second differences of the oracle's closed chain
+
+
 class Load(NamedTuple):
     """What the law asks of the joints: along p, and at the harness point."""
 
@@ -273,6 +276,8 @@ def test_holding_the_shares_changes_internal_torques_only(
     assert np.abs(error).max() > 10.0
     np.testing.assert_allclose(T.T @ error @ T, 0.0, atol=1e-3)
 
+
+# ---- a payload off the torso's centre
 
 PLACE = (0.08, -0.05, 0.15)
 

@@ -156,6 +156,8 @@ def test_one_that_leads_goes_on_beside_a_caught_module(planner: Planner, level_q
     assert len(planner.tick(now_ns)) == N_MODULES
 
 
+# ---- modules that may be limp: all stiffen for a knee, the knees for an ankle
+
 FOR = {"ankle": Support.KNEES, "knee": Support.ALL, "hip": Support.NONE}
 """Who braces for a limp one of a kind."""
 

@@ -266,6 +266,8 @@ def test_each_value_is_the_tables(joint: int, sign: float) -> None:
     assert values == pytest.approx([expected[trip] for trip in TRIPS], nan_ok=True)
 
 
+# ---- how far it drifts once the hand has left it
+
 HERE: Pair = (0.8, 0.1)
 
 

@@ -102,6 +102,8 @@ def test_soft_stop_pushes_only_inwards_and_only_beyond_the_stop(limits: TorqueLi
     assert beyond_count == 2 * 2 * (300 + 8)
 
 
+# ---- its algebra
+
 MAX = 115.6
 
 

@@ -181,6 +181,8 @@ def test_leaving_closed_loop_without_an_error_is_one(closed: bytes, left: bytes)
     assert statuses == [DriveStatus.ARMED, DriveStatus.ERROR]
 
 
+# ---- what an ODrive's registers say
+
 NONE = (0,) * 8
 
 

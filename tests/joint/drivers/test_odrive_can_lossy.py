@@ -173,6 +173,8 @@ def test_an_axis_that_disarms_shows_though_heartbeats_are_lost(bench: Bench) -> 
     assert bench.status is DriveStatus.ERROR
 
 
+# ---- each frame lost, one after the other
+
 HERE = (0.1, -0.2)
 
 

@@ -121,6 +121,8 @@ def test_a_drive_armed_by_this_driver_reports_no_torques(rig: Rig, driver: Odriv
         assert rig.cycle(driver).torque is None
 
 
+# ---- which estimates of two axes make a sample
+
 PERIOD_NS = 2_000_000
 
 

@@ -156,6 +156,9 @@ def test_an_axis_gets_its_target_right_after_its_mode(bench: Bench) -> None:
         assert ids[at + 1] == (node, Command.SET_INPUT_POS)
 
 
+# ---- orders when the queue is full
+
+
 def test_arming_goes_on_as_the_queue_empties_closed_loop_last(bench: Bench) -> None:
     bench.receive()
     bench.commands()
