@@ -19,7 +19,7 @@ from typing import Any
 from shared import revision
 from shared.exceptions import BUG_EXIT_CODE, XrlError, os_error_in_words
 from tools.guarded_streams import guarded_streams
-from tools.verb_table import NOUNS, RENAMED, VERBS, Subparsers, Verb, add_declared, sentence
+from tools.verb_table import NOUNS, RENAMED, VERBS, Subparsers, add_declared, sentence
 
 INTERRUPTED = 128 + signal.SIGINT
 _NEGATIVE_LIST = re.compile(r"-\.?\d[^,]*,")
@@ -102,13 +102,7 @@ class _TopParser(argparse.ArgumentParser):
 
 def whole_parser() -> argparse.ArgumentParser:
     """Return the parser with every verb complete; takes a second or two."""
-    parsers = [_parser([], whole=True)]
-    for parser in parsers:
-        parser.format_help()  # a study's parser has its flags once it is used
-        for action in parser._actions:  # noqa: SLF001 - argparse has no other list of them
-            if isinstance(action, argparse._SubParsersAction):  # noqa: SLF001
-                parsers += dict.fromkeys(action.choices.values())
-    return parsers[0]
+    return _parser([], whole=True)
 
 
 def _parser(arguments: Sequence[str], *, whole: bool = False) -> argparse.ArgumentParser:
@@ -127,7 +121,7 @@ def _parser(arguments: Sequence[str], *, whole: bool = False) -> argparse.Argume
     for verb in VERBS:
         among = below.get(verb.noun) or _below(verb.noun, below)
         if whole or asked == verb.name or (asked == verb.noun != "" and asked not in NOUNS):
-            _add(among, verb)
+            add_declared(among, verb)
         else:
             among.add_parser(verb.word, help=verb.help)
     return parser
@@ -142,14 +136,6 @@ def _below(noun: str, below: dict[str, Subparsers]) -> Subparsers:
         parser = among.add_parser(word, help=NOUNS[noun], description=sentence(NOUNS[noun]))
     below[noun] = parser.add_subparsers(metavar="VERB", required=noun in NOUNS)
     return below[noun]
-
-
-def _add(among: Subparsers, verb: Verb) -> None:
-    if not hasattr(verb.module, "add_parser"):
-        add_declared(among, verb)
-        return
-    verb.module.add_parser(among)  # not declared yet
-    among.choices[verb.word].set_defaults(run=verb.module.run)
 
 
 def _asked(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> str:

@@ -166,6 +166,7 @@ class _Field(NamedTuple):
     help: str
     is_repeated: bool
     is_required: bool
+    default: Any
 
 
 def fields_of(declaration: type[Flags]) -> Iterator[_Field]:
@@ -186,7 +187,7 @@ def fields_of(declaration: type[Flags]) -> Iterator[_Field]:
         text = arg.help or docs.get(name, "")
         if _shows_default(field.default, text):
             text += f" (default: {_in_words(field.default)})"
-        yield _Field(name, kind, limits, arg, text, is_repeated, is_required)
+        yield _Field(name, kind, limits, arg, text, is_repeated, is_required, field.default)
 
 
 def _taken_apart(hint: Any) -> tuple[Any, Range | None, Arg, bool]:

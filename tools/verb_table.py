@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import argparse
 import importlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from types import ModuleType
 from typing import Final, NamedTuple, TypeAlias, get_type_hints
 
-from shared import places
 from tools.flags import Flags, add_flags, read_flags
 
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # noqa: SLF001 - its only name
@@ -26,7 +25,8 @@ class Verb(NamedTuple):
     """What is typed: `demo`; or nouns and a verb, `log info`, `drive can setup`."""
     help: str
     at: str = ""
-    """MODULE:FUNCTION below `tools.verbs`; none: `run` in the module of the verb's name."""
+    """MODULE:FUNCTION, below `tools.verbs` if it does not begin with `tools.`; none: `run` in the
+    module of the verb's name."""
 
     @property
     def noun(self) -> str:
@@ -42,7 +42,7 @@ class Verb(NamedTuple):
     def module(self) -> ModuleType:
         """Imported now."""
         path = self.at.partition(":")[0] or self.name.replace(" ", ".")
-        return importlib.import_module(f"tools.verbs.{path}")
+        return importlib.import_module(path if path.startswith("tools.") else f"tools.verbs.{path}")
 
     @property
     def function(self) -> Callable[[Flags], int]:
@@ -121,11 +121,22 @@ VERBS: Final = (
     Verb("log export", "write a run for others: 3-D scene, picture, CSV, Parquet, ROS 2 bag"),
     Verb("log explain", "break one planner tick down: gains, margins, torque by origin"),
     Verb("log resim", "run a log's services again and compare, bit for bit or changed"),
-    Verb("log whatif", "kill a service at each moment of a run: would it have stood?", "whatif"),
+    Verb("log whatif", "kill a service at each moment of a run: would it have stood?"),
     Verb("topic echo", "print the messages of a topic as they come"),
     Verb("topic hz", "measure the rate, spacing, age and size of topics"),
-    Verb("study sweep", "run many random cases in virtual time and count the falls", "sweep"),
-    Verb("study crash", "kill one service after the other, live, and judge", "crashtest"),
+    *(
+        Verb(f"study {name}", about, f"tools.lab.studies.sweeps.{name}")
+        for name, about in (
+            ("kill", "kill the planner in random poses, under random pushes"),
+            ("robust", "draw every error of the plant at once: who falls, and why"),
+            ("latency", "compare three controls over bad networks: who falls, who leads"),
+            ("push", "find the hardest push by direction, duration, pose and mode"),
+            ("trips", "check that each trip comes where it should, and nowhere else"),
+            ("certificate", "check the sign of K_fail against falls in simulation"),
+            ("dynamics", "search for poses where a motion that should decay grows"),
+        )
+    ),
+    Verb("study crash", "kill one service after the other, live, and judge"),
     Verb("hosts files", "write each host's files into a folder, and bring nothing", "hosts:files"),
     Verb("hosts update", "bring each host its files: robot file, keys, unit", "hosts:update"),
     Verb("hosts check", "look whether the hosts are as they should be; 0: they are", "hosts:check"),
@@ -154,7 +165,7 @@ RENAMED: Final = {
     "stiffness": "gains --stiffness",
     "hz": "topic hz",
     "echo": "topic echo",
-    "sweep": "study sweep",
+    "sweep": "study",
     "crashtest": "study crash",
     **{
         word: f"{noun} {word}"
@@ -173,41 +184,17 @@ def sentence(text: str) -> str:
     return f"{text[0].upper()}{text[1:]}" + ("" if text.endswith("?") else ".")
 
 
-def add_declared(subparsers: Subparsers, verb: Verb) -> argparse.ArgumentParser:
-    """Add the parser of a verb whose flags are declared."""
-    parser = _with_examples(subparsers, verb, verb.examples)
-    parser.description = f"{parser.description}\n{getattr(verb.module, 'ABOUT', '')}".rstrip()
-    function, declaration = verb.function, verb.declaration
-    add_flags(parser, declaration)
-    parser.set_defaults(run=lambda found: function(read_flags(declaration, found)))
-    return parser
-
-
-def add_verb(subparsers: Subparsers, module: str, examples: str) -> argparse.ArgumentParser:
-    """Add the parser of a verb that adds its arguments itself, as the studies do."""
-    (verb,) = (verb for verb in VERBS if verb.at == module)
-    return _with_examples(subparsers, verb, [line.strip() for line in examples.strip().split("\n")])
-
-
-def _with_examples(
-    subparsers: Subparsers, verb: Verb, examples: Iterable[str]
-) -> argparse.ArgumentParser:
-    lines = "\n".join(f"  {line}" for line in examples)
-    return subparsers.add_parser(
+def add_declared(subparsers: Subparsers, verb: Verb) -> None:
+    """Add the parser of a verb: its flags as declared, its line of the table, its examples."""
+    lines = "\n".join(f"  {line}" for line in verb.examples)
+    about = getattr(verb.module, "ABOUT", "")
+    parser = subparsers.add_parser(
         verb.word,
         help=verb.help,
-        description=sentence(verb.help),
+        description=f"{sentence(verb.help)}\n{about}".rstrip(),
         epilog=f"examples:\n{lines}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-
-
-def add_config(parser: argparse.ArgumentParser) -> None:
-    """Add `--config` to the parser of a study."""
-    parser.add_argument(
-        "--config",
-        type=places.config_argument,
-        default=places.NOT_NAMED,
-        metavar="FILE",
-        help=places.HELP,
-    )
+    function, declaration = verb.function, verb.declaration
+    add_flags(parser, declaration)
+    parser.set_defaults(run=lambda found: function(read_flags(declaration, found)))

@@ -45,7 +45,7 @@ def test_every_verb_is_offered(script: Path, tmp_path: Path) -> None:
 def test_a_verbs_options_and_actions_are_offered(script: Path, tmp_path: Path) -> None:
     assert "--plant" in offered(script, "xrl sim --pl", tmp_path)
     assert "check" in offered(script, "xrl ros2 ", tmp_path)
-    assert offered(script, "xrl sweep robust --be", tmp_path) == {"--beyond"}
+    assert offered(script, "xrl study robust --be", tmp_path) == {"--beyond"}
     assert offered(script, "xrl completion ", tmp_path) >= {"bash", "zsh"}
 
 

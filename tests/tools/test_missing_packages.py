@@ -19,7 +19,7 @@ from tools.bringup import survey
         ("demo", "sim"),
         ("demo --view", "sim"),
         ("sim", "sim"),
-        ("study sweep kill --n 1", "sim"),
+        ("study kill --n 1", "sim"),
         ("study crash --quick", "sim"),
         ("log whatif OUT --kill planner", "sim"),
         ("bench", "sim"),

@@ -24,7 +24,6 @@ import tomli_w
 
 from shared.exceptions import FAULT_EXIT_CODE, RunError, XrlError
 from shared.toml_file import Section, read_toml
-from tools.number_arguments import count
 from tools.terminal import Console, marked
 
 ROOT: Final = Path(__file__).resolve().parents[2]
@@ -122,7 +121,7 @@ def _parser() -> argparse.ArgumentParser:
     which.add_argument("--sample", action="store_true", help="a fixed sample of the first group")
     which.add_argument("--survivors", action="store_true", help="those that lived the last time")
     which.add_argument("--resume", action="store_true", help="go on with a run that was stopped")
-    parser.add_argument("--children", type=count, default=os.cpu_count(), help="processes")
+    parser.add_argument("--children", type=int, default=os.cpu_count(), help="processes")
     parser.add_argument(
         "--out", type=Path, default=ROOT / "out" / "mutants", help="folder (out/mutants)"
     )

@@ -34,7 +34,7 @@ from shared.config.sections import LawConfig
 from shared.exceptions import FleetError, RunError
 from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG, SCENARIOS
-from tools.flags import Arg, ConfigFlags, Duration, Flags, Natural, add_flags, parsed
+from tools.flags import Arg, ConfigFlags, Duration, Flags, Natural, parsed
 from tools.guarded_streams import printable
 from tools.live.describe_inject import in_words_of, parse_inject
 from tools.output import make_folder
@@ -82,18 +82,6 @@ class ImuFlags(Flags):
     imu: bool = False
     """with an IMU on the torso, and its service: the robot stands on slopes (imu.fitted of the
     robot file)"""
-
-
-def add_imu(parser: argparse.ArgumentParser) -> None:
-    """Add `--imu` to the parser of a study."""
-    add_flags(parser, ImuFlags)
-    parser.set_defaults(imu=False)
-
-
-def add_plant(parser: argparse.ArgumentParser) -> None:
-    """Add `--plant` to the parser of a study."""
-    add_flags(parser, PlantFlags)
-    parser.set_defaults(plant=[])
 
 
 def _refused(text: str, form: str, **known: Iterable[str]) -> argparse.ArgumentTypeError:
@@ -146,7 +134,16 @@ def parse_fault(text: str) -> Fault:
     return msgspec.convert({**row, "axis": axis, "duration": duration}, Fault)
 
 
-class ExperimentFlags(ConfigFlags, PlantFlags, ControllerFlags, ImuFlags):
+class LawFlags(ConfigFlags, ImuFlags):
+    """A robot, with its law changed for one run."""
+
+    split: Annotated[str | None, Arg(choices=choices("split"))] = None
+    """gain split of the law"""
+    jacobian: Annotated[str | None, Arg(choices=choices("jacobian"))] = None
+    """how the legs share the load; average comes with the diagonal split: no gains certify it"""
+
+
+class ExperimentFlags(LawFlags, PlantFlags, ControllerFlags):
     """What shapes an experiment."""
 
     scenario: Annotated[str, Arg(metavar="NAME|FILE")] = "squat"
@@ -185,10 +182,6 @@ class ExperimentFlags(ConfigFlags, PlantFlags, ControllerFlags, ImuFlags):
     and s), 'all loss=20% burst=5', 'planner->left partition at=3'; at is scenario time; `xrl inject
     --help` explains each word, and which of several counts; replaces the scenario's; may be
     repeated"""
-    split: Annotated[str | None, Arg(choices=choices("split"))] = None
-    """gain split of the law"""
-    jacobian: Annotated[str | None, Arg(choices=choices("jacobian"))] = None
-    """how the legs share the load; average comes with the diagonal split: no gains certify it"""
     seed: Natural = 0
     """of the sensors' noise, and of what the network loses and how late it is"""
 
@@ -249,7 +242,7 @@ def introduce(scenario: Scenario, console: Console) -> None:
     console.print(marked("[bold]{}[/]: {}", scenario.name, about))
 
 
-def make_robot(flags: ExperimentFlags | argparse.Namespace) -> RobotConfig:
+def make_robot(flags: LawFlags) -> RobotConfig:
     """Return the robot with the flags laid over it."""
     law = (("split", flags.split), ("jacobian", flags.jacobian))
     changes = {key: value for key, value in law if value is not None}

@@ -1,8 +1,7 @@
-"""`xrl study sweep certificate`: compares the sign of K_fail with falls in simulation."""
+"""`xrl study certificate`: compares the sign of K_fail with falls in simulation."""
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Sequence
 from functools import partial
@@ -13,7 +12,8 @@ import numpy as np
 from services.simulator.physics.plant import IDEAL
 from shared.config import files as config_file
 from shared.exceptions import FELL_EXIT_CODE
-from tools.lab.studies.sweeps import certificate_trial
+from tools.flags import Count
+from tools.lab.studies.sweeps import certificate_trial, study
 from tools.lab.studies.sweeps.certificate_trial import (
     FRICTIONLESS,
     CertificateCase,
@@ -21,13 +21,31 @@ from tools.lab.studies.sweeps.certificate_trial import (
     CertificateResult,
 )
 from tools.lab.studies.sweeps.report import draw_predictions
-from tools.lab.studies.sweeps.study import Finished, Study
+from tools.lab.studies.sweeps.study import Finished, Study, StudyFlags
 
 PICTURE: Final = "certificate.png"
 LABELS: Final = (
     "the certificate's margin, in shares of what is required",
     "COM, farthest from the posture in mm",
 )
+
+
+EXAMPLES: Final = """
+xrl study certificate
+xrl study certificate --n 1000 --seed 3 --rigid
+xrl study certificate --friction
+"""
+
+
+class CertificateStudyFlags(StudyFlags):
+    """How many, on which floor."""
+
+    n: Count = 200
+    """cases"""
+    rigid: bool = False
+    """a floor as hard as the certificate takes it"""
+    friction: bool = False
+    """with the joints' dry friction, which holds up what is a little too soft"""
 
 
 class Confusion(NamedTuple):
@@ -40,20 +58,8 @@ class Confusion(NamedTuple):
     fall_fell: int
 
 
-def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the study's own flags."""
-    parser.add_argument(
-        "--rigid", action="store_true", help="a floor as hard as the certificate takes it"
-    )
-    parser.add_argument(
-        "--friction",
-        action="store_true",
-        help="with the joints' dry friction, which holds up what is a little too soft",
-    )
-
-
-def _options(args: argparse.Namespace) -> dict[str, Any]:
-    return {"rigid": args.rigid, "plant": IDEAL if args.friction else FRICTIONLESS}
+def _options(flags: CertificateStudyFlags) -> dict[str, Any]:
+    return {"rigid": flags.rigid, "plant": IDEAL if flags.friction else FRICTIONLESS}
 
 
 def report(finished: Finished) -> None:
@@ -77,7 +83,7 @@ def report(finished: Finished) -> None:
         name: [(row["margin"], row["com_mm"]) for row in rows if row["stood"] == stood]
         for name, stood in (("stood", True), ("fell", False))
     }
-    title = f"{len(rows)} random postures and gains, seed {finished.args.seed}"
+    title = f"{len(rows)} random postures and gains, seed {finished.flags.seed}"
     draw_predictions(points, LABELS, title, finished.out / PICTURE)
 
 
@@ -107,10 +113,8 @@ STUDY: Final = Study[CertificateCase](
     table="certificate.csv",
     pictures=(PICTURE,),
     code=("tools.lab.studies.sweeps.certificate_trial",),
-    n=200,
-    add_flags=add_flags,
-    load=lambda args: config_file.load(args.config),
-    cases=lambda args, robot: partial(CertificateCases(robot).draw, args.seed),
+    load=lambda flags: config_file.load(flags.config),
+    cases=lambda flags, robot: partial(CertificateCases(robot).draw, flags.seed),
     decided_by=("seed", "rigid", "friction"),
     row=certificate_trial.row_of,
     words=lambda case: f"margin {case.weakest.margin:.3g}",
@@ -123,3 +127,8 @@ STUDY: Final = Study[CertificateCase](
         FELL_EXIT_CODE if any(row["margin"] > 0.0 and not row["stood"] for row in rows) else 0
     ),
 )
+
+
+def run(flags: CertificateStudyFlags) -> int:
+    """Run the study, or one case of it."""
+    return study.run(STUDY, flags)

@@ -1,4 +1,4 @@
-"""`xrl study sweep dynamics`: does anything grow that the dynamic certificate says fades?"""
+"""`xrl study dynamics`: does anything grow that the dynamic certificate says fades?"""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from functools import partial
 from typing import Final
 
 from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE
-from tools.lab.studies.sweeps import dynamics_trial
+from tools.flags import Count
+from tools.lab.studies.sweeps import dynamics_trial, study
 from tools.lab.studies.sweeps.dynamics_trial import DynamicsResult, DynamicsTrial
 from tools.lab.studies.sweeps.report import draw_predictions
-from tools.lab.studies.sweeps.study import Finished, Study
+from tools.lab.studies.sweeps.study import AloneFlags, Finished, Study
 from tools.lab.studies.sweeps.table import Row
 
 PICTURE: Final = "dynamics.png"
@@ -19,6 +20,20 @@ LABELS: Final = (
     "rate of the slowest motion by the certificate, 1/s: below 0 it fades",
     "joints' rates 2 s after a tap, over those at once after it",
 )
+
+
+EXAMPLES: Final = """
+xrl study dynamics
+xrl study dynamics --n 400 --out out/dynamics
+xrl study dynamics --only 7
+"""
+
+
+class DynamicsStudyFlags(AloneFlags):
+    """How many."""
+
+    n: Count = 100
+    """cases"""
 
 
 def report(finished: Finished) -> None:
@@ -48,7 +63,7 @@ def report(finished: Finished) -> None:
         ]
         for name, grew in (("faded", False), ("grew", True))
     }
-    title = f"{len(rows)} random gains, poses and drivetrains, seed {finished.args.seed}"
+    title = f"{len(rows)} random gains, poses and drivetrains, seed {finished.flags.seed}"
     draw_predictions(points, LABELS, title, finished.out / PICTURE)
 
 
@@ -70,9 +85,7 @@ STUDY: Final = Study[DynamicsTrial](
     table="dynamics.csv",
     pictures=(PICTURE,),
     code=("tools.lab.studies.sweeps.dynamics_trial",),
-    n=100,
-    only="run this case alone",
-    cases=lambda args, _robot: partial(dynamics_trial.draw, args.seed),
+    cases=lambda flags, _robot: partial(dynamics_trial.draw, flags.seed),
     decided_by=("seed",),
     row=dynamics_trial.row_of,
     figures=DynamicsResult,
@@ -81,3 +94,8 @@ STUDY: Final = Study[DynamicsTrial](
     report=report,
     exit_code=exit_code,
 )
+
+
+def run(flags: DynamicsStudyFlags) -> int:
+    """Run the study, or one case of it."""
+    return study.run(STUDY, flags)

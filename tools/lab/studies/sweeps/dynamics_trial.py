@@ -181,7 +181,7 @@ def scenario_of(robot: RobotConfig, trial: DynamicsTrial) -> Scenario:
     tap = {"at": TAP_S, "duration": TAP_LASTS_S}
     return Scenario(
         name=f"dynamics-{trial.seed}-{trial.number}",
-        about=f"case {trial.number} of `xrl study sweep dynamics --seed {trial.seed}`",
+        about=f"case {trial.number} of `xrl study dynamics --seed {trial.seed}`",
         duration=DURATION_S,
         keyframe=(
             Keyframe(at=0.0, height=robot.simulation.stand_height),

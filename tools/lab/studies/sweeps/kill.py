@@ -1,8 +1,7 @@
-"""`xrl study sweep kill`: the planner killed at random, in random postures and under pushes."""
+"""`xrl study kill`: the planner killed at random, in random postures and under pushes."""
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from functools import partial
 from typing import Final
@@ -10,13 +9,16 @@ from typing import Final
 from rich.table import Table
 
 from shared.config.robot_config import RobotConfig
-from tools.lab.studies.sweeps import kill_picture, kill_trial, plants, push_range
+from tools.flags import Count
+from tools.lab.studies.sweeps import kill_picture, kill_trial, plants, push_range, study
 from tools.lab.studies.sweeps.figures import Ending, with_payload
 from tools.lab.studies.sweeps.kill_trial import PUSHES_MAX, KillCase, KillCases, KillResult
+from tools.lab.studies.sweeps.push_range import PushFlags
 from tools.lab.studies.sweeps.report import parted, show_falls, show_share
-from tools.lab.studies.sweeps.study import CaseLog, Finished, Study, bar
+from tools.lab.studies.sweeps.study import AloneFlags, CaseLog, Finished, Study, bar
 from tools.lab.studies.sweeps.table import Row
 from tools.live import experiment
+from tools.live.experiment import LawFlags
 from tools.terminal import Console
 
 PICTURE: Final = "cases.png"
@@ -35,22 +37,24 @@ WORST: Final = (
 """Column, in words, which sign is worse, unit."""
 
 
-def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the study's own flags."""
-    parser.add_argument(
-        "--split", choices=experiment.choices("split"), help="gain split of the law"
-    )
-    parser.add_argument(
-        "--jacobian", choices=experiment.choices("jacobian"), help="how the legs share the load"
-    )
-    push_range.add_flag(parser)
-    experiment.add_imu(parser)
+EXAMPLES: Final = """
+xrl study kill
+xrl study kill --n 500 --seed 1 --out out/kill
+xrl study kill --only 137 --seed 1
+xrl study kill --only 137 --seed 1 --out out/case137
+"""
 
 
-def load(args: argparse.Namespace) -> RobotConfig:
+class KillStudyFlags(AloneFlags, LawFlags, PushFlags):
+    """How many, and which law."""
+
+    n: Count = 500
+    """cases"""
+
+
+def load(flags: KillStudyFlags) -> RobotConfig:
     """Check the flags and return the robot."""
-    push_range.check(args)
-    return experiment.make_robot(args)
+    return experiment.make_robot(flags)
 
 
 def _robots(
@@ -78,8 +82,8 @@ def report(finished: Finished) -> None:
     """Draw and print what came of the study."""
     rows, console, command = finished.rows, finished.console, finished.command
     standing, fallen = parted(rows)
-    title = f"Planner killed, {len(rows)} random cases, seed {finished.args.seed}, "
-    title += f"{push_range.describe(finished.args)}: {len(fallen)} fell"
+    title = f"Planner killed, {len(rows)} random cases, seed {finished.flags.seed}, "
+    title += f"{push_range.describe(finished.flags)}: {len(fallen)} fell"
     kill_picture.draw(rows, finished.robot, title, finished.out / PICTURE)
     show_falls(fallen, command, describe, console)
     if standing:
@@ -127,13 +131,10 @@ STUDY: Final = Study[KillCase](
     table="cases.csv",
     pictures=(PICTURE,),
     code=("tools.lab.studies.sweeps.kill_trial",),
-    n=500,
-    only="run this case alone and print all of it; exit code 1 if it fell",
-    add_flags=add_flags,
     load=load,
-    cases=lambda args, robot: partial(KillCases(robot, args.push).draw, args.seed),
+    cases=lambda flags, robot: partial(KillCases(robot, flags.push).draw, flags.seed),
     decided_by=("seed", "push"),
-    inputs=lambda _args: {"ranges": plants.digest()},
+    inputs=lambda _flags: {"ranges": plants.digest()},
     row=kill_trial.row_of,
     figures=KillResult,
     trial=kill_trial.run_case,
@@ -141,3 +142,8 @@ STUDY: Final = Study[KillCase](
     log=CaseLog(kill_trial.scenario_of, kill_trial.plant_of, _metadata),
     report=report,
 )
+
+
+def run(flags: KillStudyFlags) -> int:
+    """Run the study, or one case of it."""
+    return study.run(STUDY, flags)

@@ -231,7 +231,7 @@ def scenario_of(robot: RobotConfig, case: KillCase) -> Scenario:
         )
     return Scenario(
         name=f"kill-{case.seed}-{case.number}",
-        about=f"case {case.number} of `xrl study sweep kill --seed {case.seed}`",
+        about=f"case {case.number} of `xrl study kill --seed {case.seed}`",
         duration=case.end_s,
         keyframe=tuple(frames),
         kill=(Kill(service="planner", at=case.kill_s),),

@@ -1,4 +1,4 @@
-"""`xrl study sweep latency`: three controls over networks from good to hopeless, under pushes."""
+"""`xrl study latency`: three controls over networks from good to hopeless, under pushes."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ import re
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import product
-from typing import Final
+from typing import Annotated, Final
 
 import msgspec
 
 from shared.config.robot_config import RobotConfig
 from shared.toml_file import check_ranges
-from tools.lab.studies.sweeps import latency_picture, latency_report, latency_trial, plants
+from tools.flags import Arg, Count, Number, parsed
+from tools.lab.studies.sweeps import latency_picture, latency_report, latency_trial, plants, study
 from tools.lab.studies.sweeps.latency_trial import (
     CONTROLS,
     LatencyResult,
@@ -21,10 +22,9 @@ from tools.lab.studies.sweeps.latency_trial import (
     Network,
     robot_of,
 )
-from tools.lab.studies.sweeps.study import CaseLog, Finished, Study
+from tools.lab.studies.sweeps.study import AloneFlags, CaseLog, Finished, Study
 from tools.lab.studies.sweeps.table import DECIMALS
 from tools.live import experiment
-from tools.number_arguments import count, finite
 from tools.terminal import Console
 
 DELAYS_MS: Final = "0,10,20,30,50,100,200"
@@ -32,46 +32,6 @@ LOSSES: Final = "0,0.1,0.3,0.5"
 TRIALS: Final = 4
 DELAY_MAX_MS: Final = 60_000.0
 VALUES_MAX: Final = 1000
-
-
-def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the study's own flags."""
-    delays, shares = values_in(0.0, DELAY_MAX_MS), values_in(0.0, 1.0)
-    parser.add_argument(
-        "--delay",
-        type=delays,
-        default=delays(DELAYS_MS),
-        metavar="MS",
-        help=f"of every link, each way: numbers and A:B:STEP, with commas ({DELAYS_MS})",
-    )
-    parser.add_argument(
-        "--jitter",
-        type=delays,
-        default=(0.0,),
-        metavar="MS",
-        help="half the width of a uniform spread; several as for --delay (0)",
-    )
-    parser.add_argument(
-        "--loss",
-        type=shares,
-        default=shares(LOSSES),
-        metavar="P",
-        help=f"share of the messages that is lost; several as for --delay ({LOSSES})",
-    )
-    parser.add_argument(
-        "--trials", type=count, default=TRIALS, help=f"for each of these networks ({TRIALS})"
-    )
-    about = "; ".join(f"{name}: {control.about}" for name, control in CONTROLS.items())
-    parser.add_argument(
-        "--control",
-        type=parse_controls,
-        default=tuple(CONTROLS),
-        metavar="NAME,...",
-        help=f"which to compare (all): {about}",
-    )
-    parser.add_argument(
-        "--lead-easing", type=finite, metavar="ALPHA", help="law.lead_easing, for all controls"
-    )
 
 
 def values_in(low: float, high: float) -> Callable[[str], tuple[float, ...]]:
@@ -109,20 +69,65 @@ def parse_controls(text: str) -> tuple[str, ...]:
     return tuple(name for name in CONTROLS if name in names)
 
 
-def load(args: argparse.Namespace) -> RobotConfig:
+_DELAYS: Final = values_in(0.0, DELAY_MAX_MS)
+_SHARES: Final = values_in(0.0, 1.0)
+
+EXAMPLES: Final = """
+xrl study latency
+xrl study latency --delay 0:200:10 --jitter 5 --loss 0,0.2 --trials 10 --out out/latency
+xrl study latency --control distributed --delay 0:60:5 --loss 0 --lead-easing 0
+xrl study latency --only 137 --out out/trial137
+xrl study latency --cluster tcp://HOST:8786
+"""
+
+
+class LatencyStudyFlags(AloneFlags):
+    """Which networks and controls."""
+
+    delay: Annotated[
+        tuple[float, ...],
+        parsed(
+            _DELAYS, "MS", is_one=True,
+            help=f"of every link, each way: numbers and A:B:STEP, with commas ({DELAYS_MS})",
+        ),
+    ] = _DELAYS(DELAYS_MS)  # fmt: skip
+    jitter: Annotated[tuple[float, ...], parsed(_DELAYS, "MS", is_one=True)] = (0.0,)
+    """half the width of a uniform spread; several as for --delay (default: 0)"""
+    loss: Annotated[
+        tuple[float, ...],
+        parsed(
+            _SHARES, "P", is_one=True,
+            help=f"share of the messages that is lost; several as for --delay ({LOSSES})",
+        ),
+    ] = _SHARES(LOSSES)  # fmt: skip
+    trials: Count = TRIALS
+    """for each of these networks"""
+    control: Annotated[
+        tuple[str, ...],
+        parsed(
+            parse_controls, "NAME,...", is_one=True,
+            help="which to compare (all): "
+            + "; ".join(f"{name}: {control.about}" for name, control in CONTROLS.items()),
+        ),
+    ] = tuple(CONTROLS)  # fmt: skip
+    lead_easing: Annotated[Number | None, Arg(metavar="ALPHA")] = None
+    """law.lead_easing, for all controls"""
+
+
+def load(flags: LatencyStudyFlags) -> RobotConfig:
     """Return the robot with the easing that was asked for."""
-    robot = experiment.load_robot(args.config)
-    if args.lead_easing is not None:
-        law = msgspec.structs.replace(robot.law, lead_easing=args.lead_easing)
+    robot = experiment.load_robot(flags.config)
+    if flags.lead_easing is not None:
+        law = msgspec.structs.replace(robot.law, lead_easing=flags.lead_easing)
         robot = msgspec.structs.replace(robot, law=law)
         check_ranges("--lead-easing", law)
     return robot
 
 
-def grid_of(args: argparse.Namespace) -> list[tuple[Network, str]]:
+def grid_of(flags: LatencyStudyFlags) -> list[tuple[Network, str]]:
     """Return each network with each control."""
-    networks = [Network(d, j, p) for p, j, d in product(args.loss, args.jitter, args.delay)]
-    return list(product(networks, args.control))
+    networks = [Network(d, j, p) for p, j, d in product(flags.loss, flags.jitter, flags.delay)]
+    return list(product(networks, flags.control))
 
 
 def trial_of(grid: Sequence[tuple[Network, str]], seed: int, number: int) -> LatencyTrial:
@@ -145,7 +150,7 @@ def _robots(
 
 def _report(finished: Finished) -> None:
     force_max = finished.robot.simulation.operator.force_max
-    seed = f"seed {finished.args.seed}"
+    seed = f"seed {finished.flags.seed}"
     latency_picture.draw(finished.rows, force_max, seed, finished.out)
     latency_report.show(finished.rows, finished.command, finished.console)
 
@@ -156,14 +161,11 @@ STUDY: Final = Study[LatencyTrial](
     table="latency.csv",
     pictures=(latency_picture.FALLS, latency_picture.EFFORT),
     code=("tools.lab.studies.sweeps.latency_trial",),
-    only="run this trial alone; exit code 1 if it fell, whatever its control (the study's is 1 if "
-    "distributed fell)",
-    add_flags=add_flags,
     load=load,
-    total=lambda args: args.trials * len(grid_of(args)),
-    cases=lambda args, _robot: partial(trial_of, grid_of(args), args.seed),
+    total=lambda flags: flags.trials * len(grid_of(flags)),
+    cases=lambda flags, _robot: partial(trial_of, grid_of(flags), flags.seed),
     decided_by=("seed", "delay", "jitter", "loss", "control"),
-    inputs=lambda _args: {"ranges": plants.digest()},
+    inputs=lambda _flags: {"ranges": plants.digest()},
     row=latency_trial.row_of,
     figures=LatencyResult,
     trial=latency_trial.run_trial,
@@ -176,3 +178,8 @@ STUDY: Final = Study[LatencyTrial](
     report=_report,
     counts=lambda row: row["control"] == "distributed",
 )
+
+
+def run(flags: LatencyStudyFlags) -> int:
+    """Run the study, or one case of it."""
+    return study.run(STUDY, flags)

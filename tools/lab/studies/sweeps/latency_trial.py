@@ -148,7 +148,7 @@ class LatencyTrial(msgspec.Struct, frozen=True, kw_only=True):
         bad = Inject(link="all", at=draw.impaired_from_s, **fields)
         return Scenario(
             name=f"latency-{self.seed}-{self.number}",
-            about=f"trial {self.number} of `xrl study sweep latency --seed {self.seed}`",
+            about=f"trial {self.number} of `xrl study latency --seed {self.seed}`",
             duration=DURATION_S,
             keyframe=tuple(Keyframe(at=at, height=stand - depth) for at, depth in SQUATS),
             push=tuple(pushes.push(at, PUSH_S, *how) for at, *how in draw.shoves),

@@ -1,27 +1,25 @@
-"""`xrl study sweep push`: the hardest push by direction, duration, pose and mode."""
+"""`xrl study push`: the hardest push by direction, duration, pose and mode."""
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import msgspec
 from rich.table import Table as Printed
 
 from services.simulator.physics import plant as plants
 from services.simulator.physics.plant import plant_from
-from shared.exceptions import RunError
-from tools.lab.studies.sweeps import push_trial
+from tools.flags import Arg, Degrees, Duration
+from tools.lab.studies.sweeps import push_trial, study
 from tools.lab.studies.sweeps.push_trial import MODES, POSES, PushResult, PushTrial
 from tools.lab.studies.sweeps.report import FALL_COLOUR
-from tools.lab.studies.sweeps.study import Finished, Study
+from tools.lab.studies.sweeps.study import Finished, Study, StudyFlags
 from tools.lab.studies.sweeps.table import Row
-from tools.live import experiment
-from tools.number_arguments import degrees, finite
+from tools.live.experiment import PlantFlags
 from tools.output import new_figure, save_figure
 from tools.terminal import Console
 
@@ -41,47 +39,41 @@ CURVES: Final = (
 """Mode, column, colour, line, in words."""
 
 
-def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the study's own flags."""
-    parser.add_argument(
-        "--pose", action="append", choices=tuple(POSES), help="only this one; may be repeated"
-    )
-    parser.add_argument(
-        "--angle",
-        action="append",
-        type=degrees,
-        metavar="DEG",
-        help="push that way, 0 forwards, 90 to the left; may be repeated (0, 45, 90, 135, 180)",
-    )
-    parser.add_argument(
-        "--duration",
-        action="append",
-        type=finite,
-        metavar="S",
-        help="of the pushes; may be repeated (0.3, 3)",
-    )
-    experiment.add_plant(parser)
+EXAMPLES: Final = """
+xrl study push
+xrl study push --pose stand --duration 3 --angle 90
+xrl study push --plant drivetrain.stiffness=2000 --out out/soft
+"""
 
 
-def trials_of(args: argparse.Namespace) -> list[PushTrial]:
+class PushStudyFlags(StudyFlags, PlantFlags):
+    """Which points."""
+
+    pose: Annotated[tuple[str, ...], Arg(choices=tuple(POSES))] = ()
+    """only this one; may be repeated"""
+    angle: Annotated[tuple[Degrees, ...], Arg(metavar="DEG")] = ()
+    """push that way, 0 forwards, 90 to the left; may be repeated (0, 45, 90, 135, 180)"""
+    duration: tuple[Duration, ...] = ()
+    """of the pushes; may be repeated (0.3, 3)"""
+
+
+def trials_of(flags: PushStudyFlags) -> list[PushTrial]:
     """Return the selected points."""
-    durations = tuple(args.duration or DURATIONS_S)
-    if min(durations) <= 0.0:
-        raise RunError(f"--duration {min(durations):g}: must be more than 0 s")
-    grid = product(args.pose or POSES, durations, args.angle or ANGLES_DEG, MODES)
+    durations = tuple(flags.duration or DURATIONS_S)
+    grid = product(flags.pose or POSES, durations, flags.angle or ANGLES_DEG, MODES)
     return [
         PushTrial(number=number, pose=pose, angle_deg=angle, duration_s=duration, mode=mode)
         for number, (pose, duration, angle, mode) in enumerate(grid)
     ]
 
 
-def _inputs(args: argparse.Namespace) -> dict[str, str]:
-    grid = repr([msgspec.structs.astuple(trial) for trial in trials_of(args)])
-    return {"plant": plants.to_toml(plant_from(args.plant)), "grid": grid}
+def _inputs(flags: PushStudyFlags) -> dict[str, str]:
+    grid = repr([msgspec.structs.astuple(trial) for trial in trials_of(flags)])
+    return {"plant": plants.to_toml(plant_from(flags.plant)), "grid": grid}
 
 
-def _options(args: argparse.Namespace) -> dict[str, Any]:
-    return {"plant": plant_from(args.plant)}
+def _options(flags: PushStudyFlags) -> dict[str, Any]:
+    return {"plant": plant_from(flags.plant)}
 
 
 def _report(finished: Finished) -> None:
@@ -143,9 +135,8 @@ STUDY: Final = Study[PushTrial](
     table="pushes.csv",
     pictures=(PICTURE,),
     code=("tools.lab.studies.sweeps.push_trial",),
-    add_flags=add_flags,
-    total=lambda args: len(trials_of(args)),
-    cases=lambda args, _robot: trials_of(args).__getitem__,
+    total=lambda flags: len(trials_of(flags)),
+    cases=lambda flags, _robot: trials_of(flags).__getitem__,
     inputs=_inputs,
     row=msgspec.structs.asdict,
     words=lambda point: point.words,
@@ -156,3 +147,8 @@ STUDY: Final = Study[PushTrial](
     report=_report,
     exit_code=lambda _rows: 0,
 )
+
+
+def run(flags: PushStudyFlags) -> int:
+    """Run the study, or one case of it."""
+    return study.run(STUDY, flags)

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 import random
-from typing import Final
+from typing import Annotated, Final
 
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Push
 from shared.exceptions import RunError
+from shared.toml_file import Range
+from tools.flags import Arg, Flags
 from tools.lab.design.poses import Poses
 from tools.lab.design.push_limit import LoadedStand
-from tools.number_arguments import finite
 
 DIGITS: Final = 3
 REACHED_M: Final = 1e-4
@@ -63,27 +63,23 @@ def uniform(dice: random.Random, low: float, high: float) -> float:
     return round(dice.uniform(low, high), DIGITS)
 
 
-def add_flag(parser: argparse.ArgumentParser) -> None:
-    """Add `--push`."""
-    parser.add_argument(
-        "--push",
-        type=finite,
-        default=SHARE,
-        metavar="SHARE",
-        help="push up to this share of what soles and motors bear, standing, in each direction: 1 "
-        f"is 76 N forwards and 158 N sideways of the shipped robot ({SHARE:g})",
-    )
+class PushFlags(Flags):
+    """How hard a study pushes."""
+
+    push: Annotated[
+        float,
+        Range(1e-3, SHARE_MAX, ""),
+        Arg(
+            metavar="SHARE",
+            help="push up to this share of what soles and motors bear, standing, in each "
+            "direction: 1 is 76 N forwards and 158 N sideways of the shipped robot",
+        ),
+    ] = SHARE
 
 
-def check(args: argparse.Namespace) -> None:
-    """Refuse a share that cannot be drawn."""
-    if not 0.0 < args.push <= SHARE_MAX:
-        raise RunError(f"--push {args.push:g}: more than 0, at most {SHARE_MAX:g}")
-
-
-def describe(args: argparse.Namespace) -> str:
+def describe(flags: PushFlags) -> str:
     """Return how hard a study pushes, for its picture."""
-    return f"pushed with up to {args.push:.0%} of what soles and motors bear"
+    return f"pushed with up to {flags.push:.0%} of what soles and motors bear"
 
 
 def com_height(poses: Poses, torso: float, pitch: float) -> float:

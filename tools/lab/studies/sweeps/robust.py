@@ -1,27 +1,27 @@
-"""`xrl study sweep robust`: every error of the plant drawn at once: who falls, and why."""
+"""`xrl study robust`: every error of the plant drawn at once: who falls, and why."""
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import numpy as np
 from rich.table import Table as Printed
 
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import RunError
 from shared.extras import late
-from tools.lab.studies.sweeps import plants, push_range, robust_trial
+from shared.toml_file import Range
+from tools.flags import Arg, Count, Number
+from tools.lab.studies.sweeps import plants, push_range, robust_trial, study
 from tools.lab.studies.sweeps.figures import Ending
-from tools.lab.studies.sweeps.push_range import PushRange
+from tools.lab.studies.sweeps.push_range import PushFlags, PushRange
 from tools.lab.studies.sweeps.report import FALL_COLOUR, parted, show_falls, show_share
 from tools.lab.studies.sweeps.robust_trial import RobustResult, RobustTrial
-from tools.lab.studies.sweeps.study import CaseLog, Finished, Study
+from tools.lab.studies.sweeps.study import AloneFlags, CaseLog, Finished, Study
 from tools.lab.studies.sweeps.table import Row
 from tools.live import experiment
-from tools.number_arguments import finite
+from tools.live.experiment import ImuFlags
 from tools.output import new_figure, save_figure
 
 if TYPE_CHECKING:
@@ -42,39 +42,40 @@ FIGURES: Final = (
 )
 
 
-def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the study's own flags."""
-    parser.add_argument(
-        "--beyond",
-        type=finite,
-        default=1.0,
-        metavar="F",
-        help="widen every range of deploy/plants/ranges.toml F times about its middle (1)",
-    )
-    parser.add_argument(
-        "--slope",
-        type=finite,
-        default=0.0,
-        metavar="DEG",
-        help="a floor that slopes by DEG degrees in a drawn direction (default: up to 1 degree, as "
-        "in the ranges)",
-    )
-    push_range.add_flag(parser)
-    experiment.add_imu(parser)
+EXAMPLES: Final = """
+xrl study robust
+xrl study robust --n 500 --out out/robust
+xrl study robust --beyond 2
+xrl study robust --slope 5 --imu
+xrl study robust --only 17 --out out/trial17
+"""
 
 
-def load(args: argparse.Namespace) -> RobotConfig:
+class RobustStudyFlags(AloneFlags, ImuFlags, PushFlags):
+    """How many, and how far from the file."""
+
+    n: Count = 100
+    """trials"""
+    beyond: Annotated[Number, Arg(metavar="F")] = 1.0
+    """widen every range of deploy/plants/ranges.toml F times about its middle"""
+    slope: Annotated[float, Range(0.0, SLOPE_MAX_DEG, "degrees"), Arg(metavar="DEG")] = 0.0
+    """a floor that slopes by DEG degrees in a drawn direction (default: up to 1 degree, as in the
+    ranges)"""
+
+    def check(self) -> None:
+        """Refuse ranges that cannot be drawn from."""
+        super().check()
+        plants.draw("check", beyond=self.beyond)
+
+
+def load(flags: RobustStudyFlags) -> RobotConfig:
     """Check the flags and return the robot."""
-    if not 0.0 <= args.slope <= SLOPE_MAX_DEG:
-        raise RunError(f"--slope {args.slope:g}: 0 to {SLOPE_MAX_DEG:g} degrees")
-    push_range.check(args)
-    plants.draw("check", beyond=args.beyond)
-    return experiment.load_robot(args.config, imu=args.imu)
+    return experiment.load_robot(flags.config, imu=flags.imu)
 
 
-def _cases(args: argparse.Namespace, robot: RobotConfig) -> Callable[[int], RobustTrial]:
-    pushes = PushRange(robot, args.push)
-    return lambda number: robust_trial.draw(pushes, args.seed, number, args.beyond, args.slope)
+def _cases(flags: RobustStudyFlags, robot: RobotConfig) -> Callable[[int], RobustTrial]:
+    pushes = PushRange(robot, flags.push)
+    return lambda number: robust_trial.draw(pushes, flags.seed, number, flags.beyond, flags.slope)
 
 
 def ranking(rows: Sequence[Row]) -> list[tuple[str, float]]:
@@ -100,10 +101,10 @@ def _excursion(row: Row) -> float:
 
 def report(finished: Finished) -> None:
     """Draw and print what came of the study."""
-    args, rows, console = finished.args, finished.rows, finished.console
+    flags, rows, console = finished.flags, finished.rows, finished.console
     standing, fallen = parted(rows)
-    title = f"{len(rows)} trials, every error drawn, ranges x{args.beyond:g}, seed {args.seed}, "
-    title += f"{push_range.describe(args)}: {len(fallen)} fell"
+    title = f"{len(rows)} trials, every error drawn, ranges x{flags.beyond:g}, seed {flags.seed}, "
+    title += f"{push_range.describe(flags)}: {len(fallen)} fell"
     draw(rows, title, finished.out / PICTURE)
     show_falls(
         fallen, finished.command, lambda row: f"{row['kind']}: trial {row['number']}", console
@@ -157,16 +158,18 @@ STUDY: Final = Study[RobustTrial](
     table="trials.csv",
     pictures=(PICTURE,),
     code=("tools.lab.studies.sweeps.robust_trial",),
-    n=100,
-    only="run this trial alone and print all of it; exit code 1 if it fell",
-    add_flags=add_flags,
     load=load,
     cases=_cases,
     decided_by=("seed", "beyond", "slope", "push"),
-    inputs=lambda _args: {"ranges": plants.digest()},
+    inputs=lambda _flags: {"ranges": plants.digest()},
     row=robust_trial.row_of,
     figures=RobustResult,
     trial=robust_trial.run_trial,
     log=CaseLog(robust_trial.scenario_of, robust_trial.plant_of, _metadata),
     report=report,
 )
+
+
+def run(flags: RobustStudyFlags) -> int:
+    """Run the study, or one case of it."""
+    return study.run(STUDY, flags)

@@ -116,7 +116,7 @@ def scenario_of(robot: RobotConfig, trial: RobustTrial) -> Scenario:
     }
     return Scenario(
         name=f"robust-{trial.seed}-{trial.number}",
-        about=f"trial {trial.number} of `xrl study sweep robust --seed {trial.seed}`",
+        about=f"trial {trial.number} of `xrl study robust --seed {trial.seed}`",
         duration=round(trial.kill_s + AFTER_KILL_S, 3),
         keyframe=(Keyframe(0.0, stand), *ways[trial.kind]),
         kill=(Kill(service="planner", at=trial.kill_s),),

@@ -1,19 +1,18 @@
 """A study as a table, and the one runner of all of them.
 
-The runner adds the flags that all have, draws the cases, runs those that the table lacks on this
+The runner draws the cases, runs those that the table lacks on this
 machine or on a cluster, writes each row as it is done, and reports.
 """
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, Generic, NamedTuple, Protocol, TypeVar
+from typing import Annotated, Any, Final, Generic, NamedTuple, Protocol, TypeVar
 
 import msgspec
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -24,15 +23,15 @@ from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Scenario
 from shared.exceptions import RunError
+from shared.extras import require
 from shared.places import DEFAULT_CONFIG
+from tools.flags import Arg, ConfigFlags, Count, Folder, Natural, fields_of
 from tools.lab.studies.sweeps import pool
 from tools.lab.studies.sweeps.figures import Ending, exit_code
 from tools.lab.studies.sweeps.table import CaseTable, Row, code_digest, code_of, plain
 from tools.live import experiment
-from tools.number_arguments import count, natural
 from tools.sim.recorded_lockstep import AFTER_FALL_S, judge_in_lockstep, record_run
 from tools.terminal import Console, marked
-from tools.verb_table import add_config
 
 
 class Numbered(Protocol):
@@ -47,12 +46,49 @@ C = TypeVar("C", bound=Numbered)
 
 HOW_MANY: Final = ("n", "trials")
 """Flags that say how many cases there are: a case alone does without."""
+NOT_THE_STUDY: Final = (*HOW_MANY, "config", "seed", "only", "workers", "cluster", "out")
+"""Those that `command_of` leaves out, or writes apart."""
+
+
+class StudyFlags(ConfigFlags):
+    """What all studies have."""
+
+    seed: Natural = 1
+    """of the cases"""
+    workers: Annotated[Count | None, Arg(metavar="N")] = None
+    """processes of this machine (default: one a core)"""
+    cluster: Annotated[str | None, Arg(metavar="ADDRESS")] = None
+    """run on the workers of a Dask scheduler instead, such as tcp://HOST:8786; they need this
+    project installed, and one thread each"""
+    out: Folder | None = None
+    """folder of the table and the pictures (default: out/sweep-NAME-<time>); an interrupted study
+    resumes there"""
+
+    def check(self) -> None:
+        """Refuse two places to run on."""
+        super().check()
+        if self.cluster is not None and self.workers is not None:
+            raise RunError("--workers are of this machine, --cluster has its own; leave one out")
+
+
+class AloneFlags(StudyFlags):
+    """Those of a study whose cases also run alone."""
+
+    only: Annotated[Natural | None, Arg(metavar="NUMBER")] = None
+    """run this case alone and print all of it; exit code 1 if it fell; with --out its log goes
+    there (default: none)"""
+
+    def check(self) -> None:
+        """Refuse a case alone on a cluster."""
+        super().check()
+        if self.cluster is not None and self.only is not None:
+            raise RunError("--only runs here, in one process; leave --cluster out")
 
 
 class Finished(NamedTuple):
     """A study that has run, for its report."""
 
-    args: argparse.Namespace
+    flags: Any
     robot: RobotConfig
     rows: list[Row]
     out: Path
@@ -70,15 +106,15 @@ class CaseLog(NamedTuple, Generic[C]):
     """By the case and its command, as for `record_run`."""
 
 
-def _load(args: argparse.Namespace) -> RobotConfig:
-    return experiment.load_robot(args.config)
+def _load(flags: Any) -> RobotConfig:
+    return experiment.load_robot(flags.config)
 
 
 class Study(msgspec.Struct, Generic[C], frozen=True, kw_only=True):
     """What one study has of its own."""
 
     name: str
-    """After `xrl study sweep`."""
+    """After `xrl study`."""
     case: str = "case"
     """What a case is called."""
     table: str
@@ -86,20 +122,15 @@ class Study(msgspec.Struct, Generic[C], frozen=True, kw_only=True):
     pictures: tuple[str, ...] = ()
     code: tuple[str, ...]
     """Modules that decide how a case comes out (`code_of`)."""
-    n: int = 0
-    """Default of `--n`; 0: its own flags say how many cases there are."""
-    only: str = ""
-    """What `--only` does, for its help; empty: there is none."""
-    add_flags: Callable[[argparse.ArgumentParser], None] = lambda _parser: None
-    load: Callable[[argparse.Namespace], RobotConfig] = _load
-    """Checks the flags and returns the robot."""
-    total: Callable[[argparse.Namespace], int] = lambda args: int(args.n)
+    load: Callable[[Any], RobotConfig] = _load
+    """Returns the robot."""
+    total: Callable[[Any], int] = lambda flags: int(flags.n)
     """How many cases there are."""
-    cases: Callable[[argparse.Namespace, RobotConfig], Callable[[int], C]]
+    cases: Callable[[Any, RobotConfig], Callable[[int], C]]
     """Returns what draws the case of a number, whatever was drawn before."""
     decided_by: tuple[str, ...] = ()
     """Flags that decide the rows, beside robot and code; a folder of others is refused."""
-    inputs: Callable[[argparse.Namespace], dict[str, str]] = lambda _args: {}
+    inputs: Callable[[Any], dict[str, str]] = lambda _flags: {}
     """What else decides them."""
     row: Callable[[C], dict[str, object]]
     """The draws of a case by column, its number first."""
@@ -109,7 +140,7 @@ class Study(msgspec.Struct, Generic[C], frozen=True, kw_only=True):
     """What comes of a case: the other columns."""
     trial: Callable[..., msgspec.Struct]
     """Runs a case: a function of a module, of the case, its robot, and the options."""
-    options: Callable[[argparse.Namespace], dict[str, Any]] = lambda _args: {}
+    options: Callable[[Any], dict[str, Any]] = lambda _flags: {}
     robots: Callable[[Sequence[C], RobotConfig, int, Console], Sequence[RobotConfig]] = (
         lambda cases, robot, _workers, _console: [robot] * len(cases)
     )
@@ -126,76 +157,44 @@ class Study(msgspec.Struct, Generic[C], frozen=True, kw_only=True):
     )
 
 
-def add_flags(parser: argparse.ArgumentParser, study: Study[Any]) -> None:
-    """Add all flags of a study."""
-    add_config(parser)
-    if study.n:
-        parser.add_argument("--n", type=count, default=study.n, help=f"{study.case}s ({study.n})")
-    study.add_flags(parser)
-    log = ""
-    if study.only:
-        parser.add_argument("--only", type=natural, metavar=study.case.upper(), help=study.only)
-    if study.log is not None:
-        log = f"; with --only: where the {study.case}'s log goes (default: none)"
-    parser.add_argument("--seed", type=natural, default=1, help="of the cases (1)")
-    parser.add_argument(
-        "--workers", type=count, help=f"processes of this machine (one a core: {pool.cores()})"
-    )
-    parser.add_argument(
-        "--cluster",
-        metavar="ADDRESS",
-        help="run on the workers of a Dask scheduler instead, such as tcp://HOST:8786; they need "
-        "this project installed, and one thread each",
-    )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        metavar="DIR",
-        help=f"folder of {', '.join((study.table, *study.pictures))} (default: "
-        f"out/sweep-{study.name}-<time>); an interrupted study resumes there{log}",
-    )
-
-
-def run(study: Study[C], args: argparse.Namespace) -> int:
+def run(study: Study[C], flags: Any) -> int:
     """Run a study, or one case of it; return the exit code.
 
     Raises:
-        RunError: flags do not go together or make no sense, the folder holds another study, a
-            case failed, or a worker was lost.
+        RunError: the folder holds another study, a case failed, or a worker was lost.
     """
-    only = getattr(args, "only", None)
-    if args.cluster is not None and args.workers is not None:
-        raise RunError("--workers are of this machine, --cluster has its own; leave one out")
-    if args.cluster is not None and only is not None:
-        raise RunError("--only runs here, in one process; leave --cluster out")
-    robot = study.load(args)
-    case_of = study.cases(args, robot)
-    console, command = Console(), command_of(study, args)
+    require("sim")
+    only = getattr(flags, "only", None)
+    robot = study.load(flags)
+    case_of = study.cases(flags, robot)
+    console, command = Console(), command_of(study, flags)
     if only is not None:
-        return _run_alone(study, args, robot, case_of(only), f"{command} --only {only}", console)
-    drawn = [case_of(number) for number in range(study.total(args))]
-    out = args.out or Path("out") / time.strftime(f"sweep-{study.name}-%Y%m%d-%H%M%S")
+        return _run_alone(study, flags, robot, case_of(only), f"{command} --only {only}", console)
+    drawn = [case_of(number) for number in range(study.total(flags))]
+    out = flags.out or Path("out") / time.strftime(f"sweep-{study.name}-%Y%m%d-%H%M%S")
     code = code_of(*study.code)
     inputs = {
         "study": study.name,
-        **{name: _text(getattr(args, name)) for name in study.decided_by},
-        **study.inputs(args),
+        **{name: _text(getattr(flags, name)) for name in study.decided_by},
+        **study.inputs(flags),
         "robot": digest_of(robot),
         "code": code_digest(code),
     }
     with CaseTable(out / study.table, list(map(study.row, drawn)), study.figures, inputs) as table:
         try:
-            case_s = _fill(table, study, args, robot, drawn, code, console)
+            case_s = _fill(table, study, flags, robot, drawn, code, console)
         except (KeyboardInterrupt, SystemExit, RunError):
             if done := len(table.numbers):
-                many = [f"--{name} {getattr(args, name)}" for name in HOW_MANY if name in args]
-                many += [f"--cluster {args.cluster}"] if args.cluster else []
+                many = [
+                    f"--{name} {getattr(flags, name)}" for name in HOW_MANY if hasattr(flags, name)
+                ]
+                many += [f"--cluster {flags.cluster}"] if flags.cluster else []
                 again = " ".join([command, *many, f"--out {shlex.quote(str(out))}"])
                 console.print(f"{done} cases are in {out}; resume with: {again}", soft_wrap=True)
             raise
         rows = table.rows
     pace = f"; {case_s:.2f} s a {study.case}" if case_s else ""
-    study.report(Finished(args, robot, rows, out, command, console))
+    study.report(Finished(flags, robot, rows, out, command, console))
     files = ", ".join((study.table, *study.pictures))
     console.print(f"{out}/{files}{pace}", style="dim", soft_wrap=True)
     return study.exit_code([row for row in rows if study.counts(row)])
@@ -204,23 +203,23 @@ def run(study: Study[C], args: argparse.Namespace) -> int:
 def _fill(
     table: CaseTable,
     study: Study[C],
-    args: argparse.Namespace,
+    flags: Any,
     robot: RobotConfig,
     drawn: Sequence[C],
     code: tuple[str, ...],
     console: Console,
 ) -> float:
     """Run the cases that a table lacks into it; return the wall time for each, s."""
-    done, workers = table.rows, args.workers or pool.cores()
+    done, workers = table.rows, flags.workers or pool.cores()
     if done:
         console.print(f"{len(done)} of {len(drawn)} cases are done already")
     missing = [case for case in drawn if case.number not in table.numbers]
     robots = study.robots(missing, robot, workers, console)
-    command, fallen = command_of(study, args), sum(map(study.fell, done))
+    command, fallen = command_of(study, flags), sum(map(study.fell, done))
     results = pool.results(
-        partial(_run_task, partial(study.trial, **study.options(args))),
+        partial(_run_task, partial(study.trial, **study.options(flags))),
         list(zip(missing, robots, strict=True)),
-        pool.Cluster(args.cluster, code) if args.cluster else workers,
+        pool.Cluster(flags.cluster, code) if flags.cluster else workers,
         lambda task: _name_of(study, task[0], command),
     )
     text = "{task.completed} of {task.total} cases, {task.fields[fallen]} fell"
@@ -239,13 +238,13 @@ def _run_task(trial: Callable[..., msgspec.Struct], task: tuple[C, RobotConfig])
 
 def _name_of(study: Study[C], case: C, command: str) -> str:
     """Return the name of a case in an error."""
-    alone = f"{command} --only {case.number}" if study.only else study.words(case)
+    alone = f"{command} --only {case.number}" if not study.words(case) else study.words(case)
     return f"{study.case} {case.number} ({alone})"
 
 
 def _run_alone(
     study: Study[C],
-    args: argparse.Namespace,
+    flags: Any,
     robot: RobotConfig,
     case: C,
     command: str,
@@ -255,8 +254,8 @@ def _run_alone(
     begin = study.row(case)
     (robot,) = study.robots([case], robot, 1, console)
     show(f"{study.case.capitalize()} {begin['number']}, drawn", begin, console)
-    trial = partial(study.trial, case, robot, **study.options(args))
-    asked, out = study.log, args.out
+    trial = partial(study.trial, case, robot, **study.options(flags))
+    asked, out = study.log, flags.out
     if asked is None:
         figures = trial()
     else:
@@ -292,25 +291,23 @@ def _run_alone(
     return study.exit_code([row])
 
 
-def command_of(study: Study[Any], args: argparse.Namespace) -> str:
+def command_of(study: Study[Any], flags: Any) -> str:
     """Return the command of a study with the flags that differ from their defaults.
 
     Not in it: `--only`, how many cases there are, who runs them, and `--out`.
     """
-    own = argparse.ArgumentParser()
-    study.add_flags(own)
-    words = [f"xrl study sweep {study.name} --seed {args.seed}"]
-    for name, default in vars(own.parse_args([])).items():
-        value, flag = getattr(args, name), f"--{name.replace('_', '-')}"
-        if value == default or name in HOW_MANY:
+    words = [f"xrl study {study.name} --seed {flags.seed}"]
+    for field in fields_of(type(flags)):
+        value, flag = getattr(flags, field.name), f"--{field.name.replace('_', '-')}"
+        if field.name in NOT_THE_STUDY or value == field.default:
             continue
         if value is True:
             words.append(flag)
         else:
-            several = value if isinstance(value, list) else [value]
+            several = value if field.is_repeated else [value]
             words += [f"{flag} {shlex.quote(_text(one))}" for one in several]
-    if args.config != DEFAULT_CONFIG:
-        words.append(f"--config {args.config}")
+    if flags.config != DEFAULT_CONFIG:
+        words.append(f"--config {flags.config}")
     return " ".join(words)
 
 

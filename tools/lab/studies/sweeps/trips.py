@@ -1,11 +1,10 @@
-"""`xrl study sweep trips`: does each trip come where it is to, and none where not?"""
+"""`xrl study trips`: does each trip come where it is to, and none where not?"""
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from itertools import product
-from typing import Final
+from typing import Annotated, Final
 
 import msgspec
 from rich.table import Table as Printed
@@ -14,7 +13,9 @@ from rich.text import Text
 from shared.bus.messages import Cause
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE, RunError
-from tools.lab.studies.sweeps.study import Finished, Study
+from tools.flags import Arg
+from tools.lab.studies.sweeps import study
+from tools.lab.studies.sweeps.study import Finished, Study, StudyFlags
 from tools.lab.studies.sweeps.table import Row
 from tools.lab.studies.sweeps.trips_trial import (
     PLANTS,
@@ -26,18 +27,25 @@ from tools.lab.studies.sweeps.trips_trial import (
 from tools.live import experiment
 from tools.terminal import Console, marked
 
-
-def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the study's own flags."""
-    for flag, names in (("trouble", TROUBLES), ("on", PLANTS)):
-        parser.add_argument(
-            f"--{flag}", action="append", choices=tuple(names), help="only this; may be repeated"
-        )
+EXAMPLES: Final = """
+xrl study trips
+xrl study trips --trouble sags --trouble drops
+xrl study trips --on "k 2000" --out out/trips
+"""
 
 
-def load(args: argparse.Namespace) -> RobotConfig:
+class TripsStudyFlags(StudyFlags):
+    """Which troubles, on which plants."""
+
+    trouble: Annotated[tuple[str, ...], Arg(choices=tuple(TROUBLES))] = ()
+    """only this; may be repeated"""
+    on: Annotated[tuple[str, ...], Arg(choices=tuple(PLANTS))] = ()
+    """only this; may be repeated"""
+
+
+def load(flags: TripsStudyFlags) -> RobotConfig:
     """Return the robot, if it has trips."""
-    robot = experiment.load_robot(args.config)
+    robot = experiment.load_robot(flags.config)
     if robot.gain_schedule is None:
         raise RunError(
             f'law.split = "{robot.law.split}": only robots of the certified split have trips'
@@ -45,9 +53,9 @@ def load(args: argparse.Namespace) -> RobotConfig:
     return robot
 
 
-def trials_of(args: argparse.Namespace) -> list[TripTrial]:
+def trials_of(flags: TripsStudyFlags) -> list[TripTrial]:
     """Return the selected troubles on the selected plants."""
-    grid = product(args.trouble or TROUBLES, args.on or PLANTS)
+    grid = product(flags.trouble or TROUBLES, flags.on or PLANTS)
     return [TripTrial(number=n, trouble=trouble, on=on) for n, (trouble, on) in enumerate(grid)]
 
 
@@ -116,18 +124,22 @@ STUDY: Final = Study[TripTrial](
     name="trips",
     table="trips.csv",
     code=("tools.lab.studies.sweeps.trips_trial",),
-    add_flags=add_flags,
     load=load,
-    total=lambda args: len(trials_of(args)),
-    cases=lambda args, _robot: trials_of(args).__getitem__,
+    total=lambda flags: len(trials_of(flags)),
+    cases=lambda flags, _robot: trials_of(flags).__getitem__,
     decided_by=("seed",),
-    inputs=lambda args: {"grid": ", ".join(trial.words for trial in trials_of(args))},
+    inputs=lambda flags: {"grid": ", ".join(trial.words for trial in trials_of(flags))},
     row=msgspec.structs.asdict,
     words=lambda trial: trial.words,
     figures=TripResult,
     trial=run_trial,
-    options=lambda args: {"seed": args.seed},
+    options=lambda flags: {"seed": flags.seed},
     fell=lambda row: row["fell_at_s"] is not None,
     report=_report,
     exit_code=exit_code,
 )
+
+
+def run(flags: TripsStudyFlags) -> int:
+    """Run the study, or one case of it."""
+    return study.run(STUDY, flags)

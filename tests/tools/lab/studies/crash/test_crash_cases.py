@@ -19,7 +19,7 @@ from tools.lab.studies.crash.cases import (
     CrashVerdict,
     scenario_of,
 )
-from tools.verbs import crashtest
+from tools.verbs.study import crash
 
 BY_NAME = {case.name: case for case in CASES}
 
@@ -66,7 +66,7 @@ def test_pairs_all_joint_services_and_the_planner_coming_back_are_tried() -> Non
 def test_the_short_run_has_one_of_each_kind_in_five_minutes() -> None:
     quick = [case for case in CASES if case.quick]
     assert {case.kind for case in quick} == {case.kind for case in CASES}
-    assert len(quick) * crashtest.CASE_S <= 300.0
+    assert len(quick) * crash.CASE_S <= 300.0
 
 
 def test_names_are_their_own_and_can_be_folders() -> None:

@@ -23,7 +23,7 @@ from tools.lab.studies.crash.outcome import CrashResult
 from tools.lab.studies.crash.report import Result
 from tools.live.scenario_runner import ScenarioRunner, TriggeredKill
 from tools.terminal import Console
-from tools.verbs import crashtest
+from tools.verbs.study import crash
 
 BY_NAME = {case.name: case for case in CASES}
 PLANNER = BY_NAME["kill-planner"]
@@ -127,12 +127,12 @@ RESULTS = [
 
 def test_the_exit_code_distinguishes_a_forbidden_fall_from_a_run_that_failed() -> None:
     stood, bad_fall, allowed_fall, lost = RESULTS
-    assert crashtest.exit_code([stood, allowed_fall]) == 0
-    assert crashtest.exit_code([stood, lost]) == 2
-    assert crashtest.exit_code([lost, bad_fall]) == 1
+    assert crash.exit_code([stood, allowed_fall]) == 0
+    assert crash.exit_code([stood, lost]) == 2
+    assert crash.exit_code([lost, bad_fall]) == 1
     sank = Result(PLANNER, SANK)
-    assert crashtest.exit_code([lost, sank]) == 3, "it sank, and did not fall"
-    assert crashtest.exit_code([sank, bad_fall]) == 1
+    assert crash.exit_code([lost, sank]) == 3, "it sank, and did not fall"
+    assert crash.exit_code([sank, bad_fall]) == 1
 
 
 def test_json_holds_what_was_done_and_what_came_of_it(tmp_path: Path) -> None:
@@ -185,11 +185,11 @@ def test_the_table_fits_a_terminal_and_has_every_case() -> None:
 
 
 def test_cases_are_chosen_by_name_pattern_and_length() -> None:
-    chosen = crashtest.select(CASES, quick=False, only=["kill-planner", "disarmed-*"])
+    chosen = crash.select(CASES, quick=False, only=["kill-planner", "disarmed-*"])
     assert [case.name for case in chosen[:2]] == ["kill-planner", "disarmed-ankle_right"]
     assert len(chosen) == 1 + len(MODULES)
-    assert len(crashtest.select(CASES, quick=True, only=["kill-*"])) < 6
-    assert crashtest.select(CASES, quick=False, only=None) == list(CASES)
+    assert len(crash.select(CASES, quick=True, only=["kill-*"])) < 6
+    assert crash.select(CASES, quick=False, only=()) == list(CASES)
 
 
 def test_a_name_that_fits_no_case_is_one_line_with_those_it_may_mean(tmp_path: Path) -> None:
@@ -223,10 +223,10 @@ def test_what_was_done_before_an_interrupt_is_kept(
             raise KeyboardInterrupt
         return outcomes.pop(0)
 
-    monkeypatch.setattr(crashtest, "run_case", run_case)
+    monkeypatch.setattr(crash, "run_case", run_case)
     results: list[Result] = []
     with pytest.raises(KeyboardInterrupt):
-        crashtest._run_all(CASES, robot, 0, tmp_path, results, Console(quiet=True))
+        crash._run_all(CASES, robot, 0, tmp_path, results, Console(quiet=True))
     document = json.loads((tmp_path / report.RESULTS).read_text())
     assert [row["verdict"] for row in document["cases"]] == ["stood", "fell"]
     assert document["planned"] == len(CASES)
@@ -236,8 +236,8 @@ def test_what_was_done_before_an_interrupt_is_kept(
 def test_a_fleet_that_cannot_be_run_ends_the_matrix_early(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, robot: RobotConfig
 ) -> None:
-    monkeypatch.setattr(crashtest, "run_case", lambda *_, **__: LOST)
+    monkeypatch.setattr(crash, "run_case", lambda *_, **__: LOST)
     results: list[Result] = []
     with pytest.raises(RunError, match=r"3 cases in a row.*no fleet"):
-        crashtest._run_all(CASES, robot, 0, tmp_path, results, Console(quiet=True))
+        crash._run_all(CASES, robot, 0, tmp_path, results, Console(quiet=True))
     assert len(results) == 3

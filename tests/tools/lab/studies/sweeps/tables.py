@@ -9,7 +9,7 @@ from tools import cli
 
 
 def sweep(*words: object) -> int:
-    return cli.main(["study", "sweep", *map(str, words)])
+    return cli.main(["study", *map(str, words)])
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:

@@ -1,4 +1,4 @@
-"""The random cases of `xrl study sweep kill`, and what is measured in one."""
+"""The random cases of `xrl study kill`, and what is measured in one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`xrl study sweep latency`: its grid, its trials, its figures, its words and its pictures."""
+"""`xrl study latency`: its grid, its trials, its figures, its words and its pictures."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from shared.bus.messages import JointEvent, Mode
 from shared.config import scenarios
 from shared.config.robot_config import RobotConfig
 from shared.links import DIRECTIONS
+from tools.flags import add_flags, read_flags
 from tools.lab.studies.sweeps import latency, latency_picture, latency_report
 from tools.lab.studies.sweeps.figures import Ending
 from tools.lab.studies.sweeps.latency_trial import (
@@ -28,7 +29,7 @@ from tools.lab.studies.sweeps.latency_trial import (
     robot_of,
     row_of,
 )
-from tools.lab.studies.sweeps.study import add_flags, command_of
+from tools.lab.studies.sweeps.study import command_of
 from tools.lab.studies.sweeps.table import Row
 from tools.sim.lockstep import Lockstep
 from tools.terminal import Console
@@ -40,13 +41,13 @@ def grid(*flags: str) -> list[LatencyTrial]:
     return trials_of(parsed(*flags))
 
 
-def parsed(*flags: str) -> argparse.Namespace:
+def parsed(*flags: str) -> latency.LatencyStudyFlags:
     parser = argparse.ArgumentParser()
-    add_flags(parser, latency.STUDY)
-    return parser.parse_args(flags)
+    add_flags(parser, latency.LatencyStudyFlags)
+    return read_flags(latency.LatencyStudyFlags, parser.parse_args(flags))
 
 
-def trials_of(args: argparse.Namespace) -> list[LatencyTrial]:
+def trials_of(args: latency.LatencyStudyFlags) -> list[LatencyTrial]:
     grid, total = latency.grid_of(args), latency.STUDY.total(args)
     return [latency.trial_of(grid, args.seed, number) for number in range(total)]
 
@@ -254,11 +255,11 @@ def test_falls_are_counted_where_they_were(capsys: pytest.CaptureFixture[str]) -
     assert latency_report.falls(latency_report.chosen(rows, "centralised")) == (4, 8)
     assert latency_report.falls(own).bounds[0] > 0.3
     assert {row["loss"] for row in latency_report.without_loss(rows)} == {"0"}
-    latency_report.show(rows, "xrl study sweep latency", Console(width=120))
+    latency_report.show(rows, "xrl study latency", Console(width=120))
     output = capsys.readouterr().out
     assert "centralised: 4 of 8 fell; most at 50 ms, 4 of 4" in output
     assert "distributed: none of 8 fell" in output
-    assert "xrl study sweep latency --only 4" in output
+    assert "xrl study latency --only 4" in output
 
 
 def test_each_delay_has_bounds_of_its_own_and_names_their_mix(
@@ -266,7 +267,7 @@ def test_each_delay_has_bounds_of_its_own_and_names_their_mix(
 ) -> None:
     """The worst of several delays is chosen: 95 % of it would be 83 %."""
     rows = made_up(lambda control, delay, _loss: control == "centralised" and delay == 50.0)
-    latency_report.show(rows, "xrl study sweep latency", Console(width=80))
+    latency_report.show(rows, "xrl study latency", Console(width=80))
     table, _, rest = capsys.readouterr().out.partition("Hand's peak force")
     assert "in this mix: 0, 50 % lost" in " ".join(table.split())
     assert [" ".join(line.split()) for line in table.splitlines() if " of 4" in line] == [

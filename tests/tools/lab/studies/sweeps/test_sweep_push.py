@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 import random
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -24,13 +24,8 @@ from tools.lab.studies.sweeps.push_trial import (
 )
 
 
-def asked(**changes: object) -> argparse.Namespace:
-    given: dict[str, object] = {"pose": None, "angle": None, "duration": None}
-    return argparse.Namespace(**(given | changes))
-
-
-def trials_of(**changes: object) -> list[PushTrial]:
-    return push.trials_of(asked(**changes))
+def trials_of(**changes: Any) -> list[PushTrial]:
+    return push.trials_of(push.PushStudyFlags(**changes))
 
 
 def point(**changes: object) -> PushTrial:

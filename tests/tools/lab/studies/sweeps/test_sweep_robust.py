@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import io
 import math
 import random
@@ -74,9 +73,9 @@ def test_of_a_few_trials_no_error_is_ranked(
     figures = dict.fromkeys(key for key, _, _ in robust.FIGURES)
     rows = [figures | row for row in rows_by(pushes, "drive.lag_s")[: robust.RANKED_LEAST - few]]
     printed = io.StringIO()
-    args = argparse.Namespace(beyond=1.0, seed=1, push=0.75)
+    args = robust.RobustStudyFlags()
     console = Console(width=200, file=printed)
-    robust.report(Finished(args, robot, rows, tmp_path, "xrl study sweep robust", console))
+    robust.report(Finished(args, robot, rows, tmp_path, "xrl study robust", console))
     assert ("too few to tell" in printed.getvalue()) is few
     assert ("drive.lag_s" in printed.getvalue()) is not few
 
@@ -93,7 +92,7 @@ def test_a_picture_is_drawn_and_falls_are_in_it(pushes: PushRange, tmp_path: Pat
 def test_with_every_error_drawn_it_is_led_pushed_killed_and_stands(
     robot: RobotConfig, pushes: PushRange, number: int
 ) -> None:
-    """A squat and a crawl, of the 500 that `xrl study sweep robust --n 500` runs."""
+    """A squat and a crawl, of the 500 that `xrl study robust --n 500` runs."""
     outcome = run_trial(draw(pushes, 1, number), robot)
     assert outcome.stood
     assert outcome.operator_peak_n is not None

@@ -101,5 +101,5 @@ def test_a_robot_on_which_nothing_trips_is_refused(
     assert 'split = "certified"' in shipped
     diagonal = tmp_path / "robot.toml"
     diagonal.write_text(shipped.replace('split = "certified"', 'split = "diagonal"'), "utf-8")
-    assert cli.main(["study", "sweep", "trips", "--config", str(diagonal)]) == 2
+    assert cli.main(["study", "trips", "--config", str(diagonal)]) == 2
     assert "only robots of the certified split have trips" in capsys.readouterr().err

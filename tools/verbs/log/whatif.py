@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import msgspec
 from rich.text import Text
@@ -16,8 +15,8 @@ from shared.config.scenarios import Scenario
 from shared.exceptions import FELL_EXIT_CODE, RunError
 from shared.extras import require
 from shared.joints import MODULES
-from shared.toml_file import parse_toml
-from tools.flags import RUN_HELP, add_flags, read_flags
+from shared.toml_file import Range, parse_toml
+from tools.flags import FINITE_MAX, RUN_HELP, Arg, Count, Duration, Folder, option, positional
 from tools.judge.run_parts import PartFlags, read_asked
 from tools.lab.studies.counterfactual.moments import moments_of
 from tools.lab.studies.counterfactual.run import Counterfactual, Task, counterfactual_of, draw
@@ -27,90 +26,84 @@ from tools.live.experiment import PLANT_FILE
 from tools.logs.hand_path import hand_path
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import RunLog, refuse_own_controller, robot_of, text_of
-from tools.number_arguments import count, finite
 from tools.terminal import Console, marked
-from tools.verb_table import Subparsers, add_verb
 
+STATE_EVERY_S: Final = 0.1 - 1e-9
+"""How often the world's state is recorded, within rounding."""
 KILLABLE: Final = ("planner", *MODULES)
 WIDTH: Final = 72
 """Characters of a line of the strip."""
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(
-        subparsers,
-        "whatif",
-        """
-        xrl log whatif out/a/run.mcap --kill planner
-        xrl log whatif out/a/run.mcap --kill planner --kill knee_left --every 0.5 --for 6
-        xrl log whatif out/a/run.mcap --kill planner --from 5 --to 9
-        """,
-    )
-    parser.add_argument("log", type=Path, metavar="RUN", help=f"{RUN_HELP}; of a simulated robot")
-    parser.add_argument(
-        "--kill",
-        action="append",
-        required=True,
-        choices=KILLABLE,
-        metavar="SERVICE",
-        help=f"dies at the moment: {', '.join(KILLABLE)}; may be given several times",
-    )
-    add_flags(parser, PartFlags)
-    parser.add_argument(
-        "--every", type=finite, default=0.1, metavar="S", help="between two moments (0.1 s)"
-    )
-    parser.add_argument(
-        "--for",
-        dest="for_s",
-        type=finite,
-        default=4.0,
-        metavar="S",
-        help="duration of each continued run; pushes and hand as recorded (4 s)",
-    )
-    parser.add_argument("--workers", type=count, default=cores(), metavar="N", help="processes")
-    parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="for whatif.json and whatif.png (beside the log)"
-    )
+EXAMPLES: Final = """
+xrl log whatif out/a/run.mcap --kill planner
+xrl log whatif out/a/run.mcap --kill planner --kill knee_left --every 0.5 --for 6
+xrl log whatif out/a/run.mcap --kill planner --from 5 --to 9
+"""
 
 
-def run(args: argparse.Namespace) -> int:
+class WhatIfFlags(PartFlags):
+    """What dies, and when."""
+
+    log: Annotated[Path, positional("RUN", help=f"{RUN_HELP}; of a simulated robot")]
+    kill: Annotated[
+        tuple[str, ...],
+        Arg(
+            metavar="SERVICE",
+            choices=KILLABLE,
+            help=f"dies at the moment: {', '.join(KILLABLE)}; may be given several times",
+        ),
+    ]
+    every: Annotated[float, Range(STATE_EVERY_S, FINITE_MAX, "s"), Arg(metavar="S")] = 0.1
+    """between two moments; the state is recorded so often"""
+    for_s: Annotated[Duration, option("--for", metavar="S")] = 4.0
+    """duration of each continued run; pushes and hand as recorded"""
+    workers: Annotated[Count | None, Arg(metavar="N")] = None
+    """processes (default: one a core)"""
+    out: Folder | None = None
+    """for whatif.json and whatif.png (default: beside the log)"""
+
+
+def run(flags: WhatIfFlags) -> int:
     """Go on from every moment; 0 if the robot would have stood each time."""
     require("sim")
-    if not (args.every >= 0.1 - 1e-9 and args.for_s > 0.0):
-        raise RunError("--every from 0.1 s on (so often is the state recorded), --for over 0 s")
     console = Console()
-    log = read_asked(read_flags(PartFlags, args), RunIndex(args.log), as_sent=True)
+    log = read_asked(flags, RunIndex(flags.log), as_sent=True)
     refuse_own_controller(log)
     robot, scenario = robot_of(log), scenario_of(log)
-    kill = tuple(dict.fromkeys(args.kill))
-    moments = [moment for moment in moments_of(log, robot, args.every) if moment.runs(kill)]
+    kill = tuple(dict.fromkeys(flags.kill))
+    moments = [moment for moment in moments_of(log, robot, flags.every) if moment.runs(kill)]
     if not moments:
         raise RunError(
             f"{' and '.join(kill)}: ran at no moment of this part; another --from or --to"
         )
     true_plant = plant_of(log)
     led = hand_path(log)
-    tasks = [Task(robot, scenario, true_plant, moment, kill, args.for_s, led) for moment in moments]
+    tasks = [
+        Task(robot, scenario, true_plant, moment, kill, flags.for_s, led) for moment in moments
+    ]
     counterfactuals: list[Counterfactual] = []
     text = "{task.completed} of {task.total} moments, {task.fields[fell]} fell"
     with bar(text, console) as progress:
         shown = progress.add_task("", total=len(tasks), fell=0)
         for _, counterfactual in results(
-            counterfactual_of, tasks, args.workers, lambda task: f"{task.moment.at_s:g} s"
+            counterfactual_of,
+            tasks,
+            flags.workers or cores(),
+            lambda task: f"{task.moment.at_s:g} s",
         ):
             counterfactuals.append(counterfactual)
             fell = sum(not one.stood for one in counterfactuals)
             progress.update(shown, advance=1, fell=fell)
     counterfactuals.sort(key=lambda one: one.at_s)
-    out = args.out or log.files[0].parent
+    out = flags.out or log.files[0].parent
     out.mkdir(parents=True, exist_ok=True)
     names = " and ".join(kill)
-    content = msgspec.json.encode({"kill": kill, "for_s": args.for_s, "fates": counterfactuals})
+    content = msgspec.json.encode({"kill": kill, "for_s": flags.for_s, "fates": counterfactuals})
     replace_file(out / "whatif.json", msgspec.json.format(content))
     title = f"{names} killed at each moment"
-    draw(log, counterfactuals, title, args.every, out / "whatif.png")
-    show(counterfactuals, names, args.for_s, console)
+    draw(log, counterfactuals, title, flags.every, out / "whatif.png")
+    show(counterfactuals, names, flags.for_s, console)
     console.print(f"{out}/whatif.json, whatif.png", style="dim")
     return 0 if all(one.stood for one in counterfactuals) else FELL_EXIT_CODE
 

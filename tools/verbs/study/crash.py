@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 import difflib
 import time
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 from rich.progress import BarColumn, Progress, TextColumn
 
@@ -17,6 +16,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE, RunError
 from shared.extras import require
 from shared.mcap_log import provenance
+from tools.flags import Arg, ConfigFlags, Natural
 from tools.fleet import procfs
 from tools.lab.studies.crash import report
 from tools.lab.studies.crash.cases import CASES, CrashCase, CrashVerdict
@@ -24,9 +24,7 @@ from tools.lab.studies.crash.report import JUNIT, RESULTS, Result
 from tools.lab.studies.crash.runner import run_case
 from tools.live import experiment
 from tools.live.scenario_runner import LiveSnapshot
-from tools.number_arguments import natural
 from tools.terminal import Console, marked
-from tools.verb_table import Subparsers, add_config, add_verb
 
 CASE_S: Final = 14.0
 """First estimate of a case's duration, s, until some have run."""
@@ -34,50 +32,46 @@ UNJUDGED_MAX: Final = 3
 """After this many cases in a row that cannot be judged, the machine is at fault, not the robot."""
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the verb."""
-    parser = add_verb(
-        subparsers,
-        "crashtest",
-        """
-        xrl study crash --quick
-        xrl study crash --out out/matrix
-        xrl study crash --only kill-knee_left
-        xrl study crash --only 'pair-*' --only 'disarmed-*'
-        xrl study crash --list
-        """,
-    )
-    add_config(parser)
-    parser.add_argument(
-        "--quick", action="store_true", help="one case of each kind, in 5 minutes or less"
-    )
-    parser.add_argument(
-        "--only",
-        action="append",
-        metavar="NAME",
-        help="this case alone, or those that fit a pattern such as 'kill-*'; may be repeated",
-    )
-    parser.add_argument("--list", action="store_true", help="print the cases and run none")
-    parser.add_argument(
-        "--out",
-        type=Path,
-        metavar="DIR",
-        help=f"where {RESULTS}, {JUNIT} and a folder for each case go (default: "
-        "out/crashtest-<time>); a case that did not stand keeps its run.mcap",
-    )
-    parser.add_argument("--seed", type=natural, default=0, help="of the sensors' noise")
+EXAMPLES: Final = """
+xrl study crash --quick
+xrl study crash --out out/matrix
+xrl study crash --only kill-knee_left
+xrl study crash --only 'pair-*' --only 'disarmed-*'
+xrl study crash --list
+"""
 
 
-def run(args: argparse.Namespace) -> int:
+class CrashFlags(ConfigFlags):
+    """Which cases."""
+
+    quick: bool = False
+    """one case of each kind, in 5 minutes or less"""
+    only: Annotated[tuple[str, ...], Arg(metavar="NAME")] = ()
+    """this case alone, or those that fit a pattern such as 'kill-*'; may be repeated"""
+    list: bool = False
+    """print the cases and run none"""
+    out: Annotated[
+        Path | None,
+        Arg(
+            metavar="DIR",
+            help=f"where {RESULTS}, {JUNIT} and a folder for each case go (default: "
+            "out/crashtest-<time>); a case that did not stand keeps its run.mcap",
+        ),
+    ] = None
+    seed: Natural = 0
+    """of the sensors' noise"""
+
+
+def run(flags: CrashFlags) -> int:
     """Run the matrix; 0 only if no case came out worse than it has to."""
     console = Console()
-    cases = select(CASES, quick=args.quick, only=args.only)
-    if args.list:
+    cases = select(CASES, quick=flags.quick, only=flags.only)
+    if flags.list:
         report.list_cases(cases, console)
         return 0
     require("sim")
-    robot = experiment.load_robot(args.config)
-    out = _make_out(args.out)
+    robot = experiment.load_robot(flags.config)
+    out = _make_out(flags.out)
     for other in procfs.fleets():
         console.print(
             marked("[yellow]another fleet runs in {}: two do not fit on two cores[/]", other)
@@ -90,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
     )
     results: list[Result] = []
     try:
-        _run_all(cases, robot, args.seed, out, results, console)
+        _run_all(cases, robot, flags.seed, out, results, console)
     except (KeyboardInterrupt, SystemExit, RunError):
         if results:
             report.show(results, console)
@@ -101,15 +95,13 @@ def run(args: argparse.Namespace) -> int:
     return exit_code(results)
 
 
-def select(
-    cases: Sequence[CrashCase], *, quick: bool, only: Sequence[str] | None
-) -> list[CrashCase]:
+def select(cases: Sequence[CrashCase], *, quick: bool, only: Sequence[str]) -> list[CrashCase]:
     """Return the selected cases, in their order.
 
     Raises:
         RunError: a name or pattern of `only` fits no case.
     """
-    for name in only or ():
+    for name in only:
         if not any(fnmatchcase(case.name, name) for case in cases):
             near = difflib.get_close_matches(name, [case.name for case in cases], n=3, cutoff=0.4)
             hint = f"perhaps {', '.join(near)}; " if near else ""
@@ -118,7 +110,7 @@ def select(
         case
         for case in cases
         if (case.quick or not quick)
-        and (only is None or any(fnmatchcase(case.name, name) for name in only))
+        and (not only or any(fnmatchcase(case.name, name) for name in only))
     ]
 
 
