@@ -131,7 +131,8 @@ add_extras() {  # NAME...
 # The graphs' C is right while this stays the same; a library also carries its graph's hash.
 graphs_fingerprint() {
   { command -v cc; cat "$stamp" "$root"/services/planner/law/{symbolic,model,certificate}.py \
-    "$root"/services/simulator/{body,drivetrain,plant}.py "$root"/shared/robot/compiled_graph.py \
+    "$root"/services/simulator/physics/{body,actuation,plant}.py \
+    "$root"/services/simulator/drives/axis_control.py "$root"/shared/robot/compiled_graph.py \
     "$root"/tools/graph_libraries.py "$root"/deploy/robot.toml; } 2>/dev/null | sha256sum || true
 }
 

@@ -206,10 +206,8 @@ def test_a_fleet_knows_no_state_before_it(tmp_path: Path, left: RearmGuard, ends
     assert left.read() is LastState.HELD
     neighbours.Neighbours(tmp_path, MODULE)
     if ends == "a new fleet":
-        plan = process_table.make_plan(
-            DEFAULT_CONFIG, Path("/nowhere"), overrides={}, services=[MODULE], simulation=True,
-            table_path=process_table.TABLE,
-        )  # fmt: skip
+        options = process_table.FleetOptions(services=[MODULE])
+        plan = process_table.make_plan(DEFAULT_CONFIG, Path("/nowhere"), options)
         RunDir(tmp_path).prepare(plan)
     else:
         run = RunDir(tmp_path)

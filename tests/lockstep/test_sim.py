@@ -18,6 +18,7 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Fault, Scenario
 from shared.joints import MODULES
 from tests.lockstep.runs import kill, push, restart, still
+from tests.tools.exit_codes import exit_code
 from tools import cli
 from tools.logs.run_log import read_run
 from tools.sim import lockstep
@@ -29,7 +30,7 @@ without a message, and no tool links."""
 
 
 def sim(out: Path, *flags: str) -> int:
-    return cli.main(["sim", "--out", str(out), *flags])
+    return exit_code(["sim", "--out", out, *flags])
 
 
 def statuses_of(out: Path) -> list[PlannerStatus]:
@@ -94,7 +95,7 @@ def test_a_lean_that_was_asked_for_is_no_excursion_and_comes_out_again(tmp_path:
     ("flags", "words"),
     [
         (("--loss", "1.5"), "from 0 to 1"),
-        (("--delay", "-1"), "at least 0 ms"),
+        (("--delay", "-1"), "of at least 0 ms"),
         (("--kill", "harness@1"), "only the planner"),
     ],
 )

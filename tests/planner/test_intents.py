@@ -176,14 +176,14 @@ def test_an_offset_stays_within_size_and_rate(course: list[tuple[int, float, flo
     probe, last = ReferenceProbe(MOST, LED), (NO_ROW, 0.0)
     for row, wanted, dt in course:
         probe.advance(row, wanted, P, REST, dt)
-        if probe.row == NO_ROW:
-            assert probe.offset == 0.0
+        if probe.state.row == NO_ROW:
+            assert probe.state.offset == 0.0
         else:
-            most = MOST[probe.row]
-            assert abs(probe.offset) <= most
-            before = last[1] if last[0] == probe.row else 0.0
-            assert abs(probe.offset - before) <= dt * most / PROBE_S * (1.0 + 1e-9)
-        last = (probe.row, probe.offset)
+            most = MOST[probe.state.row]
+            assert abs(probe.state.offset) <= most
+            before = last[1] if last[0] == probe.state.row else 0.0
+            assert abs(probe.state.offset - before) <= dt * most / PROBE_S * (1.0 + 1e-9)
+        last = (probe.state.row, probe.state.offset)
 
 
 def test_another_row_begins_only_when_the_first_is_back() -> None:
@@ -193,7 +193,7 @@ def test_another_row_begins_only_when_the_first_is_back() -> None:
     rows = []
     for _ in range(30):
         probe.advance(3, 0.02, P, REST, DT)
-        rows.append((probe.row, probe.offset))
+        rows.append((probe.state.row, probe.state.offset))
     assert rows[0][0] == 0
     assert rows[-1] == (3, pytest.approx(0.02))
     switch = [row for row, _ in rows].index(NO_ROW)
@@ -203,7 +203,7 @@ def test_another_row_begins_only_when_the_first_is_back() -> None:
 def test_a_row_that_the_robot_file_forbids_is_never_probed() -> None:
     probe = ReferenceProbe(MOST, LED)
     probe.advance(5, 0.01, P, REST, DT)
-    assert probe.row == NO_ROW
+    assert probe.state.row == NO_ROW
 
 
 def referred(probe: ReferenceProbe, p: Array, pdot: Array) -> tuple[Array, Array]:
@@ -217,9 +217,9 @@ def test_a_led_row_is_taken_only_at_rest() -> None:
     probe, moving = ReferenceProbe(MOST, LED), np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0])
     for _ in range(50):
         probe.advance(2, 0.01, P, moving, DT)
-    assert probe.row == NO_ROW
+    assert probe.state.row == NO_ROW
     probe.advance(2, 0.01, P, REST, DT)
-    assert probe.row == 2
+    assert probe.state.row == 2
 
 
 def test_a_led_row_is_held_and_given_back_without_a_step() -> None:
@@ -235,7 +235,7 @@ def test_a_led_row_is_held_and_given_back_without_a_step() -> None:
         p_ref, pdot_ref = referred(probe, p, pdot)
         largest = max(largest, abs(p_ref[2] - last) - 0.1 * DT)
         last = p_ref[2]
-        seen.append((probe.row, p_ref[2] - p[2], pdot_ref[2]))
+        seen.append((probe.state.row, p_ref[2] - p[2], pdot_ref[2]))
     # the deviation of 0.12 m that is held goes back over half a second
     assert largest <= offset_step + 0.15 * DT / 0.5 + 1e-9
     assert seen[250][0] == 2

@@ -135,19 +135,27 @@ class VirtualJoint:
             events=RecordOutbox(record, topics.JOINT_EVENT, name),
             traces=RecordOutbox(record, topics.JOINT_TRACE, name) if traced else None,
         )
-        self._start()
+        self._start(make())
 
-    def _start(self) -> None:
-        self.manager = self._make()
+    @property
+    def manager(self) -> DriveManager:
+        """The service's decisions; another one takes its place from the next cycle on."""
+        return self._loop.module
+
+    @manager.setter
+    def manager(self, manager: DriveManager) -> None:
+        self._start(manager)
+
+    def _start(self, manager: DriveManager) -> None:
         self._loop = JointLoop(
             self._config,
-            self.manager,
+            manager,
             self._wired,
             self._ports,
             neighbours=self._place,
             clock=self._clock,
         )
-        self._place.write(row_of(self.manager.controller))
+        self._place.write(row_of(manager.controller))
 
     def cycle(self) -> DriveAction:
         """Run one cycle."""
@@ -163,7 +171,7 @@ class VirtualJoint:
         self.frozen = False
         if self._is_dead:
             self._is_dead = False
-            self._start()
+            self._start(self._make())
             self.drive.start_service()
 
     def resume(self, state: DriveManagerState | None) -> None:

@@ -26,7 +26,7 @@ REFUSED = {
         (["--kill", "planner@30"], "not inside the run"),
         (["--restart", "planner@3"], "kill it first"),
         (["--push", "1:2:3"], "START:DURATION:FX,FY,FZ"),
-        (["--duration", "0"], "more than 0"),
+        (["--duration", "0"], "a number of at least 0.001 s"),
         (["--config", "no_such.toml"], "not found"),
     ],
 }

@@ -15,7 +15,8 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from tests.conftest import ROBOT_FILE
 from tests.tools.exit_codes import exit_code
-from tools.bringup.tune.excitation import Excitation, excitation
+from tools.bringup.tune import excitation
+from tools.bringup.tune.excitation import Excitation
 from tools.bringup.tune.pose_probe import ProbeCourse
 from tools.verbs.drive import tune
 

@@ -226,9 +226,9 @@ def remarks(estimates: Sequence[ParameterEstimate], robot: RobotConfig) -> list[
             )
         if row.key == "drive.torque_constant":
             said.append(
-                "drive.torque_constant: the drives have a copy. After it is written: `xrl "
-                "configure --apply`, which restarts them, then zero them; until then the robot is "
-                "as it was, and to measure and write again would count the error twice"
+                "drive.torque_constant: the drives have a copy. After it is written: "
+                "`xrl drive configure --apply`, which restarts them, then zero them; until then "
+                "the robot is as it was, and to measure and write again would count the error twice"
             )
     return said
 
