@@ -70,7 +70,7 @@ how_to_install() {
 }
 
 # Wheels bring all but one library of the system. Without it the first import would be a traceback.
-# (Drives over USB want libusb-1.0 as well; who uses them is told so, shared/system_packages.py.)
+# (Drives over USB want libusb-1.0 as well; who uses them is told so, shared/extras.py.)
 check_libraries() {  # PYTHON
   "$1" -c 'import ctypes; ctypes.CDLL("libgomp.so.1")' 2>/dev/null ||
     die "the library libgomp.so.1 is missing, which Pinocchio needs; install it:" \

@@ -1,3 +1,3 @@
-"""The command line `xrl`: one file for each verb."""
+"""The command line `xrl`, and what its verbs use."""
 
 import shared  # noqa: F401 - before NumPy: it settles the number of threads

@@ -1,4 +1,4 @@
-"""`xrl`: the command line. One file per verb in `tools/verbs`; `tools.verb_table` lists them."""
+"""`xrl`: the command line. The verbs are in `tools/verbs`; `tools.verb_table` lists them."""
 
 from __future__ import annotations
 
@@ -144,9 +144,8 @@ def _asked(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> str:
     A word that is neither is refused, with what may be meant.
     """
     names = {verb.name for verb in VERBS} | set(NOUNS)
-    first = [word for word in arguments if not word.startswith("-")][:1]
     found = ""
-    for word in first + list(arguments[1:]):
+    for word in itertools.dropwhile(lambda word: word.startswith("-"), arguments):
         longer = f"{found} {word}".lstrip()
         if longer not in names:
             if not word.startswith("-") and (not found or found in NOUNS):

@@ -36,7 +36,7 @@ from typing import (
 
 from shared import places
 from shared.joints import MODULES
-from shared.run_directory import default_run_dir, own_directory
+from shared.run_directory import check_own, default_run_dir, own_directory
 from shared.toml_file import Range
 from tools.field_docs import field_docs
 
@@ -323,11 +323,17 @@ def read_flags(declaration: type[F], found: argparse.Namespace) -> F:
     return flags
 
 
+def _own_run_dir() -> Path:
+    path = default_run_dir()
+    check_own(path, alone=False)
+    return path
+
+
 class RunDirFlags(Flags):
     """Which fleet is meant."""
 
     run_dir: Annotated[Path, parsed(own_directory, "DIR")] = dataclasses.field(
-        default_factory=lambda: own_directory(str(default_run_dir()))
+        default_factory=_own_run_dir
     )
     """directory of the fleet's sockets and logs (default: $XRL_RUN_DIR, else /tmp/xrl-UID of the
     user); keep it short"""

@@ -136,10 +136,12 @@ VERBS: Final = (
             ("dynamics", "search for poses where a motion that should decay grows"),
         )
     ),
-    Verb("study crash", "kill one service after the other, live, and judge"),
+    Verb(
+        "study crash", "bring down services, links and drives one after the other, live, and judge"
+    ),
     Verb("hosts files", "write each host's files into a folder, and bring nothing", "hosts:files"),
     Verb("hosts update", "bring each host its files: robot file, keys, unit", "hosts:update"),
-    Verb("hosts check", "look whether the hosts are as they should be; 0: they are", "hosts:check"),
+    Verb("hosts check", "check that the hosts are as they should be; 0: they are", "hosts:check"),
     Verb("hosts up", "start the services on all hosts, and arm the drives", "hosts:up"),
     Verb("hosts status", "show the services of all hosts in one table", "hosts:status"),
     Verb("hosts records", "bring the newest records here, joined into one run", "hosts:bring"),
@@ -148,7 +150,7 @@ VERBS: Final = (
     Verb("keys make", "make a robot's authority, and a certificate for each process", "keys:make"),
     Verb("keys pack", "pack what one host needs: never the authority's key", "keys:pack"),
     Verb("keys check", "look at this host's keys; 0: all are right", "keys:check"),
-    Verb("keys renew", "make new certificates; the old ones go on to be let in", "keys:renew"),
+    Verb("keys renew", "make new certificates; the old ones stay valid", "keys:renew"),
     Verb("keys revoke", "make certificates of the next generation, for lost ones", "keys:revoke"),
     Verb("gains", "compute a robot's certified gain schedule, or how stiff it must be"),
     Verb("ros2 check", "join the network as a node: is the robot there, with all its topics?"),

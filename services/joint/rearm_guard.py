@@ -210,5 +210,5 @@ class Pendant:
 
     def _write_beats(self, beats: int) -> None:
         for memory in self._memories.values():
-            # not `pack_into`, which first writes zeros: for a reader there would be no pendant
+            # packing in place first writes zeros: for a reader there would be no pendant
             memory[_BEATS_AT : _BEATS_AT + _BEATS.size] = _BEATS.pack(beats)

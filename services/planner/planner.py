@@ -277,8 +277,10 @@ class Planner:
         self._law.restore(own.law)
         self._overload.state, self._trips.state = own.overload, own.trips
         self._unattended.state, self._phases.state = own.unattended, own.phases
-        if self._guard is not None and own.guard is not None:
-            self._guard.state = own.guard
+        if self._guard is not None:
+            if own.guard is not None:
+                self._guard.state = own.guard
+            own.guard = self._guard.state
 
     def _watch_rival(self, states: Sequence[JointState]) -> None:
         """Find out if another planner leads, and if modules have retired this one's session."""

@@ -1,1 +1,1 @@
-"""The robot file and scenarios, read and checked."""
+"""The robot file, its gain schedule, scenarios and impairments, read and checked."""

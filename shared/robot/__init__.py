@@ -1,1 +1,1 @@
-"""Geometry, gains, and the tables of faults and trips."""
+"""Geometry, models, compiled graphs, and the tables of faults and trips."""

@@ -23,7 +23,7 @@ TALK: dict[Topic, tuple[tuple[str, ...], tuple[str, ...]]] = {
     topics.PLANNER_STATUS: (("planner",), ("recorder", TOOL)),
     topics.OPERATOR_INTENT: (("simulator", TOOL), ("planner", "simulator", "recorder", TOOL)),
     topics.OPERATOR_HAND: ((TOOL,), ("simulator", "recorder")),
-    topics.ESTOP: (("planner", "harness", TOOL), (*MODULES, "planner", "recorder")),
+    topics.ESTOP: ((TOOL,), (*MODULES, "planner", "recorder")),
     topics.SIM_TRUTH: (("simulator",), ("recorder", TOOL)),
     topics.SIM_CONTROL: ((TOOL,), ("simulator", "recorder")),
     topics.RUN_EVENT: ((TOOL,), ("recorder",)),

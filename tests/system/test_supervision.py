@@ -363,10 +363,10 @@ def up_in_a_process(run_dir: Path, table: Path, *, then: str = "") -> subprocess
     code = (
         "import sys, time, tools.cli, tools.verbs.up, tools.fleet.supervise as s\n"
         "from pathlib import Path\n"
-        "def run(args):\n"
+        "def run(flags: tools.verbs.up.UpFlags) -> int:\n"
         f"    options = s.FleetOptions(table_path=Path({str(table)!r}), leashed={bool(then)},"
         " timeout_s=60)\n"
-        "    s.SupervisedFleet.start(args.config, args.run_dir, options)\n"
+        "    s.SupervisedFleet.start(flags.config, flags.run_dir, options)\n"
         f"    {then or 'return 0'}\n"
         "tools.verbs.up.run = run\n"
         f"sys.exit(tools.cli.main(['up', '--run-dir', {str(run_dir)!r}]))\n"
@@ -450,7 +450,7 @@ def test_top_hz_and_echo_show_what_the_services_send(start: Start, order: Order)
     code, said = order(*words)
     assert (code, "mode: HOLD (1)" in said) == (0, True)
 
-    code, shown = order("top", "--once")
+    code, shown = order("status", "--traffic")
     assert code == 0
     assert str(fleet.pids()["ankle_right"]) in shown
     assert "joint/ankle_right/state" in shown

@@ -123,6 +123,16 @@ def test_down_without_a_fleet_succeeds_and_makes_nothing(tmp_path: Path) -> None
     assert not (tmp_path / "none").exists()
 
 
+@pytest.mark.parametrize("verb", ["down", "status"])
+def test_a_run_directory_of_the_environment_that_is_none_is_one_line(
+    verb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XRL_RUN_DIR", str(tmp_path / "file"))
+    assert cli.main([verb]) == 2
+    assert capsys.readouterr().err.endswith("is no directory; give another --run-dir\n")
+
+
 def test_a_missing_robot_file_is_one_line_and_starts_nothing(tmp_path: Path) -> None:
     run_dir = tmp_path / "run"
     assert_one_line_error(xrl("up", "--config", "nowhere.toml", "--run-dir", str(run_dir)))

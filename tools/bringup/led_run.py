@@ -1,4 +1,4 @@
-"""A live robot that is asked for something for a while: by `identify body` and `tune`."""
+"""A live robot that is asked for something for a while, to identify its body and to tune it."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ ExecStart={xrl} up --no-sim --disarmed --config {hosts.folder}/{ROBOT_FILE} \\
 ExecStop={xrl} down --keep-stops --run-dir {RUN_DIR}
 Restart=always
 RestartSec=2
-# A start that were cut short would idle the drives of what is up.
+# A start that is cut short would idle the drives of what is up.
 TimeoutStartSec=infinity
 TimeoutStopSec=30
 # Nor are they all to go because one process took too much memory.

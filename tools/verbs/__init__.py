@@ -1,1 +1,1 @@
-"""The verbs of `xrl`, one file each: flags, calls, output. No verb imports another."""
+"""The verbs of `xrl`: flags, calls, output. No verb imports another."""

@@ -61,8 +61,8 @@ class UpFlags(ConfigFlags, RunDirFlags, PlantFlags, ControllerFlags, PaceFlags, 
     out: Folder | None = None
     """where the recorder writes (default: out/ and the time)"""
     scenario: Annotated[str | None, Arg(metavar="NAME|FILE")] = None
-    """what the simulated operator does once the robot stands: a file, or a name from
-    deploy/scenarios (its kills are left to you)"""
+    """what the simulated operator does once the robot stands: a file, or a name
+    (beside the robot file in scenarios/, or a shipped one; its kills are left to you)"""
     no_sim: bool = False
     """start no simulator: the drives are real, or come later"""
     only: Annotated[

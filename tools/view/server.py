@@ -1,4 +1,4 @@
-"""The page's server: one asyncio loop, on this computer only, for who knows the token.
+"""The page's server: one asyncio loop, on this computer only, for whoever knows the token.
 
 Every request needs the token in its path, and this server's own name as Host; a WebSocket also its
 own Origin. A page of a stranger in the same browser has none of them.

@@ -1,1 +1,1 @@
-"""Parts of `xrl log play`: reading, selection of keys, schedule, player, keys."""
+"""Parts of `xrl log play`: arguments, guard, reading, selection, schedule, player."""

@@ -55,7 +55,7 @@ class CrashFlags(ConfigFlags):
         Arg(
             metavar="DIR",
             help=f"where {RESULTS}, {JUNIT} and a folder for each case go (default: "
-            "out/crashtest-<time>); a case that did not stand keeps its run.mcap",
+            "out/crash-<time>); a case that did not stand keeps its run.mcap",
         ),
     ] = None
     seed: Natural = 0
@@ -195,4 +195,4 @@ def _make_out(out: Path | None) -> Path:
     """Make the folder of the results, unless it holds some already."""
     if out is not None and (out / RESULTS).exists():
         raise RunError(f"{out}: holds results already; choose another --out, or remove it")
-    return experiment.make_out(out, "crashtest")
+    return experiment.make_out(out, "crash")

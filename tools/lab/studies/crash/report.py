@@ -183,7 +183,7 @@ def as_junit(results: Sequence[Result], about: Mapping[str, str]) -> bytes:
         ET.SubElement(properties, "property", name=name, value=value)
     for result in results:
         case, outcome = result
-        row = ET.SubElement(suite, "testcase", classname=f"crashtest.{case.kind}", name=case.name)
+        row = ET.SubElement(suite, "testcase", classname=f"crash.{case.kind}", name=case.name)
         row.set("time", f"{outcome.wall_s:.1f}")
         if not result.good:
             tag = "error" if outcome.verdict is CrashVerdict.UNJUDGED else "failure"
