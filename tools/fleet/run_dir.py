@@ -7,6 +7,7 @@ import fcntl
 import os
 import shlex
 import stat
+import time
 from pathlib import Path
 from typing import Final
 
@@ -26,6 +27,9 @@ SUPERVISOR_PID: Final = "supervisord.pid"
 """Written when the fleet starts."""
 MARKER: Final = ".xrl-run"
 """Lies in every run directory: nothing is removed, and nobody attached to, where it does not."""
+
+ENDING_S: Final = 0.5
+"""Longest wait for the lock of a fleet whose processes were killed, and are no longer found."""
 
 _BY_HAND: Final = ("*.zenoh.lock", "*.rearm", "*.near", PACE_FILE, usb_standin.FOLDER,
                    usb_standin.BUILT)  # fmt: skip
@@ -85,14 +89,19 @@ class RunDir:
     def claim(self, *, alone: bool = True) -> int:
         """Make the directory, or take one that is empty or a fleet's; mark and lock it.
 
-        The supervisor inherits the descriptor, so the lock lives as long as it does.
+        The supervisor inherits the descriptor, so the lock lives as long as it does. A process that
+        was killed holds it for a moment after it has ended to all appearances: `ENDING_S`.
         """
+        give_up_s = time.monotonic() + ENDING_S
         while True:
             descriptor = self._open(alone=alone)
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 os.close(descriptor)
+                if time.monotonic() < give_up_s:
+                    time.sleep(ENDING_S / 50)
+                    continue
                 raise FleetError(
                     f"a fleet is up in {self.path}; stop it with `xrl down`, "
                     "or give another directory with --run-dir"

@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -20,7 +21,7 @@ from shared.run_directory import FLEET_VARIABLE, check_own
 from tests.tools.fleet.plans import plan
 from tools import cli
 from tools.fleet import procfs
-from tools.fleet.run_dir import MARKER, RunDir
+from tools.fleet.run_dir import ENDING_S, MARKER, RunDir
 from tools.fleet.supervise import SupervisedFleet
 
 
@@ -43,6 +44,14 @@ def test_the_run_directory_has_one_owner_at_a_time(run_dir: Path) -> None:
         RunDir(run_dir).claim()
     os.close(lock)
     os.close(RunDir(run_dir).claim())
+
+
+def test_a_directory_is_taken_whose_owner_is_just_ending(run_dir: Path) -> None:
+    lock = RunDir(run_dir).claim()
+    ends = threading.Timer(0.1 * ENDING_S, os.close, [lock])
+    ends.start()
+    os.close(RunDir(run_dir).claim())
+    ends.join()
 
 
 def test_clearing_leaves_foreign_files_and_sockets_alone(claimed: RunDir) -> None:
