@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import fnmatch
+import graphlib
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
@@ -290,6 +291,18 @@ def test_a_room_imports_only_those_below_it(storey: str) -> None:
     assert offenders(in_folder(f"{storey}/"), is_above) == set()
 
 
+def test_no_files_import_each_other_in_a_circle_not_even_for_a_type() -> None:
+    file_of = {
+        file.removesuffix(".py").removesuffix("/__init__").replace("/", "."): file
+        for file in SOURCES
+    }
+    graph = {
+        file: {file_of.get(i.full) or file_of.get(i.module, file) for i in imports} - {file}
+        for file, imports in IMPORTS.items()
+    }
+    tuple(graphlib.TopologicalSorter(graph).static_order())  # raises CycleError, which names them
+
+
 def test_the_design_of_the_gains_knows_the_planners_law_and_no_other_service() -> None:
     allowed = ("services.planner.", "shared.", "tools.lab.design.", "tools.output.")
 
@@ -368,7 +381,7 @@ def is_impure(_: str, i: Import) -> bool:
 
 
 def test_a_law_knows_no_clock_bus_thread_process_or_log() -> None:
-    """Of the clock it takes the units only."""
+    """It may take the units of `shared.clock`, and nothing else of it."""
     assert offenders(LAWS, is_impure) == set()
 
 

@@ -72,7 +72,7 @@ class Arg(NamedTuple):
     """What a field's type does not say about its flag."""
 
     names: tuple[str, ...] = ()
-    """Of the flag; none: `--` and the field's name."""
+    """The flag's names; none: `--` and the field's name."""
     metavar: str = ""
     choices: tuple[str, ...] = ()
     """As of a `Literal`, where a table elsewhere has them."""

@@ -27,7 +27,7 @@ class SetpointState(msgspec.Struct, kw_only=True):
     frozen: Setpoint
     """The setpoint at the last change of mode: HOLD keeps it, TRACK blends from it."""
     current: Setpoint
-    """Of the last cycle."""
+    """The last cycle's."""
     changed_ns: int = 0
     """Time of the last change of mode."""
     stiffened_ns: int = 0

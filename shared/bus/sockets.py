@@ -32,7 +32,7 @@ Address = tuple[str, int]
 """Numeric host and port."""
 
 ADDRESSES_MAX: Final = 64
-"""Of each family; the kernel takes programs of 4096 instructions."""
+"""Per address family; the kernel takes programs of 4096 instructions."""
 
 _SO_ATTACH_FILTER: Final = 26
 # Classic BPF, <linux/bpf_common.h> and <linux/filter.h>

@@ -27,7 +27,7 @@ Force = Annotated[float, Range(-2000.0, 2000.0, "N")]
 ShiftLength = Annotated[float, Range(-0.1, 0.1, "m")]
 ShiftAngle = Annotated[float, Range(-0.3, 0.3, "rad")]
 Shift = tuple[float, float, float, float]
-"""Of x, y (m), roll and yaw (rad)."""
+"""A change of x, y (m), roll and yaw (rad)."""
 
 SIGNALS = ("KILL", "STOP", "TERM", "INT")
 """Signals of a kill; STOP freezes the process instead."""

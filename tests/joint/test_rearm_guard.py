@@ -313,7 +313,7 @@ def test_a_pendant_that_falls_silent_stops_the_module_and_one_that_was_never_the
 def test_a_pendant_of_before_is_missed_unless_it_was_laid_down(
     robot: RobotConfig, start: Start, tmp_path: Path, laid_down: bool, mode: Mode
 ) -> None:
-    """By the service that starts anew, too."""
+    """The pendant beats before the service starts."""
     RearmGuard(tmp_path, MODULE)
     pendant = Pendant(tmp_path, MODULES)
     pendant.beat()

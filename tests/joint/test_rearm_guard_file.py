@@ -1,4 +1,4 @@
-"""The file of what a joint service left, and the verbs that ask for a module anew."""
+"""The file of what a joint service left, and the verbs that re-arm a module."""
 
 from __future__ import annotations
 

@@ -127,7 +127,7 @@ def test_a_torque_goes_to_the_drive_unchanged_until_the_next_however_long(bench:
         assert step.event is None
     assert bench.mode is Mode.TRACK
     step = bench.passes((math.nan, 0.0))
-    assert bench.torque_of(step) == pytest.approx((5.0, -60.0)), "what is no number is not passed"
+    assert bench.torque_of(step) == pytest.approx((5.0, -60.0)), "NaN is not passed on"
 
 
 def test_a_torque_made_from_an_old_state_is_taken(bench: Bench) -> None:

@@ -19,7 +19,7 @@ DRAWN = 300
 
 
 CLEAR = 0.1
-"""Of K_required; nearer to zero the floor's own elasticity may decide."""
+"""Fraction of K_required; nearer to zero the floor's own elasticity may decide."""
 
 
 TRIED = 8

@@ -185,7 +185,7 @@ def test_yesterdays_commands_put_onto_the_bus_move_nothing(
 ) -> None:
     """A record of the same robot, same session, in the same pose: older by a day.
 
-    Or ahead by one: the host has been started anew since, so its clock is behind the record's.
+    Or ahead by one: the host has restarted since, so its clock is behind the record's.
     """
     twin = gone_on(robot, start, led=led)
     for days in (-1, 1):

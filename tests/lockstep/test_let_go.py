@@ -21,7 +21,7 @@ LET_GO_S = 3.0
 
 
 REFUSED_ROWS = 600
-"""Of the simulated world, which is seen at 100 Hz: 6 s."""
+"""Rows of the simulated world, which come at 100 Hz: 6 s."""
 
 
 def let_go(

@@ -163,7 +163,7 @@ def reachable(robot: RobotConfig, limits: Array, rng: np.random.Generator) -> tu
 def test_every_reachable_pose_is_reached_from_any_start_inside_the_limits(
     robot: RobotConfig, ik: InverseKinematics, limits: Array
 ) -> None:
-    """Of 7 500 poses drawn so, each from a random start and from a stand, none failed."""
+    """None of 7 500 such poses failed, each from a random start and from a stand."""
     rng = np.random.default_rng(2024)
     for _ in range(30):
         _, p_ref = reachable(robot, limits, rng)

@@ -31,7 +31,7 @@ POSES = ((1.188, 0.0), (0.948, 0.0), (0.85, 0.6), (0.80, 1.2))
 
 
 MARGIN, MARGIN_ONBOARD = 0.9, 0.45
-"""Of what is required; asked for at the nodes are 1 and 0.5."""
+"""Fractions of the required margins; the nodes are designed for 1 and 0.5."""
 RowsOfGains = tuple[tuple[tuple[float, float, float, float, float, float], ...], ...]
 
 

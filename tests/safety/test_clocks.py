@@ -103,7 +103,7 @@ def test_what_cannot_be_a_planners_is_refused_counted_and_moves_nothing(
 
 
 def test_a_planner_restarted_in_its_old_session_is_refused(robot: RobotConfig) -> None:
-    """Sessions are drawn at random for this: its numbers begin anew, and old ones are refused."""
+    """Sessions are drawn at random for this: its numbers begin again, and old ones are refused."""
     bench, twin = (bench_in(Mode.TRACK, robot) for _ in range(2))
     for one in (bench, twin):
         one.run(30)
@@ -115,7 +115,7 @@ def test_a_planner_restarted_in_its_old_session_is_refused(robot: RobotConfig) -
     assert bench.controller.failsafe.refused == refused + caught_up
 
 
-@pytest.mark.parametrize("uptime_s", [5, 90_000], ids=["host anew too", "same host"])
+@pytest.mark.parametrize("uptime_s", [5, 90_000], ids=["restarted host", "same host"])
 def test_a_restarted_robot_refuses_its_last_record(uptime_s: int, robot: RobotConfig) -> None:
     """Its services know of no session yet; only the stamps can tell."""
     bench, twin, last = Bench(robot), Bench(robot), Bench(robot)

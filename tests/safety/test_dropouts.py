@@ -151,7 +151,7 @@ class Arrival(msgspec.Struct, frozen=True):
 
 
 def brute_force(arrivals: dict[int, Arrival], cycles: int, timing: Timing) -> list[Mode]:
-    """Return the mode of every cycle, told anew from the whole past in each.
+    """Return the mode of every cycle, computed from the whole past in each.
 
     No state is carried but the list of modes itself; nothing drops out for long enough to
     be forgotten.

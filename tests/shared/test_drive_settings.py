@@ -36,7 +36,7 @@ TRAPS = (
     "controller.config.spinout_electrical_power_threshold",
     "controller.config.spinout_mechanical_power_threshold",
 )
-"""Of docs/drives.md, of each axis: what an ODrive ships is wrong."""
+"""Each axis's, from docs/drives.md: an ODrive ships with others."""
 
 
 @pytest.mark.parametrize("module", MODULES)

@@ -31,7 +31,7 @@ class Kind(NamedTuple):
     one: Frames
     two: Frames
     lost_unseen: tuple[tuple[int, ...], ...] = ()
-    """Of the frames of both, losses that leave those of a sample in order: the docs name them."""
+    """Losses of frames that leave a sample's frames in order; the docs name them."""
 
     def samples(self) -> list[Any]:
         return [added(self.assembler(), frames)[-1] for frames in (self.one, self.two)]

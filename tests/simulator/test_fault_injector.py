@@ -25,7 +25,7 @@ from tests.simulator.banks import DT, ZERO, make_bank
 
 FAILED = AxisError.MOTOR_FAILED
 NO_COMMAND = MotorError.UNKNOWN_TORQUE | MotorError.UNKNOWN_VOLTAGE_COMMAND
-"""Of a motor whose controller has failed: what a real board was seen to leave, ODrive issue 700."""
+"""Errors that a real board leaves on a motor whose controller has failed (ODrive issue 700)."""
 
 
 class Outcome(NamedTuple):

@@ -102,7 +102,7 @@ def messages(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
 
 
 def garbage(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
-    """Put what is no message on the commands' keys."""
+    """Put payloads that are no messages on the commands' keys."""
     session = link(robot, run_dir)
     publishers = [session.declare_publisher(f"xrl/{robot.name}/joint/{m}/command") for m in MODULES]
     each = itertools.cycle(publishers)

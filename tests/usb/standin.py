@@ -117,7 +117,7 @@ class Control:
         self.samples = 0
         self.raised: BaseException | None = None
         self.longest_s = 0.0
-        """Of one cycle beyond the time it was to wait."""
+        """Longest time that one cycle took beyond its wait."""
         self.hang = threading.Event()
         """While set, the loop does nothing."""
         self._asked: list[Callable[[], None]] = []

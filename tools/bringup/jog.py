@@ -28,7 +28,7 @@ class ThereAndBack(NamedTuple):
 
     @property
     def duration_s(self) -> float:
-        """Of all cycles."""
+        """Duration of all cycles."""
         return self.cycles * self.period_s
 
     @property

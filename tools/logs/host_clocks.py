@@ -24,7 +24,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import combinations, pairwise, product
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple, Protocol, TypeAlias
 
 from shared.bus import topics
 from shared.bus.topics import RECORDER, Topic
@@ -32,9 +32,6 @@ from shared.clock import NS_PER_MS, NS_PER_S, NS_PER_US
 from shared.joints import MODULES
 from tools.logs.run_index import RunIndex
 from tools.topic_keys import every_key, sender_of
-
-if TYPE_CHECKING:
-    from tools.logs.run_log import RunLog
 
 PLANNER: Final = "planner"
 ONE_CLOCK_NS: Final = 20 * NS_PER_MS
@@ -58,6 +55,19 @@ SAMPLES_MAX: Final = 400
 
 Heard: TypeAlias = tuple[str, int, str, int]
 """Sender, its time, receiver, and a time of that one at which it surely had the message."""
+
+
+class SentMessages(Protocol):
+    """Messages of a part of a run, with all times as they were sent (`RunLog`)."""
+
+    def messages(self, topic: Topic, module: str = "", /) -> list[Any]:
+        """Return the messages of a topic."""
+
+    def received_ns(self, topic: Topic, module: str = "", /) -> list[int]:
+        """Return when each of them reached the recorder, on its host's clock."""
+
+    def holds(self, received_ns: int, /) -> bool:
+        """Return True for a message of this part, False for one of its margins."""
 
 
 class OffsetBounds(NamedTuple):
@@ -224,10 +234,10 @@ class HostClocks(NamedTuple):
         return lines
 
 
-def find_clocks(index: RunIndex, read: Callable[[float, float], RunLog]) -> HostClocks | None:
+def find_clocks(index: RunIndex, read: Callable[[float, float], SentMessages]) -> HostClocks | None:
     """Compare the clocks of a run's hosts; None if all its services ran on one.
 
-    `read` gives a part with all times as they were sent, from and to s since its first message.
+    `read` returns the part from and to s since the first message.
     """
     hosts = index.hosts
     if RECORDER not in hosts or len(set(hosts.values())) == 1:
@@ -293,7 +303,7 @@ def _looks_in(first_ns: int, last_ns: int) -> tuple[int, ...]:
     return first_ns + LOOK_NS // 2, last_ns - LOOK_NS // 2
 
 
-def _heard(log: RunLog) -> Iterator[Heard]:
+def _heard(log: SentMessages) -> Iterator[Heard]:
     for topic, module in every_key():
         sender = sender_of(topic, module)
         rows = zip(log.messages(topic, module), log.received_ns(topic, module), strict=True)
@@ -305,7 +315,7 @@ def _heard(log: RunLog) -> Iterator[Heard]:
     yield from _inputs_taken(log)
 
 
-def _commands_taken(log: RunLog, module: str) -> Iterator[Heard]:
+def _commands_taken(log: SentMessages, module: str) -> Iterator[Heard]:
     """Yield commands: a cycle reads its time before it takes one, so the next cycle's time counts.
 
     What came between may be a pause of the process.
@@ -319,7 +329,7 @@ def _commands_taken(log: RunLog, module: str) -> Iterator[Heard]:
             yield PLANNER, sent_ns, module, after.now_ns
 
 
-def _inputs_taken(log: RunLog) -> Iterator[Heard]:
+def _inputs_taken(log: SentMessages) -> Iterator[Heard]:
     """Yield the planner's inputs: those of this look came before the tick's end."""
     states = [_numbered(log.messages(topics.JOINT_STATE, module)) for module in MODULES]
     wrenches = _numbered(log.messages(topics.WRENCH))

@@ -45,7 +45,7 @@ class HostRecord(NamedTuple):
     host: str
     """As the fleet's robot file names it."""
     clock: ClockLife | None
-    """Of the host, against the fleet's recorder; None: it is one clock."""
+    """The host's clock against that of the fleet's recorder; None: it is one clock."""
 
     def to_fleets_ns(self, own_ns: int) -> int:
         """Return a time of this record on the clock of the fleet's."""
@@ -68,7 +68,7 @@ class HostRecord(NamedTuple):
 def host_record(fleets: RunIndex, index: RunIndex) -> HostRecord:
     """Return how a record joins the fleet's.
 
-    Refuses what is no host's own, another robot's, of another time, or of an unknown clock.
+    Refuses a record that no host wrote, of another robot, of another time or of an unknown clock.
     """
     if fleets.metadata["run"].get("of"):
         raise RunError(f"{fleets.path}: is a host's own record; the fleet's comes first")

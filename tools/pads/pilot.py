@@ -62,7 +62,7 @@ class Pilot:
 
 
 def _beyond(deflection: float) -> float:
-    """Return a deflection without its dead zone; what is no number is none."""
+    """Return a deflection without its dead zone; 0 if it is not a number."""
     size = min(1.0, abs(deflection)) if deflection == deflection else 0.0
     if size <= DEAD_ZONE:
         return 0.0

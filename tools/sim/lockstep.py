@@ -80,7 +80,7 @@ class FleetMoment(msgspec.Struct, frozen=True):
 
 
 class _Periods(NamedTuple):
-    """Of what comes at a rate, ns."""
+    """Periods of what comes at a rate, ns."""
 
     cycle: int
     step: int

@@ -166,7 +166,7 @@ class Frame(msgspec.Struct, frozen=True):
     tau: tuple[float, ...]
     """Joint torques (12,), N m."""
     force: Vector3
-    """Of the person on the torso, N, torso axes."""
+    """The person's force on the torso, N, torso axes."""
     push: Vector3
     """N."""
     planner: PlannerShown | None

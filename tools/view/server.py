@@ -21,7 +21,7 @@ from shared.exceptions import FleetError, XrlError
 from tools.view.source import FRAMES_S, HOST, PAGE, PORT, UPLOT, Order, Source
 
 RATES: Final = (0.05, 20.0)
-"""Of a record's cursor."""
+"""Slowest and fastest rate at which a record is played."""
 MESSAGE_MAX: Final = 4096
 """Largest message of a page, bytes."""
 CLIENTS_MAX: Final = 8

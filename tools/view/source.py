@@ -67,11 +67,11 @@ class Order(msgspec.Struct, frozen=True):
     service: str = ""
     """Service to `kill`, `freeze` or `start`; for `cut` a name in `CUTS`."""
     height: float = 0.0
-    """Of `hand`: where to lead the torso, m above the ankles."""
+    """For `hand`: where to lead the torso, m above the ankles."""
     pitch: float = 0.0
-    """Of `hand`, rad."""
+    """For `hand`, rad."""
     force: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of `push`, N, world."""
+    """For `push`, N, world."""
 
 
 class Model(msgspec.Struct, frozen=True):
@@ -95,7 +95,7 @@ class Model(msgspec.Struct, frozen=True):
     """That `kill`, `freeze` and `start` are for."""
     begin_s: float = 0.0
     end_s: float = 0.0
-    """Of a record, on its timeline; equal to `begin_s`: there is no timeline."""
+    """A record's end on its timeline; equal to `begin_s`: there is no timeline."""
     marks: tuple[Mark, ...] = ()
 
 

@@ -318,7 +318,7 @@ class OdriveUsb:
             await self._judge(board, values[4:])
             if found and self._status is DriveStatus.ARMED:
                 torque = await board.torques(self._drive.torque_constant)
-        if all(map(isfinite, values)):  # what is no number is no sample
+        if all(map(isfinite, values)):  # else it is no sample
             pos, vel = (values[0], values[1]), (values[2], values[3])
             self._sample = DriveReading(t_ns, pos, vel, self._status, self._errors, torque)
             if self._target is not None:

@@ -40,7 +40,7 @@ class ProbeState(msgspec.Struct, array_like=True):
     """State of `ReferenceProbe`."""
 
     row: int = NO_ROW
-    """Of p that is probed; `NO_ROW`: none."""
+    """The coordinate of p that is probed; `NO_ROW`: none."""
     offset: float = 0.0
     """m or rad"""
     held: float = 0.0

@@ -63,7 +63,7 @@ def test_a_drive_found_armed_tells_its_torques(rig: Rig, driver: OdriveCan, shed
     second = shed.driver()
     readings = [rig.cycle(second) for _ in range(5)]
     statuses = [reading.status for reading in readings]
-    assert DriveStatus.ERROR not in statuses, "it would be armed anew, and drop the robot"
+    assert DriveStatus.ERROR not in statuses, "it would be armed again, and drop the robot"
     assert statuses[-1] is DriveStatus.ARMED
     assert readings[-1].torque == pytest.approx(tuple(rig.bank.torque[list(AXES)]), abs=0.05)
     second.write(TARGET)

@@ -198,7 +198,7 @@ LISTEN_MS = 20
 
 
 EXCESS_MAX = 1.02 * 0.4 / 0.2
-"""Of the spring: HOLD's pos_gain, if it is DAMP's that was lost, with DAMP's vel_gain."""
+"""As a ratio of the spring's torque: without DAMP's pos_gain, HOLD's acts with DAMP's vel_gain."""
 
 
 ENTERING = 14

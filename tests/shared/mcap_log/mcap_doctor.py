@@ -24,7 +24,7 @@ from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 
 MAGIC_SIZE: Final = 8
 PREFIX_SIZE: Final = 9
-"""Of a record: opcode and length."""
+"""Bytes before a record: opcode and length."""
 PROFILES: Final = ("", "ros1", "ros2")
 SAME: Final = ("message_start_time", "message_end_time", "compression", "uncompressed_size")
 """Fields of a chunk that its index repeats."""

@@ -37,6 +37,12 @@ def lab(tmp_path: Path) -> Path:
     return path
 
 
+def identified(record: Path, lab: Path, out: Path) -> int:
+    return exit_code(
+        ["drive", "identify", "body", record, "--config", lab, "--apply", "--out", out]
+    )
+
+
 def test_what_was_planted_is_found_within_its_interval_and_written(
     record: Path,
     lab: Path,
@@ -44,18 +50,7 @@ def test_what_was_planted_is_found_within_its_interval_and_written(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     before = config_file.load_without_schedule(lab)
-    words = [
-        "drive",
-        "identify",
-        "body",
-        record,
-        "--config",
-        lab,
-        "--apply",
-        "--out",
-        tmp_path / "fit",
-    ]
-    assert exit_code(words) == 0
+    assert identified(record, lab, tmp_path / "fit") == 0
     told = capsys.readouterr().out
     rows = {
         match[1].strip(): (float(match[2]), float(match[3]))
@@ -97,18 +92,7 @@ def test_a_file_that_is_not_the_records_robot_is_not_written(
 ) -> None:
     text = lab.read_text(encoding="utf-8").replace("payload = 20.4", "payload = 15.0", 1)
     lab.write_text(text, encoding="utf-8")
-    words = [
-        "drive",
-        "identify",
-        "body",
-        record,
-        "--config",
-        lab,
-        "--apply",
-        "--out",
-        tmp_path / "fit",
-    ]
-    assert exit_code(words) == 2
+    assert identified(record, lab, tmp_path / "fit") == 2
     assert "mass.payload is 15.0, and was 20.4" in capsys.readouterr().err
     assert lab.read_text(encoding="utf-8") == text
 

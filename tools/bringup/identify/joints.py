@@ -43,7 +43,7 @@ class JointFlags(MotionFlags):
     """where the picture goes (out/identify-<time>)"""
 
     def check(self) -> None:
-        """Refuse what is no module."""
+        """Refuse unknown modules."""
         super().check()
         unknown = [name for name in self.module if name not in MODULES]
         if unknown:

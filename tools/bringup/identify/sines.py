@@ -53,10 +53,10 @@ YIELDS: Final = 0.05
 DRY_SD: Final = 0.04
 """N m; cogging and play show as dry friction of this size."""
 MASS_SD: Final = 0.03
-"""Of the leg's inertia by the robot file."""
+"""Fraction of the leg's inertia in the robot file."""
 HARMONICS: Final = 9
 MOVING: Final = 0.3
-"""Of a tone's fastest rate: slower samples, about the turns, are not used. There a joint sticks."""
+"""Fraction of a tone's fastest rate; slower samples, where a joint sticks, are not used."""
 
 
 class Tone(NamedTuple):
@@ -95,7 +95,7 @@ class Tones(NamedTuple):
 
     @property
     def duration_s(self) -> float:
-        """Of all tones, s."""
+        """Duration of all tones, s."""
         return sum(tone.duration_s for tone in self.tones)
 
     @property

@@ -9,7 +9,7 @@ BODY_RATE: Final = 6.0
 """rad/s; a body's natural frequency, which `FREQUENCIES_HZ` are about."""
 FREQUENCIES_HZ: Final = (0.3, 0.5, 0.75, 1.1, 1.6, 2.3, 3.3)
 CYCLES: Final = 4
-"""Of each sine; the first settles and is not used."""
+"""Cycles of each sine; the first settles and is not used."""
 SHORTEST_S: Final = 3.0
 REST_S: Final = 1.0
 HOLD_S: Final = 4.0

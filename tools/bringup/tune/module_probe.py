@@ -17,7 +17,7 @@ LIGHT_TORQUE: Final = 15.0
 HEAVY_TORQUE: Final = 60.0
 """N m; a leg that is moved by less than the play of its drivetrain shows the rotor alone."""
 STEP_SHARE: Final = 0.4
-"""Of the torque that the step takes at its begin."""
+"""Fraction of the torque that the step takes when it begins."""
 STEP_MAX: Final = 0.02
 """rad"""
 

@@ -43,7 +43,7 @@ class ProbeCourse(NamedTuple):
     r: Array
     """Offset of the reference (n,), m or rad."""
     y: Array
-    """Of the robot from where it stood (n,), m or rad."""
+    """The robot's displacement from where it stood (n,), m or rad."""
     ended: str
     """Why it ended before its time; "" if it did not."""
 

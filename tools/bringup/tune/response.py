@@ -28,14 +28,14 @@ Array = NDArray[np.float64]
 
 RISE: Final = (0.1, 0.9)
 SETTLED: Final = 0.05
-"""Of the final value; later within it the step has settled."""
+"""Fraction of the final value within which a step has settled."""
 FINAL_S: Final = 1.0
 """The end of a step whose mean is its final value."""
 MOVED_MIN: Final = 0.03
-"""Of the offset; a reference that is answered by less is hardly answered at all."""
+"""Fraction of the offset; a smaller response is too small to judge."""
 BAND: Final = 0.3
-"""Of the largest answer; from the first frequency on at which less is left, flexible joints, play
-and friction are seen, and not the body: they are no part of the fit."""
+"""Fraction of the largest response. The fit ends at the first frequency with less: flexible joints,
+play and friction are seen there, and not the body."""
 POINTS_MIN: Final = 4
 MISFIT_MAX: Final = 0.25
 """With more, this is no second-order system: a heavy leg behind play and a soft drivetrain, seen by

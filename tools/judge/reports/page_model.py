@@ -81,7 +81,7 @@ class Choice(Panel, frozen=True, kw_only=True):
     initial: str
     """Set that is shown first."""
     weight: float = 0.0
-    """Of several parts of a run, that of the greatest says what is shown first."""
+    """The heaviest of several parts of a run says what is shown first."""
 
 
 class Bars(Panel, frozen=True, kw_only=True):
@@ -89,7 +89,7 @@ class Bars(Panel, frozen=True, kw_only=True):
 
     rows: Sequence[BarRow]
     names: type[IntEnum]
-    """Of the codes."""
+    """Names of the codes."""
     colours: Mapping[int, str]
     """Name of the colour of each code."""
 
@@ -149,7 +149,7 @@ class _Gathered:
 
     def __init__(self, panel: Panel) -> None:
         self.panel = panel
-        """Of the newest part."""
+        """The newest part's."""
         self._traces: dict[str, dict[str, _Trace]] = {}
         """By choice and label; the only choice of a plot is ""."""
         self._limits: dict[str, Sequence[LevelLine]] = {}

@@ -85,7 +85,7 @@ class StateBars(NamedTuple):
 
     title: str
     label: str
-    """Of its row; empty: a row for each module."""
+    """Its row's label; empty: a row for each module."""
     topic: Topic
     field: str
     names: type[IntEnum]

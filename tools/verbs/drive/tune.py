@@ -42,7 +42,7 @@ from tools.output import make_folder, progress_along
 from tools.terminal import Console, marked
 
 SIZE_SHARE: Final = 0.8
-"""Of `law.probe_max`."""
+"""Default size of a probe, as a fraction of `law.probe_max`."""
 STATUSES_MIN: Final = 1000
 """Fewer are no course: four seconds of the planner's."""
 UNITS: Final = ("N/m", "N/m", "N/m", "N m/rad", "N m/rad", "N m/rad")

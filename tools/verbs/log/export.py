@@ -38,7 +38,7 @@ LAYOUT: Final = FILES / "foxglove" / "xrl.json"
 """For a robot of this name; `--layout` writes it for the name in the log."""
 LAYOUT_ROBOT: Final = "xrl"
 BAG_RATE_HZ: Final = 100.0
-"""Of joint states, transforms and wrench in a bag."""
+"""Rate of joint states, transforms and wrench in a bag."""
 
 
 EXAMPLES: Final = """

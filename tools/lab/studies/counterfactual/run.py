@@ -16,7 +16,7 @@ from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Kill, Scenario
 from tools.lab.studies.counterfactual.moments import Moment
-from tools.lab.studies.sweeps.figures import rows_that_count, sole_tilt_max_rad, unwatched
+from tools.lab.studies.sweeps.figures import NOBODY, sole_tilt_max_rad
 from tools.logs.hand_path import HandRow
 from tools.logs.run_log import RunLog
 from tools.output import new_figure, save_figure
@@ -82,7 +82,7 @@ def counterfactual_of(task: Task) -> Counterfactual:
     scenario = scenario_from(task.scenario, moment.at_s, task.kill, task.for_s)
     fleet = Lockstep(task.robot, scenario, BASE, plant=task.plant, hand=task.hand)
     fleet.resume(FleetMoment(moment.state, moment.modules, moment.planner))
-    rows = list(rows_that_count(fleet.run(), -math.inf, unwatched, 0.0))
+    rows = list(NOBODY.rows_that_count(fleet.run(), -math.inf))
     fell = rows.pop() if rows and rows[-1].fallen else None
     return Counterfactual(
         at_s=moment.at_s,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from enum import StrEnum
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 
@@ -13,13 +13,41 @@ from shared.bus.messages import JointEvent, SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE
 from tools.judge.standing import is_tipping
-from tools.sim.lockstep import Watch
+from tools.sim.lockstep import Watch, forget
+from tools.sim.virtual_time import Record
 
 END_TOLERANCE_S: Final = 0.1
 
 
-def unwatched(_row: SimTruth) -> None:
-    """Watch nothing."""
+class Observer(NamedTuple):
+    """Who looks on while a trial runs; by default nobody."""
+
+    record: Record = forget
+    """Takes every message."""
+    watch: Watch = lambda _row: None
+    """Sees every row of the world, also those that do not count."""
+    after_fall_s: float = 0.0
+    """How long the trial continues after a fall, at which measurement ends."""
+
+    def rows_that_count(self, run: Iterable[SimTruth], from_s: float) -> Iterator[SimTruth]:
+        """Run to the end or to the fall; yield what counts of it, a fall included.
+
+        Args:
+            run: the world, as a fleet in virtual time gives it.
+            from_s: scenario time from which on a row counts, s.
+        """
+        fell_at_s: float | None = None
+        for row in run:
+            self.watch(row)
+            if fell_at_s is not None:
+                if row.scenario_s > fell_at_s + self.after_fall_s:
+                    return
+            elif row.fallen or row.scenario_s >= from_s:
+                fell_at_s = row.scenario_s if row.fallen else None
+                yield row
+
+
+NOBODY: Final = Observer()
 
 
 class Ending(StrEnum):
@@ -52,28 +80,6 @@ def exit_code(endings: Iterable[str]) -> int:
     if not_stood - {Ending.UNREADY}:
         return FELL_EXIT_CODE
     return FAULT_EXIT_CODE if not_stood else 0
-
-
-def rows_that_count(
-    run: Iterable[SimTruth], from_s: float, watch: Watch, after_fall_s: float
-) -> Iterator[SimTruth]:
-    """Run to the end or to the fall; yield what counts of it, a fall included.
-
-    Args:
-        run: the world, as a fleet in virtual time gives it.
-        from_s: scenario time from which on a row counts, s.
-        watch: sees every row, also what does not count.
-        after_fall_s: how long to go on after a fall.
-    """
-    fell_at_s: float | None = None
-    for row in run:
-        watch(row)
-        if fell_at_s is not None:
-            if row.scenario_s > fell_at_s + after_fall_s:
-                return
-        elif row.fallen or row.scenario_s >= from_s:
-            fell_at_s = row.scenario_s if row.fallen else None
-            yield row
 
 
 def ending_of(last: SimTruth, end_s: float, robot: RobotConfig) -> Ending:

@@ -33,20 +33,20 @@ from shared.robot.robot_model import stand_pose
 from tools.lab.design import split_program
 from tools.lab.studies.sweeps import plants, pool
 from tools.lab.studies.sweeps.figures import (
+    NOBODY,
     Ended,
     Ending,
+    Observer,
     com_max_mm,
     ending_of,
     event_steps_nm,
     operator_peak_n,
-    rows_that_count,
     scalars,
     sole_tilt_max_rad,
-    unwatched,
     with_payload,
 )
 from tools.lab.studies.sweeps.push_range import DIGITS, SHARE, PushRange, uniform
-from tools.sim.lockstep import Lockstep, Watch, forget
+from tools.sim.lockstep import Lockstep
 from tools.sim.virtual_time import Record
 
 PAYLOADS: Final = 5
@@ -313,19 +313,12 @@ def plant_of(case: KillCase) -> PlantConfig:
     return plants.draw(f"kill {case.seed} {case.number}")
 
 
-def run_case(
-    case: KillCase,
-    robot: RobotConfig,
-    *,
-    record: Record = forget,
-    watch: Watch = unwatched,
-    after_fall_s: float = 0.0,
-) -> KillResult:
-    """Run a case to its end, or so long beyond the fall, at which measurement ends.
+def run_case(case: KillCase, robot: RobotConfig, observer: Observer = NOBODY) -> KillResult:
+    """Run a case to its end or to the fall, and measure it.
 
     The robot has the case's payload and is ready to run (`prepare`).
     """
-    monitor = KillRecorder(record)
+    monitor = KillRecorder(observer.record)
     fleet = Lockstep(
         robot,
         scenario_of(robot, case),
@@ -341,9 +334,9 @@ def run_case(
     def let_go_in_time(row: SimTruth) -> None:
         if case.let_go_s is not None and row.scenario_s >= case.let_go_s:
             fleet.world.let_go()
-        watch(row)
+        observer.watch(row)
 
-    for row in rows_that_count(fleet.run(), 0.0, let_go_in_time, after_fall_s):
+    for row in observer._replace(watch=let_go_in_time).rows_that_count(fleet.run(), 0.0):
         rows.append(row)
         loads.append(min(feet.read()))
     return measure(case, rows, loads, fleet.events, monitor, robot)

@@ -35,21 +35,21 @@ from shared.config.scenarios import Inject, Keyframe, Scenario
 from shared.joints import MODULES
 from tools.lab.studies.sweeps import plants
 from tools.lab.studies.sweeps.figures import (
+    NOBODY,
     Ended,
     Ending,
+    Observer,
     com_max_mm,
     ending_of,
     event_steps_nm,
     operator_peak_n,
-    rows_that_count,
     sole_tilt_max_rad,
     step_nm,
-    unwatched,
 )
 from tools.lab.studies.sweeps.push_range import SHARE, PushRange, uniform
 from tools.lab.studies.sweeps.table import plain
 from tools.sim.centralised.fleet import CentralisedLockstep
-from tools.sim.lockstep import Lockstep, Watch, forget
+from tools.sim.lockstep import Lockstep
 from tools.sim.virtual_time import Record
 
 SQUATS: Final = ((0.5, 0.0), (3.0, 0.24), (5.5, 0.0), (8.0, 0.24))
@@ -242,19 +242,14 @@ def plant_of(trial: LatencyTrial) -> PlantConfig:
 
 
 def run_trial(
-    trial: LatencyTrial,
-    robot: RobotConfig,
-    *,
-    record: Record = forget,
-    watch: Watch = unwatched,
-    after_fall_s: float = 0.0,
+    trial: LatencyTrial, robot: RobotConfig, observer: Observer = NOBODY
 ) -> LatencyResult:
-    """Run a trial to its end, or so long beyond the fall, at which measurement ends."""
+    """Run a trial to its end or to the fall, and measure it."""
     impaired_from_s = trial.draw.impaired_from_s
-    monitor = LatencyRecorder(record, impaired_from_s)
+    monitor = LatencyRecorder(observer.record, impaired_from_s)
     fleet = fleet_of(trial, robot, monitor)
     rows: list[SimTruth] = []
-    for row in rows_that_count(fleet.run(), impaired_from_s, watch, after_fall_s):
+    for row in observer.rows_that_count(fleet.run(), impaired_from_s):
         rows.append(row)
         monitor.fallen = row.fallen
     return measure(rows, fleet.events, monitor, robot)

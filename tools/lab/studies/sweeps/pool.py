@@ -42,7 +42,7 @@ class Cluster(NamedTuple):
     """A Dask cluster."""
 
     address: str
-    """Of the scheduler: tcp://HOST:PORT, or dask://HOST:PORT."""
+    """The scheduler's: tcp://HOST:PORT, or dask://HOST:PORT."""
     code: tuple[str, ...]
     """Files that decide a result (`code_digest`): the workers must have the same."""
 

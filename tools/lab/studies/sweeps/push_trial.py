@@ -18,7 +18,7 @@ from shared.config.scenarios import Keyframe, Kill, Push, Scenario
 from shared.exceptions import RunError
 from tools.lab.design.poses import Poses
 from tools.lab.design.push_limit import LoadedStand, PushLimits, limits_along
-from tools.lab.studies.sweeps.figures import Ending, ending_of, rows_that_count, unwatched
+from tools.lab.studies.sweeps.figures import NOBODY, Ending, ending_of
 from tools.lab.studies.sweeps.push_range import com_height
 from tools.sim.lockstep import FleetMoment, Lockstep
 from tools.sim.network import BASE
@@ -154,5 +154,5 @@ def _stands(
     scenario = scenario_of(trial, force_n)
     fleet = Lockstep(robot, msgspec.structs.replace(scenario, kill=()), BASE, plant=plant)
     fleet.resume(start)
-    rows = list(rows_that_count(fleet.run(), -math.inf, unwatched, 0.0))
+    rows = list(NOBODY.rows_that_count(fleet.run(), -math.inf))
     return bool(rows) and ending_of(rows[-1], scenario.duration, robot) is Ending.STOOD

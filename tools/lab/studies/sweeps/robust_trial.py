@@ -14,20 +14,19 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Kill, Push, Scenario
 from tools.lab.studies.sweeps import plants
 from tools.lab.studies.sweeps.figures import (
+    NOBODY,
     Ended,
     Ending,
+    Observer,
     com_max_mm,
     ending_of,
     event_steps_nm,
     operator_peak_n,
-    rows_that_count,
     scalars,
     sole_tilt_max_rad,
-    unwatched,
 )
 from tools.lab.studies.sweeps.push_range import PushRange, uniform
-from tools.sim.lockstep import Lockstep, Watch, forget
-from tools.sim.virtual_time import Record
+from tools.sim.lockstep import Lockstep
 
 KINDS: Final = ("squat", "crawl", "lean")
 DELAY_MAX_MS: Final = 10.0
@@ -124,24 +123,17 @@ def scenario_of(robot: RobotConfig, trial: RobustTrial) -> Scenario:
     )
 
 
-def run_trial(
-    trial: RobustTrial,
-    robot: RobotConfig,
-    *,
-    record: Record = forget,
-    watch: Watch = unwatched,
-    after_fall_s: float = 0.0,
-) -> RobustResult:
-    """Run a trial to its end, or so long beyond the fall, at which measurement ends."""
+def run_trial(trial: RobustTrial, robot: RobotConfig, observer: Observer = NOBODY) -> RobustResult:
+    """Run a trial to its end or to the fall, and measure it."""
     fleet = Lockstep(
         robot,
         scenario_of(robot, trial),
         Impairment(delay_ms=trial.delay_ms),
         seed=trial.number,
-        record=record,
+        record=observer.record,
         plant=plant_of(trial),
     )
-    rows = list(rows_that_count(fleet.run(), 0.0, watch, after_fall_s))
+    rows = list(observer.rows_that_count(fleet.run(), 0.0))
     if not rows or rows[0].scenario_s < 0.0:
         return RobustResult(ending=Ending.FELL if rows else Ending.UNREADY)
     last = rows[-1]

@@ -27,7 +27,7 @@ from shared.extras import require
 from shared.places import DEFAULT_CONFIG
 from tools.flags import Arg, ConfigFlags, Count, Folder, Natural, fields_of
 from tools.lab.studies.sweeps import pool
-from tools.lab.studies.sweeps.figures import Ending, exit_code
+from tools.lab.studies.sweeps.figures import Ending, Observer, exit_code
 from tools.lab.studies.sweeps.table import CaseTable, Row, code_digest, code_of, plain
 from tools.live import experiment
 from tools.sim.recorded_lockstep import AFTER_FALL_S, judge_in_lockstep, record_run
@@ -267,7 +267,7 @@ def _run_alone(
                 shown.update(line, completed=max(0.0, truth.scenario_s))
 
             if out is None:
-                figures = trial(watch=watch)
+                figures = trial(Observer(watch=watch))
             else:
                 experiment.make_out(out, "sweep")
                 figures = record_run(
@@ -275,9 +275,7 @@ def _run_alone(
                     robot,
                     out,
                     asked.metadata(case, command),
-                    lambda record, watched: trial(
-                        record=record, watch=watched, after_fall_s=AFTER_FALL_S
-                    ),
+                    lambda record, watched: trial(Observer(record, watched, AFTER_FALL_S)),
                     watch,
                     asked.plant(case),
                 )

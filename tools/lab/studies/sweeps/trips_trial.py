@@ -71,9 +71,9 @@ class TripTrial(msgspec.Struct, frozen=True, kw_only=True):
 
     number: int
     trouble: str
-    """Of `TROUBLES`."""
+    """A key of `TROUBLES`."""
     on: str
-    """Of `PLANTS`."""
+    """A key of `PLANTS`."""
 
     @property
     def words(self) -> str:

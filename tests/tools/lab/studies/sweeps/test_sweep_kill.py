@@ -22,7 +22,7 @@ from shared.config.scenarios import Keyframe, Push, Scenario, lead
 from shared.robot.robot_model import stand_pose
 from tools.judge.standing import is_tipping
 from tools.lab.studies.sweeps import kill_trial as cases
-from tools.lab.studies.sweeps.figures import Ending, exit_code, with_payload
+from tools.lab.studies.sweeps.figures import Ending, Observer, exit_code, with_payload
 from tools.lab.studies.sweeps.kill_trial import (
     FootLoads,
     KillCase,
@@ -197,7 +197,7 @@ def test_the_hand_is_off_from_the_time_in_the_case(
 ) -> None:
     case = msgspec.structs.replace(drawn[0], kill_s=0.9, let_go_s=0.8, delay_ms=1.0, pushes=())
     rows: list[SimTruth] = []
-    run_case(case, with_payload(diagonal, case.payload_kg), watch=rows.append)
+    run_case(case, with_payload(diagonal, case.payload_kg), Observer(watch=rows.append))
     on = [row.operator_force[2] for row in rows if 0.6 < row.scenario_s < 0.79]
     off = [row.operator_force[2] for row in rows if row.scenario_s > 0.82]
     assert max(abs(force) for force in on) > 1.0
