@@ -433,6 +433,34 @@ def test_no_file_is_so_long_that_it_has_two_reasons_to_change() -> None:
     assert long == set()
 
 
+ATTRIBUTES_MAX = 20
+"""What a reader can hold at once; a class that has more is made of parts that have names."""
+MANY_ATTRIBUTES = {"AxisBank"}
+"""It holds twelve axes in arrays, one for each quantity: parts would be arrays of two axes."""
+
+
+def attributes_set_in(node: ast.ClassDef) -> set[str]:
+    """Return the attributes of `self` that a class assigns, in whatever method and form."""
+    return {
+        target.attr
+        for target in ast.walk(node)
+        if isinstance(target, ast.Attribute)
+        and isinstance(target.ctx, ast.Store)
+        and ast.unparse(target.value) == "self"
+    }
+
+
+def test_no_class_has_so_many_attributes_that_it_should_be_several() -> None:
+    """Fields of messages and of the robot file are not counted: these are layouts."""
+    many = {
+        node.name
+        for source in SOURCES.values()
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.ClassDef) and len(attributes_set_in(node)) > ATTRIBUTES_MAX
+    }
+    assert many == MANY_ATTRIBUTES
+
+
 def test_no_controller_can_see_the_plant() -> None:
     """What is true of the simulated robot is the simulator's alone, and the tools' that run it."""
     readers = {

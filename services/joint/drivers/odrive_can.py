@@ -21,6 +21,7 @@ from services.joint.drivers.firmware import (
     AxesReport,
     Dialect,
 )
+from services.joint.drivers.frame_times import FrameTimes, OrderWindows
 from services.joint.drivers.odrive_frames import Frames
 from services.joint.drivers.replies import NOTHING, Replies
 from services.joint.drivers.resend_policy import GainRow, ResendPolicy
@@ -35,18 +36,6 @@ from shared.exceptions import DriveError
 
 __all__ = ["RETRY_MS", "OdriveCan"]
 
-REBOOT_MS: Final = 500
-"""Silence after which the drive may have been switched off and on: its earlier heartbeats are
-forgotten. The same holds for an axis that sends estimates and no heartbeats, because nothing else
-would show that it disarmed."""
-ARM_GRACE_MS: Final = 10
-"""Time after `arm` in which heartbeats may be from before it, and are ignored."""
-FEED_MS: Final = 1000
-"""Time after `arm` in which reading feeds the watchdogs until the drive is ARMED: that shows only
-in the next heartbeat, and a watchdog may run out before it."""
-INSIST_MS: Final = 1000
-"""Time after `idle` from which an axis that still reports closed loop is commanded again at
-once."""
 CLOSE_MS: Final = 20
 """Time for which a command that the bus had no room for may hold up `close`."""
 
@@ -92,7 +81,6 @@ class OdriveCan:
         self._node_ids = node_ids
         self._drive = drive
         self._counts_per_turn = encoder_counts_per_turn
-        self._lost_after_ns = round(drive.lost_after_s * NS_PER_S)
         self._frames = Frames(node_ids, drive)
         # The firmware takes it as food for the watchdog, and 0.6 tells its version besides.
         self._food = [message(n, Command06.GET_VERSION, b"") for n in node_ids]
@@ -113,14 +101,9 @@ class OdriveCan:
         self._report = AxesReport()
         self._due = ResendPolicy()
         self._first = 0  # the axis that is written first
-        self._insist_until_ns = 0
-        self._believe_from_ns = 0
-        self._feed_until_ns = 0
+        self._windows = OrderWindows()
         self._encoders = EncoderPair()
-        self._arrived_ns = 0  # when the frames at hand came
-        self._heard_ns = [0, 0]  # its newest heartbeat
-        self._sample_ns = now_ns()
-        self._has_sample = False
+        self._times = FrameTimes(round(drive.lost_after_s * NS_PER_S), now_ns())
         self._connect()
 
     @property
@@ -158,14 +141,12 @@ class OdriveCan:
             self._pump(machine_s((deadline - now) / NS_PER_S))
             now = now_ns()
             if self._encoders.complete():
-                self._sample_ns = now
-                self._has_sample = True
+                unheard = self._times.sampled(now)
                 status = self._report.status
-                unheard_ns = now - min(self._heard_ns)
-                if status is not _LOST and unheard_ns > REBOOT_MS * NS_PER_MS:
+                if unheard and status is not _LOST:
                     self._forget()
                     status = _LOST
-                if status is not _ARMED and now < self._feed_until_ns:
+                if status is not _ARMED and now < self._windows.feed_until_ns:
                     self._link.send(self._food)
                 return self._reading(status)
             if now >= deadline or not self._link.is_open:
@@ -214,15 +195,13 @@ class OdriveCan:
         self._send(odrive_frames.arming(self._drive, onboard=onboard), armed=True)
         now = now_ns()
         self._due.armed(now)
-        self._insist_until_ns = 0
-        self._feed_until_ns = now + FEED_MS * NS_PER_MS
+        self._windows.armed(now)
 
     def idle(self) -> None:
         """Ask both axes to go idle, with their input torque zeroed."""
         self._send(odrive_frames.IDLING, armed=False)
-        self._insist_until_ns = now_ns() + INSIST_MS * NS_PER_MS
+        self._windows.idle(now_ns())
         self._due.idle()
-        self._feed_until_ns = 0
 
     def set_position(self, turns: Pair) -> None:
         """Write both motors' position, turns; see `Drive.set_position`.
@@ -250,14 +229,14 @@ class OdriveCan:
         """Send commands to both axes and forget their earlier reports."""
         self._report.requested(armed=armed)
         self._answers.forget_torques()
-        self._believe_from_ns = now_ns() + ARM_GRACE_MS * NS_PER_MS
+        self._windows.ordered(now_ns())
         self._link.order(odrive_frames.messages_of(self._node_ids, commands))
 
     def _pump(self, timeout_s: float) -> None:
         """Take in the frames of one wait; most of a shared bus's are other modules'."""
         takers = self._takers
         frames = self._link.receive(max(0.0, timeout_s))
-        self._arrived_ns = now_ns()
+        self._times.now_ns = now_ns()
         for can_id, data in frames:
             found = takers.get(can_id)
             if found is not None:
@@ -275,14 +254,15 @@ class OdriveCan:
                 estimate = answers.counted[axis] or estimate
             else:
                 answers.counted[axis] = None
-            self._encoders.take(axis, estimate, self._arrived_ns)
+            self._encoders.take(axis, estimate, self._times.now_ns)
 
     def _take_heartbeat(self, axis: int, data: bytes) -> None:
-        now = self._arrived_ns
-        if len(data) != HEARTBEAT_BYTES or now < self._believe_from_ns:
+        times, windows = self._times, self._windows
+        now = times.now_ns
+        if len(data) != HEARTBEAT_BYTES or now < windows.believe_from_ns:
             return
-        self._heard_ns[axis] = now
-        if now < self._insist_until_ns and data[4] == AxisState.CLOSED_LOOP_CONTROL:
+        times.heard_ns[axis] = now
+        if now < windows.insist_until_ns and data[4] == AxisState.CLOSED_LOOP_CONTROL:
             self._send(odrive_frames.IDLING, armed=False)  # it was lost on the way
             return
         report = self._report
@@ -303,10 +283,9 @@ class OdriveCan:
         A link that failed counts as silence too: an interface that restarts is not a lost
         drive.
         """
-        silent_ns = now - self._sample_ns
-        if self._has_sample and silent_ns <= self._lost_after_ns:
+        if self._times.has_recent_sample(now):
             return None
-        if silent_ns > REBOOT_MS * NS_PER_MS:
+        if self._times.may_have_restarted(now):
             self._forget()
         return self._reading(DriveStatus.LOST)
 
@@ -319,7 +298,7 @@ class OdriveCan:
         """Return the newest estimates with a status."""
         (pos_0, vel_0), (pos_1, vel_1) = self._encoders.estimates
         return DriveReading(
-            self._sample_ns,
+            self._times.sample_ns,
             (pos_0, pos_1),
             (vel_0, vel_1),
             status,
@@ -335,7 +314,7 @@ class OdriveCan:
         self._due.connected()
         self._answers.forget_torques()
         self._answers.forget_counts()
-        if not self._has_sample or now_ns() - self._sample_ns > self._lost_after_ns:
+        if not self._times.has_recent_sample(now_ns()):
             self._report.forget()
         if self._report.dialect == "":
             self._link.send(self._answers.ask_version)

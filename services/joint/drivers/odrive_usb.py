@@ -64,6 +64,28 @@ class _Request:
         self.arm = arm
 
 
+class _Wanted:
+    """What the control thread has left for the package's loop, the newest of each."""
+
+    def __init__(self) -> None:
+        self.target: MotorTarget | None = None
+        self.request: _Request | None = None
+        self.position: Pair | None = None  # the loop takes it away when it is written
+        self.closing = False
+
+
+class _Exchanged:
+    """How far the package's loop has come with the drive; the control thread writes none of it."""
+
+    def __init__(self) -> None:
+        self.request: _Request | None = None  # carried out last
+        self.target: MotorTarget | None = None  # sent last
+        self.axes = AxesStatus()
+        self.status, self.errors = DriveStatus.LOST, 0
+        self.count = 0  # of exchanges
+        self.feed_until_ns = 0  # later than 0: arm was asked for, and no idle since
+
+
 def device_manager() -> DeviceManager:
     """Return the package's manager, on a loop in a thread of its own; loads libusb-1.0.
 
@@ -107,24 +129,15 @@ class OdriveUsb:
         self._period_s = max(1.0 / EXCHANGE_HZ, drive.encoder_period_ms * 1e-3)
         self._torque_max = drive.current_lim * drive.torque_constant
         self._lost_after_s = drive.lost_after_s
-        # Written by the control thread:
-        self._target: MotorTarget | None = None
-        self._request: _Request | None = None
-        self._position: Pair | None = None
-        self._closing = False
+        self._wanted = _Wanted()
         self._silent_s = 0.0  # waited in vain: a process that was stopped has not waited
         # Written by the package's loop:
         self._sample = DriveReading(now_ns(), _ZERO, _ZERO, DriveStatus.LOST, 0)
         self._fresh = threading.Event()
         self._connected = False
-        self._carried_out: _Request | None = None
-        self._sent: MotorTarget | None = None
-        self._axes = AxesStatus()
-        self._status, self._errors = DriveStatus.LOST, 0
-        self._exchanges = 0
+        self._done = _Exchanged()
         # Made by the package's loop, and resolved there once the control thread has written:
         self._awaited: asyncio.Future[None] | None = None
-        self._feed_until_ns = 0  # later than 0: arm was asked for, and no idle since
         self._manager = device_manager()
         self._task: Future[None] = asyncio.run_coroutine_threadsafe(
             self._run(self._manager), self._manager.loop
@@ -142,7 +155,7 @@ class OdriveUsb:
             self._fresh.clear()
             self._silent_s = 0.0
             sample = self._sample
-            if self._request is not self._carried_out:  # it tells of the time before
+            if self._wanted.request is not self._done.request:  # it tells of the time before
                 return msgspec.structs.replace(sample, status=DriveStatus.IDLE, error=0)
             return sample
         sample = self._sample
@@ -169,7 +182,7 @@ class OdriveUsb:
         if max(map(abs, target.torque)) > limit:
             first, second = (clamp(value, -limit, limit) for value in target.torque)
             target = msgspec.structs.replace(target, torque=(first, second))
-        self._target = target
+        self._wanted.target = target
         awaited = self._awaited
         if awaited is not None:
             self._awaited = None
@@ -182,11 +195,11 @@ class OdriveUsb:
         the same torque, and torque mode would limit it by the present vel_gain. Like `idle` the
         request is dropped if the drive is lost before; the caller repeats it.
         """
-        self._request = _Request(arm=True)
+        self._wanted.request = _Request(arm=True)
 
     def idle(self) -> None:
         """Ask both axes to go idle, with their input torque zeroed; see `arm`."""
-        self._request = _Request(arm=False)
+        self._wanted.request = _Request(arm=False)
 
     def set_position(self, turns: Pair) -> None:
         """Request writing both encoders' position, turns; dropped if the drive is lost before.
@@ -196,11 +209,11 @@ class OdriveUsb:
         """
         if not self._connected:
             raise DriveError(f"ODrive {self._serial_number}: lost; its position cannot be written")
-        self._position = turns
+        self._wanted.position = turns
 
     def close(self) -> None:
         """Carry out the last request if the drive is there, and release it."""
-        self._closing = True
+        self._wanted.closing = True
         try:
             self._task.result(CLOSE_S)
         except TimeoutError:
@@ -212,7 +225,7 @@ class OdriveUsb:
 
     async def _run(self, manager: DeviceManager) -> None:
         """Connect, exchange, and begin again when the drive is gone; never raises."""
-        while not self._closing:
+        while not self._wanted.closing:
             device: RuntimeDevice | None = None
             try:
                 device = await self._find(manager)
@@ -221,9 +234,9 @@ class OdriveUsb:
                     await board.look()
                     # What was left for a drive that was not there is not for this one: it
                     # may hold the robot by its own loop, and has no use for an old target.
-                    self._carried_out, self._position = self._request, None
-                    self._sent = self._target
-                    self._status = DriveStatus.LOST
+                    self._done.request, self._wanted.position = self._wanted.request, None
+                    self._done.target = self._wanted.target
+                    self._done.status = DriveStatus.LOST
                     self._connected = True
                     self.connections += 1
                     await self._stay(board)
@@ -244,7 +257,7 @@ class OdriveUsb:
         loop = asyncio.get_running_loop()
         report_at = loop.time() + REPORT_S
         try:
-            while not self._closing:
+            while not self._wanted.closing:
                 await asyncio.wait((search,), timeout=RETRY_S)
                 if search.done():
                     return search.result()
@@ -264,35 +277,36 @@ class OdriveUsb:
         """Exchange at the rate until closing, or until a transfer fails."""
         loop = asyncio.get_running_loop()
         due = loop.time()
-        while not (self._closing and self._is_carried_out()):
+        while not (self._wanted.closing and self._is_carried_out()):
             await self._exchange(board)
             due = max(due + machine_s(self._period_s), loop.time())
             await asyncio.sleep(due - loop.time())
 
     def _is_carried_out(self) -> bool:
-        return self._request is self._carried_out and self._position is None
+        return self._wanted.request is self._done.request and self._wanted.position is None
 
     async def _exchange(self, board: OdriveV3) -> None:
         """Carry out a request if there is one; then take a sample and send the target."""
-        request, position = self._request, self._position
-        new = request if request is not self._carried_out else None
+        wanted, done = self._wanted, self._done
+        request, position = wanted.request, wanted.position
+        new = request if request is not done.request else None
         if position is not None and (new is None or new.arm):
             # Never while armed, or it jumps by as many turns: to arm waits for the next
             # exchange, and so does the position if it comes with a request to go idle.
             await board.set_position(position)
-            if self._position is position:  # and not another one by now
-                self._position = None
-            request = self._carried_out
+            if wanted.position is position:  # and not another one by now
+                wanted.position = None
+            request = done.request
         elif new is not None:
             await self._carry_out(board, new)
         await self._take_sample(board)
-        self._carried_out = request  # not before there is a sample of the time after it
+        done.request = request  # not before there is a sample of the time after it
         await self._answer()
-        target, sent = self._target, self._sent
-        self._sent = target
+        target, sent = wanted.target, done.target
+        done.target = target
         if target is not None and target is not sent:
             await board.target.write(target)
-        if board.hungry and (target is not sent or now_ns() < self._feed_until_ns):
+        if board.hungry and (target is not sent or now_ns() < done.feed_until_ns):
             await board.feed()
 
     async def _answer(self) -> None:
@@ -306,46 +320,49 @@ class OdriveUsb:
 
     async def _take_sample(self, board: OdriveV3) -> None:
         """Take a sample of both axes, for the control thread."""
-        self._exchanges += 1
+        wanted, done = self._wanted, self._done
+        done.count += 1
         torque = None
-        found = self._request is None and self._target is None
-        if self._status is DriveStatus.ARMED and not found and self._exchanges % STATES_EVERY:
+        found = wanted.request is None and wanted.target is None
+        if done.status is DriveStatus.ARMED and not found and done.count % STATES_EVERY:
             values = await board.sample.read()
             t_ns = now_ns()
         else:
             values = await board.sample_and_state.read()
             t_ns = now_ns()
             await self._judge(board, values[4:])
-            if found and self._status is DriveStatus.ARMED:
+            if found and done.status is DriveStatus.ARMED:
                 torque = await board.torques(self._drive.torque_constant)
         if all(map(isfinite, values)):  # else it is no sample
             pos, vel = (values[0], values[1]), (values[2], values[3])
-            self._sample = DriveReading(t_ns, pos, vel, self._status, self._errors, torque)
-            if self._target is not None:
+            self._sample = DriveReading(t_ns, pos, vel, done.status, done.errors, torque)
+            if wanted.target is not None:
                 self._awaited = asyncio.get_running_loop().create_future()
             self._fresh.set()
 
     async def _judge(self, board: OdriveV3, states: tuple[int, ...]) -> None:
         """Make the status out of both axes' states."""
-        self._errors = 0
+        done = self._done
+        done.errors = 0
         if any(state != AxisState.CLOSED_LOOP_CONTROL for state in states):
-            self._errors = self._axes.errors(
-                await board.errors.read(), wanted_armed=self._feed_until_ns != 0
+            done.errors = done.axes.errors(
+                await board.errors.read(), wanted_armed=done.feed_until_ns != 0
             )
-        self._status = self._axes.judge(states, self._errors)
+        done.status = done.axes.judge(states, done.errors)
 
     async def _carry_out(self, board: OdriveV3, request: _Request) -> None:
         """Arm or idle both axes; their earlier reports are forgotten."""
+        done = self._done
         if request.arm:
             await board.arm(self._drive.vel_limit, self._drive.current_lim)
-            self._feed_until_ns = now_ns() + FEED_MS * NS_PER_MS
-            self._sent = self._target  # it was for the time before
+            done.feed_until_ns = now_ns() + FEED_MS * NS_PER_MS
+            done.target = self._wanted.target  # it was for the time before
         else:
             await board.idle()
-            self._feed_until_ns = 0
+            done.feed_until_ns = 0
         board.target.forget()
-        self._axes = AxesStatus()
-        self._status = DriveStatus.LOST  # it is looked at before it is told
+        done.axes = AxesStatus()
+        done.status = DriveStatus.LOST  # it is looked at before it is told
 
 
 def _resolve(future: asyncio.Future[None]) -> None:

@@ -375,7 +375,7 @@ class Hocca:
         self._apply_stance()
 
     def _apply_stance(self) -> None:
-        for stance in (self._measured.stance, self._reference.stance):
+        for stance in (self._measured.stance, self._reference.inputs.stance):
             stance[:] = self._stance.taken
 
     def _align(self, q: Array) -> None:

@@ -46,12 +46,12 @@ class LawAtReference:
             e_p: p_ref - p (6,), m and rad.
             e_pdot: pdot_ref - pdot (6,), m/s and rad/s.
         """
-        T, p = reference.T, reference.p
+        T, p, inputs = reference.T, reference.p, reference.inputs
 
         def body_gains() -> JointGains:
-            F = self._gains.K_p * e_p + self._gains.B_p * e_pdot + reference.F_O
+            F = self._gains.K_p * e_p + self._gains.B_p * e_pdot + inputs.F_O
             kinematics = reference.kinematics()
-            return self._gains.gains(kinematics, kinematics.hessian_times(F, reference.F_assist))
+            return self._gains.gains(kinematics, kinematics.hessian_times(F, inputs.F_assist))
 
         local = self._split.split(body_gains, float(p[2]), float(p[4]), T, reference.hessian_O)
         K_fail = self._split.certificate.failsafe_stiffness(local.D)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from typing import Final
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,6 +31,28 @@ STEPS_MAX: Final = 3
 """Steps by the graph; near a solution each squares the error. What needs more is not near."""
 
 
+class ReferenceInputs(msgspec.Struct, frozen=True):
+    """Arguments of the graph, in its order: `Reference` writes all arrays but `stance`."""
+
+    q: Array
+    """Joint angles (12,), rad, at which the graph is evaluated."""
+    stance: Array
+    """The right foot relative to the left (6,), as in `Kinematics`; the caller writes it."""
+    D_left: Array
+    """Load sharing (6, 6), chosen at the measured pose."""
+    p_ref: Array
+    pdot_ref: Array
+    F_O: Array
+    """Force and moment that hold the body (6,), N and N m, world."""
+    F_assist: Array
+    """Force at the harness (3,), N, world."""
+    assist_rate: Array
+    """Its rate (3,), N/s."""
+    low: Array
+    """Joint limits (12,), rad."""
+    high: Array
+
+
 class Reference:
     """The reference pose.
 
@@ -43,7 +66,7 @@ class Reference:
     - `gravity` (12,): F_O^T J; `assist` (12,): F_assist^T J_harness; N m.
     - `dtau_ff` (12,): change of both along v_ref and with the assist, N m/s.
 
-    `load` sets `D_left` (6, 6), `F_O` (6,) and `F_assist` (3,); the caller writes `stance` (6,).
+    `load` sets `inputs`; the caller writes `inputs.stance`.
     """
 
     def __init__(self, config: RobotConfig) -> None:
@@ -51,12 +74,8 @@ class Reference:
         limits = np.array(config.joint_limits())
         self._ik = InverseKinematics(Kinematics(config), limits)
         self._graph = CompiledGraph(graphs_of(config).reference)
-        (
-            self._q, self.stance, self.D_left,
-            self._p_ref, self._pdot_ref, self.F_O, self.F_assist, self._assist_rate,
-            self._low, self._high,
-        ) = self._graph.arguments  # fmt: skip
-        self._low[:], self._high[:] = limits.T
+        self.inputs = ReferenceInputs(*self._graph.arguments)
+        self.inputs.low[:], self.inputs.high[:] = limits.T
         (
             self._q_next, self._check, self.T, self.v, self.p, self.J, self.J_harness,
             self.hessian_O, self.gravity, self.assist, self.dtau_ff,
@@ -70,16 +89,12 @@ class Reference:
     ) -> None:
         """Set what the next `solve` or `evaluate` uses besides the pose.
 
-        Args:
-            pdot_ref: (6,), m/s and rad/s.
-            F_O: force and moment that hold the body (6,), N and N m, world.
-            F_assist: force at the harness (3,), N, world.
-            assist_rate: its rate (3,), N/s.
-            D_left: load sharing (6, 6), chosen at the measured pose.
+        The arguments are as in `ReferenceInputs`; `pdot_ref` in m/s and rad/s.
         """
-        self._pdot_ref[:], self.F_O[:] = pdot_ref, F_O
-        self.F_assist[:], self._assist_rate[:] = F_assist, assist_rate
-        self.D_left[:] = D_left
+        inputs = self.inputs
+        inputs.pdot_ref[:], inputs.F_O[:] = pdot_ref, F_O
+        inputs.F_assist[:], inputs.assist_rate[:] = F_assist, assist_rate
+        inputs.D_left[:] = D_left
 
     def solve(self, p_ref: Array) -> IkResult:
         """Solve q = IK(p_ref) from `start`, and evaluate all arrays there: docs/law.md (7).
@@ -87,7 +102,8 @@ class Reference:
         Args:
             p_ref: (6,), m and rad.
         """
-        self._q[:], self._p_ref[:] = self.start, p_ref
+        inputs = self.inputs
+        inputs.q[:], inputs.p_ref[:] = self.start, p_ref
         for iterations in range(1, STEPS_MAX + 1):
             self._graph()
             largest, beyond = self._check.tolist()
@@ -96,10 +112,10 @@ class Reference:
             if largest < STEP_SURE:
                 self.q[:] = self._q_next
                 return IkResult(iterations, largest * largest)
-            self._q[:] = self._q_next
+            inputs.q[:] = self._q_next
         ik = self._ik
-        ik.q[:], ik.kinematics.stance[:] = self.start, self.stance
-        result = ik.solve(p_ref, self.D_left)
+        ik.q[:], ik.kinematics.stance[:] = self.start, inputs.stance
+        result = ik.solve(p_ref, inputs.D_left)
         self.evaluate(ik.q)
         return result
 
@@ -112,17 +128,17 @@ class Reference:
         self.start += self.q
         if not np.isfinite(self.start).all():
             self.start[:] = self.q
-        np.maximum(self.start, self._low, out=self.start)
-        np.minimum(self.start, self._high, out=self.start)
+        np.maximum(self.start, self.inputs.low, out=self.start)
+        np.minimum(self.start, self.inputs.high, out=self.start)
 
     def evaluate(self, q: Array) -> None:
         """Take q (12,), rad, for the reference, and evaluate all arrays there."""
-        self.q[:] = self._q[:] = q
+        self.q[:] = self.inputs.q[:] = q
         self._graph()
 
     def kinematics(self) -> Kinematics:
         """Return the kinematics at the pose of the last evaluation; not for every tick."""
         kinematics = self._ik.kinematics
-        kinematics.stance[:] = self.stance
-        kinematics.update(self._q, self.D_left)
+        kinematics.stance[:] = self.inputs.stance
+        kinematics.update(self.inputs.q, self.inputs.D_left)
         return kinematics

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
-from services.joint.drivers.odrive_can import ARM_GRACE_MS, OdriveCan
+from services.joint.drivers.frame_times import ARM_GRACE_MS
+from services.joint.drivers.odrive_can import OdriveCan
 from services.simulator.drives.axis_bank import AxisBank
 from services.simulator.fronts.cansimple_dialects import DialectName
 from services.simulator.fronts.cansimple_front import CanSimpleFront

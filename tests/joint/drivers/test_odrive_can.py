@@ -12,7 +12,8 @@ import pytest
 from services.joint.differential import joint_torque, motor_from_joint
 from services.joint.drive_setpoint import DriveSetpointLaw
 from services.joint.drivers.base import Drive, DriveStatus, MotorTarget
-from services.joint.drivers.odrive_can import ARM_GRACE_MS, INSIST_MS, REBOOT_MS, OdriveCan
+from services.joint.drivers.frame_times import ARM_GRACE_MS, INSIST_MS, REBOOT_MS
+from services.joint.drivers.odrive_can import OdriveCan
 from services.joint.pd_law import Setpoint
 from shared.bus.messages import Pair
 from shared.can.cansimple import (

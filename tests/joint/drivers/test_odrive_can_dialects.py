@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from services.joint.drivers.base import DriveStatus
-from services.joint.drivers.odrive_can import REBOOT_MS, RETRY_MS, OdriveCan
+from services.joint.drivers.frame_times import REBOOT_MS
+from services.joint.drivers.odrive_can import RETRY_MS, OdriveCan
 from services.simulator.fronts.cansimple_dialects import DialectName
 from shared.can.cansimple import AxisError, AxisState
 from shared.config.sections import CanConfig

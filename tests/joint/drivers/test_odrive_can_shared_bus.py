@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
-from services.joint.drivers.odrive_can import ARM_GRACE_MS, OdriveCan
+from services.joint.drivers.frame_times import ARM_GRACE_MS
+from services.joint.drivers.odrive_can import OdriveCan
 from shared.can.cansimple import AxisState, Command, arbitration_id, pack_two_floats
 from shared.config.sections import CanConfig
 from tests.joint.drivers.rig import DRIVE, MS, Rig, read

@@ -9,7 +9,8 @@ import pytest
 
 from services.joint.drivers.base import DriveReading
 from services.joint.drivers.encoder_pair import EncoderPair
-from services.joint.drivers.odrive_can import REBOOT_MS, RETRY_MS, OdriveCan
+from services.joint.drivers.frame_times import REBOOT_MS
+from services.joint.drivers.odrive_can import RETRY_MS, OdriveCan
 from shared.bus.messages import Pair
 from shared.can.cansimple import AxisState, Command, pack_two_floats, pack_two_ints
 from shared.config.sections import CanConfig

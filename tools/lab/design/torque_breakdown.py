@@ -96,7 +96,7 @@ def torque_breakdown(
         RunError: the pose is singular: a leg is straight, or the legs turn the torso opposite ways.
     """
     measured, reference = Measured(config), Reference(config)
-    measured.stance[:] = reference.stance[:] = stance
+    measured.stance[:] = reference.inputs.stance[:] = stance
     measured.update(q, v)
     law, split = GainLaw(config), GainSplit(config)
     up = np.array(up_of(slope))
