@@ -67,8 +67,11 @@ def test_keys_are_named_by_patterns_and_a_wrong_one_says_what_there_is() -> None
     assert [key.name for key in keys_named(["joint/hip_*/event", "estop"])] == [
         "joint/hip_right/event", "joint/hip_left/event", "estop",
     ]  # fmt: skip
-    with pytest.raises(RunError, match="joint/foot/state: no topic is so named; there are joint"):
-        keys_named(["joint/foot/state"])
+    assert keys_named(["joint/**ate"]) == keys_named(["joint/*/state"])
+    for wrong in ("joint/foot/state", "joint/*", "*state"):
+        with pytest.raises(RunError, match="no topic is so named; there are joint") as caught:
+            keys_named([wrong])
+        assert str(caught.value).startswith(f"{wrong}: ")
 
 
 def test_a_message_of_another_type_is_told_and_not_a_traceback() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -17,7 +16,7 @@ from shared.exceptions import FleetError
 from shared.joints import MODULES
 from tools.fleet.process_table import is_listening
 from tools.fleet.supervise import SupervisedFleet
-from tools.logs.playback.selection import LIVE, short
+from tools.topic_keys import LIVE, match, row_of, short
 
 IN_THE_LOOP: Final = (topics.JOINT_STATE, topics.JOINT_COMMAND, topics.WRENCH, topics.ATTITUDE)
 """Topics that move a robot: never published beside a live drive, even with --force.
@@ -44,9 +43,8 @@ _POLL_S: Final = 0.01
 
 def those_of(rows: Iterable[Topic], keys: Iterable[str]) -> list[str]:
     """Return the live keys that belong to some topics, of whatever robot."""
-    names = "|".join(re.escape(row.name).replace(r"\*", "[^/]+") for row in rows)
-    pattern = re.compile(f"{LIVE}/[^/]+/({names})")
-    return [key for key in keys if pattern.fullmatch(key)]
+    names = [f"{LIVE}/*/{row.name}" for row in rows]
+    return [key for key in keys if any(match(name, key) for name in names)]
 
 
 class LiveRobotWatch:
@@ -118,5 +116,4 @@ def allowed(targets: Mapping[str, str], live: str, *, force: bool) -> dict[str, 
 
 def describe(keys: Iterable[str]) -> str:
     """Return live keys as topics, each once."""
-    names = (re.sub("^joint/[^/]+/", "joint/*/", short(key)) for key in keys)
-    return ", ".join(sorted(set(names)))
+    return ", ".join(sorted({row_of(short(key)) for key in keys}))

@@ -1,8 +1,4 @@
-"""Which topics of a log are played, and onto which keys. Pure.
-
-A name is what follows `xrl/<robot>/` in a key, or the whole key. In a name `*` stands for
-any part of one section (`joint/*/state`), `**` for any number of sections.
-"""
+"""Which topics of a log are played, and onto which keys; names as in `tools.topic_keys`. Pure."""
 
 from __future__ import annotations
 
@@ -13,20 +9,11 @@ from typing import Final
 
 from shared.bus.topics import TOPICS
 from shared.exceptions import RunError
-
-LIVE: Final = "xrl"
-"""First section of every key that a robot's services use."""
+from tools.topic_keys import LIVE, match, row_of, short
 
 CLOCK: Final = "clock"
 
 _SECTION: Final = re.compile(r"[^/*$?#\s]+")
-_PARTS: Final = {"**": "(.*)", "*": "([^/]*)"}
-
-
-def short(key: str) -> str:
-    """Return a key without the `xrl/<robot>/` before it; another key as it is."""
-    parts = key.split("/", 2)
-    return parts[2] if len(parts) == 3 and parts[0] == LIVE else key
 
 
 def choose(
@@ -40,11 +27,11 @@ def choose(
     chosen = tuple(
         key
         for key in present
-        if (not wanted or any(_fits(name, key) for name in wanted))
-        and not any(_fits(name, key) for name in unwanted)
+        if (not wanted or any(match(name, key) for name in wanted))
+        and not any(match(name, key) for name in unwanted)
     )
     if not chosen:
-        recorded = ", ".join(sorted({_row_of(short(key)) for key in present})) or "nothing"
+        recorded = ", ".join(sorted({row_of(short(key)) for key in present})) or "nothing"
         raise RunError(f"nothing is left to play; the log holds {recorded}")
     return chosen
 
@@ -78,7 +65,7 @@ def targets(
         if not (old and equals and new):
             raise RunError(f"--remap {remap!r}: OLD=NEW is right, as harness/wrench=harness/was")
         _check_known("--remap", old, chosen)
-        fitting = [key for key in chosen if _fits(old, key)]
+        fitting = [key for key in chosen if match(old, key)]
         if not fitting:
             raise RunError(f"--remap {remap!r}: {old} is not among what is played")
         for key in fitting:
@@ -105,8 +92,8 @@ def clock_key(prefix: str) -> str:
 
 def _renamed(remap: str, old: str, new: str, key: str) -> str:
     new = short(new)
-    match = _pattern(old).fullmatch(_subject(old, key))
-    parts = list(match.groups()) if match else []
+    found = match(old, key)
+    parts = list(found.groups()) if found else []
     if new.count("*") not in (0, len(parts)) or "**" in new:
         raise RunError(f"--remap {remap!r}: as many * on the right as on the left are right")
     if new.count("*"):
@@ -129,29 +116,10 @@ def _check_apart(found: dict[str, str]) -> None:
 def _check_known(flag: str, name: str, present: Collection[str]) -> None:
     """Refuse a name that is neither in the log nor in the table of topics."""
     tables = [topic.name for topic in TOPICS]
-    if any(_fits(name, key) for key in present):
+    if any(match(name, key) for key in present):
         return
-    if any(_pattern(short(name)).fullmatch(row) or _fits(row, short(name)) for row in tables):
+    if any(match(short(name), row) or match(row, short(name)) for row in tables):
         return
     known = sorted({*tables, *(short(key) for key in present)})
     near = difflib.get_close_matches(short(name), known, n=1, cutoff=0.0)
     raise RunError(f"{flag} {name}: no such topic; the nearest is {near[0]}")
-
-
-def _row_of(name: str) -> str:
-    """Return the row of the table of topics that a name belongs to; else the name."""
-    return next((topic.name for topic in TOPICS if _fits(topic.name, name)), name)
-
-
-def _fits(name: str, key: str) -> bool:
-    return _pattern(name).fullmatch(_subject(name, key)) is not None
-
-
-def _subject(name: str, key: str) -> str:
-    """Return the text that a name is matched against: the whole key if the name is one."""
-    return key if name.partition("/")[0] == LIVE else short(key)
-
-
-def _pattern(name: str) -> re.Pattern[str]:
-    parts = re.split(r"(\*\*|\*)", name.strip("/"))
-    return re.compile("".join(_PARTS.get(part) or re.escape(part) for part in parts))

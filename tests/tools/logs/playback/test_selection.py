@@ -14,7 +14,8 @@ from shared.exceptions import FleetError, RunError
 from tests.shared.test_links import TALK, TOOL
 from tools.logs.playback import guard, selection
 from tools.logs.playback.guard import ACTED_ON, IN_THE_LOOP, allowed, describe, those_of
-from tools.logs.playback.selection import check_prefix, choose, clock_key, short, targets
+from tools.logs.playback.selection import check_prefix, choose, clock_key, targets
+from tools.topic_keys import short
 
 KEYS = tuple(topics.all_keys("lab"))
 STATES = topics.keys(topics.JOINT_STATE, "lab")
