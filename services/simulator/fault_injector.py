@@ -12,6 +12,7 @@ from services.simulator.drives.axis_faults import (
     ROOM_TEMPERATURE,
 )
 from services.simulator.drives.dc_bus import SUPPLY_VOLTAGE
+from services.simulator.drives.odd_encoder import Words
 from shared.config.scenarios import Fault
 from shared.exceptions import DriveError
 from shared.joints import MODULE_INDEX
@@ -57,8 +58,9 @@ class FaultInjector:
                 limit = bank.settings.axis("motor.fet_thermistor.config.temp_limit_upper")[axis]
                 hot = float(limit) + OVER_TEMP_MARGIN + _ABOVE
                 bank.conditions.heat(axis, hot if begins else ROOM_TEMPERATURE)
-            case "encoder":
-                bank.conditions.fail_encoder(axis, lost=begins)
+            case "encoder" | "encoder_gap" | "encoder_zero":
+                wrong = Words.ZERO if fault.kind == "encoder_zero" else Words.NONE
+                bank.conditions.read_encoder(axis, wrong if begins else Words.TRUE)
             case "link_lost":
                 bank.conditions.link(drive, up=not begins)
             case "over_voltage":

@@ -77,6 +77,8 @@ FaultKind = Literal[
     "disarmed",
     "overspeed",
     "brown_out",
+    "encoder_zero",
+    "encoder_gap",
 ]
 
 
@@ -93,12 +95,16 @@ class FaultTraits(NamedTuple):
 FAULT_KINDS: Final[Mapping[str, FaultTraits]] = {
     "over_temperature": FaultTraits("an output stage too hot", 5.0, whole=False),
     "over_voltage": FaultTraits("the supply too high", 0.1, whole=True),
-    "encoder": FaultTraits("an encoder lost, it repeats its last", 5.0, whole=False),
+    "encoder": FaultTraits("an encoder sends no more words", 5.0, whole=False),
     "watchdog": FaultTraits("an axis's watchdog fires", None, whole=False),
     "link_lost": FaultTraits("the cable out: nothing sent, nothing heard", 0.5, whole=True),
     "disarmed": FaultTraits("an axis goes idle without an error", None, whole=False),
     "overspeed": FaultTraits("an axis disarms for its speed", None, whole=False),
     "brown_out": FaultTraits("no power, then a restart", 0.2, whole=True),
+    "encoder_zero": FaultTraits("an encoder reads 0, which is a valid word", 5.0, whole=False),
+    "encoder_gap": FaultTraits(
+        "a gap in an encoder's words, too short for an error", 0.045, whole=False
+    ),
 }
 """Faults by name. An axis that disarms floats; its sibling keeps its torque."""
 

@@ -30,8 +30,8 @@ class DriveFault(NamedTuple):
     """Reaction of the drive by itself."""
     limp: bool
     """True if the module gives no torque; False if the drive goes on holding it."""
-    cause: Cause
-    """Cause of FAULT, as `xrl status` and the service's log show it."""
+    cause: Cause | None
+    """Cause of FAULT, as `xrl status` and the service's log show it; None: nothing notices it."""
     zero_lost: bool
     """True if the joint must be zeroed (`xrl drive zero`) before it can be armed again."""
     recovery: str
@@ -53,7 +53,7 @@ DRIVE_FAULTS: Final[dict[FaultKind, DriveFault]] = {
         recovery=f"{_HANG}; make the supply absorb the current of braking legs",
     ),
     "encoder": DriveFault(
-        f"it goes on reporting the last position; {_LIMP}", limp=True,
+        f"it reports the last position, armed and blind for 51 ms; then {_LIMP}", limp=True,
         cause=Cause.DRIVE_DISARMED, zero_lost=True,
         recovery=f"{_HANG}; repair the encoder or its cable, then `xrl drive zero`",
     ),
@@ -77,6 +77,17 @@ DRIVE_FAULTS: Final[dict[FaultKind, DriveFault]] = {
         "no power: both axes float; it restarts without a zero", limp=True,
         cause=Cause.DRIVE_LOST, zero_lost=True,
         recovery=f"{_HANG}; mend the supply, then `xrl drive zero`",
+    ),
+    "encoder_zero": DriveFault(
+        f"the position goes to the encoder's nearest turn and stays, with no encoder error; {_LIMP}"
+        " if that is a jump (OVERSPEED), else armed and blind", limp=True,
+        cause=Cause.DRIVE_DISARMED, zero_lost=False,
+        recovery=f"{_HANG}; repair the encoder's cable or supply; check the joint's angle",
+    ),
+    "encoder_gap": DriveFault(
+        "it holds the last position, armed and blind, and goes on without an error; the turns made "
+        "meanwhile are missing", limp=False, cause=None, zero_lost=False,
+        recovery="repair the encoder's cable; check the joint's angle",
     ),
 }  # fmt: skip
 """By the name that scenarios and `--fault` use."""

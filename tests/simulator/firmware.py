@@ -1,7 +1,7 @@
 """One axis of firmware 0.5.6 in plain numbers at its own 8 kHz: the reference of the bank.
 
-Read from `Encoder::update` and `Controller::update` (odriverobotics/ODrive), one line for one
-line, for an incremental count and pass-through inputs.
+Read from `Encoder::update` and `Controller::update` (odriverobotics/ODrive): an incremental count
+or the words of an absolute encoder, and pass-through inputs.
 """
 
 from __future__ import annotations
@@ -31,6 +31,10 @@ class FirmwareAxis:
         self.integrator = 0.0
         self._pos = float(math.floor(turns * counts_per_turn))  # estimates, in counts
         self._vel = vel * counts_per_turn
+        self.shadow_count = math.floor(turns * counts_per_turn)
+        self.count_in_cpr = self.shadow_count % counts_per_turn
+        self.spi_error_rate = 0.0
+        self.com_fail = False
 
     @property
     def pos_estimate(self) -> float:
@@ -41,9 +45,30 @@ class FirmwareAxis:
         return self._vel / self.counts_per_turn
 
     def encoder(self, turns: float) -> None:
-        """Run the PLL at a bandwidth of 1000 1/s, phase detector in whole counts."""
+        """Run the PLL on an incremental count."""
+        self._pll(math.floor(turns * self.counts_per_turn))
+
+    def read(self, word: int | None) -> None:
+        """Run a cycle on the word of an absolute encoder; None: it has not come."""
+        if word is None:
+            self.spi_error_rate += PERIOD_S * (1.0 - self.spi_error_rate)
+            if self.spi_error_rate > 0.05:
+                self.com_fail = True
+                return
+            word = self.count_in_cpr
+        else:
+            self.spi_error_rate -= PERIOD_S * self.spi_error_rate
+        delta = (word - self.count_in_cpr) % self.counts_per_turn
+        if delta > self.counts_per_turn // 2:
+            delta -= self.counts_per_turn
+        self.shadow_count += delta
+        self.count_in_cpr = word
+        self._pll(self.shadow_count)
+
+    def _pll(self, count: int) -> None:
+        """Estimate at a bandwidth of 1000 1/s, phase detector in whole counts."""
         self._pos += PERIOD_S * self._vel
-        error = math.floor(turns * self.counts_per_turn) - math.floor(self._pos)
+        error = count - math.floor(self._pos)
         self._pos += PERIOD_S * 2000.0 * error
         self._vel += PERIOD_S * 1e6 * error
         if abs(self._vel) < 0.5 * PERIOD_S * 1e6:

@@ -157,15 +157,16 @@ def test_position_estimate_settles_on_the_count_below_the_true_position() -> Non
     assert bank.encoder_turns * CPR == pytest.approx(math.floor(0.70001 * CPR))
 
 
-@pytest.mark.parametrize(("turns", "within"), [(5.75, -0.25), (-9.3, -0.3), (9.2, 0.2)])
-def test_a_drive_counts_from_its_mark_and_after_a_restart_of_its_own_within_a_turn(
-    turns: float, within: float
+@pytest.mark.parametrize("turns", [5.75, -9.3, 9.2])
+def test_a_drive_counts_from_its_mark_and_after_a_restart_by_its_encoders_own_angle(
+    turns: float,
 ) -> None:
     bank = idle_bank(np.full(12, turns), mark=64.0)
     np.testing.assert_allclose(bank.pos_estimate, 64.0 + turns, atol=1e-4)
     bank.reboot(4)
     step_for(bank, DT, pos=np.full(12, turns))
-    assert bank.pos_estimate[[4, 5]] == pytest.approx([within] * 2, abs=1e-4)
+    own = turns + bank.encoder_mount[[4, 5]] / CPR
+    assert bank.pos_estimate[[4, 5]] == pytest.approx(own - np.round(own), abs=1e-4)
     assert np.delete(bank.pos_estimate, [4, 5]) == pytest.approx([64.0 + turns] * 10, abs=1e-4)
 
 
@@ -177,12 +178,9 @@ def test_a_count_that_was_set_is_counted_on_from_without_a_jump_in_velocity() ->
     assert bank.vel_estimate[3] == pytest.approx(bank.vel_estimate[2])
 
 
-def test_a_lost_encoder_comes_back_where_it_was_set_since() -> None:
-    bank = idle_bank(mark=64.0)
-    bank.conditions.fail_encoder(2, lost=True)
-    step_for(bank, DT)
-    assert bank.pos_estimate[2] == 64.0, "it reads what it did"
-    bank.set_count(2, 0.0)
-    bank.conditions.fail_encoder(2, lost=False)
-    step_for(bank, DT)
-    assert bank.pos_estimate[2] == pytest.approx(0.0, abs=1e-3)
+def test_setting_the_count_leaves_the_encoders_own_angle() -> None:
+    bank = idle_bank(np.full(12, 0.3))
+    before = [bank.encoder_angle(axis) for axis in range(12)]
+    assert before == [(math.floor(0.3 * CPR) + int(at)) % CPR for at in bank.encoder_mount]
+    bank.set_count(3, 64.1 * CPR)
+    assert [bank.encoder_angle(axis) for axis in range(12)] == before

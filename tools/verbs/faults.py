@@ -53,17 +53,17 @@ def run(flags: FaultsFlags) -> int:
     console = Console(highlight=False)
     console.print(
         marked(
-            "[bold]A drive's fault.[/] Its module goes to FAULT, and the planner has the other "
-            "five HOLD. An axis that disarms floats; its sibling keeps its torque until the "
-            "service idles it, at once. Nothing is re-armed automatically: mend it, then restart "
-            "the module's service (`xrl kill MODULE`).\n"
+            "[bold]A drive's fault.[/] Once it is noticed its module goes to FAULT, and the "
+            "planner has the other five HOLD. An axis that disarms floats; its sibling keeps its "
+            "torque until the service idles it, at once. Nothing is re-armed automatically: mend "
+            "it, then restart the module's service (`xrl kill MODULE`).\n"
         )
     )
     for kind, row in DRIVE_FAULTS.items():
         limp = "limp" if row.limp else "held"
         console.print(marked("[bold]{}[/]: {}", kind, FAULT_KINDS[kind].about))
         _say(console, "the drive", f"{row.drive} ({limp})")
-        _say(console, "because", row.cause.name)
+        _say(console, "because", row.cause.name if row.cause else "nothing notices it")
         _say(console, "way out", row.recovery)
     console.print(marked("\n[bold]What else can be lost.[/]\n"))
     for name, loss in LOSSES.items():

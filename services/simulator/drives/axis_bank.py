@@ -3,8 +3,8 @@
 Firmware 0.5.6; the traps are kept on purpose: OVERSPEED disarms in torque mode too, a disarmed axis
 floats while its sibling keeps its torque, the watchdog runs in IDLE as well, re-arming does not
 zero `input_torque`, setting a mode moves `input_pos` to the motor, an axis can be in IDLE with
-`axis_error` 0, a lost encoder keeps its last reading and returns without the turns made meanwhile,
-and a restart restores the saved settings.
+`axis_error` 0, an axis that reads no encoder stays armed and blind for 51 ms and counts no turns
+made meanwhile, and a restart restores the saved settings.
 
 Pure: no clock, no I/O. Axes 2i and 2i + 1 are axis0 and axis1 of module i, one ODrive.
 Units at the motor: turns, turn/s, N m, A.
@@ -28,6 +28,7 @@ from services.simulator.drives.axis_faults import (
     AxisErrors,
     Conditions,
     controller_fault,
+    in_idle,
 )
 from services.simulator.drives.axis_settings import configured
 from services.simulator.drives.dc_bus import DEAD_VOLTAGE, DcBus
@@ -94,6 +95,8 @@ class AxisBank:
         self.current_lim = column("motor.config.current_lim")
         self.pos_estimate, self.vel_estimate = encoders.pos_estimate, encoders.vel_estimate
         self.encoder_turns, self.connected = encoders.turns, control.connected
+        self.encoder_mount, self.encoder_angle = encoders.mount, encoders.angle
+        self._shaft = np.zeros(n)
         self.now_s = -math.inf
         self.calibration = Calibration(self.settings)
         self.conditions = Conditions(self.settings, control, encoders)
@@ -135,7 +138,7 @@ class AxisBank:
         for drive, why in self.bus.check(least, most).items():
             for axis in _both(2 * drive):
                 self._fail(axis, BUS_FAULTS[why])
-        return self.torque
+        return self._commutated() if self._encoders.odd else self.torque
 
     # ---- requests of a front
 
@@ -190,10 +193,12 @@ class AxisBank:
     def clear_errors(self, axis: int) -> None:
         """Clear all errors of the axis's ODrive: the firmware clears both axes.
 
-        A cause that lasts (heat, a lost encoder, the bus) sets its error again at the next step.
+        A cause that lasts (heat, the bus) sets its error again at the next step, missing words of
+        an encoder only after 51 ms: their filter is emptied.
         """
         for each in _both(axis):
             self.faults[each] = AxisErrors()
+            self._encoders.clear_errors(each)
 
     def estop(self, axis: int) -> None:
         """Disarm one axis with ESTOP_REQUESTED; its sibling goes on."""
@@ -268,9 +273,34 @@ class AxisBank:
                 self._fed_s[axis] = self.now_s
         for axis, fault in self.conditions.disarming():
             self._fail(axis, fault)
+        self._check_odd_encoders()
         for axis in list(self.calibration.running):
             turns = float(self.encoder_turns[axis])
             self._become(axis, self.calibration.advance(axis, self.now_s, turns))
+
+    def _check_odd_encoders(self) -> None:
+        """Check speeds within the step; an estimate that is valid again ends its error."""
+        column = self.settings.axis
+        for axis, odd in self._encoders.odd.items():
+            if odd.fails:
+                continue
+            fault = self.faults[axis]
+            if fault.controller & ControllerError.INVALID_ESTIMATE:
+                valid = fault.controller & ~ControllerError.INVALID_ESTIMATE
+                self.faults[axis] = fault._replace(controller=valid)
+            limit = column("controller.config.vel_limit")[axis]
+            limit *= column("controller.config.vel_limit_tolerance")[axis]
+            checks = column("controller.config.enable_overspeed_error")[axis] * self.connected[axis]
+            if checks and odd.peak > limit * column("encoder.config.cpr")[axis]:
+                self._fail(axis, FAULTS["OVERSPEED"])
+
+    def _commutated(self) -> Vector:
+        """Return the torques at the shafts: a rotor away from its last word is driven off phase."""
+        self._shaft[:] = self.torque
+        for axis, odd in self._encoders.odd.items():
+            poles = self.settings.axis("motor.config.pole_pairs")[axis]
+            self._shaft[axis] *= math.cos(2.0 * math.pi * poles * odd.off_phase)
+        return self._shaft
 
     def _check_watchdogs(self) -> None:
         """Disarm axes whose watchdog was not fed."""
@@ -310,6 +340,8 @@ class AxisBank:
         """Latch a fault and disarm this axis alone; a drive that is down has no registers."""
         if axis >> 1 in self.conditions.down:
             return
+        if self.state[axis] != AxisState.CLOSED_LOOP_CONTROL:
+            fault = in_idle(fault, connected=self.connected[axis] > 0.0)
         self.faults[axis] = self.faults[axis].with_(fault)
         self.calibration.stop(axis)
         self._disarm(axis)

@@ -3,43 +3,40 @@
 Firmware 0.5.6: a PLL estimates position and velocity from the encoder's whole counts. The firmware
 runs it at 8 kHz; here it is evaluated once a step, discretised exactly for the step's length. The
 firmware's estimate moves in quanta (one count in position, 0.0076 turn/s in velocity, which snaps
-to 0 below half of that); that is left out, because it changes no joint's motion. Pure: no clock, no
+to 0 below half of that); that is left out, because it changes no joint's motion. An axis that reads
+no words of its encoder, or wrong ones, is run cycle by cycle (`odd_encoder`). Pure: no clock, no
 I/O. Arrays are indexed by axis, shape (12,). Units at the motor: turns, turn/s.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.simulator.drives.axis_settings import Settings
+from services.simulator.drives.odd_encoder import OddEncoder, Words, nearest
 from shared.joints import N_JOINTS
 
 Vector = NDArray[np.float64]
 
-
-class _LostEncoder(NamedTuple):
-    """State of an encoder that has stopped answering."""
-
-    at: int
-    """Its count then."""
-    said: int | None
-    """Its count when it returns; None: its angle within a turn."""
-    pos: float
-    vel: float
-    """The last estimates, turns and turn/s."""
+_SPREAD: Final = 0.6180339887498949
+"""turn from one encoder's magnet to the next one's: angles as a robot has them, no two alike."""
 
 
 class AxisEncoders:
     """Counts and estimates of all axes.
 
     Attributes:
-        counts_from: each encoder's count at the true zero, a whole number.
+        counts_from: each drive's count at the true zero, a whole number.
+        mount: each encoder's own count at the true zero, within a turn: how its magnet sits. It may
+            be written before the first step.
         pos_estimate: turns.
         vel_estimate: turn/s.
-        turns: the encoders' whole counts, in turns.
+        turns: the drives' whole counts, in turns.
+        odd: the axes that do not read their encoders' words, by axis.
         dt_s: length of the last step; 0 before the first and after a change of settings.
     """
 
@@ -48,8 +45,11 @@ class AxisEncoders:
         self._settings = settings
         self._seen = -1
         self._counts_per_turn = counts_per_turn
-        self._lost: dict[int, _LostEncoder] = {}
+        self.odd: dict[int, OddEncoder] = {}
+        self._error_rates: dict[int, tuple[float, float]] = {}  # as they were, and when
+        self._clock_s = 0.0
         self.counts_from = np.zeros(N_JOINTS)
+        self.mount = np.floor(np.arange(1, N_JOINTS + 1) * _SPREAD % 1.0 * counts_per_turn)
         self._rows = np.zeros((4, N_JOINTS))  # estimated position and velocity; turns before, now
         self._next = np.zeros((2, N_JOINTS))
         self.pos_estimate: Vector = self._rows[0]
@@ -65,45 +65,57 @@ class AxisEncoders:
         self._rows[1] = vel_turns
 
     def set_count(self, axis: int, count: float) -> None:
-        """Set an axis's encoder to a count at its present place, as `set_linear_count` does."""
+        """Set an axis's count where it is, as `set_linear_count` does; its angle stays."""
         if self._seen != self._settings.version:
             self._derive()
-        if axis in self._lost:  # the estimates follow when it is back
-            self._lost[axis] = self._lost[axis]._replace(said=round(count))
+        odd = self.odd.get(axis)
+        if odd is not None:
+            odd.set_count(round(count))
+            self._rows[2:, axis] = odd.count / self._cpr[axis]
             return
-        cpr = self._cpr[axis]
         self.counts_from[axis] += round(count) - self._counted(axis)
-        self._rows[2:, axis] = self._rows[0, axis] = round(count) / cpr
+        self._rows[2:, axis] = self._rows[0, axis] = round(count) / self._cpr[axis]
 
     def forget_turns(self, axis: int) -> None:
         """Make an axis's encoder know its angle within a turn only, as at power-up."""
+        odd = self.odd.get(axis)
+        self.clear_errors(axis)
+        if odd is not None:
+            odd.restart()
+            self._rows[:, axis] = 0.0
+            return
+        self.set_count(axis, nearest(self.angle(axis), self._counts_per_turn))
+
+    def angle(self, axis: int) -> int:
+        """Return an axis's `count_in_cpr`: its encoder's own count within a turn, as last read."""
         if self._seen != self._settings.version:
             self._derive()
-        if axis in self._lost:
-            self._lost[axis] = _LostEncoder(0, None, 0.0, 0.0)
-            return
-        count = self._counted(axis) - round(self.counts_from[axis])
-        self.set_count(axis, self._within_a_turn(count))
+        odd = self.odd.get(axis)
+        return odd.angle if odd is not None else self._raw(axis) % self._counts_per_turn
 
-    def freeze(self, axis: int) -> None:
-        """Hold an axis's estimates: the firmware keeps reporting the last ones."""
-        lost = self._lost.get(axis)
-        if lost is None:
-            at, (pos, vel) = self._counted(axis), self._rows[:2, axis].tolist()
-            self._lost[axis] = lost = _LostEncoder(at, at, pos, vel)
-        self._rows[:2, axis] = lost.pos, lost.vel
+    def read_words(self, axis: int, words: Words) -> None:
+        """Let an axis read no words of its encoder, zeros, or its own again."""
+        if self._seen != self._settings.version:
+            self._derive()
+        odd = self.odd.get(axis)
+        if odd is None:
+            rate, then_s = self._error_rates.pop(axis, (0.0, 0.0))
+            pos, vel = (self._rows[:2, axis] * self._cpr[axis]).tolist()
+            self.odd[axis] = odd = OddEncoder(
+                self._raw(axis),
+                self._counted(axis),
+                pos,
+                vel,
+                per_turn=self._counts_per_turn,
+                error_rate=rate * math.exp(then_s - self._clock_s),
+            )
+        odd.words = words
 
-    def recover(self, axis: int) -> None:
-        """Restart an axis's estimates; turns made meanwhile are not counted."""
-        lost = self._lost.pop(axis, None)
-        if lost is None:
-            return
-        if lost.said is None:
-            self.forget_turns(axis)
-        else:
-            moved = self._counted(axis) - lost.at
-            self.set_count(axis, lost.said + self._within_a_turn(moved))
-        self._rows[1, axis] = 0.0
+    def clear_errors(self, axis: int) -> None:
+        """Empty the filter of an axis's missing words, as `clear_errors` does."""
+        self._error_rates.pop(axis, None)
+        if axis in self.odd:
+            self.odd[axis].error_rate = 0.0
 
     def estimate(self, dt_s: float, pos_turns: Vector) -> None:
         """Run the encoders' PLLs over the step, exactly for counts that ramp within it."""
@@ -111,6 +123,7 @@ class AxisEncoders:
             self._derive()
         if dt_s != self.dt_s:
             self._discretise(dt_s)
+        self._clock_s += dt_s
         rows = self._rows
         rows[2] = rows[3]
         self._count(pos_turns)
@@ -118,16 +131,32 @@ class AxisEncoders:
             np.matmul(self._pll, rows, out=self._next)
         else:
             np.sum(self._plls * rows, axis=1, out=self._next)
+        if self.odd:
+            self._run_odd(dt_s)
         rows[:2] = self._next
+
+    def _run_odd(self, dt_s: float) -> None:
+        """Run the odd encoders over the step, in place of their PLLs."""
+        for axis, odd in list(self.odd.items()):
+            raw, cpr = self._raw(axis), self._cpr[axis]
+            odd.run(dt_s, raw, float(self._bandwidth[axis]))
+            self._rows[3, axis] = odd.count / cpr
+            if odd.fails:  # no estimate is made, and the last one stays
+                self._next[:, axis] = self._rows[:2, axis]
+                continue
+            self._next[:, axis] = odd.pos / cpr, odd.vel / cpr
+            if odd.is_over:
+                self.counts_from[axis] = odd.count - raw + round(self.mount[axis])
+                self._error_rates[axis] = odd.error_rate, self._clock_s
+                del self.odd[axis]
 
     def _counted(self, axis: int) -> int:
         """Return an axis's encoder's count."""
         return round(float(self._rows[3, axis] * self._cpr[axis]))
 
-    def _within_a_turn(self, count: int) -> int:
-        """Return the count within half a turn of zero: an absolute encoder counts no turns."""
-        half = self._counts_per_turn // 2
-        return half - (half - count) % self._counts_per_turn
+    def _raw(self, axis: int) -> int:
+        """Return an encoder's own count, with turns; of an odd one only once `_count` has run."""
+        return self._counted(axis) - round(float(self.counts_from[axis] - self.mount[axis]))
 
     def _count(self, pos_turns: Vector) -> None:
         """Write the encoder's whole counts, in turns as the setting `cpr` has them."""

@@ -17,6 +17,7 @@ from typing import Final, NamedTuple
 from services.simulator.drives.axis_control import AxisControl
 from services.simulator.drives.axis_encoders import AxisEncoders
 from services.simulator.drives.axis_settings import N_DRIVES, Settings
+from services.simulator.drives.odd_encoder import Words
 from shared.can.cansimple import (
     AxisError,
     ControllerError,
@@ -46,15 +47,32 @@ class AxisErrors(NamedTuple):
         return AxisErrors(*(a | b for a, b in zip(self, other, strict=True)))
 
 
+_MOTOR: Final = AxisError.MOTOR_FAILED
+
+
 def _motor(error: MotorError) -> AxisErrors:
-    return AxisErrors(AxisError.MOTOR_FAILED, motor=error)
+    return AxisErrors(_MOTOR, motor=error)
 
 
 def controller_fault(error: ControllerError) -> AxisErrors:
     """Return the torque of a failed controller: none."""
     no_command = MotorError.UNKNOWN_TORQUE | MotorError.UNKNOWN_VOLTAGE_COMMAND
-    axis = AxisError.CONTROLLER_FAILED | AxisError.MOTOR_FAILED
+    axis = AxisError.CONTROLLER_FAILED | _MOTOR
     return AxisErrors(axis, motor=no_command, controller=error)
+
+
+def in_idle(fault: AxisErrors, *, connected: bool) -> AxisErrors:
+    """Return what a fault leaves on an axis in IDLE, whose motor misses no command.
+
+    Until its first closed loop a controller is not connected: it sees no invalid estimate.
+    """
+    if not fault.controller:
+        return fault
+    if connected:
+        return fault._replace(axis=fault.axis & ~_MOTOR, motor=MotorError.UNKNOWN_TORQUE)
+    controller = fault.controller & ~ControllerError.INVALID_ESTIMATE
+    lost = _MOTOR if controller else _MOTOR | AxisError.CONTROLLER_FAILED
+    return fault._replace(axis=fault.axis & ~lost, motor=0, controller=controller)
 
 
 FAULTS: Final[Mapping[str, AxisErrors]] = {
@@ -102,7 +120,6 @@ class Conditions:
     Attributes:
         down: the drives (0 .. 5) that are without power or starting up.
         silent: the axes (0 .. 11) without communication: down, or the cable out.
-        blind: the axes (0 .. 11) whose encoder is lost.
         temperature: of each axis's output stage (12,), C.
     """
 
@@ -111,7 +128,6 @@ class Conditions:
         self._settings, self._control, self._encoders = settings, control, encoders
         self.down: set[int] = set()
         self.silent: set[int] = set()
-        self.blind: set[int] = set()
         self.temperature = [ROOM_TEMPERATURE] * N_JOINTS
         self._hot: set[int] = set()
         self._linked = [True] * N_DRIVES
@@ -120,7 +136,7 @@ class Conditions:
     @property
     def all_well(self) -> bool:
         """True if no axis has to be looked at."""
-        return not (self.down or self.blind or self._hot)
+        return not (self.down or self._encoders.odd or self._hot)
 
     def link(self, drive: int, *, up: bool) -> None:
         """Pull a drive's cable, or plug it in."""
@@ -151,14 +167,9 @@ class Conditions:
             self._update_silent()
         return up
 
-    def fail_encoder(self, axis: int, *, lost: bool) -> None:
-        """Take an axis's encoder away, or bring it back."""
-        if lost:
-            self.blind.add(axis)
-            self._encoders.freeze(axis)  # it keeps its last reading
-        elif axis in self.blind:
-            self.blind.remove(axis)
-            self._encoders.recover(axis)
+    def read_encoder(self, axis: int, words: Words) -> None:
+        """Let an axis read no words of its encoder, zeros, or its own again."""
+        self._encoders.read_words(axis, words)
 
     def heat(self, axis: int, celsius: float) -> None:
         """Bring an axis's output stage to a temperature; near its limit the current is less."""
@@ -173,10 +184,9 @@ class Conditions:
         (self._hot.add if over else self._hot.discard)(axis)
 
     def disarming(self) -> list[tuple[int, AxisErrors]]:
-        """Return the axes that a condition disarms, and with what; blind ones stand still."""
-        for axis in self.blind:
-            self._encoders.freeze(axis)
-        failing = [(axis, FAULTS["ENCODER"]) for axis in sorted(self.blind)]
+        """Return the axes that a condition disarms, and with what."""
+        odd = self._encoders.odd
+        failing = [(axis, FAULTS["ENCODER"]) for axis in sorted(odd) if odd[axis].fails]
         return failing + [(axis, FAULTS["OVER_TEMP"]) for axis in sorted(self._hot)]
 
     def _update_silent(self) -> None:

@@ -133,7 +133,7 @@ def _estimates_of_one(estimates: Callable[[AxisBank], tuple[Vector, Vector]]) ->
 def _encoder_count(bank: AxisBank, axis: int) -> bytes:
     per_turn = int(bank.settings.axis("encoder.config.cpr")[axis])
     count = round(bank.encoder_turns[axis] * per_turn)
-    return cansimple.pack_two_ints(count, count % per_turn)
+    return cansimple.pack_two_ints(count, bank.encoder_angle(axis))
 
 
 def _twice(value: float) -> bytes:

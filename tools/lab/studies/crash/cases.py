@@ -152,10 +152,13 @@ LEFT_ONLY: Final[tuple[tuple[FaultKind, str], ...]] = (
     ("over_temperature", "hip_left"),
     ("watchdog", "hip_left"),
     ("overspeed", "hip_left"),
+    ("encoder_zero", "knee_left"),
+    ("encoder_gap", "knee_left"),
 )
 """Faults that leave a module limp as `disarmed` does: left and right are mirrored, and one
 module is enough where only the error's name differs."""
 
+_LASTING: Final = ("encoder", "encoder_zero", "link_lost", "over_temperature")
 _FREE: Final = "each drive holds by its own loop, and needs neither its service nor the others'"
 _NEITHER: Final = "HOLD needs neither"
 
@@ -168,7 +171,7 @@ def killed(*services: str, signal: str = "KILL") -> tuple[Kill, ...]:
 
 def fault(module: str, kind: FaultKind) -> Fault:
     """Return a drive's fault at the time of the crash."""
-    lasts = FAULT_LASTS_S if kind in ("encoder", "link_lost", "over_temperature") else None
+    lasts = FAULT_LASTS_S if kind in _LASTING else None
     return Fault(module=module, kind=kind, at=CRASH_S, duration=lasts)
 
 
@@ -200,6 +203,8 @@ def _faulted(module: str, kind: FaultKind, *, quick: bool, sort: str = "") -> Cr
     if kind == "link_lost":
         name = "unplugged"
         why = "the drive holds its last target; its service has lost contact"
+    elif not DRIVE_FAULTS[kind].limp:
+        why = f"{FAULT_KINDS[kind].about}: the drive holds through it"
     else:
         expected, reason = LIMP[kind_of(module)]
         why = f"limp ({FAULT_KINDS[kind].about}): {reason}"
@@ -209,6 +214,7 @@ def _faulted(module: str, kind: FaultKind, *, quick: bool, sort: str = "") -> Cr
         crash=(fault(module, kind),),
         expected=expected,
         why=why,
+        holds=DRIVE_FAULTS[kind].cause is not None,
         leads_again=not DRIVE_FAULTS[kind].zero_lost,
         quick=quick,
     )
@@ -236,6 +242,7 @@ def _pair(name: str, *crash: Kill | Fault, why: str = _FREE, **changes: Any) -> 
     return CrashCase(name=f"pair-{name}", kind="pair", crash=crash, why=why, **changes)
 
 
+_SORTS: Final = {"brown_out": "", "encoder_zero": "encoder", "encoder_gap": "encoder"}
 _KNEES: Final = ("knee_right", "knee_left")
 _HIP: Final = fault("hip_left", "disarmed")
 
@@ -252,7 +259,7 @@ CASES: Final[Sequence[CrashCase]] = (
             module,
             kind,
             quick=module == "hip_left" and kind in ("brown_out", "over_voltage"),
-            sort="" if kind == "brown_out" else "drive trips",
+            sort=_SORTS.get(kind, "drive trips"),
         )
         for kind, module in LEFT_ONLY
     ),
