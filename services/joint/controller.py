@@ -271,8 +271,8 @@ class JointController:
         s = self._state
         if reading is None:
             return _NONE
-        controlled = s.failsafe.mode is not _DISARMED and not flushing
-        event = s.estimate.take(reading, armed=controlled)
+        armed = s.failsafe.mode is not _DISARMED and not flushing
+        event = s.estimate.take(reading, armed=armed, flushing=flushing)
         if reading.torque is not None:
             s.initial_torque = joint_torque(reading.torque, self._gear_ratio)
         return event

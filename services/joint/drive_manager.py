@@ -20,12 +20,14 @@ from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.neighbours import UNKNOWN, NeighbourView
 from services.joint.rearm_guard import LastState
 from shared.bus.messages import Cause, JointCommand, JointEvent, Mode, Pair
-from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 
 ARM_EVERY_NS: Final = 500 * NS_PER_MS
 """Time between two attempts to arm while DISARMED, ns."""
+FORGET_EVERY_NS: Final = 150 * NS_PER_MS
+"""Time from idling the drive to the command to forget its zero, and to the next one until the drive
+shows that it has none: a heartbeat shows first that both axes are idle. An armed one would jump."""
 IDLE_EVERY_NS: Final = 500 * NS_PER_MS
 """Time between two idle commands to a drive of which one axis disarmed: its sibling keeps its
 torque."""
@@ -46,6 +48,7 @@ class DriveCommand(Enum):
     IDLE = 3
     ARM = 4
     CLEAR_ZERO = 5
+    CLEAR_ERRORS = 6
 
 
 class ArmingInhibit(Enum):
@@ -59,6 +62,8 @@ class ArmingInhibit(Enum):
     """The drive lost torque after it held the robot; a person must request re-arming."""
     WAITING = 5
     """The drive holds by its own loop; it is taken over once a planner is there."""
+    FAILED = 6
+    """The drive has errors: they are cleared, and it is armed if they stay away until then."""
 
 
 class DriveAction(msgspec.Struct, gc=False, frozen=True):
@@ -73,7 +78,12 @@ class DriveAction(msgspec.Struct, gc=False, frozen=True):
     inhibit: ArmingInhibit
 
 
+_AT_ARMING: Final = {
+    ArmingInhibit.NONE: DriveCommand.ARM,
+    ArmingInhibit.FAILED: DriveCommand.CLEAR_ERRORS,
+}
 _NO_TORQUE: Pair = (0.0, 0.0)
+_NOT_ARMED: Final = (DriveStatus.IDLE, DriveStatus.ERROR, DriveStatus.UNZEROED)
 _MAY_HOLD: Final = (DriveStatus.LOST, DriveStatus.HOLDING, DriveStatus.ARMED)
 _UNCONTROLLED: Final = (Mode.DISARMED, Mode.FAULT)
 
@@ -96,6 +106,9 @@ class DriveManagerState(msgspec.Struct, kw_only=True):
     tries: int = 0
     forgets: bool = False
     """The drive's zero is to be forgotten when its position is lost."""
+    forget_at_ns: int = 0
+    """The next command to forget it; 0: the drive was not idled yet."""
+    forgot: bool = False
     target: MotorTarget | None = None
     """The last target sent to the drive."""
     last_cycle_ns: int = 0
@@ -187,10 +200,12 @@ class DriveManager:
                 if now_ns < s.listen_until_ns or reading is None:
                     return DriveAction(result.event, _NO_COMMAND, _NO_TORQUE, None, _NO_INHIBIT)
                 s.listen_until_ns = 0
+        if s.forgets and mode in _UNCONTROLLED and self._must_forget(now_ns):
+            return DriveAction(result.event, DriveCommand.CLEAR_ZERO, _NO_TORQUE, None, _NO_INHIBIT)
         if mode is _DISARMED and now_ns >= s.arm_at_ns:
             inhibit = self._inhibit(now_ns, reading)
             if inhibit is not None:
-                command_out = DriveCommand.ARM if inhibit is _NO_INHIBIT else _NO_COMMAND
+                command_out = _AT_ARMING.get(inhibit, _NO_COMMAND)
                 return DriveAction(result.event, command_out, _NO_TORQUE, None, inhibit)
         command_out, torque, target = _NO_COMMAND, _NO_TORQUE, None
         if mode is _FAULT:
@@ -238,22 +253,29 @@ class DriveManager:
         """Return the command to the drive of a module in FAULT.
 
         A lost drive that may hold by its own loop gets no command: when the link comes back it
-        still holds, unless one of its axes lost torque meanwhile. Any other drive goes idle. A
-        drive that lost its position also forgets its zero: a failed encoder that comes back may
-        have missed turns.
+        still holds, unless one of its axes lost torque meanwhile. Any other drive goes idle.
         """
         s = self._state
         samples, cause = self.controller.samples, self.controller.cause
         if cause is Cause.DRIVE_LOST and self.onboard and samples.status in _MAY_HOLD:
             return DriveCommand.NOTHING
         if now_ns >= s.idle_at_ns:
+            s.forget_at_ns = s.forget_at_ns or now_ns + FORGET_EVERY_NS
             s.idle_at_ns = now_ns + IDLE_EVERY_NS
             return DriveCommand.IDLE
-        astray = cause is Cause.POSITION_LOST or samples.error & AxisError.ENCODER_FAILED
-        if s.forgets and astray:
-            s.forgets = False
-            return DriveCommand.CLEAR_ZERO
         return DriveCommand.NOTHING
+
+    def _must_forget(self, now_ns: int) -> bool:
+        """Return True if an idle drive is to forget its zero now: it may lack turns."""
+        s, samples = self._state, self.controller.samples
+        if not samples.turns_lost or samples.status not in _NOT_ARMED or now_ns < s.forget_at_ns:
+            return False
+        if s.forget_at_ns == 0 and self.controller.failsafe.mode is _FAULT:
+            return False  # it is not idle yet
+        if s.forgot and samples.status is DriveStatus.UNZEROED:
+            return False
+        s.forget_at_ns, s.forgot = now_ns + FORGET_EVERY_NS, True
+        return True
 
     def _found_armed(self, now_ns: int, reading: DriveReading) -> DriveReading:
         """Return the reading of a drive that was found armed.
@@ -292,7 +314,7 @@ class DriveManager:
         return LastState.DAMP if mode is Mode.DAMP or s.estop else LastState.HELD
 
     def _inhibit(self, now_ns: int, reading: DriveReading | None) -> ArmingInhibit | None:
-        """Return what inhibits arming now; None if the drive is silent."""
+        """Return what inhibits arming now; None if it is not known yet."""
         s = self._state
         if reading is None or reading.status is DriveStatus.LOST:
             return None
@@ -307,7 +329,12 @@ class DriveManager:
             return ArmingInhibit.LOST_TORQUE
         if not self.controller.inside_limits():
             return ArmingInhibit.OUTSIDE_LIMITS
+        if self.controller.samples.turns_lost:
+            return ArmingInhibit.UNZEROED
+        if self.controller.samples.moved:
+            return None
         s.tries += 1
         if s.tries <= ARM_TRIES:
-            return ArmingInhibit.NONE
+            failed = reading.status is DriveStatus.ERROR
+            return ArmingInhibit.FAILED if failed else ArmingInhibit.NONE
         return ArmingInhibit.REFUSED if s.tries == ARM_TRIES + 1 else None

@@ -3,7 +3,8 @@
 A drive without a valid position goes on reporting numbers. Firmware 0.5.6 repeats the last value of
 a lost encoder until a heartbeat shows the error, and starts over, turns away, when it is back; a
 restarted drive reports 0. Accepted for 40 ms, a knee at 0 was commanded -107 N m. So a sample that
-the joint cannot have reached is rejected, and after a few of them the position counts as lost.
+the joint cannot have reached is rejected, and after a few of them the position counts as lost. So
+it does when whole turns may be missing (`turn_watch`), also while the module is not controlled.
 """
 
 from __future__ import annotations
@@ -15,7 +16,9 @@ import msgspec
 from services.joint.differential import joint_from_motor
 from services.joint.drivers.base import DriveReading, DriveStatus
 from services.joint.failsafe import Event
+from services.joint.turn_watch import UNKNOWN, TurnWatch
 from shared.bus.messages import Pair
+from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_S
 
 JUMP_TURNS: Final = 0.1
@@ -63,36 +66,71 @@ class JointEstimate(msgspec.Struct):
     """Time of the newest accepted sample."""
     rejected_count: int = 0
     """Samples rejected since then."""
+    first: TurnWatch = msgspec.field(default_factory=TurnWatch)
+    second: TurnWatch = msgspec.field(default_factory=TurnWatch)
 
-    def take(self, reading: DriveReading, *, armed: bool) -> Event:
+    @property
+    def turns_lost(self) -> bool:
+        """True if the drive's count may lack turns, until it has no zero any more."""
+        return self.first.lost or self.second.lost
+
+    @property
+    def moved(self) -> bool:
+        """True if the drive has not yet shown why its position jumped while it was idle."""
+        known = self.first.encoder_zero != UNKNOWN and self.second.encoder_zero != UNKNOWN
+        return known and (self.first.moved or self.second.moved)
+
+    def take(self, reading: DriveReading, *, armed: bool, flushing: bool = False) -> Event:
         """Take a sample; return its event for the failsafe.
 
         Args:
             reading: the drive's sample.
             armed: True if the module is controlled; otherwise any position is accepted.
+            flushing: samples may be old, and jump: nothing is judged.
         """
         self.status, self.error, self.t_ns = reading.status, reading.error, reading.t_ns
         event = _EVENT[reading.status]
-        if event is _DRIVE_LOST or event is _POSITION_LOST:
-            return event  # with positions that are old, or mean nothing
-        if armed and not self._is_plausible(reading):
+        if event is _DRIVE_LOST:
+            return event  # with positions that are old
+        if event is _POSITION_LOST:  # they mean nothing, and the next zero is a new one
+            self.first, self.second = TurnWatch(lost=armed), TurnWatch(lost=armed)
+            self.accepted_ns = 0
+            return event
+        first, second = self.first, self.second
+        if reading.encoder_zero is not None:
+            first.compare(reading.encoder_zero[0])
+            second.compare(reading.encoder_zero[1])
+        if reading.error & AxisError.ENCODER_FAILED:  # when it is back, turns may be missing
+            first.lost = second.lost = True
+        possible = flushing or not self.accepted_ns or self._is_plausible(reading, armed=armed)
+        if armed and not possible:
             self.rejected_count += 1
-            if event is not _DRIVE_ARMED:
-                return event
-            return _POSITION_LOST if self.rejected_count >= REJECTED_MAX else _NONE
+            if self.rejected_count >= REJECTED_MAX:
+                first.lost = second.lost = True
+            elif event is _DRIVE_ARMED:
+                return _NONE
+        if (first.lost or second.lost) and event is _DRIVE_ARMED:
+            return _POSITION_LOST
+        if armed and not possible:
+            return event
         self.rejected_count = 0
         self.pos, self.vel, self.accepted_ns = reading.pos_turns, reading.vel_turns, self.t_ns
         self.q = joint_from_motor(reading.pos_turns, self.gear_ratio)
         self.v = joint_from_motor(reading.vel_turns, self.gear_ratio)
         return event
 
-    def _is_plausible(self, reading: DriveReading) -> bool:
-        dt_s = (reading.t_ns - self.accepted_ns) / NS_PER_S
-        (a, b), (was_a, was_b), (vel_a, vel_b) = reading.pos_turns, self.pos, self.vel
-        free = JUMP_TURNS + JUMP_SPEED * dt_s
-        speed_a, speed_b = reading.vel_turns
+    def _is_plausible(self, reading: DriveReading, *, armed: bool) -> bool:
+        """Return True if the motors can have come here since the last accepted sample."""
+        (a, b), (speed_a, speed_b) = reading.pos_turns, reading.vel_turns
         if not (abs(speed_a) <= SPEED_MAX and abs(speed_b) <= SPEED_MAX):
             return False
-        return abs(a - was_a) <= free + abs(vel_a) * dt_s and (
-            abs(b - was_b) <= free + abs(vel_b) * dt_s
-        )
+        t_ns, first, second = reading.t_ns, self.first, self.second
+        dt_s = (t_ns - self.accepted_ns) / NS_PER_S
+        (was_a, was_b), (vel_a, vel_b) = self.pos, self.vel
+        free = JUMP_TURNS + JUMP_SPEED * dt_s
+        jump_a, jump_b = a - was_a, b - was_b
+        first_can = first.take(t_ns, a, speed_a, jump_a, free + abs(vel_a) * dt_s)
+        second_can = second.take(t_ns, b, speed_b, jump_b, free + abs(vel_b) * dt_s)
+        first.moved = not armed and (first.moved or not first_can)
+        second.moved = not armed and (second.moved or not second_can)
+        return first_can and second_can

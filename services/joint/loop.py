@@ -48,6 +48,8 @@ _WHY_NOT: Final = {
     "drive error 0x{error:x}; hang the robot, find out why, then ask for it: xrl kill MODULE",
     ArmingInhibit.WAITING: "the drive holds by its own loop; it is taken over once a planner is "
     "there",
+    ArmingInhibit.FAILED: "drive error 0x{error:x}; it is cleared, and the drive armed if it stays "
+    "away",
     ArmingInhibit.REFUSED: f"requested {ARM_TRIES} times: drive error 0x{{error:x}}",
 }
 
@@ -175,6 +177,8 @@ class JointLoop:
             drive.write_torque(step.torque)
         elif order is DriveCommand.ARM:
             drive.arm(onboard=self.module.onboard)
+        elif order is DriveCommand.CLEAR_ERRORS:
+            drive.clear_errors()
         elif order is DriveCommand.IDLE:
             drive.idle()
         elif order is DriveCommand.CLEAR_ZERO:

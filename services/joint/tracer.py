@@ -22,6 +22,7 @@ SNAPSHOT_EVERY: Final = 50
 """Messages between two with the service's snapshot: 1 s."""
 
 _NOTHING: Final = (0.0, 0.0)
+_UNTOLD: Final = (-1.0, -1.0)
 
 
 class Tracer:
@@ -69,6 +70,7 @@ class Tracer:
                 near.sinks,
                 near.stiffen,
                 malformed,
+                (r and r.encoder_zero) or _UNTOLD,
             )
         )
         return self.take() if len(self._cycles) == CYCLES else None

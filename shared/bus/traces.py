@@ -36,7 +36,8 @@ class CycleTrace(msgspec.Struct, gc=False, frozen=True):
     estop: bool
     """True while the emergency stop is engaged."""
     drive_command: Int64
-    """Command to the drive: 0 nothing, 1 torques, 2 a target, 3 idle, 4 arm, 5 forget the zero."""
+    """Command to the drive: 0 nothing, 1 torques, 2 a target, 3 idle, 4 arm, 5 forget the zero,
+    6 clear errors."""
     tau: Pair
     """Joint torques of this cycle, N m, after the limiter."""
     below: Pair = (0.0, 0.0)
@@ -50,6 +51,8 @@ class CycleTrace(msgspec.Struct, gc=False, frozen=True):
     """It saw a limp module that it stiffens for."""
     malformed: Int64 = 0
     """What came as a command in this cycle and was none."""
+    encoder_zero: Pair = (-1.0, -1.0)
+    """Where the motors' encoders read 0, turns modulo one; -1: not answered in this cycle."""
 
 
 class JointTrace(Message, frozen=True):

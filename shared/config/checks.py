@@ -269,9 +269,11 @@ def _drive(config: RobotConfig) -> Problems:
         yield "drive.vel_limit", found, right
     kind, turns = max(((kind, _turns(config, kind)) for kind in KINDS), key=lambda row: row[1])
     least = 2 * (turns + _POWER_UP_TURNS)
-    if 0.0 < drive.zero_mark_turns < least:
+    if drive.zero_mark_turns < least:
         found = f"{drive.zero_mark_turns:g} turns: the {kind} comes to half of it"
-        right = f"at least {math.ceil(least)} turns, twice a joint's range; 0: no such check"
+        if drive.zero_mark_turns == 0.0:
+            found = "0 turns: a drive that had no power would be armed wherever its joint is"
+        right = f"at least {math.ceil(least)} turns, twice a joint's range"
         yield "drive.zero_mark_turns", found, right
 
 

@@ -79,15 +79,16 @@ DRIVE_FAULTS: Final[dict[FaultKind, DriveFault]] = {
         recovery=f"{_HANG}; mend the supply, then `xrl drive zero`",
     ),
     "encoder_zero": DriveFault(
-        f"the position goes to the encoder's nearest turn and stays, with no encoder error; {_LIMP}"
-        " if that is a jump (OVERSPEED), else armed and blind", limp=True,
-        cause=Cause.DRIVE_DISARMED, zero_lost=False,
-        recovery=f"{_HANG}; repair the encoder's cable or supply; check the joint's angle",
+        "the position goes to the encoder's nearest turn and stays, with no encoder error; "
+        f"{_LIMP}, at once if that is a jump (OVERSPEED), else within 70 ms", limp=True,
+        cause=Cause.DRIVE_DISARMED, zero_lost=True,
+        recovery=f"{_HANG}; repair the encoder's cable or supply, then `xrl drive zero`",
     ),
     "encoder_gap": DriveFault(
-        "it holds the last position, armed and blind, and goes on without an error; the turns made "
-        "meanwhile are missing", limp=False, cause=None, zero_lost=False,
-        recovery="repair the encoder's cable; check the joint's angle",
+        "it holds the last position, armed and blind, and goes on without an error; if a turn may "
+        "be missing then, it is idled and forgets its zero", limp=False, cause=None,
+        zero_lost=False,
+        recovery="repair the encoder's cable",
     ),
 }  # fmt: skip
 """By the name that scenarios and `--fault` use."""

@@ -15,6 +15,7 @@ from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.neighbours import UNKNOWN, NeighbourView
 from services.joint.rearm_guard import LastState
 from shared.bus.messages import JointCommand, Mode, Pair
+from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_S
 from shared.config.gain_schedule import believing
 from shared.config.robot_config import RobotConfig
@@ -158,6 +159,9 @@ class ModuleBench:
         self.q: Pair = (0.02, -1.0)
         self.v: Pair = (0.0, 0.0)
         self.status, self.carries, self.obeys = status, carries, obeys
+        self.error = AxisError.NONE
+        self.zero: Pair | None = None
+        """Where the drive answers that its encoders read 0."""
         self.target: MotorTarget | None = None
         self.torque: Pair = (0.0, 0.0)
         self.seq = 0
@@ -181,7 +185,9 @@ class ModuleBench:
     def reading(self) -> DriveReading:
         """Return what the drive measures."""
         pos, vel = motor_from_joint(self.q, self.ratio), motor_from_joint(self.v, self.ratio)
-        return DriveReading(self.now_ns, pos, vel, self.status, 0, self.carries)
+        return DriveReading(
+            self.now_ns, pos, vel, self.status, int(self.error), self.carries, self.zero
+        )
 
     def cycle(
         self,

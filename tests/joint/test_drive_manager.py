@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from services.joint.drive_manager import (
     ARM_EVERY_NS,
     ARM_TRIES,
+    FORGET_EVERY_NS,
     GAP_NS,
     IDLE_EVERY_NS,
     LISTEN_NS,
@@ -26,6 +27,7 @@ from services.joint.drivers.base import DriveStatus
 from services.joint.neighbours import NeighbourView
 from services.joint.sinking import DOUBT_NS
 from shared.bus.messages import Mode, Pair
+from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from tests.joint.helpers import LoopName, ModuleBench
@@ -205,25 +207,81 @@ def test_a_drive_that_never_arms_is_asked_so_often_and_reported_once(robot: Robo
     assert bench.mode is Mode.DISARMED
 
 
+def marked(robot: RobotConfig, mark_turns: float = 40.0) -> ModuleBench:
+    drive = msgspec.structs.replace(robot.drive, zero_mark_turns=mark_turns)
+    return ModuleBench(msgspec.structs.replace(robot, drive=drive))
+
+
+@pytest.mark.parametrize("mark_turns", [0.0, 0.5, 40.0])
 @pytest.mark.parametrize(
-    ("status", "mark_turns", "forgets"),
+    ("status", "error", "lacks"),
     [
-        (DriveStatus.UNZEROED, 0.0, False),
-        (DriveStatus.UNZEROED, 0.5, True),
-        (DriveStatus.UNZEROED, 40.0, True),
-        (DriveStatus.ERROR, 40.0, False),
+        (DriveStatus.UNZEROED, 0, True),
+        (DriveStatus.ERROR, AxisError.ENCODER_FAILED, True),
+        (DriveStatus.ERROR, AxisError.MOTOR_FAILED, False),
     ],
 )
-def test_only_a_drive_with_a_mark_for_no_zero_that_lost_it_is_made_to_forget_its_zero(
-    robot: RobotConfig, status: DriveStatus, mark_turns: float, forgets: bool
+def test_a_drive_that_may_lack_turns_is_idled_and_forgets_its_zero_after_a_heartbeat(
+    robot: RobotConfig, mark_turns: float, status: DriveStatus, error: AxisError, lacks: bool
 ) -> None:
-    drive = msgspec.structs.replace(robot.drive, zero_mark_turns=mark_turns)
-    bench = ModuleBench(msgspec.structs.replace(robot, drive=drive))
+    bench = marked(robot, mark_turns)
     bench.to(Mode.HOLD)
-    bench.status = status
-    orders = [step.command for step in bench.run(1000 * bench.cycle_ns)]
-    assert bench.mode is Mode.FAULT
-    assert orders.count(DriveCommand.CLEAR_ZERO) == int(forgets)
+    bench.status, bench.error = status, error
+    orders = [step.command for step in bench.run(FORGET_EVERY_NS)]
+    assert (bench.mode, orders[0]) == (Mode.FAULT, DriveCommand.IDLE)
+    assert DriveCommand.CLEAR_ZERO not in orders
+    orders = [step.command for step in bench.run(10 * bench.cycle_ns)]
+    assert (DriveCommand.CLEAR_ZERO in orders) is (lacks and mark_turns > 0.0)
+
+
+def test_an_order_to_forget_is_repeated_until_the_drive_shows_that_it_has_no_zero(
+    robot: RobotConfig,
+) -> None:
+    bench = marked(robot)
+    bench.to(Mode.HOLD)
+    bench.status, bench.error = DriveStatus.ERROR, AxisError.ENCODER_FAILED
+    orders = [step.command for step in bench.run(5 * FORGET_EVERY_NS)]
+    assert orders.count(DriveCommand.CLEAR_ZERO) == 4
+    bench.status, bench.error = DriveStatus.UNZEROED, AxisError.NONE
+    assert not [s for s in bench.run(NS_PER_S) if s.command is DriveCommand.CLEAR_ZERO]
+
+
+def test_the_first_error_does_not_save_a_zero_from_the_jump_that_came_with_it(
+    robot: RobotConfig,
+) -> None:
+    """An encoder that reads 0 disarms its axis by overspeed, before three samples are rejected."""
+    bench = marked(robot)
+    bench.to(Mode.HOLD)
+    bench.status, bench.q = DriveStatus.ERROR, (bench.q[0] + 0.1, bench.q[1])
+    orders = [step.command for step in bench.run(2 * FORGET_EVERY_NS)]
+    assert DriveCommand.CLEAR_ZERO in orders
+
+
+def test_a_disarmed_drive_whose_encoder_fails_forgets_its_zero_too(robot: RobotConfig) -> None:
+    bench = marked(robot)
+    bench.obeys = False
+    bench.run(10 * bench.cycle_ns)
+    bench.status, bench.error = DriveStatus.ERROR, AxisError.ENCODER_FAILED
+    assert bench.cycle().command is DriveCommand.CLEAR_ZERO
+    assert bench.mode is Mode.DISARMED
+
+
+@pytest.mark.parametrize("zeroed", [True, False])
+def test_an_idle_joint_that_jumps_is_armed_only_once_a_new_zero_explains_it(
+    robot: RobotConfig, zeroed: bool
+) -> None:
+    bench = marked(robot)
+    bench.status, bench.zero = DriveStatus.LOST, (0.25, 0.75)
+    bench.cycle()
+    bench.status, bench.obeys = DriveStatus.IDLE, False
+    bench.cycle()
+    bench.q, bench.zero = (bench.q[0] + 0.18, bench.q[1] + 0.18), None
+    assert {step.command for step in bench.run(NS_PER_S)} == {DriveCommand.NOTHING}
+    bench.zero = (0.5, 0.75) if zeroed else (0.25, 0.75)
+    bench.cycle()
+    found = {step.command for step in bench.run(NS_PER_S)}
+    assert (DriveCommand.ARM in found) is zeroed
+    assert (DriveCommand.CLEAR_ZERO in found) is not zeroed
 
 
 def test_what_the_neighbours_do_comes_through(bench: ModuleBench) -> None:

@@ -48,7 +48,9 @@ class FakeDrive:
         self.q: Pair = (0.0, -1.0)
         self.silent = False
         self.obeys = True
-        self.armed = self.idled = 0
+        self.armed = self.idled = self.cleared = 0
+        self.comes_back = False
+        """Errors are there again as soon as they are cleared."""
         self.told: list[Pair] = []
         """Where the motors were told that they are."""
         self.torques: list[Pair] = []
@@ -74,6 +76,11 @@ class FakeDrive:
         self.armed += 1
         if self.obeys:
             self.status = DriveStatus.ARMED
+
+    def clear_errors(self) -> None:
+        self.cleared += 1
+        if not self.comes_back:
+            self.status = DriveStatus.IDLE
 
     def idle(self) -> None:
         self.idled += 1
@@ -161,12 +168,20 @@ class Stop:
         return self.left < 0
 
 
-@pytest.mark.parametrize("status", [DriveStatus.IDLE, DriveStatus.ERROR])
-def test_a_drive_that_answers_is_armed_despite_errors(rig: Rig, status: DriveStatus) -> None:
-    rig.drive.status = status
+def test_a_drive_without_errors_is_armed_at_once(rig: Rig) -> None:
     rig.run(2)
-    assert rig.drive.armed == 1
-    assert rig.mode is Mode.HOLD
+    assert (rig.drive.cleared, rig.drive.armed, rig.mode) == (0, 1, Mode.HOLD)
+
+
+def test_errors_are_cleared_and_have_stayed_away_before_the_drive_is_armed(rig: Rig) -> None:
+    """A failed encoder shows again 51 ms after it was cleared; armed meanwhile, it is blind."""
+    rig.drive.status = DriveStatus.ERROR
+    rig.drive.comes_back = True
+    rig.run_ns(3 * ARM_EVERY_NS)
+    assert (rig.drive.cleared > 2, rig.drive.armed) == (True, 0)
+    rig.drive.comes_back = False
+    rig.run_ns(2 * ARM_EVERY_NS)
+    assert (rig.drive.armed, rig.mode) == (1, Mode.HOLD)
 
 
 def test_a_torque_drive_armed_by_another_is_armed_by_us_before_it_is_held(

@@ -159,6 +159,7 @@ REFUSALS: list[tuple[Callable[[Table], object], str, str, str]] = [
     (setting("drive.vel_limit", 2.0), "drive.vel_limit", "2 turn/s", "at least 55.7 turn/s"),
     (setting("joint_service.v_max", 22.0), "drive.vel_limit", "60 turn/s", "at least 61.3"),
     (setting("drive.zero_mark_turns", 8.0), "drive.zero_mark_turns", "8 turns: the hip", "41"),
+    (setting("drive.zero_mark_turns", 0.0), "drive.zero_mark_turns", "had no power", "41"),
     (setting("joint.gear_ratio", 30.0), "drive.vel_limit", "60 turn/s", "at least 95.5"),
     (
         setting("can.harness.interface", "socketcam"),
@@ -290,7 +291,6 @@ def test_payload_may_be_all_that_is_allowed_and_nothing(tmp_path: Path) -> None:
         ("drive.current_lim", 60.0),
         ("drive.vel_limit", 55.8),
         ("drive.zero_mark_turns", 41.0),
-        ("drive.zero_mark_turns", 0.0),
         ("can.harness.interface", "socketcan"),
         ("can.harness.interface", "slcan"),
         ("simulation.can_dialect", "0.6"),

@@ -9,8 +9,11 @@ from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.simulator.drives.axis_bank import AxisBank
 from shared.bus.messages import Pair
 from shared.can.cansimple import AxisState, ControlMode, InputMode
-from shared.clock import NS_PER_S
+from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import DriveConfig
+
+ASK_EVERY_NS: Final = 100 * NS_PER_MS
+"""A heartbeat's period: with each of an idle axis the CAN driver asks for its count."""
 
 # Compared in each cycle: docs/contributing.md, The control path.
 _LOST, _IDLE, _ARMED = DriveStatus.LOST, DriveStatus.IDLE, DriveStatus.ARMED
@@ -36,6 +39,7 @@ class VirtualDrive:
         self._drive, self._clock, self._counts_per_turn = drive, clock, counts_per_turn
         self._lost_after_ns = round(drive.lost_after_s * NS_PER_S)
         self._sampled_ns = clock()
+        self._ask_at_ns = 0
         self._written = True
         """False: the service is new, and reads the torques of a drive that it finds armed."""
 
@@ -68,7 +72,22 @@ class VirtualDrive:
             status,
             int(errors),
             None if self._written else (float(bank.torque[a]), float(bank.torque[b])),
+            None if armed or status is _LOST else self._encoder_zero(now_ns),
         )
+
+    def _encoder_zero(self, now_ns: int) -> Pair | None:
+        """Return `DriveReading.encoder_zero` as often as a drive's heartbeats have it asked for."""
+        if now_ns < self._ask_at_ns:
+            return None
+        self._ask_at_ns = now_ns + ASK_EVERY_NS
+        bank, per_turn = self._bank, self._counts_per_turn
+        a, b = (
+            (round(bank.encoder_turns[axis] * per_turn) - bank.encoder_angle(axis))
+            % per_turn
+            / per_turn
+            for axis in self._axes
+        )
+        return (a, b)
 
     def write_torque(self, torque: Pair) -> None:
         """See `Drive.write_torque`."""
@@ -85,6 +104,12 @@ class VirtualDrive:
         bank.input_torque[a], bank.input_torque[b] = target.torque
         bank.pos_gain[a], bank.pos_gain[b] = target.pos_gain
         bank.vel_gain[a], bank.vel_gain[b] = target.vel_gain
+
+    def clear_errors(self) -> None:
+        """See `Drive.clear_errors`."""
+        if self._receives():
+            for axis in self._axes:
+                self._bank.clear_errors(axis)
 
     def idle(self) -> None:
         """See `Drive.idle`."""

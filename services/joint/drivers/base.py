@@ -25,6 +25,9 @@ class DriveReading(msgspec.Struct, gc=False, frozen=True):
     torque: Pair | None = None
     """Torque of the motors' own loops, N m; known while a drive that was found armed waits for its
     take-over."""
+    encoder_zero: Pair | None = None
+    """Where the encoders' angles within the turn are 0, turns modulo one, when the drive has just
+    answered that; `drive.set_position` moves it."""
 
 
 class MotorTarget(msgspec.Struct, gc=False, frozen=True):
@@ -66,6 +69,9 @@ class Drive(Protocol):
             onboard: True for the motors' own position loop (`write`), with no gains at
                 first; False for torques only (`write_torque`).
         """
+
+    def clear_errors(self) -> None:
+        """Clear both axes' errors; one that is still there comes back, an encoder's in 51 ms."""
 
     def idle(self) -> None:
         """Ask both axes to go idle."""

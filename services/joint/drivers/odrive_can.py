@@ -203,6 +203,10 @@ class OdriveCan:
         self._windows.idle(now_ns())
         self._due.idle()
 
+    def clear_errors(self) -> None:
+        """See `Drive.clear_errors`."""
+        self._link.send(odrive_frames.messages_of(self._node_ids, odrive_frames.CLEARING))
+
     def set_position(self, turns: Pair) -> None:
         """Write both motors' position, turns; see `Drive.set_position`.
 
@@ -269,6 +273,8 @@ class OdriveCan:
         report.receive(axis, bytes(data))
         if report.dialect == "":
             self._link.send(self._answers.ask_version)
+        if report.status is not DriveStatus.ARMED and report.dialect == "0.5":
+            self._link.send((self._answers.ask_counts[axis],))
         found_armed = report.status is DriveStatus.ARMED and self._due.gains is None
         if found_armed and self._answers.torques is None:
             self._link.send(self._answers.ask_currents)  # whoever takes it over asks for them
@@ -304,6 +310,7 @@ class OdriveCan:
             status,
             self._report.errors,
             self._answers.torques if self._due.gains is None else None,
+            self._answers.encoder_zero(),
         )
 
     def _connect(self) -> bool:

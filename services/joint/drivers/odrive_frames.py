@@ -33,6 +33,8 @@ IDLING: Final[tuple[CanCommand, ...]] = (
     (Command.SET_INPUT_TORQUE, cansimple.pack_float(0.0)),
     (Command.SET_AXIS_STATE, cansimple.pack_u32(AxisState.IDLE)),
 )
+CLEARING: Final[tuple[CanCommand, ...]] = ((Command.CLEAR_ERRORS, b"\0"),)
+"""0.6 takes a byte (whether to blink), 0.5 looks at none."""
 
 
 def messages_of(nodes: Nodes, commands: tuple[CanCommand, ...]) -> list[can.Message]:
@@ -53,8 +55,7 @@ def arming(drive: DriveConfig, *, onboard: bool) -> tuple[CanCommand, ...]:
         (Command.SET_POS_GAIN, cansimple.pack_float(0.0)),
     )
     return (
-        # 0.6 takes a byte (whether to blink), 0.5 looks at none
-        (Command.CLEAR_ERRORS, b"\0"),
+        *CLEARING,
         (Command.SET_CONTROLLER_MODE, _modes(onboard=onboard)),
         (Command.SET_LIMITS, cansimple.pack_two_floats(drive.vel_limit, drive.current_lim)),
         *(no_gains if onboard else ()),

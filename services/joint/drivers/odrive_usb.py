@@ -47,6 +47,8 @@ RETRY_S: Final = 0.2
 """Between two attempts to connect."""
 STATES_EVERY: Final = 4
 """Exchanges of a drive that we hold armed from one look at its states to the next: 20 ms."""
+COUNTS_EVERY: Final = 20
+"""Exchanges of a drive that is not armed from one look at its counts to the next: 100 ms."""
 ANSWER_S: Final = 0.003
 """Time an exchange waits for the control thread's target after its sample."""
 REPORT_S: Final = 5.0
@@ -60,8 +62,8 @@ _ZERO = (0.0, 0.0)
 class _Request:
     """Request of the control thread; its identity tells it from an earlier one."""
 
-    def __init__(self, *, arm: bool) -> None:
-        self.arm = arm
+    def __init__(self, *, arm: bool = False, clear: bool = False) -> None:
+        self.arm, self.clear = arm, clear
 
 
 class _Wanted:
@@ -197,6 +199,10 @@ class OdriveUsb:
         """
         self._wanted.request = _Request(arm=True)
 
+    def clear_errors(self) -> None:
+        """See `Drive.clear_errors`."""
+        self._wanted.request = _Request(clear=True)
+
     def idle(self) -> None:
         """Ask both axes to go idle, with their input torque zeroed; see `arm`."""
         self._wanted.request = _Request(arm=False)
@@ -322,7 +328,7 @@ class OdriveUsb:
         """Take a sample of both axes, for the control thread."""
         wanted, done = self._wanted, self._done
         done.count += 1
-        torque = None
+        torque = zero = None
         found = wanted.request is None and wanted.target is None
         if done.status is DriveStatus.ARMED and not found and done.count % STATES_EVERY:
             values = await board.sample.read()
@@ -333,9 +339,11 @@ class OdriveUsb:
             await self._judge(board, values[4:])
             if found and done.status is DriveStatus.ARMED:
                 torque = await board.torques(self._drive.torque_constant)
+            if done.status is not DriveStatus.ARMED and done.count % COUNTS_EVERY == 1:
+                zero = await board.encoder_zero()
         if all(map(isfinite, values)):  # else it is no sample
             pos, vel = (values[0], values[1]), (values[2], values[3])
-            self._sample = DriveReading(t_ns, pos, vel, done.status, done.errors, torque)
+            self._sample = DriveReading(t_ns, pos, vel, done.status, done.errors, torque, zero)
             if wanted.target is not None:
                 self._awaited = asyncio.get_running_loop().create_future()
             self._fresh.set()
@@ -351,9 +359,11 @@ class OdriveUsb:
         done.status = done.axes.judge(states, done.errors)
 
     async def _carry_out(self, board: OdriveV3, request: _Request) -> None:
-        """Arm or idle both axes; their earlier reports are forgotten."""
+        """Arm or idle both axes, or clear errors; their earlier reports are forgotten."""
         done = self._done
-        if request.arm:
+        if request.clear:
+            await board.clear_errors()
+        elif request.arm:
             await board.arm(self._drive.vel_limit, self._drive.current_lim)
             done.feed_until_ns = now_ns() + FEED_MS * NS_PER_MS
             done.target = self._wanted.target  # it was for the time before

@@ -27,6 +27,7 @@ ARM_SETTINGS: Final = (
 IDLE_SETTINGS: Final = ("controller.input_torque", "requested_state")
 _AXES = ("axis0", "axis1")
 _DIRECTION = "encoder.config.direction"
+_COUNTS = ("encoder.shadow_count", "encoder.count_in_cpr", "encoder.config.cpr")
 
 
 class EndpointBatch:
@@ -153,6 +154,7 @@ class OdriveV3:
         if all(f"{axis}.{_DIRECTION}" in device.properties for axis in _AXES):
             self._directions = EndpointBatch(device, self._both((_DIRECTION,)))
         self._signs = (1, 1)
+        self._counts = EndpointBatch(device, self._both(_COUNTS))
 
     async def look(self) -> None:
         """Read saved settings: watchdogs, and the direction of the currents."""
@@ -178,6 +180,12 @@ class OdriveV3:
         sign_0, sign_1 = self._signs
         return sign_0 * first * torque_constant, sign_1 * second * torque_constant
 
+    async def encoder_zero(self) -> Pair:
+        """Return where both encoders' angles within the turn are 0, turns modulo one."""
+        count, in_turn, per_turn, count_1, in_turn_1, per_turn_1 = await self._counts.read()
+        zero_1 = (count_1 - in_turn_1) % per_turn_1 / per_turn_1
+        return (count - in_turn) % per_turn / per_turn, zero_1
+
     @property
     def hungry(self) -> bool:
         """True if a watchdog runs: over USB nothing but `feed` feeds it."""
@@ -195,9 +203,13 @@ class OdriveV3:
             name = f"{axis}.encoder.set_linear_count"
             await self.device.call_function(self.device.functions[name], round(where * cpr))
 
+    async def clear_errors(self) -> None:
+        """Clear all errors of both axes."""
+        await self.device.call_function("clear_errors")
+
     async def arm(self, vel_limit: float, current_lim: float) -> None:
         """Ask both axes for closed loop, without torque and gains; turn/s and A."""
-        await self.device.call_function("clear_errors")
+        await self.clear_errors()
         modes = (ControlMode.POSITION, InputMode.PASSTHROUGH)
         await self._write_both(ARM_SETTINGS, (*modes, vel_limit, current_lim, *[0.0] * 5))
         await self.feed()

@@ -47,6 +47,7 @@ class Replies:
         self.ask_counts = [request_of(n, Command.GET_ENCODER_COUNT) for n in node_ids]
         self.counted: list[Pair | None] = [None, None]
         self._torques: list[float | None] = [None, None]
+        self._zeros: list[float | None] = [None, None]
         self._torque_constant = torque_constant
         self._counts_per_turn = counts_per_turn
 
@@ -58,7 +59,15 @@ class Replies:
 
     def forget_counts(self) -> None:
         """Forget the counts: the drive may have restarted, or be another one."""
-        self.counted[:] = None, None
+        self.counted[:] = self._zeros[:] = None, None
+
+    def encoder_zero(self) -> Pair | None:
+        """Return `DriveReading.encoder_zero`, once for each time that both axes answered."""
+        a, b = self._zeros
+        if a is None or b is None:
+            return None
+        self._zeros[:] = None, None
+        return (a, b)
 
     def forget_torques(self) -> None:
         """Forget the currents: they were of the time before."""
@@ -67,8 +76,10 @@ class Replies:
     def take_count(self, axis: int, data: bytes) -> None:
         """Take the count of axis 0 or 1; it shows no velocity."""
         if len(data) == _BYTES and self._counts_per_turn is not None:
-            shadow_count, _ = cansimple.unpack_two_ints(data)
+            shadow_count, in_turn = cansimple.unpack_two_ints(data)
             self.counted[axis] = (shadow_count / self._counts_per_turn, 0.0)
+            per_turn = self._counts_per_turn
+            self._zeros[axis] = (shadow_count - in_turn) % per_turn / per_turn
 
     def take_current(self, axis: int, data: bytes) -> None:
         """Take the current setpoint of axis 0 or 1; one that is not finite is no answer.

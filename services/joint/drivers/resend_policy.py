@@ -20,7 +20,8 @@ DRIFT_MS: Final = 10
 before are sent again only after this time: they drift, a lost frame is soon replaced, and the bus
 has other work."""
 SETTLE_MS: Final = 1000
-"""Time after `arm`, or the first target, in which limits and modes are sent every `GAINS_MS`."""
+"""Time after `arm` in which limits and modes are sent every `GAINS_MS`. A drive that is taken over
+gets none: firmware 0.5 disarms when a current limit falls below the present current."""
 
 Gains = tuple[Pair, Pair]
 """Position gains 1/s and velocity gains N m s/turn, of both axes."""
@@ -70,8 +71,6 @@ class ResendPolicy:
         """Return the gains to send with a target, and count them as sent."""
         new = gains != self.gains
         due = new or now_ns >= self._gains_at_ns
-        if self.gains is None:  # taken over as it stands
-            self._settle(now_ns)
         if due:
             drifting = now_ns - self._sent_ns < DRIFT_MS * NS_PER_MS
             wait_ms = GAINS_MS if not new else DRIFT_MS if drifting else 0

@@ -30,7 +30,7 @@ class MotorFrame(NamedTuple):
         mark, (sign_a, sign_b) = self
         (a, b), (vel_a, vel_b), torque = reading.pos_turns, reading.vel_turns, reading.torque
         a, b = a * sign_a - mark, b * sign_b - mark
-        status, half = reading.status, 0.5 * mark
+        status, half, zero = reading.status, 0.5 * mark, reading.encoder_zero
         zeroed = mark == 0.0 or (-half < a < half and -half < b < half)
         if not zeroed and status is not DriveStatus.LOST:
             status = DriveStatus.UNZEROED
@@ -41,6 +41,9 @@ class MotorFrame(NamedTuple):
             status,
             reading.error,
             None if torque is None else self._signed(torque),
+            None
+            if zero is None
+            else ((zero[0] * sign_a - mark) % 1.0, (zero[1] * sign_b - mark) % 1.0),
         )
 
     def target(self, target: MotorTarget) -> MotorTarget:
@@ -108,6 +111,11 @@ class WiredDrive:
         """See `Drive.arm`."""
         if not self._read_only:
             self._drive.arm(onboard=onboard)
+
+    def clear_errors(self) -> None:
+        """See `Drive.clear_errors`."""
+        if not self._read_only:
+            self._drive.clear_errors()
 
     def idle(self) -> None:
         """See `Drive.idle`."""

@@ -167,6 +167,8 @@ def _axis(i: int) -> list[Property | Function]:
         Property("motor.current_control.Iq_measured", "float", lambda b: _current(b, i)),
         _fault("encoder.error", "uint16", i, "encoder"),
         Property("encoder.is_ready", "bool", lambda b: b.bank.calibration.encoder[b.axis(i)]),
+        Property("encoder.shadow_count", "int32", lambda b: _count(b, i)),
+        Property("encoder.count_in_cpr", "int32", lambda b: b.bank.encoder_angle(b.axis(i))),
         Property("encoder.pos_estimate", "float", lambda b: float(b.bank.pos_estimate[b.axis(i)])),
         Property("encoder.vel_estimate", "float", lambda b: float(b.bank.vel_estimate[b.axis(i)])),
         Function(
@@ -193,6 +195,12 @@ def _fault(name: str, kind: str, i: int, register: str) -> Property:
 def _current(board: EmulatedBoard, i: int) -> float:
     axis = board.axis(i)
     return board.bank.settings.current(axis, board.bank.torque[axis])
+
+
+def _count(board: EmulatedBoard, i: int) -> int:
+    axis = board.axis(i)
+    per_turn = float(board.bank.settings.axis("encoder.config.cpr")[axis])
+    return round(float(board.bank.encoder_turns[axis]) * per_turn)
 
 
 def _input(name: str, i: int) -> Property:

@@ -137,7 +137,7 @@ def board(**values: float) -> OdriveV3:
         "encoder.pos_estimate", "encoder.vel_estimate", "current_state", "error", "motor.error",
         "encoder.error", "controller.error", "controller.input_pos", "controller.input_torque",
         "controller.config.pos_gain", "controller.config.vel_gain", "config.enable_watchdog",
-        "encoder.config.cpr",
+        "encoder.config.cpr", "encoder.shadow_count", "encoder.count_in_cpr",
     )  # fmt: skip
     tree = {f"{axis}.{name}": 0.0 for axis in ("axis0", "axis1") for name in names}
     return OdriveV3(Tree(tree | {name.replace("__", "."): value for name, value in values.items()}))
@@ -164,3 +164,12 @@ def test_a_torque_has_its_sign_whichever_way_the_phases_are_wired(
 def test_a_current_that_is_no_number_is_no_torque() -> None:
     assert asyncio.run(board(**currents(float("nan"), 1.0)).torques(0.5)) is None
     assert asyncio.run(board(**currents(2.0, 1.0)).torques(0.5)) == (1.0, 0.5)
+
+
+def test_each_encoders_zero_is_told_modulo_a_turn() -> None:
+    of_axis = {
+        "axis0": {"shadow_count": 96.0, "count_in_cpr": 16.0, "config__cpr": 64.0},
+        "axis1": {"shadow_count": -8.0, "count_in_cpr": 8.0, "config__cpr": 32.0},
+    }
+    values = {f"{axis}__encoder__{k}": v for axis, row in of_axis.items() for k, v in row.items()}
+    assert asyncio.run(board(**currents(0.0, 0.0), **values).encoder_zero()) == (0.25, 0.5)

@@ -124,15 +124,13 @@ def test_limits_and_modes_are_sent_for_a_while_after_arming_and_then_no_more(ben
     assert not any(modes[-100:])
 
 
-def test_a_drive_found_armed_is_sent_its_limits_and_modes(bench: Bench) -> None:
+def test_a_drive_found_armed_is_sent_no_limit_it_could_be_above(bench: Bench) -> None:
     bench.receive(AxisState.CLOSED_LOOP_CONTROL)
     bench.commands()
     bench.driver.write(TARGET)
-    sent = bench.commands()
-    assert sent.count(Command.SET_CONTROLLER_MODE) == sent.count(Command.SET_LIMITS) == 2
     bench.wait(2e-3 * GAINS_MS)
     bench.driver.write(TARGET)
-    assert bench.commands().count(Command.SET_CONTROLLER_MODE) == 2, "the first may have been lost"
+    assert not {Command.SET_CONTROLLER_MODE, Command.SET_LIMITS} & set(bench.commands())
 
 
 def test_modes_are_sent_again_with_torques_too(bench: Bench) -> None:

@@ -73,6 +73,8 @@ class _Cycle:
     def idle(self) -> None:
         """Do nothing."""
 
+    clear_errors = idle
+
     def close(self) -> None:
         """Do nothing."""
 
@@ -216,4 +218,5 @@ def _reading(c: CycleTrace) -> DriveReading | None:
         status,
         c.error,
         c.carried if c.carries else None,
+        c.encoder_zero if c.encoder_zero[0] >= 0.0 else None,
     )

@@ -1,0 +1,149 @@
+"""Whether turns that an encoder missed are noticed, on axes whose true motion the test draws."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.joint.drivers.base import DriveReading, DriveStatus
+from services.joint.failsafe import Event
+from services.joint.joint_estimate import REJECTED_MAX, JointEstimate
+from services.joint.turn_watch import ACCELERATION, FADES, GAP_NS
+from shared.can.cansimple import AxisError
+from shared.clock import NS_PER_MS, NS_PER_S
+
+PERIOD_NS = 2 * NS_PER_MS
+BANDWIDTH = 2000.0
+GAP_MAX_S = 0.051
+
+
+class Axis:
+    """A motor, its absolute encoder, and a drive that counts the short way round."""
+
+    def __init__(self, pos: float, speed: float) -> None:
+        self.samples = JointEstimate(17.5)
+        self.true = self.count = self.estimate = pos
+        self.speed = speed
+        self.t_ns = NS_PER_S
+        self.vel = speed
+        self.sample(armed=True)
+
+    @property
+    def turns_missing(self) -> int:
+        return round(self.true - self.count)
+
+    def sample(self, status: DriveStatus = DriveStatus.ARMED, *, armed: bool) -> Event:
+        reading = DriveReading(self.t_ns, (self.estimate, 0.0), (self.vel, 0.0), status, 0)
+        return self.samples.take(reading, armed=armed)
+
+    def move(self, acceleration: float, word: float | None, *, armed: bool = True) -> Event:
+        """Move for a period; the encoder then says a word within the turn, or none."""
+        dt_s = PERIOD_NS / NS_PER_S
+        self.t_ns += PERIOD_NS
+        self.speed += acceleration * dt_s
+        self.true += self.speed * dt_s
+        before = self.count
+        if word is not None:
+            self.count += math.remainder(word - self.count, 1.0)
+        # A critically damped estimate, from the step's end of the count, at a float's precision.
+        fade = math.exp(-BANDWIDTH * dt_s)
+        self.vel = (self.count - before) / dt_s + fade * self.vel
+        self.estimate = self.count - fade * (self.count - self.estimate)
+        if abs(self.count - self.estimate) < 1e-5:
+            self.estimate = self.count
+        return self.sample(armed=armed)
+
+    def goes(self, acceleration: float, cycles: int) -> list[Event]:
+        return [self.move(acceleration, self.word()) for _ in range(cycles)]
+
+    def word(self) -> float:
+        return self.true % 1.0
+
+
+@given(
+    pos=st.floats(-3.0, 3.0),
+    speed=st.floats(-25.0, 25.0),
+    acceleration=st.floats(-0.7 * ACCELERATION, 0.7 * ACCELERATION),
+    gap_ms=st.integers(2, 50),
+)
+def test_turns_missed_in_a_gap_without_an_error_are_noticed(
+    pos: float, speed: float, acceleration: float, gap_ms: int
+) -> None:
+    axis = Axis(pos, speed)
+    axis.goes(0.0, 20)
+    for _ in range(gap_ms * NS_PER_MS // PERIOD_NS):
+        axis.move(acceleration, None)
+    events = axis.goes(0.0, 2 + REJECTED_MAX)
+    if axis.turns_missing:
+        assert Event.POSITION_LOST in events
+        assert axis.samples.turns_lost
+
+
+@given(st.floats(-3.0, 3.0), st.floats(-8.0, 8.0), st.integers(2, 30))
+def test_a_gap_in_which_no_turn_can_be_missing_is_held_through(
+    pos: float, speed: float, gap_ms: int
+) -> None:
+    axis = Axis(pos, speed)
+    axis.goes(0.0, 20)
+    for _ in range(gap_ms * NS_PER_MS // PERIOD_NS):
+        axis.move(0.0, None)
+    assert set(axis.goes(0.0, 20)) <= {Event.DRIVE_ARMED, Event.NONE}
+    assert not axis.samples.turns_lost
+    assert axis.samples.pos[0] == pytest.approx(axis.true, abs=0.05)
+
+
+@given(st.floats(-3.0, 3.0), st.floats(-15.0, 15.0), st.floats(1.0, FADES), st.integers(1, 200))
+def test_an_encoder_that_is_read_all_the_time_raises_no_doubt(
+    pos: float, speed: float, acceleration: float, rests: int
+) -> None:
+    """It stops, rests for any time, and goes on."""
+    axis = Axis(pos, speed)
+    events = axis.goes(0.0, 5)
+    while axis.speed:
+        braked = min(acceleration, abs(axis.speed) / 2e-3)
+        events.append(axis.move(math.copysign(braked, -axis.speed), axis.word()))
+        if abs(axis.speed) < 1e-9:
+            axis.speed = 0.0
+    events += axis.goes(0.0, rests) + axis.goes(acceleration, 20)
+    assert set(events) == {Event.DRIVE_ARMED}
+
+
+@pytest.mark.parametrize("in_turn", [0.02, 0.3, 0.499, 0.501, 0.95])
+@pytest.mark.parametrize("armed", [True, False])
+def test_an_encoder_that_reads_0_is_noticed_from_any_angle(in_turn: float, armed: bool) -> None:
+    axis = Axis(2.0 + in_turn, 0.0)
+    axis.goes(0.0, 5)
+    zero = DriveReading(
+        axis.t_ns, (axis.count, 0.0), (0.0, 0.0), DriveStatus.IDLE, 0, None, (0, 0.5)
+    )
+    axis.samples.take(zero, armed=False)
+    for _ in range(2 * GAP_NS // PERIOD_NS):
+        axis.move(0.0, 0.0, armed=armed)
+    assert axis.samples.turns_lost
+
+
+def test_an_encoder_that_rests_elsewhere_than_at_its_0_does_not_read_0() -> None:
+    axis = Axis(2.1, 0.0)
+    zero = DriveReading(
+        axis.t_ns, (axis.count, 0.0), (0.0, 0.0), DriveStatus.IDLE, 0, None, (0, 0.5)
+    )
+    axis.samples.take(zero, armed=False)
+    axis.goes(0.0, 500)
+    assert not axis.samples.turns_lost
+
+
+@pytest.mark.parametrize("armed", [True, False])
+def test_a_failed_encoder_lacks_turns_until_the_drive_has_no_zero(armed: bool) -> None:
+    axis = Axis(0.0, 0.0)
+    failed = DriveReading(
+        axis.t_ns, (0.0, 0.0), (0.0, 0.0), DriveStatus.ERROR, int(AxisError.ENCODER_FAILED)
+    )
+    axis.samples.take(failed, armed=armed)
+    axis.sample(DriveStatus.IDLE, armed=armed)
+    assert axis.samples.turns_lost
+    axis.sample(DriveStatus.UNZEROED, armed=False)
+    axis.sample(DriveStatus.IDLE, armed=False)
+    assert not axis.samples.turns_lost
