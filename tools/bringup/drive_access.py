@@ -126,7 +126,7 @@ class DriveSettingFlags(Flags):
     """Settings that the emulated drives have kept."""
 
     plant: Annotated[tuple[str, ...], Arg(metavar="MODULE.NAME=VALUE")] = ()
-    """emulated robot only: a setting that a drive has kept, as
+    """emulated robot only: a stored setting of a drive, such as
     knee_left.axis0.controller.config.vel_limit=2; may be given several times"""
 
 

@@ -19,8 +19,8 @@ class PartFlags(Flags):
     """Part of a run: the whole of it if none is given."""
 
     begin_s: Annotated[Number, option("--from", metavar="S")] = -math.inf
-    """begin of the part (default: the run's): scenario time, or time since the log begins if it has
-    no scenario; as in the report"""
+    """start of the part (default: the run's): scenario time, or time since the start of the log if
+    it has no scenario; as in the report"""
     end_s: Annotated[Number, option("--to", metavar="S")] = math.inf
     """end of the part (default: the run's)"""
 

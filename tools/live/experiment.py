@@ -63,7 +63,7 @@ class PlantFlags(Flags):
             metavar="NAME|FILE|KEY=VALUE",
             help=f"the true robot: {', '.join(NAMED)} (default: realistic), a TOML file, or one "
             "value such as drivetrain.stiffness=5000 or floor.slope=[0.03,0.0]; may be repeated, "
-            "each laid over those before; no controller sees it (deploy/plants/README.md)",
+            "each overrides those before; no controller sees it (deploy/plants/README.md)",
         ),
     ] = ()
 
@@ -72,15 +72,15 @@ class ControllerFlags(Flags):
     """A controller of somebody's own in the place of the law."""
 
     controller: Annotated[str | None, Arg(metavar="FILE.py[:NAME]")] = None
-    """a controller of your own in the place of the law, behind the same certificate, age rule and
-    limits (docs/own-controller.md, examples/lqr_controller.py)"""
+    """your own controller instead of the law, behind the same certificate, age rule and limits
+    (docs/own-controller.md, examples/lqr_controller.py)"""
 
 
 class ImuFlags(Flags):
     """An IMU, whatever the robot file says."""
 
     imu: bool = False
-    """with an IMU on the torso, and its service: the robot stands on slopes (imu.fitted of the
+    """add an IMU on the torso and its service: the robot then stands on slopes (imu.fitted of the
     robot file)"""
 
 
@@ -140,15 +140,16 @@ class LawFlags(ConfigFlags, ImuFlags):
     split: Annotated[str | None, Arg(choices=choices("split"))] = None
     """gain split of the law"""
     jacobian: Annotated[str | None, Arg(choices=choices("jacobian"))] = None
-    """how the legs share the load; average comes with the diagonal split: no gains certify it"""
+    """how the legs share the load; average implies the diagonal split, because no gains certify
+    it"""
 
 
 class ExperimentFlags(LawFlags, PlantFlags, ControllerFlags):
     """What shapes an experiment."""
 
     scenario: Annotated[str, Arg(metavar="NAME|FILE")] = "squat"
-    """what happens: a name (of a file in scenarios/ beside the robot file, or one that is shipped),
-    or a file (default: squat, the paper's Fig. 7)"""
+    """scenario: a name (of a file in scenarios/ beside the robot file, or of a shipped one), or a
+    file (default: squat, the paper's Fig. 7)"""
     duration: Duration | None = None
     """scenario time to run, s"""
     kill: Annotated[
@@ -178,12 +179,12 @@ class ExperimentFlags(LawFlags, PlantFlags, ControllerFlags):
     inject: Annotated[tuple[Inject, ...] | None, parsed(parse_inject, "'LINK KEY=VALUE ...'")] = (
         None
     )
-    """what the network does to a link, such as 'planner->joints delay=30 jitter=10 at=3 for=4' (ms
+    """impair a link, such as 'planner->joints delay=30 jitter=10 at=3 for=4' (ms
     and s), 'all loss=20% burst=5', 'planner->left partition at=3'; at is scenario time; `xrl inject
-    --help` explains each word, and which of several counts; replaces the scenario's; may be
+    --help` explains each word, and which of several applies; replaces the scenario's; may be
     repeated"""
     seed: Natural = 0
-    """of the sensors' noise, and of what the network loses and how late it is"""
+    """seed of the sensors' noise and of the network's losses and delays"""
 
 
 ROW_FIELDS: Final = ("kill", "restart", "push", "fault", "inject")

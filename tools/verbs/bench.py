@@ -40,7 +40,7 @@ EXAMPLES: Final = """
 xrl bench
 xrl bench --against HEAD~1
 xrl bench --rounds 25 --json bench.json
-xrl bench bus                                # the bus beside other transports
+xrl bench bus                                # the bus compared with other transports
 xrl bench bus --transport zenoh --transport datagrams --seconds 30
 xrl bench fleet                              # the whole fleet, live
 xrl bench fleet --against HEAD~1 --rounds 5 --json fleet.json
@@ -78,7 +78,7 @@ def measure(
     Args:
         config: robot file; of one in this checkout the other revision takes its own version.
         against: a git revision that measures in turn with this tree, or None.
-        rounds: turns of each.
+        rounds: rounds of each.
         console: for the progress.
     """
     with ExitStack() as stack:

@@ -54,14 +54,14 @@ class DemoFlags(experiment.ExperimentFlags, PaceFlags, PortFlags):
     """An experiment, and how the fleet runs it."""
 
     scenario: Annotated[str, Arg(metavar="NAME|FILE")] = ""
-    """what happens: a name (of a file in scenarios/ beside the robot file, or one that is shipped),
-    or a file (default: squat, the paper's Fig. 7; with --view stand)"""
+    """scenario: a name (of a file in scenarios/ beside the robot file, or of a shipped one), or a
+    file (default: squat, the paper's Fig. 7; with --view: stand)"""
     no_restart: bool = False
-    """services that end by themselves stay down; without it the supervisor restarts them. What
-    --kill kills stays down until its --restart either way"""
+    """do not restart services that end by themselves. A service that --kill kills stays down until
+    its --restart in either case"""
     view: bool = False
-    """show it in a browser, and let a page act on it; without --scenario and --duration it stands
-    until Ctrl-C, and is judged then"""
+    """show the robot in a browser, and let the page act on it; without --scenario and --duration it
+    stands until Ctrl-C, then the verdict follows"""
     out: Folder | None = None
     """where results go (default: out/demo-<time>)"""
 

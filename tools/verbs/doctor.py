@@ -27,7 +27,7 @@ class DoctorFlags(FleetRobotFlags, DriveSettingFlags):
     """What is shown."""
 
     verbose: bool = False
-    """a line for each check that is ok"""
+    """also show each check that is ok"""
     json: bool = False
     """print JSON: every row"""
 

@@ -19,7 +19,7 @@ class DownFlags(RunDirFlags):
     """Which fleet."""
 
     keep_stops: bool = False
-    """an emergency stop holds on in the next `xrl up --disarmed`"""
+    """keep an emergency stop in force for the next `xrl up --disarmed`"""
 
 
 def run(flags: DownFlags) -> int:

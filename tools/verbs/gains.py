@@ -56,8 +56,8 @@ class GainsFlags(ConfigFlags):
     """Whose schedule, and what is done with it."""
 
     damping_of: Path | None = None
-    """take damping and coupling from another schedule, such as deploy/robot.gains.json, and hold
-    them to the dynamic certificate; without it they are searched for (two minutes)"""
+    """take damping and coupling from another schedule, such as deploy/robot.gains.json, and check
+    them with the dynamic certificate; without it the verb searches for them (two minutes)"""
     picture: Annotated[Path | None, Arg(metavar="FILE.png")] = None
     """draw how each motion decays, over the drivetrain's stiffness"""
     check_only: Annotated[bool, option("--check", exclusive="only")] = False

@@ -27,13 +27,13 @@ from tools.terminal import Console, marked
 
 DEFAULT_HOSTS: Final = Path("hosts.toml")
 EXAMPLES: Final = """
-xrl hosts files -o out/hosts               # write what each host will have, and look at it
+xrl hosts files -o out/hosts               # writes what each host will get, to look at
 xrl keys make --hosts hosts.toml           # once: the authority, and a certificate for each service
-xrl hosts update                           # bring it there, over ssh
+xrl hosts update                           # sends the files over ssh
 xrl hosts check                            # versions, keys, clocks, units
 xrl hosts up
 xrl hosts status
-xrl hosts records -o out/lab               # bring the newest records here, joined into one run
+xrl hosts records -o out/lab               # copies the newest records here, joins them into a run
 xrl hosts estop
 xrl hosts down
 """
@@ -61,21 +61,21 @@ class UpdateFlags(HostsFlags):
     """And when."""
 
     while_up: bool = False
-    """although services are running: one that crashes starts with the new files"""
+    """update although services run: one that crashes restarts with the new files"""
 
 
 class RecordsFlags(FilesFlags):
     """And when."""
 
     while_up: bool = False
-    """although services are running: what leads shares the network with the records"""
+    """copy although services run: the records share the network with the planner"""
 
 
 class HostsUpFlags(HostsFlags):
     """How they start."""
 
     disarmed: bool = False
-    """leave drives that do not hold idle"""
+    """leave drives idle that do not hold"""
 
 
 class _Given(NamedTuple):

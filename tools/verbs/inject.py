@@ -27,20 +27,20 @@ from tools.terminal import Console
 
 ALL: Final = "all"
 WORDS: Final = "'LINK KEY=VALUE ...'"
-RULE: Final = "of several on one link, a partition counts first, else what began last"
+RULE: Final = "of several on one link, a partition applies first, else the one that began last"
 
-_WHAT: Final = f"""what is done to every message of it
-A message is a batch of Zenoh's here: what is sent at once travels, and is lost, as one.
+_WHAT: Final = f"""what happens to every message on the link
+A message here is a batch of Zenoh's: messages sent together travel, and are lost, together.
 TIME: 30, 30ms, 0.03s or 500us. SHARE: a probability, 0.2 or 20%.
 {RULE[0].upper()}{RULE[1:]};
-when that is over, the others count again."""
+when that ends, the others apply again."""
 
 EXAMPLES: Final = """
 xrl up --injectable                                       # first
 xrl inject --link 'planner->joints' --delay 30ms --jitter 10ms --for 4
 xrl inject --link all --loss 20% --burst 5
 xrl inject --link 'planner->left' --partition --ordered --at 2 --for 1
-xrl inject 'planner->joints delay=30 jitter=10 for=4'     # as --inject of demo and sim
+xrl inject 'planner->joints delay=30 jitter=10 for=4'     # same words as --inject of demo and sim
 xrl inject --list
 xrl inject --clear
 """
@@ -50,7 +50,8 @@ class InjectFlags(RunDirFlags):
     """A link, and what is done to it; each value is read as in the words of a scenario."""
 
     words: Annotated[str | None, positional(WORDS)] = None
-    """all of it in words, in place of flags: as --inject of demo and sim, but `at` is from now"""
+    """everything as one string instead of flags, as --inject of demo and sim; `at` counts from
+    now"""
     link: Annotated[
         str | None,
         Arg(
@@ -79,9 +80,9 @@ class InjectFlags(RunDirFlags):
     partition: Annotated[bool, Arg(group=_WHAT)] = False
     """nothing passes"""
     ordered: Annotated[bool, Arg(group=_WHAT)] = False
-    """as on a stream: a late message delays those behind it, and a partition holds all back until
-    its end; --loss still loses messages, nothing is sent again. Without it, as datagrams: an
-    overtaken message, or one in a partition, is lost"""
+    """behave like a stream: a late message delays those behind it, and a partition holds all back
+    until its end; --loss still loses messages, and nothing is resent. Without it the link behaves
+    like datagrams: an overtaken message, or one in a partition, is lost"""
     at: Annotated[str | None, Arg(metavar="T", group="when")] = None
     """start in T seconds from now (default: 0)"""
     for_: Annotated[str | None, Arg(metavar="T", group="when")] = None
@@ -89,7 +90,7 @@ class InjectFlags(RunDirFlags):
     list: Annotated[bool, Arg(group="in place of that", exclusive="other")] = False
     """list active and planned impairments"""
     clear: Annotated[bool, Arg(group="in place of that", exclusive="other")] = False
-    """end what touches the link: wholly, on its other directions too"""
+    """end every impairment that touches the link, in all of its directions"""
 
     @property
     def given(self) -> dict[str, str]:

@@ -34,7 +34,7 @@ from tools.output import write_atomically
 from tools.terminal import Console
 
 EXAMPLES: Final = """
-xrl keys make --config lab.toml                       # once, where the keys are kept
+xrl keys make --config lab.toml                       # once, on the computer that keeps the keys
 xrl keys make --hosts hosts.toml                      # ... of a robot on several hosts
 xrl keys pack planner harness recorder operator -o body.keys.tar
 xrl keys pack --install                               # all, onto this host
@@ -48,7 +48,7 @@ class KeysFlags(ConfigFlags):
     """Whose keys."""
 
     hosts: Path | None = None
-    """services are at the addresses of this hosts file (default: as the robot file has it)"""
+    """take the services' addresses from this hosts file (default: from the robot file)"""
     authority: Folder | None = None
     """folder of the authority (default: ~/.config/xrl/ROBOT/authority)"""
 
@@ -64,7 +64,7 @@ class MakeFlags(KeysFlags):
     """How long they are good."""
 
     days: Annotated[Count, Arg(metavar="DAYS")] = CERTIFICATE_DAYS
-    """until the certificates expire"""
+    """days until the certificates expire"""
 
 
 class RenewFlags(MakeFlags):

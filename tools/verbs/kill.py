@@ -10,10 +10,10 @@ from tools.flags import RunDirFlags, positional
 from tools.fleet.supervise import SupervisedFleet
 
 EXAMPLES: Final = """
-xrl kill planner                        # dead at once; the supervisor starts it again
-xrl kill planner --signal STOP          # frozen, as a hung process is
-xrl kill planner --signal CONT          # and on again
-xrl kill knee_left                      # its drive holds; the next service takes it over
+xrl kill planner                        # dead at once; the supervisor restarts it
+xrl kill planner --signal STOP          # frozen, like a hung process
+xrl kill planner --signal CONT          # resumed
+xrl kill knee_left                      # its drive holds; the new service takes it over
 """
 
 

@@ -70,7 +70,7 @@ xrl lead --keys          # arrows: height and pitch; + and -: assist; space: sto
 xrl lead --pad /dev/input/event7 --hold leftshoulder --stop x
 xrl lead --assist 80 --for 60             # no pad: N for a minute, then it fades out
 xrl lead --assist 0 --shift 0.02,0,0,0    # lean the COM 2 cm forwards
-xrl lead --calibrate     # a pad that is not known: asks for each stick, trigger and button
+xrl lead --calibrate     # an unknown pad: asks for each stick, trigger and button
 """
 
 
@@ -78,25 +78,24 @@ class LeadFlags(RunDirFlags):
     """By what the robot is led."""
 
     keys: Annotated[bool, Arg(exclusive="by")] = False
-    """keys of this terminal, no gamepad"""
+    """lead by the keys of this terminal, not a gamepad"""
     pad: Annotated[str | None, Arg(metavar="DEVICE", exclusive="by")] = None
     """event device (default: the first gamepad)"""
     assist: Annotated[Number | None, Arg(metavar="N", exclusive="by")] = None
-    """nothing is led: ask the robot to carry so much of the person, N, until Ctrl-C; then it fades
-    out"""
+    """lead nothing: ask the robot to carry N newtons of the person until Ctrl-C; then fade out"""
     shift: Annotated[
         tuple[float, ...] | None,
         parsed(numbers(4, "such as 0.02,0,0,0"), "X,Y,ROLL,YAW", is_one=True),
     ] = None
-    """with --assist: where COM (m) and torso (rad) are to be off a straight stand (0,0,0,0)"""
+    """with --assist: offset of COM (m) and torso (rad) from a straight stand (0,0,0,0)"""
     for_s: Annotated[Duration | None, option("--for")] = None
-    """with --assist: so long"""
+    """with --assist: duration, s"""
     hold: Annotated[str, Arg(choices=BUTTONS)] = "rightshoulder"
     """dead man's button"""
     stop: Annotated[str, Arg(choices=BUTTONS)] = "b"
     """emergency stop"""
     calibrate: bool = False
-    """learn what the pad's axes and buttons mean, and keep it; needs no robot"""
+    """learn and store what the pad's axes and buttons mean; needs no robot"""
 
     def check(self) -> None:
         """Refuse what goes with another way of leading."""

@@ -25,7 +25,7 @@ _ABOUT_PLANTS: Final = (
 
 EXAMPLES: Final = """
 xrl new lab                     # then: cd lab; every verb finds robot.toml there
-xrl new .                       # here, if nothing is here
+xrl new .                       # here, if this directory is empty
 """
 
 
@@ -33,7 +33,7 @@ class NewFlags(Flags):
     """Where."""
 
     directory: Annotated[Path, positional("DIR")]
-    """made if it is absent; else it must be empty"""
+    """directory; made if absent, else it must be empty"""
 
 
 def run(flags: NewFlags) -> int:

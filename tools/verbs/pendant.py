@@ -20,8 +20,8 @@ OTHER_S: Final = 0.2
 
 
 EXAMPLES: Final = """
-xrl pendant               # held until Enter lays it down; Ctrl-C is the stop
-xrl pendant --for 600     # laid down by itself after ten minutes
+xrl pendant               # Enter lays it down without a stop; Ctrl-C stops every module
+xrl pendant --for 600     # lays itself down after ten minutes
 """
 
 

@@ -46,16 +46,15 @@ class SimFlags(experiment.ExperimentFlags):
     """An experiment, the network it runs over, and who computes the torques."""
 
     delay: Milliseconds = 1.0
-    """of every link, each way"""
+    """delay of every link, each way"""
     jitter: Milliseconds = 0.0
     """half the width of a uniform spread"""
     loss: Annotated[float, Range(0.0, 1.0, ""), Arg(metavar="P")] = 0.0
     """probability that a message is lost"""
     control: Annotated[str, Arg(choices=CONTROLS)] = SHIPPED
-    """who computes the torques; centralised: the planner all of them, a baseline to compare with"""
+    """where torques are computed; centralised: all in the planner, a baseline to compare with"""
     hand: Annotated[Path | None, Arg(metavar="RUN")] = None
-    """lead and push as somebody did in this record (`operator/hand`), in place of the scenario's
-    path"""
+    """repeat the hand and pushes of this record (`operator/hand`) instead of the scenario's path"""
     out: Folder | None = None
     """where results go (default: out/sim-<time>)"""
 

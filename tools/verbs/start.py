@@ -9,7 +9,7 @@ from tools.fleet.supervise import SupervisedFleet
 
 EXAMPLES: Final = """
 xrl start planner       # after `xrl up --no-planner`: it leads once all six are ready
-xrl start knee_left     # at once, where the supervisor waits after several failures
+xrl start knee_left     # at once, even if the supervisor waits after several failures
 """
 
 

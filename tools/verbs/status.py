@@ -42,9 +42,9 @@ class StatusFlags(RunDirFlags):
     json: Annotated[bool, Arg(exclusive="form")] = False
     """print JSON, in SI units"""
     watch: Annotated[bool, Arg(exclusive="form")] = False
-    """keep showing until Ctrl-C"""
+    """refresh until Ctrl-C"""
     traffic: bool = False
-    """processes and topics in place of services and modules: CPU, rates, ages, bytes"""
+    """show processes and topics instead of services and modules: CPU, rates, ages, bytes"""
 
     def check(self) -> None:
         """Refuse JSON of what has none."""

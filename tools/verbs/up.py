@@ -44,14 +44,14 @@ EXAMPLES: Final = """
 xrl up
 xrl up --scenario crawl --out out/crawl
 xrl up --view                                  # and lead it by hand, in a browser
-xrl up --ros2                                  # seen by ROS 2: docs/ros2.md
-xrl up --ros2 --domain 7 --accept estop        # which may stop it, too
+xrl up --ros2                                  # ROS 2 sees it: docs/ros2.md
+xrl up --ros2 --domain 7 --accept estop        # and may stop it
 xrl up --injectable                            # then: xrl inject --link ... --delay 30
 xrl up --config lab.toml --no-sim
-xrl up --config lab.toml --no-sim --only ankle_left,knee_left,hip_left  # of one host
-xrl up --config lab.toml --no-sim --only hip_left,host_recorder         # and its record
+xrl up --config lab.toml --no-sim --only ankle_left,knee_left,hip_left  # one host's services
+xrl up --config lab.toml --no-sim --only hip_left,host_recorder         # with a record on this host
 xrl up --config lab.toml --no-sim --disarmed   # from a systemd unit
-xrl up --config lab.toml --no-sim --readonly   # move the joints by hand, and look
+xrl up --config lab.toml --no-sim --readonly   # to move the joints by hand and watch
 """
 
 
@@ -64,34 +64,34 @@ class UpFlags(ConfigFlags, RunDirFlags, PlantFlags, ControllerFlags, PaceFlags, 
     """what the simulated operator does once the robot stands: a file, or a name
     (beside the robot file in scenarios/, or a shipped one; its kills are left to you)"""
     no_sim: bool = False
-    """start no simulator: the drives are real, or come later"""
+    """start no simulator: the drives are real, or start later"""
     only: Annotated[
         tuple[str, ...] | None,
         parsed(names_of(), "SERVICE,...", is_one=True),
     ] = None
-    """only these: the robot's other services run on other hosts, where their endpoints in the robot
-    file are"""
+    """start only these: the other services run on other hosts, at their endpoints in the robot
+    file"""
     snapshot: Annotated[Number | None, Arg(metavar="SECONDS")] = None
     """record nothing until a fault, then SECONDS before and after it"""
     no_planner: bool = False
-    """six modules that HOLD by themselves; `xrl start planner` lets it lead"""
+    """start no planner: the six modules HOLD; `xrl start planner` starts it later"""
     injectable: bool = False
     """put the network proxy between planner, joints and sensors, for `xrl inject`"""
     disarmed: bool = False
-    """arm no drive until a person asks (xrl kill MODULE); one that holds is taken over: for a start
-    by itself, after a power cut"""
+    """arm no drive until a person asks (xrl kill MODULE), but take over drives that hold; for
+    automatic starts, as after a power cut"""
     view: bool = False
-    """then show it in a browser until Ctrl-C, as `xrl view` does; a page may act on a simulated
-    robot. The fleet stays up"""
+    """then show the robot in a browser until Ctrl-C, as `xrl view` does; the page may act on a
+    simulated robot. The fleet stays up"""
     ros2: bool = False
-    """show it to ROS 2 over Zenoh: joint states, transforms, diagnostics (docs/ros2.md)"""
+    """show the robot to ROS 2 over Zenoh: joint states, transforms, diagnostics (docs/ros2.md)"""
     domain: Annotated[int | None, parsed(rmw.domain, "N")] = None
     """with --ros2: its domain (default: $ROS_DOMAIN_ID, else 0)"""
     accept: Annotated[tuple[str, ...] | None, parsed(acceptable, "TOPICS", is_one=True)] = None
     """with --ros2: let ROS 2 ask for assist (intent), stop the robot (estop), or both
     (intent,estop)"""
     readonly: bool = False
-    """the joint services listen to their drives and publish, and send them nothing"""
+    """the joint services read their drives and publish, and send the drives nothing"""
 
     def check(self) -> None:
         """Refuse what is for a service that is not started."""

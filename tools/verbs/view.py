@@ -29,7 +29,7 @@ from tools.view.serving import PortFlags, serve
 from tools.view.source import FOXGLOVE_PORT, HOST, PORT, Source
 
 EXAMPLES: Final = """
-xrl view                       # the fleet that is up: look, and touch nothing
+xrl view                       # the running fleet, without touching it
 xrl view --act                 # ... and lead, push, kill, freeze, start, cut, stop
 xrl view out/demo/run.mcap     # a record: play, pause, step, scrub
 xrl view out/demo/run.mcap --html run.html     # ... as one file that opens anywhere
@@ -43,13 +43,13 @@ class ViewFlags(PortFlags, PartFlags, RunDirFlags):
 
     record: Run | None = None
     sim: bool = False
-    """a robot of its own, in virtual time"""
+    """simulate a robot in this process, in virtual time"""
     html: Path | None = None
     """write the record into one HTML file that needs no server, and end"""
     act: bool = False
-    """let the page act on the fleet that is up; a real robot's name has to be typed first"""
+    """let the page act on the running fleet; for a real robot you type its name first"""
     foxglove: Annotated[
-        bool, Arg(help=f"serve the frames to Foxglove in place of a page (port: {FOXGLOVE_PORT})")
+        bool, Arg(help=f"serve the frames to Foxglove instead of a page (port: {FOXGLOVE_PORT})")
     ] = False
     config: Annotated[Path | None, robot_file_of("that of the record or of the fleet")] = None
 

@@ -21,15 +21,15 @@ the environment made first. `xrl --version` prints version and commit, `xrl help
 
 | exit code | meaning |
 |---|---|
-| 0 | good |
-| 1 | a robot fell, or is about to; nothing else |
-| 2 | bad input, a person who said no, a fleet that cannot be started, or what the system refuses |
-| 3 | something is not as it should be: a check found a fault, a difference, or nothing came |
+| 0 | success |
+| 1 | a robot fell, or is about to fall; nothing else |
+| 2 | bad input, a person declined, the fleet cannot start, or the system refused a request |
+| 3 | a check found a fault or a difference, or no message came |
 | 70 | a fault of `xrl` itself: please report its traceback |
-| 130, 141, 143 | interrupted; its reader has gone (`xrl ... \\| head`); SIGTERM |
+| 130, 141, 143 | Ctrl-C; the reader of its output ended (`xrl ... \\| head`); SIGTERM |
 
-A pipe or a file gets tables whole, without frames and colours. Control characters of a log, of the
-bus or of a file's name are printed as `\u001b`.
+A pipe or a file gets whole tables, without frames and colours. Control characters in a log, on the
+bus or in a file's name are printed escaped, such as `\\u001b`.
 """
 
 

@@ -112,7 +112,8 @@ class BusFlags(BenchFlags):
     transport: Annotated[
         tuple[str, ...], Arg(choices=tuple(row.name for row in TRANSPORTS), metavar="NAME")
     ] = ()
-    """one of them; repeat it for several (default: all that are installed; those beyond Zenoh and
+    """measure only this one; may be repeated (default: all that are installed; those beyond Zenoh
+    and
     datagrams come with the extra `bench`)"""
     seconds: Duration = 10.0
     """of each run"""

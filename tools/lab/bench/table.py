@@ -103,16 +103,16 @@ class BenchFlags(Flags):
     """How often, and where the figures go."""
 
     rounds: Annotated[Count | None, Arg(metavar="N")] = None
-    """turns of each (default: 9 for the parts, 3 else)"""
+    """rounds of each (default: 9 for the parts, 3 else)"""
     json: Annotated[Path | None, parsed(_writable, "FILE")] = None
-    """write the figures there too"""
+    """also write the figures to this file"""
 
 
 class AgainstFlags(BenchFlags, ConfigFlags):
     """A tree, and one to compare it with."""
 
     against: Annotated[str | None, Arg(metavar="REV")] = None
-    """measure a git revision too, in turn with this tree, and print the ratios; both run in this
+    """also measure a git revision, in turn with this tree, and print the ratios; both run in this
     environment"""
     strict: Annotated[bool, Arg(help=f"exit code {FAULT_EXIT_CODE} if a target is missed")] = False
 

@@ -19,28 +19,28 @@ WAIT_S: Final = 1.0
 
 ABOUT: Final = f"""
 Messages go out in the order and at the times at which the recorder had them, byte for byte:
-t_ns and every other stamp in them is that of the recording. Hold them against --clock, not
-against your own. What is late goes at once.
+t_ns and every other stamp in them is that of the recording. Compare them with --clock, not with
+your own clock. Late messages go at once.
 
 Keys: xrl/<robot>/x becomes {PREFIX}/xrl/<robot>/x, which no service subscribes to. With
 --prefix "" it is xrl/<robot>/x itself. What a robot acts on (joint states and commands,
 harness wrench and tare, attitude, operator intent, estop, sim/control) is then refused while a
-joint service is on the bus. --force puts tare, intent, estop and sim/control all the same;
+joint service is on the bus. --force puts tare, intent, estop and sim/control anyway;
 states, commands, wrenches and attitudes would move the robot, and are never put beside a live
 drive.
 
 Subscribers dial the player at --listen:
   open_session(robot, "mine", run_dir, connect=["{LISTEN}"])
   .stream(["{PREFIX}/**"])
-or any Zenoh 1.x peer or client that connects there. The services of a fleet that is up in
---run-dir are dialled by the player.
+or any Zenoh 1.x peer or client that connects there. The player dials the services of a
+fleet that is up in --run-dir.
 
-In a terminal: space pauses and goes on; right puts the next message of a paused play (or
-goes on by 100 ms); up and down change the rate by a tenth; q ends.
+In a terminal: space pauses and resumes; right sends the next message of a paused play (or
+skips 100 ms); up and down change the rate by a tenth; q ends.
 
 Exit code: 0 played; 2 refused, messages could not be sent, or a subscriber that took nothing for
-5 s was dropped; 130 Ctrl-C. A subscriber that links up later misses what went out before: the
-summary says how many messages nobody heard.
+5 s was dropped; 130 Ctrl-C. A subscriber that links later misses earlier messages: the
+summary says how many messages nobody received.
 """
 
 
@@ -48,19 +48,19 @@ class PlayFlags(RunDirFlags):
     """What of a log is put, when, and under which keys."""
 
     files: Annotated[tuple[Path, ...], positional("FILE")] = ()
-    """files of a run in any order, finished or not, or its directory; write it first"""
+    """files of a run in any order, finished or not, or its directory; put it before the flags"""
     topics: Annotated[tuple[str, ...], Arg(metavar="NAME", takes_many=True)] = ()
-    """play these only: names below xrl/<robot>/, or globs as joint/*/state"""
+    """play only these: names below xrl/<robot>/, or globs such as joint/*/state"""
     exclude: Annotated[tuple[str, ...], Arg(metavar="NAME", takes_many=True)] = ()
-    """leave these out: names below xrl/<robot>/, or globs as joint/*/state"""
+    """leave these out: names below xrl/<robot>/, or globs such as joint/*/state"""
     remap: Annotated[tuple[str, ...], Arg(metavar="OLD=NEW", takes_many=True)] = ()
     """play OLD under the name NEW, both below xrl/<robot>/; * stands for the same in both"""
     prefix: Annotated[str, Arg(metavar="WORD")] = PREFIX
-    """what stands before each key (default: replay); empty: the live keys"""
+    """prefix of each key (default: replay); empty: the live keys"""
     force: bool = False
-    """on the live keys beside a live drive: also what it acts on, but for what moves it"""
+    """on the live keys beside a live drive: also send what it acts on, except what moves it"""
     rate: Annotated[float, Range(RATE_MIN, RATE_MAX, ""), option("--rate", "-r", metavar="R")] = 1.0
-    """recorded seconds for each second"""
+    """recorded seconds per second"""
     start_offset: Annotated[Seconds, option("--start-offset", "-s")] = 0.0
     """start S seconds after the first message of the log"""
     duration: Annotated[float | None, Range(1e-9, FINITE_MAX, "s"), option("--duration", "-d")] = (
@@ -68,9 +68,9 @@ class PlayFlags(RunDirFlags):
     )
     """length of the part to play, in recorded seconds"""
     loop: Annotated[bool, option("--loop", "-l")] = False
-    """again and again, until Ctrl-C"""
+    """repeat until Ctrl-C"""
     start_paused: Annotated[bool, option("--start-paused", "-p")] = False
-    """until space is pressed; on a terminal"""
+    """wait until you press space; on a terminal"""
     clock: Annotated[
         bool, Arg(help=f"publish the recorded time on PREFIX/{CLOCK}, as {{t_ns, seq}}")
     ] = False

@@ -42,7 +42,7 @@ EXAMPLES: Final = """
 xrl drive can setup --config lab.toml             # prints the commands
 sudo xrl drive can setup --config lab.toml --apply
 xrl drive can test --config lab.toml --for 5      # listens, sends nothing
-xrl drive can latency --config lab.toml           # asks each axis 200 times; the fleet is down
+xrl drive can latency --config lab.toml           # asks each axis 200 times; the fleet must be down
 """
 
 
@@ -50,14 +50,14 @@ class CanFlags(ConfigFlags, RunDirFlags):
     """Which buses."""
 
     bus: Annotated[str | None, Arg(metavar="NAME")] = None
-    """only this one of the robot file"""
+    """only this bus of the robot file"""
 
 
 class SetUpFlags(ConfigFlags):
     """Whether it is done."""
 
     apply: bool = False
-    """run the commands, as root; else they are printed"""
+    """run the commands, as root; without it they are only printed"""
 
 
 class TestFlags(CanFlags):
@@ -71,7 +71,7 @@ class LatencyFlags(CanFlags):
     """How often."""
 
     count: Annotated[Count, Arg(metavar="N")] = REQUESTS
-    """requests an axis"""
+    """requests per axis"""
 
 
 def set_up(flags: SetUpFlags) -> int:

@@ -34,7 +34,7 @@ BACKUPS: Final = Path("out") / "drive-backups"
 
 
 EXAMPLES: Final = """
-xrl drive configure                          # what would be changed, and nothing else
+xrl drive configure                          # shows what it would change, writes nothing
 xrl drive configure --apply
 xrl drive configure --apply --module knee_left
 xrl drive configure --restore out/drive-backups/20260301-101500.json --apply
@@ -55,9 +55,9 @@ class ConfigureFlags(FleetRobotFlags, DriveSettingFlags):
     apply: Annotated[bool, Arg(exclusive="what")] = False
     """write and save it; the boards restart"""
     module: tuple[Module, ...] = ()
-    """this one only; may be given several times (default: all six)"""
+    """only this module; may be given several times (default: all six)"""
     restore: Annotated[Path | None, Arg(metavar="BACKUP.json")] = None
-    """what a backup has, instead of what the robot file wants"""
+    """write a backup's settings instead of the robot file's"""
     out: Folder = BACKUPS
     """where the backup is written"""
 

@@ -51,8 +51,8 @@ MOTIONS: Final = "identify"
 
 
 EXAMPLES: Final = """
-xrl drive identify body --dry-run                      # the motions, and nothing else
-xrl drive identify body                                # lead the robot that is up, and fit
+xrl drive identify body --dry-run                      # shows the motions, moves nothing
+xrl drive identify body                                # leads the running robot, then fits
 xrl drive identify body out/a/run.mcap                 # from a record of slow motions
 xrl drive identify body run.mcap loaded.mcap --added 0 --added 10   # 10 kg more on the torso
 xrl drive identify body run.mcap --weighed --config lab.toml --apply
@@ -66,17 +66,17 @@ class BodyFlags(MotionFlags):
     """From which motions."""
 
     record: Annotated[tuple[Path, ...], positional("RUN")] = ()
-    """records of this robot, standing and led slowly; without one the robot that is up is led
+    """records of this robot, standing and led slowly; without one the verb leads the running robot
     through deploy/scenarios/identify.toml"""
     added: tuple[Annotated[float, Range(0.0, 100.0, "kg")], ...] = ()
-    """mass on the torso beyond the robot file's, known by a scale; once for each record"""
+    """weighed mass on the torso beyond the robot file's; once for each record"""
     weighed: Annotated[
-        bool, Arg(help=f"the robot file's payload was on a scale, within {WEIGHED_SD:g} kg")
+        bool, Arg(help=f"the robot file's payload has been weighed, within {WEIGHED_SD:g} kg")
     ] = False
     level: Annotated[float, Range(1e-6, LEVEL_MAX, "rad")] = LEVEL_SD
     """how level the floor is, as a standard deviation"""
     apply: bool = False
-    """write what changes into the robot file, after a backup of it"""
+    """write the changes into the robot file, after a backup"""
     out: Folder | None = None
     """where the picture goes (out/identify-<time>)"""
 

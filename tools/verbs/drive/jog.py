@@ -42,7 +42,7 @@ CYCLES_MAX: Final = 100
 EXAMPLES: Final = """
 xrl drive jog knee_left
 xrl drive jog hip_right --axis phi --by -0.1 --period 4
-xrl drive jog knee_left --torque-limit 30     # where its load needs more
+xrl drive jog knee_left --torque-limit 30     # if its load needs more
 """
 
 
@@ -53,12 +53,12 @@ class JogFlags(MotionFlags):
     """which module"""
     axis: Annotated[str, Arg(choices=AXES)] = "theta"
     by: Annotated[float, Range(-BY_MAX, BY_MAX, "rad")] = BY
-    """how far, and back; positive theta leans forward"""
+    """distance out and back; positive theta leans forward"""
     period: Annotated[float, Range(PERIOD_MIN_S, 60.0, "s")] = PERIOD_S
-    """time of one there and back"""
+    """time of one motion out and back"""
     cycles: Annotated[int, Range(1, CYCLES_MAX, "")] = CYCLES
     torque_limit: Annotated[Number, Arg(metavar="NM")] = TORQUE_LIMIT
-    """of both axes together at the joint; the drive's own current limit is set to it"""
+    """limit of both axes together at the joint, set as the drive's own current limit"""
 
     def check(self) -> None:
         """Refuse a motion that is none."""

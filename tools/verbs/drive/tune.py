@@ -49,7 +49,7 @@ UNITS: Final = ("N/m", "N/m", "N/m", "N m/rad", "N m/rad", "N m/rad")
 
 
 EXAMPLES: Final = """
-xrl drive tune x                                    # the robot that is up: step and sines
+xrl drive tune x                                    # the running robot: step and sines
 xrl drive tune y --sim                              # in virtual time, on the realistic plant
 xrl drive tune y --sim --plant drivetrain.stiffness=3000
 xrl drive tune x --bandwidth 7 --damping 0.6        # proposes K_p and B_p
@@ -70,17 +70,17 @@ class TuneFlags(MotionFlags, experiment.PlantFlags):
         ),
     ]
     size: Annotated[Number | None, Arg(metavar="S")] = None
-    """of a direction's step and sines, m or rad"""
+    """size of a direction's step and sines, m or rad"""
     axis: Annotated[str | None, Arg(choices=AXES)] = None
     """of a module (theta)"""
     torque: Annotated[float | None, Range(1e-3, FINITE_MAX, "N m")] = None
-    """of a module's step and sines (15; 60 for legs)"""
+    """torque of a module's step and sines (15; 60 for legs)"""
     bandwidth: Annotated[float | None, Range(0.1, 500.0, "rad/s")] = None
     """wanted natural frequency"""
     damping: Annotated[float | None, Range(0.05, 3.0, ""), Arg(metavar="RATIO")] = None
     """wanted damping ratio"""
     sim: bool = False
-    """a robot in virtual time, no fleet"""
+    """use a robot in virtual time, not the fleet"""
     out: Folder | None = None
     """for the picture (out/tune-<time>)"""
 

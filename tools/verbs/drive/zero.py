@@ -50,7 +50,7 @@ EXAMPLES: Final = """
 xrl drive zero knee_left --at 0,-0.5          # by a protractor: phi, theta in rad
 xrl drive zero ankle_right --at -0.02,0.14
 xrl drive zero --all --standing 1.188         # in the jig: soles flat, hips 1.188 m above ankles
-xrl drive zero knee_left --by 0,-0.009        # corrects a zero, as `xrl drive identify body` tells
+xrl drive zero knee_left --by 0,-0.009        # corrects a zero, as `xrl drive identify body` prints
 """
 
 
@@ -70,7 +70,7 @@ class ZeroFlags(FleetRobotFlags):
     """the joint is this much farther, rad, than its present zero says"""
     standing: Annotated[Number | None, Arg(metavar="HEIGHT", exclusive="where!")] = None
     """the robot stands or hangs as if it stood: both soles flat and level, at their distance
-    (geometry.w_base), torso upright, COM over the ankles, the hips' axis so many m above the
+    (geometry.w_base), torso upright, COM over the ankles, the hips' axis HEIGHT m above the
     ankles'; the angles then follow from the lengths in the robot file"""
     yes: bool = False
     """do not ask"""

@@ -68,7 +68,7 @@ class ExportFlags(PartFlags):
     gif: Path | None = None
     """also draw the robot from the side and the front, as an animated picture"""
     curves: bool = False
-    """beside it COM, height and hand as they come"""
+    """with --gif: add curves of COM, height and hand"""
     csv: Folder | None = None
     """also write CSV tables: a file for each key, with all of its messages"""
     parquet: Folder | None = None
@@ -80,8 +80,8 @@ class ExportFlags(PartFlags):
     rate: Annotated[
         Rate | None,
         Arg(
-            help="of the tables: all topics in one, at each time the newest messages; of the bag: "
-            f"default {BAG_RATE_HZ:g} Hz"
+            help="rate of one table of all topics, with the newest messages at each time; "
+            f"or of the bag: default {BAG_RATE_HZ:g} Hz"
         ),
     ] = None
     force: bool = False

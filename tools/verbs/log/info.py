@@ -46,14 +46,14 @@ class InfoFlags(Flags):
     """Which log, and in which form."""
 
     file: Annotated[Path, positional("FILE")]
-    """an MCAP file, finished or not; of a directory its run's first"""
+    """an MCAP file, finished or not; or a directory: the first file of its run"""
     whole_run: Annotated[bool, option("--run")] = False
     """all files of the run that it belongs to, counted together"""
     full: Annotated[
         bool,
         Arg(
-            help=f"read every message of a finished file over {LARGE >> 20} MiB too: sizes, "
-            "longest gaps and damage; else what its recorder counted is shown"
+            help=f"read every message even of a finished file over {LARGE >> 20} MiB, for sizes, "
+            "longest gaps and damage; without it the recorder's counts are shown"
         ),
     ] = False
     json: bool = False

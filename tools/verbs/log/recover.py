@@ -24,7 +24,7 @@ class RecoverFlags(Flags):
     """Which log, and where the copy goes."""
 
     file: Annotated[Path, positional("FILE")]
-    """an MCAP file; it is not touched"""
+    """an MCAP file; it stays unchanged"""
     out: Annotated[Path | None, option("-o", "--out", metavar="OUT")] = None
     """where the recovered file goes (default: NAME.recovered.mcap beside it)"""
     force: bool = False

@@ -22,7 +22,7 @@ MIB: Final = 1 << 20
 EXAMPLES: Final = """
 xrl log report out/a/run.mcap
 xrl log report out/a/run.mcap -o report.html --open no
-xrl log report out/a/run.mcap --from 1200 --to 1260   # a minute of an hour
+xrl log report out/a/run.mcap --from 1200 --to 1260   # one minute of an hour
 """
 
 

@@ -43,9 +43,9 @@ xrl log resim out/a/run.mcap                              # planner and six serv
 xrl log resim out/a/run.mcap --service knee_left --until-first-difference
 xrl log resim out/a/run.mcap --service planner --param law.K_p.x=2000
 xrl log resim out/a/run.mcap --service planner --controller mine.py   # what would it have sent?
-xrl log resim out/a/run.mcap --tolerance 1e-9             # of another machine class
+xrl log resim out/a/run.mcap --tolerance 1e-9             # recorded on another machine class
 xrl log resim out/a                                       # a split run, all of its files
-xrl log resim out/a --from 1200 --to 1260                 # a minute of a long one
+xrl log resim out/a --from 1200 --to 1260                 # one minute of a long run
 """
 
 
@@ -62,11 +62,10 @@ class ResimFlags(ControllerFlags, PartFlags):
         ),
     ] = ()
     param: Annotated[tuple[str, ...], Arg(metavar="NAME=VALUE")] = ()
-    """a key of the robot file with another value, such as law.K_p.x=2000 or
-    joint_service.blend_ms=100: the same inputs, and what would have come out; a new file is written
-    beside the old"""
+    """change a key of the robot file, such as law.K_p.x=2000 or joint_service.blend_ms=100, and
+    write what the same inputs give to a new file beside the old"""
     until_first_difference: bool = False
-    """stop there; sooner done"""
+    """stop at the first difference"""
     tolerance: Annotated[float, Range(0.0, FINITE_MAX, ""), Arg(metavar="T")] = 0.0
     """largest accepted difference of numbers (default 0: equal to the last bit)"""
     workers: Annotated[Count, Arg(metavar="N")] = dataclasses.field(default_factory=cores)

@@ -55,7 +55,7 @@ class WhatIfFlags(PartFlags):
         ),
     ]
     every: Annotated[float, Range(STATE_EVERY_S, FINITE_MAX, "s"), Arg(metavar="S")] = 0.1
-    """between two moments; the state is recorded so often"""
+    """time between two moments; the state is recorded as often"""
     for_s: Annotated[Duration, option("--for", metavar="S")] = 4.0
     """duration of each continued run; pushes and hand as recorded"""
     workers: Annotated[Count | None, Arg(metavar="N")] = None

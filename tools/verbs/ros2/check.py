@@ -41,7 +41,7 @@ class CheckFlags(ConfigFlags):
     router: Annotated[str | None, Arg(metavar="ENDPOINT")] = None
     """router (default: ros2.router of the robot file)"""
     wait: Seconds = 5.0
-    """time in which router and node must be there"""
+    """longest wait for router and node"""
 
 
 def run(flags: CheckFlags) -> int:

@@ -47,7 +47,7 @@ class CrashFlags(ConfigFlags):
     quick: bool = False
     """one case of each kind, in 5 minutes or less"""
     only: Annotated[tuple[str, ...], Arg(metavar="NAME")] = ()
-    """this case alone, or those that fit a pattern such as 'kill-*'; may be repeated"""
+    """only this case, or those that match a pattern such as 'kill-*'; may be repeated"""
     list: bool = False
     """print the cases and run none"""
     out: Annotated[

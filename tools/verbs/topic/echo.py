@@ -38,9 +38,9 @@ class EchoFlags(RunDirFlags):
     topic: Annotated[tuple[str, ...], positional("TOPIC")]
     """such as 'joint/*/state'"""
     field: Annotated[tuple[str, ...], Arg(metavar="NAME")] = ()
-    """only these; may be repeated"""
+    """print only this field; may be repeated"""
     hz: Annotated[Rate | None, Arg(metavar="HZ")] = None
-    """at most so many of each topic a second"""
+    """at most HZ messages of each topic per second"""
     count: Annotated[Count | None, Arg(metavar="N")] = None
     """end after N messages"""
     for_s: Annotated[Seconds | None, option("--for")] = None

@@ -33,7 +33,7 @@ class HzFlags(RunDirFlags):
     topic: Annotated[tuple[str, ...], positional("TOPIC")] = ()
     """such as 'joint/*/state' (default: all)"""
     for_s: Annotated[Duration | None, option("--for")] = None
-    """measure so long and print once; exit code 3 if nothing came"""
+    """measure for S seconds and print once; exit code 3 if no message came"""
 
 
 def run(flags: HzFlags) -> int:

@@ -43,9 +43,9 @@ class CertificateStudyFlags(StudyFlags):
     n: Count = 200
     """cases"""
     rigid: bool = False
-    """a floor as hard as the certificate takes it"""
+    """a floor as hard as the certificate assumes"""
     friction: bool = False
-    """with the joints' dry friction, which holds up what is a little too soft"""
+    """with the joints' dry friction, which holds up a robot that is a little too soft"""
 
 
 class Confusion(NamedTuple):

@@ -88,7 +88,8 @@ class LatencyStudyFlags(AloneFlags):
         tuple[float, ...],
         parsed(
             _DELAYS, "MS", is_one=True,
-            help=f"of every link, each way: numbers and A:B:STEP, with commas ({DELAYS_MS})",
+            help="delay of every link, each way: numbers and A:B:STEP, with commas "
+            f"(default: {DELAYS_MS})",
         ),
     ] = _DELAYS(DELAYS_MS)  # fmt: skip
     jitter: Annotated[tuple[float, ...], parsed(_DELAYS, "MS", is_one=True)] = (0.0,)
@@ -97,7 +98,8 @@ class LatencyStudyFlags(AloneFlags):
         tuple[float, ...],
         parsed(
             _SHARES, "P", is_one=True,
-            help=f"share of the messages that is lost; several as for --delay ({LOSSES})",
+            help="share of the messages that is lost; several as for --delay "
+            f"(default: {LOSSES})",
         ),
     ] = _SHARES(LOSSES)  # fmt: skip
     trials: Count = TRIALS
@@ -106,7 +108,7 @@ class LatencyStudyFlags(AloneFlags):
         tuple[str, ...],
         parsed(
             parse_controls, "NAME,...", is_one=True,
-            help="which to compare (all): "
+            help="which to compare (default: all): "
             + "; ".join(f"{name}: {control.about}" for name, control in CONTROLS.items()),
         ),
     ] = tuple(CONTROLS)  # fmt: skip

@@ -58,8 +58,8 @@ class StudyFlags(ConfigFlags):
     workers: Annotated[Count | None, Arg(metavar="N")] = None
     """processes of this machine (default: one a core)"""
     cluster: Annotated[str | None, Arg(metavar="ADDRESS")] = None
-    """run on the workers of a Dask scheduler instead, such as tcp://HOST:8786; they need this
-    project installed, and one thread each"""
+    """run on the workers of a Dask scheduler instead, such as tcp://HOST:8786; each needs this
+    project installed, and one thread"""
     out: Folder | None = None
     """folder of the table and the pictures (default: out/sweep-NAME-<time>); an interrupted study
     resumes there"""
@@ -75,8 +75,8 @@ class AloneFlags(StudyFlags):
     """Those of a study whose cases also run alone."""
 
     only: Annotated[Natural | None, Arg(metavar="NUMBER")] = None
-    """run this case alone and print all of it; exit code 1 if it fell; with --out its log goes
-    there (default: none)"""
+    """run only this case and print all of it; exit code 1 if it fell; with --out its log goes there
+    (default: none)"""
 
     def check(self) -> None:
         """Refuse a case alone on a cluster."""
