@@ -112,7 +112,7 @@ def _parser(arguments: Sequence[str], *, whole: bool = False) -> argparse.Argume
         usage="xrl [--version] VERB ...",
         description="Runtime for Extra Robotic Legs. `xrl VERB --help` shows flags and examples.",
     )
-    parser.add_argument("--version", action=_Version, help="print version and commit, and end")
+    parser.add_argument("--version", action=_Version, help="print version and commit, and exit")
     asked = _asked(parser, arguments)
     verbs = parser.add_subparsers(
         prog="xrl", metavar="VERB", required=True, parser_class=argparse.ArgumentParser

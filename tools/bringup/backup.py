@@ -79,7 +79,7 @@ def read(path: Path) -> Backup:
     except OSError as error:
         raise DriveError(f"{path}: cannot be read: {error.strerror}") from None
     except (msgspec.DecodeError, UnicodeError) as error:
-        raise DriveError(f"{path}: no backup of `xrl drive configure`: {error}") from None
+        raise DriveError(f"{path}: not a backup of `xrl drive configure`: {error}") from None
     if backup.version != VERSION:
         raise DriveError(f"{path}: a backup of version {backup.version}, not {VERSION}")
     return backup

@@ -85,9 +85,7 @@ def against_backup(module: str, saved: Mapping[str, Value], board: Board) -> lis
         elif equal(settings[name], value):
             continue
         elif name.partition(".")[2] in _FOUND:
-            inhibit = (
-                "calibration finds it, by how the phases are wired now; the board keeps its own"
-            )
+            inhibit = "calibration finds it from the wiring of the phases; the board keeps its own"
         else:
             inhibit = ""
         fits, before = partial(equal, value), settings.get(name)
@@ -102,8 +100,8 @@ def refuse_armed(module: str, board: Board) -> None:
             known = state in AxisState.__members__.values()
             words = AxisState(state).name if known else str(state)
             raise DriveError(
-                f"{module}.{axis} is in {words}, not idle: saving restarts the board, which lets "
-                "the module go. Hang the robot; `xrl down`, or switch its supply off and on"
+                f"{module}.{axis} is in {words}, not idle: saving restarts the board, and the "
+                "module goes limp. Hang the robot; `xrl down`, or switch its supply off and on"
             )
 
 

@@ -67,9 +67,9 @@ def _odd_ones(name: str, boards: Boards) -> list[Finding]:
     usual, count = Counter(words.values()).most_common(1)[0]
     if count == len(boards) or 2 * count <= len(boards):
         return []
-    fix = "in `odrivetool`, and `save_configuration()`; or it is meant so"
+    fix = "in `odrivetool`, and `save_configuration()`; or it is intended"
     wanted = f"{usual}, as {count} others"
-    why = "a board that was set up otherwise behaves otherwise"
+    why = "a board with other settings behaves differently"
     return [
         warning(*split_name(module, name), found, wanted, fix, why)
         for module, found in words.items()

@@ -25,7 +25,7 @@ TEMPERATURES: Final = (-10.0, 70.0)
 """C; of an output stage that is idle."""
 _DIRECTION: Final = "encoder.config.direction"
 
-FIND_CAUSE: Final = "find what caused it; `xrl up` clears it at arming, power off and on does too"
+FIND_CAUSE: Final = "find the cause; arming by `xrl up` clears it, and so does power off and on"
 CALIBRATE: Final = (
     "unload the joint, `odrivetool`: requested_state = AXIS_STATE_FULL_CALIBRATION_SEQUENCE, "
     "then pre_calibrated = True on motor and encoder"
@@ -43,7 +43,7 @@ def firmware_row(module: str, firmware: tuple[int, int, int]) -> Finding:
     if is_known(firmware):
         why = "settings may have other names or defaults"
         return advised(firmware == FIRMWARE, module, "firmware", found, wanted, fix, why)
-    why = "other settings, other errors, other CAN frames: nothing of it can be compared"
+    why = "other settings, other errors, other CAN frames: nothing can be compared"
     return wrong(module, "firmware", found, wanted, fix, why)
 
 
@@ -76,7 +76,7 @@ def direction_rows(module: str, values: Values, robot: RobotConfig) -> list[Find
         "swap two of the motor's phases and calibrate again; `motor_signs` is for mirrored legs, "
         "not for this"
     )
-    why = "CAN does not tell it: a service that takes the drive over would turn its torque round"
+    why = "CAN does not report it: a service that takes the drive over would reverse its torque"
     rows = []
     for axis in AXES:
         value = values.get(f"{axis}.{_DIRECTION}")
@@ -145,7 +145,7 @@ def state_row(subject: str, state: int, *, services_up: bool) -> Finding:
     if state == AxisState.CLOSED_LOOP_CONTROL and services_up:
         return ok(subject, "state", found, "armed by its service")
     fix = "hang the robot; `xrl up` takes it over, power off lets it go"
-    return warning(subject, "state", found, "idle", fix, "it moves or holds with nobody at it")
+    return warning(subject, "state", found, "idle", fix, "it moves or holds without a service")
 
 
 def position_rows(module: str, turns: tuple[float, float], robot: RobotConfig) -> list[Finding]:

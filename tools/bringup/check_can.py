@@ -78,10 +78,10 @@ def imu_rows(robot: RobotConfig, traffic: BusTraffic) -> list[Finding]:
     subject, what, imu, samples = "IMU", "samples", robot.imu, traffic.imu.samples
     if traffic.trouble:
         return [_closed(robot, subject, imu.bus, traffic)]
-    why = "the floor is taken as level"
+    why = "the planner assumes a level floor"
     if not samples:
         fix = "its supply and wires, its CAN output; its frames are in shared/can/imu_can.py"
-        found = f"{traffic.frames} frames that make none"
+        found = f"{traffic.frames} frames that give no attitude"
         return [wrong(subject, what, found, f"{imu.rate_hz:g} Hz", fix, why)]
     known = sum(sample.valid for sample in samples)
     found, good = f"{known} of {len(samples)} samples", known == len(samples)

@@ -32,7 +32,7 @@ ODRIVE_VENDOR: Final = "1209"
 ODRIVE_PRODUCTS: Final = tuple(f"0d3{i}" for i in range(1, 10))
 """As in deploy/udev/91-odrive.rules."""
 UDEV_FIX: Final = (
-    f"`sudo cp {FILES}/udev/91-odrive.rules /etc/udev/rules.d/` and what its head says; "
+    f"`sudo cp {FILES}/udev/91-odrive.rules /etc/udev/rules.d/`, then follow its header; "
     "plug in again"
 )
 LIMIT_FIX: Final = (
@@ -101,10 +101,10 @@ def _delays(root: Path, *, emulated: bool) -> list[Finding]:
          "performance", "`sudo cpupower frequency-set -g performance`",
          "a processor that sleeps is late"),
         (clock in ("", *CLOCKS), "clock source", clock or "unknown here", f"{CLOCKS[0]} or alike",
-         "look in the kernel's log why it was given up",
-         "every look at the clock costs a system call"),
+         "see in the kernel's log why it was dropped",
+         "every read of the clock costs a system call"),
         (may_lock, "locked memory", "allowed" if may_lock else locked, "allowed", MEMLOCK_FIX,
-         "a page that has to be read again stops a loop"),
+         "a page that must be read from disk stops a loop"),
         (areas <= 0, "swap", "none" if areas <= 0 else f"{areas} in use", "none",
          "`sudo swapoff -a`",
          "a service that may not lock its memory stops for a page that was swapped out"),

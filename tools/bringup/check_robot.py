@@ -26,7 +26,7 @@ def robot_rows(robot: RobotConfig, path: Path) -> list[Finding]:
     if count and process_table.is_simulated(robot):
         assumed = ok(SUBJECT, "assumed", f"{found}; the drives are emulated by them")
     elif count:
-        fix = f"measure {', '.join(robot.assumed)}; then take them off `assumed`"
+        fix = f"measure {', '.join(robot.assumed)}; then remove them from `assumed`"
         assumed = warning(SUBJECT, "assumed", found, "none", fix)
     else:
         assumed = ok(SUBJECT, "assumed", found, "none")
@@ -86,7 +86,7 @@ def security_rows(robot: RobotConfig) -> list[Finding]:
         why = "anyone who reaches a port commands the robot"
         return [warning("bus", "security", mode, "mtls or local", fix, why)]
     if mode == "local":
-        return [ok("bus", "security", mode, "who may link: this user alone")]
+        return [ok("bus", "security", mode, "only this user may link")]
     try:
         return [_key_row(row) for row in inspect_keys(keys_folder(robot), robot)]
     except XrlError as error:
@@ -98,6 +98,6 @@ def _key_row(row: KeyRow) -> Finding:
     if row.wrong:
         return wrong("bus", what, row.wrong, wanted, "`xrl keys check`", "no link")
     if row.warning:
-        why = "then no new link: those that stand stay"
+        why = "then no new links; existing links stay"
         return warning("bus", what, row.warning, wanted, "`xrl keys renew`", why)
     return ok("bus", what, f"from {row.begins} until {row.expires}", wanted)

@@ -94,7 +94,7 @@ def _details(name: str, link: Mapping[str, Any]) -> list[Finding]:
         low, high = QUEUE
         found, wanted = f"{length} frames", f"{low} to {high}"
         fix = f"{FILES}/udev/92-can.rules, or `sudo ip link set {name} txqueuelen 64`"
-        why = "too short for an arming; too long, old frames reach a drive that was plugged in"
+        why = "too short: it overflows at arming; too long: a plugged-in drive gets old frames"
         good = low <= length <= high
         rows.append(advised(good, name, "send queue", found, wanted, fix, why))
     return rows
@@ -106,7 +106,7 @@ def _state(name: str, state: str, errors: Mapping[str, Any], again: str) -> Find
     if state in _OFF:
         return wrong(name, "controller", found, _WELL.lower(), again, "it takes no part in the bus")
     wires = "120 ohm at both ends and nowhere else, ground wired along, one bit rate, short stubs"
-    why = "frames are sent again and come late, or the bus goes off"
+    why = "frames are resent and arrive late, or the bus goes off"
     return advised(state == _WELL, name, "controller", found, _WELL.lower(), wires, why)
 
 

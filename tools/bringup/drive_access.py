@@ -118,7 +118,9 @@ def confirm(question: str, *, yes: bool) -> bool:
     if yes:
         return True
     if not sys.stdin.isatty():
-        raise FleetError("no terminal to ask on; give --yes if the robot may be touched unasked")
+        raise FleetError(
+            "no terminal to ask on; give --yes to move or change the robot without a question"
+        )
     return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
 
 
@@ -253,9 +255,7 @@ def drives_to_ourselves(
             drives_within_reach(robot, config_path, run_dir, lifted=lifted)
         )
         if started:
-            progress(
-                "no fleet is up and the drives are emulated: their simulator runs for the while"
-            )
+            progress("no fleet is up and the drives are emulated: their simulator runs meanwhile")
             time.sleep(SETTLE_S)
         if is_simulated(robot) and robot.joint_service.driver == "odrive_usb":
             stack.enter_context(emulated_usb(run_dir))

@@ -113,7 +113,7 @@ def idle_reading(drive: Drive, clock: Clock = now_ns) -> DriveReading:
     if reading.status is DriveStatus.UNZEROED:
         raise DriveError("its drive does not know where the joint is; `xrl drive zero` first")
     if reading.status is DriveStatus.ARMED:
-        raise DriveError("its drive is armed (closed loop) by somebody else; make it idle first")
+        raise DriveError("its drive is armed (closed loop) by another program; make it idle first")
     return reading
 
 
@@ -145,7 +145,7 @@ def hanging_angles(
         if not until_still or clock() - still_since > _ns(STILL_FOR_S):
             return q
         if clock() - begin > _ns(STILL_WAIT_S):
-            raise DriveError("the leg swings: hold it still, and again")
+            raise DriveError("the leg swings: hold it still, and try again")
 
 
 def run_motion(
@@ -257,7 +257,7 @@ def _follow(
             if (other := one.step(one.drive.read(0.0))) and not trouble:
                 trouble = f"{one.name}: {other}"
         if moved.clock() > give_up_ns:
-            return "it took too long: the drive's samples come too seldom"
+            return "it took too long: the drive's samples come too rarely"
         if law.samples and law.samples[-1].t_s >= report_at_s:
             report_at_s = law.samples[-1].t_s + PROGRESS_S
             progress(law.samples[-1])

@@ -145,7 +145,7 @@ class UsbBus:
             return f"plugged in, but silent for {CONNECT_S:g} s"
         except Exception as error:  # noqa: BLE001 - the package raises bare Exceptions
             return f"plugged in, but: {describe(error)}"
-        return connected if isinstance(connected, RuntimeDevice) else "no ODrive that runs"
+        return connected if isinstance(connected, RuntimeDevice) else "no running ODrive"
 
     async def _leave(self) -> None:
         for board in self._boards:

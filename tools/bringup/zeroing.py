@@ -108,7 +108,7 @@ def refusal(seen: DriveLook) -> str:
     if seen.speed > STILL or seen.moved > MOVED_MAX:
         return (
             f"it moves: {seen.speed:.2f} rad/s, {seen.moved:.3f} rad in {LOOK_S:g} s; "
-            "hold it still, and again"
+            "hold it still, and try again"
         )
     return ""
 

@@ -49,7 +49,9 @@ def request_here(run_dir: Path) -> tuple[list[str], list[str]]:
         processes = procfs.service_pids(run_dir) if processes is None else processes
         if module in processes:
             procfs.signal_all([processes[module]], signal.SIGUSR1)
-            errors.append(f"{module}: its shared memory is gone: asked by SIGUSR1, unconfirmed")
+            errors.append(
+                f"{module}: its shared memory is gone: stop requested by SIGUSR1, unconfirmed"
+            )
     return here, errors
 
 

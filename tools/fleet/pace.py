@@ -51,7 +51,7 @@ def usual_pace() -> float:
     try:
         return float(text)
     except ValueError:
-        raise FleetError(f"{PACE_VARIABLE}={text}: no number; 1 is real time") from None
+        raise FleetError(f"{PACE_VARIABLE}={text}: not a number; 1 is real time") from None
 
 
 def check_pace(pace: float, *, simulated: bool) -> None:
@@ -73,7 +73,7 @@ def run_at_fitting_pace(run: Callable[[float], T], tell: Callable[[str], None]) 
             if slower < PACE_MIN:
                 raise
             os.environ[PACE_VARIABLE] = f"{slower:g}"
-            tell(f"{error}; again in slow motion, at {slower:g}")
+            tell(f"{error}; starting again in slow motion, at {slower:g}")
 
 
 class IdleMeter:

@@ -124,7 +124,7 @@ class FleetOptions(msgspec.Struct, frozen=True, kw_only=True):
     disarmed: bool = False
     """No person asks for this start. It arms no drive, takes those over that hold, and keeps an
     emergency stop and the logs of what ended. If a service does not come up it ends nothing, which
-    would idle the drives of the others: the supervisor goes on trying."""
+    would idle the drives of the others: the supervisor keeps trying."""
     table_path: Path = TABLE
     timeout_s: float = 30.0
     """Time in which every service has to be up."""
@@ -234,7 +234,7 @@ def _check_placeholders(path: Path, index: int, row: Process) -> None:
     for key, text, placeholders in texts:
         stray = stray_braces(text, placeholders)
         if stray:
-            found = f"{text!r}: {stray} is no placeholder here"
+            found = f"{text!r}: {stray} is not a placeholder here"
             right = f"one of {', '.join(placeholders)}"
             raise ConfigError(str(path), f"process[{index}].{key}", found, right)
 

@@ -65,7 +65,7 @@ class ProxyClient:
         try:
             reply = _decode(line)
         except (msgspec.DecodeError, UnicodeDecodeError) as error:
-            text = f"{self._path}: the answer is none of a network proxy of this version: {error}"
+            text = f"{self._path}: the answer is not from a network proxy of this version: {error}"
             raise FleetError(text) from None
         if reply.error:
             raise FleetError(f"refused: {reply.error}")

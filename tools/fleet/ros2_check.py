@@ -34,7 +34,7 @@ def check(robot: RobotConfig, domain: int, wait_s: float) -> list[CheckRow]:
     ros2, types = robot.ros2, RosTypes(robot.ros2.distribution)
     ros = _opened(ros2.router, domain, types, wait_s)
     if ros is None:
-        fix = "start it where ROS 2 is: ros2 run rmw_zenoh_cpp rmw_zenohd; or mend ros2.router"
+        fix = "start it where ROS 2 is: ros2 run rmw_zenoh_cpp rmw_zenohd; or correct ros2.router"
         return [CheckRow(False, f"router {ros2.router}", "does not answer", fix)]
     with ros:
         rows = [CheckRow(True, f"router {ros2.router}", "answers")]

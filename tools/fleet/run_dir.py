@@ -123,8 +123,8 @@ class RunDir:
         if foreign is not None:
             os.close(descriptor)
             raise FleetError(
-                f"{self.path}: holds {foreign}, which is no fleet's; give a new or an empty "
-                "directory with --run-dir"
+                f"{self.path}: holds {foreign}, which does not belong to a fleet; give a new or an "
+                "empty directory with --run-dir"
             )
         self.marker.touch(mode=0o600)
         return descriptor

@@ -43,7 +43,7 @@ REMEDIES: Final = {
     Refusal.NOT_NEWER.name: "a network that repeats, or a command forged in the planner's name",
     Refusal.OUT_OF_ENVELOPE.name: "a wrong planner, or a forged command: xrl kill planner",
     Refusal.OUT_OF_LIMITS.name: "a wrong planner, or a forged command: xrl kill planner",
-    Refusal.TOO_FAR_AHEAD.name: "a number that no planner counts to: find out who sends it",
+    Refusal.TOO_FAR_AHEAD.name: "a number that no planner reaches: find out who sends it",
     Refusal.FROM_THE_FUTURE.name: "clocks of several hosts mixed up, or a forged command",
     Refusal.MALFORMED.name: "no planner sends null, NaN or broken JSON: find out who does",
 }

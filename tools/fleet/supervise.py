@@ -207,7 +207,7 @@ class SupervisedFleet:
             except FleetError as error:
                 if not (disarmed and self._is_supervised):
                     raise
-                log.get("xrl").warning("%s; the supervisor goes on trying", error)
+                log.get("xrl").warning("%s; the supervisor keeps trying", error)
         except BaseException as error:
             with _uninterrupted():
                 self._end()
@@ -262,7 +262,7 @@ class SupervisedFleet:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(_POLL_S)  # else it stays a zombie of ours
         if left:
-            raise FleetError(f"processes {sorted(left)} do not end, not even by SIGKILL")
+            raise FleetError(f"processes {sorted(left)} did not end, even after SIGKILL")
 
     def _launch(self, environment: Mapping[str, str], lock: int, *, leashed: bool) -> None:
         leash = ["--parent", str(os.getpid())] if leashed else []

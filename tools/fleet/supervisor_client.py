@@ -17,8 +17,8 @@ from tools.fleet.run_dir import RunDir
 
 _TIMEOUT_S = 3.0
 UNSUPERVISED: Final = (
-    "what runs goes on and hears `xrl estop`, but nothing restarts what ends: hang the robot, then "
-    "`xrl down`"
+    "running services continue and obey `xrl estop`, but nothing restarts one that ends: "
+    "hang the robot, then `xrl down`"
 )
 """What a dead supervisor means, and the way out."""
 

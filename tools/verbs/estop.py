@@ -67,7 +67,7 @@ class EstopFlags(Flags):
         """Refuse what goes with one way only."""
         super().check()
         if self.partly and not self.local:
-            raise FleetError("--partly goes with --local: over the bus all six have to stop")
+            raise FleetError("--partly goes with --local: over the bus all six must stop")
         if self.wait and self.local:
             raise FleetError("--wait is for the bus; `xrl pendant` waits by shared memory")
 

@@ -55,8 +55,8 @@ def run(flags: FaultsFlags) -> int:
         marked(
             "[bold]A drive's fault.[/] Once it is noticed its module goes to FAULT, and the "
             "planner has the other five HOLD. An axis that disarms floats; its sibling keeps its "
-            "torque until the service idles it, at once. Nothing is re-armed automatically: mend "
-            "it, then restart the module's service (`xrl kill MODULE`).\n"
+            "torque until the service idles it, at once. Nothing is re-armed automatically: remove "
+            "the cause, then restart the module's service (`xrl kill MODULE`).\n"
         )
     )
     for kind, row in DRIVE_FAULTS.items():
@@ -74,8 +74,8 @@ def run(flags: FaultsFlags) -> int:
         _say(console, "it ends", loss.recovery)
     console.print(
         marked(
-            "\n[bold]What trips.[/] Noticed while the robot is led, by each module or by the "
-            "planner: all six HOLD, and are led again after a wait that each one lengthens.\n"
+            "\n[bold]Trips.[/] Each module and the planner check these while the planner leads: "
+            "all six HOLD. The planner leads again after a wait that grows with each trip.\n"
         )
     )
     for name, (trip, limit) in trips.items():

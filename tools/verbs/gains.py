@@ -173,7 +173,7 @@ def _show_damping(robot: RobotConfig, schedule: GainSchedule, console: Console) 
     )
     nodes = split_program.dynamic_nodes(robot, schedule)[::ROOM_EVERY]
     certificate, design = DynamicCertificate(robot, nodes), split_program.design_of(schedule)
-    table = Table(title="In hand before any motion grows (TRACK, HOLD, drives alone)")
+    table = Table(title="Margin before any motion grows (TRACK, HOLD, drives alone)")
     for heading in ("drivetrain N m/rad", "all feedback", "tau_coupled", "delay ms"):
         table.add_column(heading, justify="right")
     for room in certificate.margins(design):

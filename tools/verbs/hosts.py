@@ -209,7 +209,7 @@ def bring(flags: RecordsFlags) -> int:
         raise RunError("the recorder's host is not among those named: its record comes first")
     (body,) = fleets
     if not flags.while_up:
-        installation.refuse_up(body, "what leads over the same network would wait")
+        installation.refuse_up(body, "the records would delay the planner on the same network")
     base = records.fetch(body, records.newest(body), out / body.host.name)
     _tell(body.host.name, str(base))
     fleets_run = records.fleets_run(base)

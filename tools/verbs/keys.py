@@ -153,7 +153,7 @@ def _authority_folder(flags: KeysFlags, robot: RobotConfig) -> Path:
 def _opened(flags: KeysFlags, robot: RobotConfig) -> Authority:
     authority = Authority(_authority_folder(flags, robot))
     if authority.names.robot != robot.name:
-        right = f"that of {robot.name!r} is right: give --authority"
+        right = f"give that of {robot.name!r} by --authority"
         raise BusError(f"{authority.folder}: authority of {authority.names.robot!r}; {right}")
     return authority
 

@@ -101,7 +101,7 @@ class LeadFlags(RunDirFlags):
         """Refuse what goes with another way of leading."""
         super().check()
         if self.hold == self.stop:
-            raise FleetError(f"--hold and --stop are both {self.hold}: two buttons are right")
+            raise FleetError(f"--hold and --stop are both {self.hold}; give two buttons")
         if self.calibrate and (self.keys or self.assist is not None):
             raise FleetError("--calibrate is for a pad: leave out --keys or --assist")
         if self.assist is None and (self.shift is not None or self.for_s is not None):
@@ -125,7 +125,7 @@ def run(flags: LeadFlags) -> int:
         if ended is not Key.STOP:
             console.print(f"let go: the hand stays, assist fades out in {robot.assist.fade_s:g} s")
             if pad is not None and pad.gone:
-                raise FleetError(f"{pad.name}: lost: unplugged, or out of its receiver's reach")
+                raise FleetError(f"{pad.name}: lost: unplugged, or out of its receiver's range")
             return 0
         request_here(fleet.run.path)
         going = BusStop(robot, session, fleet.run.path).stop()

@@ -19,7 +19,7 @@ from tools.flags import Flags, positional
 HOSTS_FILE: Final = "hosts.example.toml"
 _ABOUT_PLANTS: Final = (
     "# How the true robot differs from robot.toml; for the simulator: --plant plants/{}.toml\n"
-    "# What is left out is that of `realistic`, which the simulator takes without --plant.\n"
+    "# Keys that are left out are as in `realistic`, which the simulator takes without --plant.\n"
 )
 
 
@@ -89,7 +89,7 @@ def _made(directory: Path) -> bool:
         raise RunError(f"{directory}: {directory.parent} does not exist; make it first") from None
     except FileExistsError:
         if not directory.is_dir():
-            raise RunError(f"{directory}: no directory; name a new or an empty one") from None
+            raise RunError(f"{directory}: not a directory; name a new or an empty one") from None
         if not any(directory.iterdir()):
             return False
         right = "nothing in it is replaced; name a new or an empty one"
@@ -108,7 +108,7 @@ def _what_next(directory: Path) -> str:
     ]
     if shutil.which("cc"):
         lines += [
-            "the law runs as C, and faster, after this, once for each change of robot.toml:",
+            "to run the law as C, which is faster, run this after each change of robot.toml:",
             f"  {graph_libraries.command()}",
         ]
     return "\n".join(lines)

@@ -49,7 +49,7 @@ def run(flags: PendantFlags) -> int:
     console, stop = Console(), StopFlag()
     elsewhere = [module for module in MODULES if module not in pendant.modules]
     if elsewhere:
-        console.print(f"does not stop {', '.join(elsewhere)}: no service of theirs on this host")
+        console.print(f"does not stop {', '.join(elsewhere)}: they have no service on this host")
     console.print("held: Enter lays it down; Ctrl-C, or this program's end, stops all modules")
     ends = None if flags.for_s is None else time.monotonic() + flags.for_s
     shown = None

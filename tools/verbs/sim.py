@@ -62,7 +62,9 @@ class SimFlags(experiment.ExperimentFlags):
         """Refuse two controllers."""
         super().check()
         if self.controller is not None and self.control != SHIPPED:
-            raise RunError("--controller and --control: one of them says who computes the torques")
+            raise RunError(
+                "--controller and --control: both choose what computes the torques; leave one out"
+            )
 
 
 def run(flags: SimFlags) -> int:

@@ -100,7 +100,9 @@ class UpFlags(ConfigFlags, RunDirFlags, PlantFlags, ControllerFlags, PaceFlags, 
         absent = {"simulator"} if self.no_sim else set()
         if only is not None:
             if not only:
-                raise FleetError("--only names no service; --only planner,harness,recorder, say")
+                raise FleetError(
+                    "--only names no service; for example --only planner,harness,recorder"
+                )
             check_known(only, [row.name for row in load_table().process])
             if HOST_RECORDER in only and ("recorder" in only or not _of_host(only)):
                 raise FleetError(

@@ -65,7 +65,7 @@ class ViewFlags(PortFlags, PartFlags, RunDirFlags):
         if self.html is not None and self.record is None:
             raise RunError("--html is for a record: name one")
         if self.html is None and self.foxglove and (self.record is not None or self.act):
-            raise RunError("--foxglove only looks, at a fleet or at --sim; it opens records itself")
+            raise RunError("--foxglove shows a fleet or --sim; Foxglove itself opens records")
 
 
 def run(flags: ViewFlags) -> int:
@@ -142,9 +142,9 @@ def confirm(robot: RobotConfig) -> None:
     console.print(
         marked(
             "[bold red]This is a real robot.[/] A page can kill its services and stop it, and "
-            "replaces no switch that cuts the power."
+            "does not replace a switch that cuts the power."
         )
     )
-    typed = console.input(f"Type its name ({robot.name}) to go on: ")
+    typed = console.input(f"Type its name ({robot.name}) to continue: ")
     if typed.strip() != robot.name:
         raise FleetError(f"{typed.strip()!r} is another name; nothing was started")

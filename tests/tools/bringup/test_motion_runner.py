@@ -94,7 +94,7 @@ def test_samples_that_come_too_seldom_end_it(
 ) -> None:
     monkeypatch.setattr(motion_runner, "OVERTIME_S", -4.0)
     result = on_bench(drive, limited)
-    assert "the drive's samples come too seldom" in result.trouble
+    assert "the drive's samples come too rarely" in result.trouble
     assert drive.status is DriveStatus.IDLE
 
 
@@ -102,7 +102,7 @@ def test_samples_that_come_too_seldom_end_it(
     ("status", "words"),
     [
         (DriveStatus.UNZEROED, "does not know where the joint is; `xrl drive zero`"),
-        (DriveStatus.ARMED, "armed .closed loop. by somebody else"),
+        (DriveStatus.ARMED, "armed .closed loop. by another program"),
         (DriveStatus.LOST, "does not answer"),
     ],
 )

@@ -62,7 +62,7 @@ def test_a_pace_out_of_range_is_refused(value: float) -> None:
 
 def test_a_variable_that_is_no_number_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(pace.PACE_VARIABLE, "slow")
-    with pytest.raises(FleetError, match="no number"):
+    with pytest.raises(FleetError, match="not a number"):
         usual_pace()
 
 

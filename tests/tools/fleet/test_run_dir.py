@@ -85,7 +85,7 @@ def test_a_folder_of_a_persons_own_files_is_refused_and_stays_as_it_is(run_dir: 
     (run_dir / "logs").mkdir(parents=True)
     (run_dir / "logs/run.log").write_text("mine")
     (run_dir / "supervisord.conf").write_text("mine too")
-    with pytest.raises(FleetError, match="holds logs, which is no fleet's"):
+    with pytest.raises(FleetError, match="holds logs, which does not belong to a fleet"):
         RunDir(run_dir).claim()
     RunDir(run_dir).clear(keep_logs=False)
     SupervisedFleet(run_dir).stop()
@@ -97,7 +97,7 @@ def test_a_folder_of_a_persons_own_files_is_refused_and_stays_as_it_is(run_dir: 
 def test_one_file_with_a_name_that_a_fleet_uses_too_is_a_persons(run_dir: Path, name: str) -> None:
     run_dir.mkdir()
     (run_dir / name).write_text("mine")
-    with pytest.raises(FleetError, match=f"holds {name}, which is no fleet's"):
+    with pytest.raises(FleetError, match=f"holds {name}, which does not belong to a fleet"):
         RunDir(run_dir).claim()
     assert (run_dir / name).read_text() == "mine"
 

@@ -97,7 +97,7 @@ def test_beside_a_certified_fleet_a_log_is_played_on_a_bus_of_its_own(
     found = play.bus_of(reading.read([log]), arguments_of(log, *words))
     assert found.robot.bus == robot.bus
     assert "mtls" in found.note
-    with pytest.raises(RunError, match="nobody may put another's keys"):
+    with pytest.raises(RunError, match="no process may write another's keys"):
         play.bus_of(reading.read([log]), arguments_of(log, *words, "--prefix", ""))
 
 

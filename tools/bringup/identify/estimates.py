@@ -222,13 +222,14 @@ def remarks(estimates: Sequence[ParameterEstimate], robot: RobotConfig) -> list[
         if row.key == "mass.payload" and not _is_written(row, robot):
             said.append(
                 f"mass.payload: {row.value:.1f} kg is not within 0 .. mass.payload_max "
-                f"({robot.mass.payload_max:g} kg): not written; put the load or the maximum right"
+                f"({robot.mass.payload_max:g} kg): not written; correct the load or the maximum"
             )
         if row.key == "drive.torque_constant":
             said.append(
                 "drive.torque_constant: the drives have a copy. After it is written: "
                 "`xrl drive configure --apply`, which restarts them, then zero them; until then "
-                "the robot is as it was, and to measure and write again would count the error twice"
+                "the drives use the old value, and to measure and write again would count the "
+                "error twice"
             )
     return said
 

@@ -81,7 +81,7 @@ def tell(
         console.print("to write into the robot file (`--apply` does, after a backup):")
         console.print(lines_of(values), markup=False, highlight=False, end="")
     else:
-        console.print("nothing to write: the robot file is right, within what was measured")
+        console.print("nothing to write: the robot file agrees with the measurement")
     if known:
         console.print(f"measured now, no longer assumed: {', '.join(sorted(known))}", style="dim")
     for remark in remarks(estimates, robot):
@@ -93,9 +93,9 @@ def tell(
         console.print(f"{path}: nothing to write")
         return
     backup = apply(path, values, known, time.strftime("%Y%m%d-%H%M%S"))
-    console.print(f"{path}: written; as it was: {backup}")
+    console.print(f"{path}: written; the old file: {backup}")
     if any(key.startswith(SCHEDULED) for key in values):
-        console.print(f"now `xrl gains --config {path}`: its schedule is another robot's")
+        console.print(f"now `xrl gains --config {path}`: the gain schedule no longer fits")
 
 
 def draw_body(estimates: Sequence[ParameterEstimate], fit: BodyFit, path: Path) -> None:
@@ -105,8 +105,8 @@ def draw_body(estimates: Sequence[ParameterEstimate], fit: BodyFit, path: Path) 
     axes = right.subplots(3, 1, sharex=True)
     t = SLOT_S * np.arange(len(fit.residuals))
     rows = (
-        ("force left over, N", fit.residuals_before[:, 2], fit.residuals[:, 2], "up"),
-        ("moment left over, N m", fit.residuals_before[:, 4], fit.residuals[:, 4], "about pitch"),
+        ("residual force, N", fit.residuals_before[:, 2], fit.residuals[:, 2], "up"),
+        ("residual moment, N m", fit.residuals_before[:, 4], fit.residuals[:, 4], "about pitch"),
         ("feet apart, mm", 1e3 * fit.feet_before[:, 3], 1e3 * fit.feet[:, 3], "along x"),
     )
     for axis, (label, before, after, what) in zip(axes, rows, strict=True):
@@ -154,7 +154,7 @@ def _draw_intervals(figure: Any, estimates: Sequence[ParameterEstimate], *, widt
     ]
     axis.set_yticks(range(len(estimates)), labels, fontsize=8)
     axis.axvline(0.0, lw=0.8, color="black")
-    axis.set_xlabel("away from the robot file, in half widths of the 95 % interval")
+    axis.set_xlabel("difference from the robot file, in half widths of the 95 % interval")
     axis.set_title("red: change   green: agrees   grey: not shown by this record", fontsize=9)
     axis.set_xlim(-FARTHEST - 0.5, FARTHEST + 0.5)
     return right

@@ -28,7 +28,7 @@ def edited(text: str, file: str, values: Mapping[str, Value], measured: Collecti
     try:
         document = tomlkit.parse(text)
     except TOMLKitError as error:
-        raise RunError(f"{file}: no TOML file: {error}") from None
+        raise RunError(f"{file}: not a TOML file: {error}") from None
     for key, value in values.items():
         section, name = key.split(".")
         table: Any = document[section]

@@ -98,10 +98,10 @@ def in_lockstep(
     for truth in fleet.run():
         progress(max(0.0, truth.scenario_s))
         if truth.fallen:
-            raise RunError("the robot fell in lockstep; nothing can be told of its answer")
+            raise RunError("the robot fell in lockstep; its response cannot be measured")
     left = [status for status in statuses if status.mode != PlannerMode.LEADING]
     if not statuses or left:
-        why = left[0].why if left else "it was never led"
+        why = left[0].why if left else "the planner never led"
         raise RunError(f"in lockstep the planner stopped leading: {why}")
     return course_of(statuses, row)
 

@@ -60,7 +60,7 @@ def write(
             finish: Callable[[], None] = writer.finish  # mcap leaves it without annotations
             finish()
     except FileExistsError:
-        raise RunError(f"{path}: is there already; remove it, or name another with --out") from None
+        raise RunError(f"{path}: already exists; remove it, or name another with --out") from None
     except OSError as error:
         raise RunError(f"{path}: cannot be written: {error.strerror or error}") from None
     return len(rows)

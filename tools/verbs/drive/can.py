@@ -139,7 +139,7 @@ def _ran(words: list[str]) -> bool:
         raise FleetError(f"{shlex.join(words)}: {error}; package iproute2 has `ip`") from None
     if done.returncode != 0:
         Console(stderr=True).print(
-            marked("[red]{}[/]; as root? is it plugged in?", done.stderr.strip())
+            marked("[red]{}[/]; run as root, and check that it is plugged in", done.stderr.strip())
         )
     return done.returncode == 0
 

@@ -134,7 +134,7 @@ def modules_of(
         if serial != other:
             raise DriveError(
                 f"{flags.restore}: {module} is ODrive {other} there and {serial or 'unnamed'} in "
-                "the robot file; a backup is for the board that it was made of"
+                "the robot file; a backup can be restored only onto the board it came from"
             )
     return modules
 
@@ -271,7 +271,7 @@ def conclude(
     if done and robot.drive.zero_mark_turns > 0.0:
         written = (outcome.change for outcome in outcomes if not outcome.change.inhibit)
         restarted = dict.fromkeys(change.module for change in written)
-        console.print(f"restarted, and so without a zero: {', '.join(restarted)}; `xrl drive zero`")
+        console.print(f"restarted and therefore unzeroed: {', '.join(restarted)}; `xrl drive zero`")
     if emulated and is_simulated(robot):
         console.print(drive_access.GONE)
     return FAULT_EXIT_CODE if bad else 0

@@ -90,8 +90,8 @@ class BodyFlags(MotionFlags):
         super().check()
         if len(self.masses) != max(1, len(self.record)):
             raise RunError(
-                f"--added: {len(self.added)} for {max(1, len(self.record))} records; once for each "
-                "is right"
+                f"--added: {len(self.added)} for {max(1, len(self.record))} records; give it once "
+                "for each"
             )
 
 
@@ -155,8 +155,8 @@ def _same_robot(logs: Sequence[RunLog]) -> RobotConfig:
         for part in ("name", "mass", "geometry", "joint", "drive"):
             if getattr(other, part) != getattr(first, part):
                 raise RunError(
-                    f"{log.path}: its robot differs in {part} from that of {logs[0].path}; records "
-                    "of one robot file are right"
+                    f"{log.path}: its robot differs in {part} from that of {logs[0].path}; give "
+                    "records of one robot file"
                 )
     return first
 
@@ -187,11 +187,12 @@ def _led(
     simulated = "simulator" in fleet.manifest.services
     if not simulated:
         console.print(
-            "it will lean and turn by itself. Lead the torso by hand to the height and pitch that "
-            "are shown, and rest on the harness with the assist that is shown; nobody else touches "
-            "it"
+            "the robot leans and turns by itself. Lead the torso by hand to the height and pitch "
+            "shown, and rest on the harness with the assist shown; nobody else may touch it"
         )
-        if not confirm("Does it stand, with room around it, and the stop at hand?", yes=flags.yes):
+        if not confirm(
+            "Does it stand with room around it, and is the stop at hand?", yes=flags.yes
+        ):
             return None
     interrupts = Interrupts()
     with open_session(robot, "identify", fleet.run.path) as session:

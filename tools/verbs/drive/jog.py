@@ -127,7 +127,7 @@ def report(moved: Moved[ThereAndBack], module: str, console: Console) -> int:
     words = "[bold red]DID NOT FOLLOW[/]" if code else "[bold green]FOLLOWED[/]"
     console.print(marked(f"{words}: {{}} {{}}", module, AXES[plan.axis]))
     console.print(
-        f"right only if you saw this: {what_to_see(module, plan.axis, plan.course.by)}; "
+        f"correct only if you saw this: {what_to_see(module, plan.axis, plan.course.by)}; "
         "an encoder on the motor cannot tell"
     )
     return code

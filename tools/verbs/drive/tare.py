@@ -65,7 +65,7 @@ def run(flags: TareFlags) -> int:
         wrenches = session.latest(topics.WRENCH, Wrench)
         before = tare(requests, wrenches, anyway=flags.anyway)
     read = describe(before) if before.valid else "nothing valid"
-    Console().print(f"the harness is tared: what it reads now is zero; before it read {read}")
+    Console().print(f"the harness is tared: its present reading is zero; before it read {read}")
     return 0
 
 
@@ -74,8 +74,8 @@ def tare(requests: TareClient, wrenches: Wrenches, *, anyway: bool) -> Wrench:
     before = newest = _first(wrenches)
     if before.valid and math.hypot(*before.force) > LOADED_N and not anyway:
         raise FleetError(
-            f"the harness reads {describe(before)}: let go of it, and again; "
-            "or --anyway, if nobody holds it and the sensor has drifted"
+            f"the harness reads {describe(before)}: release it and try again; or "
+            "use --anyway if nobody holds it and the sensor has drifted"
         )
     source = f"xrl drive tare by {user_name()}"
     begun = False
@@ -110,9 +110,9 @@ def _first(wrenches: Wrenches) -> Wrench:
 
 def _why_not(newest: Wrench, *, begun: bool) -> str:
     if not begun:
-        return "the harness service did not begin; see `xrl status`"
+        return "the harness service did not begin the tare; see `xrl status`"
     if newest.saturated:
         return "a load cell is at the end of its range; unload the harness"
     if newest.tare == Tare.UNSTEADY:
-        return "the forces move; keep robot and harness still, it goes on by itself"
-    return "its load cells send nothing steady; look at their bus"
+        return "the forces move; keep robot and harness still; it then continues by itself"
+    return "its load cells do not send steadily; check their bus"

@@ -131,7 +131,8 @@ def _tune_direction(flags: TuneFlags, console: Console) -> int:
     unit = "m" if row < 3 else "rad"
     console.print(
         f"{flags.what}: a step of {plan.size:g} {unit} there and back, then sines of it at {sines} "
-        f"Hz: {plan.duration_s:.0f} s. The planner limits it (law.probe_max), and all trips stay"
+        f"Hz: {plan.duration_s:.0f} s. The planner limits it (law.probe_max), and all trips stay "
+        "active"
     )
     if flags.dry_run:
         return 0
@@ -196,8 +197,8 @@ def _live(
 ) -> ProbeCourse | None:
     """Return what the robot that is up does; None if the person does not want it."""
     require_operator(robot, "tune")
-    console.print("leave the robot alone but for the hand that holds its height")
-    question = "Does it stand, with room around it, and the stop at hand?"
+    console.print("touch the robot only with the hand that holds its height")
+    question = "Does it stand with room around it, and is the stop at hand?"
     simulated = "simulator" in fleet.manifest.services
     if not simulated and not drive_access.confirm(question, yes=flags.yes):
         return None
@@ -238,12 +239,12 @@ def _answer(course: ProbeCourse, plan: Excitation) -> ResponseFit:
     """
     if len(course.t_s) < STATUSES_MIN or float(np.ptp(course.r)) < plan.size:
         raise RunError(
-            "the planner did not offset its reference as asked: the robot moved too much for a led "
-            "direction to be held, or the planner was started before law.probe_max was set"
+            "the planner did not offset its reference as requested: the robot moved too much for a "
+            "led direction to be held, or the planner was started before law.probe_max was set"
         )
     answer = answer_of(course.t_s, course.r, course.y, plan)
     if answer is None:
-        raise RunError("the offset was hardly answered; a larger one is seen better")
+        raise RunError("the response to the offset is hardly measurable; try a larger one (--size)")
     return answer
 
 
@@ -256,7 +257,7 @@ def _proposed(
 ) -> RobotConfig | None:
     """Tell gains for the wanted answer; return the robot with them, None if there are none."""
     if not answer.is_second_order:
-        console.print("no second-order answer was measured: no gains follow from it")
+        console.print("no second-order response was measured, so no gains follow from it")
         return None
     law = robot.law
     k, b = propose(
@@ -266,7 +267,7 @@ def _proposed(
     if k <= 0.0 or b <= 0.0:
         console.print(
             marked(
-                "[yellow]no gains: with K_p = {:.3g} and B_p = {:.3g} it would be so; "
+                "[yellow]no gains: they would be K_p = {:.3g} and B_p = {:.3g}; "
                 "local gains and joints give more stiffness or damping than was wanted[/]",
                 k,
                 b,

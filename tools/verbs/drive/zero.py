@@ -158,7 +158,7 @@ def corrected(before: Mapping[str, DriveLook], by: Pair, robot: RobotConfig) -> 
     """
     if not all(abs(part) <= CORRECTION_MAX for part in by):  # so that a NaN is refused
         raise DriveError(
-            f"--by: at most {CORRECTION_MAX:g} rad either way is a correction; measure, and --at"
+            f"--by: at most {CORRECTION_MAX:g} rad either way is a correction; else use --at"
         )
     wanted = {}
     for module, seen in before.items():
@@ -238,7 +238,7 @@ def _set_all(
     console.print(table)
     if code:
         console.print(
-            marked("[bold red]what is not zeroed must not be armed[/]: look at it, and again")
+            marked("[bold red]do not arm an unzeroed drive[/]: check it, and zero it again")
         )
     return code
 

@@ -57,7 +57,7 @@ DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
 SPLIT_DESCRIPTION = {
     SplitSource.DIAGONAL: "diag(K_q)",
     SplitSource.SCHEDULE: "certified schedule",
-    SplitSource.STIFFENED: "stiffened: what was wanted does not meet the certificate",
+    SplitSource.STIFFENED: "stiffened: the wanted gains do not meet the certificate",
     SplitSource.UNCERTIFIED: "none meets the certificate: hold",
 }
 
@@ -208,7 +208,7 @@ def tick_at(log: RunLog, at_s: float | None, zero_ns: int) -> Tick:
         command = _find(log.messages(topics.JOINT_COMMAND, module), status.seq, status.session)
         state = _find(log.messages(topics.JOINT_STATE, module), status.state_seq[number])
         if command is None or state is None:
-            raise RunError(f"{log.path}: {module}: tick {status.seq} is not whole in the log")
+            raise RunError(f"{log.path}: {module}: tick {status.seq} is incomplete in the log")
         commands.append(command)
         states.append(state)
     return Tick(status, commands, states)

@@ -146,7 +146,7 @@ def _show_file(file: FileFacts, console: Console) -> None:
         for line in describe_lost(file.cut, file.damage, finished=file.finished):
             console.print(f"  {line}", style="yellow", soft_wrap=True)
     if file.orphans:
-        console.print(f"  {file.orphans} messages of channels that are nowhere described")
+        console.print(f"  {file.orphans} messages of channels without a description")
     if file.passed_over:
         console.print(f"  passed over: {describe_passed_over(file.passed_over)}")
     flush_ms = file.metadata.get("recorder", {}).get("flush_ms", "")

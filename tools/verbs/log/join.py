@@ -42,7 +42,7 @@ def run(flags: JoinFlags) -> int:
         gained = join(fleets, records, out, lambda done: progress.update(task, completed=done))
     count = sum(gained.values())
     console.print(
-        f"{printable(str(out / FIRST))}: {count} messages that the fleet's record had not",
+        f"{printable(str(out / FIRST))}: {count} messages that the fleet's record did not have",
         soft_wrap=True,
     )
     for key, number in sorted(gained.items()):

@@ -82,7 +82,7 @@ def run(flags: PlayFlags) -> int:
         console.print(words, markup=False, soft_wrap=True)
         keyboard = stack.enter_context(Keyboard(PRESSES))
         if flags.start_paused and not keyboard.present:
-            raise RunError("--start-paused: nobody could press space here; a terminal is needed")
+            raise RunError("--start-paused: there is no terminal here to press space on")
         return _play(flags, schedule, targets, session, keyboard, _alarm(watch, targets, flags))
 
 
@@ -115,8 +115,8 @@ def bus_of(recording: Recording, flags: PlayFlags) -> Bus:
             return Bus(robot, "")
         if not flags.prefix.strip("/"):
             right = "leave --prefix as it is: subscribers dial the player"
-            raise RunError(f"{file}: under mtls nobody may put another's keys; {right}")
-        note = "the fleet's bus is mtls, where nobody may put another's keys: on a bus of its own"
+            raise RunError(f"{file}: under mtls no process may write another's keys; {right}")
+        note = "the fleet's bus is mtls, which refuses a player: it plays on a bus of its own"
         return Bus(msgspec.structs.replace(robot, bus=shipped.bus), note)
     why = "the log holds no robot file"
     if recording.robot_file is not None:

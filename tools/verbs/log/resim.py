@@ -83,7 +83,7 @@ def run(flags: ResimFlags) -> int:
     names = SERVICES if "all" in chosen else tuple(name for name in SERVICES if name in chosen)
     path = flags.out or index.files[0].with_suffix(".resim.mcap")
     if flags.param and path.exists():
-        raise RunError(f"{path}: is there already; remove it, or name another with --out")
+        raise RunError(f"{path}: already exists; remove it, or name another with --out")
     recomputed = dict[str, list[Message]]()
     # a new file, a controller's memory and a first difference need one part after the other
     one_by_one = flags.param or flags.controller or flags.until_first_difference
@@ -105,7 +105,7 @@ def run(flags: ResimFlags) -> int:
             )
     if has_own_controller(index) and flags.controller is None and "planner" in names:
         console.print(
-            "a controller of somebody's own led: the planner is equal only with --controller FILE",
+            "a custom controller led this run: the planner is equal only with --controller FILE",
             style="yellow",
         )
     console.print(summary(outcomes))
@@ -116,8 +116,8 @@ def run(flags: ResimFlags) -> int:
         _tell_reason(index, console)
     if not any(outcome.ticks for outcome in outcomes):
         raise RunError(
-            f"{flags.log}: nothing could be executed: it holds no memory of these services; a "
-            "run that was recorded by this version for more than a second does"
+            f"{flags.log}: nothing could be executed: it has no checkpoint of these services; a "
+            "run of over a second that this version recorded has"
         )
     if whole is not None:
         number = rewritten.write(whole, path, recomputed, {"params": ", ".join(flags.param)})
@@ -208,8 +208,8 @@ def tell(outcome: ReexecutionResult, index: RunIndex, console: Console, *, chang
     first = outcome.comparison.first
     if outcome.lost_inputs:
         console.print(
-            f"{outcome.service}: the log lacks {outcome.lost_inputs} messages that it took; "
-            "execution went on from the next memory"
+            f"{outcome.service}: the log lacks {outcome.lost_inputs} messages that it consumed; "
+            "execution continued from the next checkpoint"
         )
     if first is None:
         return

@@ -51,7 +51,7 @@ class WhatIfFlags(PartFlags):
         Arg(
             metavar="SERVICE",
             choices=KILLABLE,
-            help=f"dies at the moment: {', '.join(KILLABLE)}; may be given several times",
+            help=f"service to kill: {', '.join(KILLABLE)}; may be given several times",
         ),
     ]
     every: Annotated[float, Range(STATE_EVERY_S, FINITE_MAX, "s"), Arg(metavar="S")] = 0.1
@@ -75,7 +75,7 @@ def run(flags: WhatIfFlags) -> int:
     moments = [moment for moment in moments_of(log, robot, flags.every) if moment.runs(kill)]
     if not moments:
         raise RunError(
-            f"{' and '.join(kill)}: ran at no moment of this part; another --from or --to"
+            f"{' and '.join(kill)}: did not run in this part; give another --from or --to"
         )
     true_plant = plant_of(log)
     led = hand_path(log)

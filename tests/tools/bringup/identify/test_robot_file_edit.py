@@ -60,5 +60,5 @@ def test_a_backup_is_never_overwritten(file: Path) -> None:
 
 
 def test_what_is_no_toml_is_refused() -> None:
-    with pytest.raises(RunError, match="no TOML"):
+    with pytest.raises(RunError, match="not a TOML"):
         edited("mass = [", "lab.toml", VALUES, set())

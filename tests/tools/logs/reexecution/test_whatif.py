@@ -122,7 +122,7 @@ def test_no_moment_counts_at_which_the_service_was_dead_already(
     assert _main([*words, "--every", "0.5"]) == 0
     assert "planner killed at 2 moments at which it ran" in capsys.readouterr().out
     assert _main([*words, "--from", "1.2"]) == 2
-    assert "planner: ran at no moment" in capsys.readouterr().err
+    assert "planner: did not run" in capsys.readouterr().err
 
 
 def test_a_run_without_a_simulated_world_is_refused(log: RunLog) -> None:
