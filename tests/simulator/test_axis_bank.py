@@ -7,7 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from services.simulator.drives.axis_bank import AXIS_NAMES, FAULTS, AxisErrors
+from services.simulator.drives.axis_bank import AXIS_NAMES, FAULTS, AxisBank, AxisErrors
+from services.simulator.drives.axis_faults import SHARED_FAULTS
+from services.simulator.drives.axis_settings import PHASE_INDUCTANCE
 from shared.can.cansimple import AxisError, AxisState, ControllerError, ControlMode, InputMode
 from shared.exceptions import DriveError
 from tests.simulator.banks import (
@@ -47,6 +49,7 @@ def test_an_idle_axis_spun_too_fast_has_the_error_once_it_has_been_armed() -> No
 
 def test_speed_below_the_tolerance_keeps_the_axis_armed() -> None:
     bank = make_bank()
+    bank.settings.fill("motor.config.current_lim_margin", math.inf)  # it starts at speed
     step_for(bank, 0.1, vel=np.full(12, 65.0))
     assert bank.state == [CLOSED_LOOP] * 12
 
@@ -121,7 +124,7 @@ def test_reboot_restarts_both_axes_of_one_odrive_only() -> None:
     assert bank.input_torque[4] == bank.input_torque[5] == 0.0
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("fault", sorted(set(FAULTS) - SHARED_FAULTS))
 def test_injected_fault_floats_that_axis_alone(fault: str) -> None:
     bank = make_bank()
     bank.input_torque[:] = 1.0
@@ -131,6 +134,82 @@ def test_injected_fault_floats_that_axis_alone(fault: str) -> None:
     assert torque[10] == 0.0
     assert np.delete(torque, 10) == pytest.approx(1.0)
     assert (bank.heartbeat(10).errors == 0) == (fault == "DISARM")
+
+
+def test_gate_drivers_share_their_fault_line_so_both_axes_float_in_the_same_step() -> None:
+    bank = make_bank()
+    bank.input_torque[:] = 1.0
+    bank.inject("hip_left.axis0", "DRV_FAULT")
+    torque = step_for(bank, DT)
+    assert list(np.flatnonzero(torque == 0.0)) == [10, 11]
+    assert bank.faults[10] == bank.faults[11] == FAULTS["DRV_FAULT"]
+
+
+# ---- the current
+
+
+def heavy_bank(torque: float, **limits: float) -> AxisBank:
+    """Return a bank with a torque on all axes for long enough that the current is there."""
+    bank = make_bank()
+    for name, value in limits.items():
+        getattr(bank, name)[:] = value
+    bank.vel_gain[:] = 100.0  # else the velocity limit of torque mode clamps first
+    bank.input_torque[:] = torque
+    step_for(bank, 0.01)
+    return bank
+
+
+@pytest.mark.parametrize(("lowered_to", "disarms"), [(30.0, False), (20.0, True), (10.0, True)])
+def test_a_current_limit_lowered_under_load_disarms_beyond_8_a(
+    lowered_to: float, disarms: bool
+) -> None:
+    """38 A flow; a cycle later an eighth of the difference is gone, and 8 A are allowed."""
+    bank = heavy_bank(38.0 * 0.0827, current_lim=40.0)
+    bank.current_lim[3] = lowered_to
+    step_for(bank, DT)
+    assert (bank.state[3] == IDLE) == disarms
+    assert bank.faults[3] == (FAULTS["OVER_CURRENT"] if disarms else AxisErrors())
+    assert bank.state[2] == CLOSED_LOOP
+
+
+@pytest.mark.parametrize(("speed", "disarms"), [(2.0, False), (8.0, True)])
+def test_a_bump_under_load_disarms_where_the_emf_drives_the_current_beyond_its_limit(
+    speed: float, disarms: bool
+) -> None:
+    """Thrown to a speed within a step at full current; without a load neither does."""
+    for torque, limp in ((-40.0 * 0.0827, disarms), (0.0, False)):
+        bank = heavy_bank(torque, current_lim=40.0)
+        bumped = np.zeros(12)
+        bumped[4] = speed
+        step_for(bank, 0.005, vel=bumped)
+        assert (bank.faults[4] == FAULTS["OVER_CURRENT"]) == limp
+
+
+def test_the_current_that_an_emf_drives_is_that_of_the_loop_at_its_own_rate() -> None:
+    """Winding and PI loop of the firmware at 8 kHz, against the bank's step of a millisecond."""
+    bank = make_bank()
+    bank.settings.fill("motor.config.current_lim_margin", math.inf)
+    loops = bank._control._loops.reshape(3, 12)
+    rng = np.random.default_rng(5)
+    kt, resistance, inductance, w = 0.0827, 0.1, PHASE_INDUCTANCE, 1000.0
+    fine = 64
+    period, current, integral, speed, worst, largest = 1.0 / 8000.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(1, 200):
+        target = speed + rng.normal(0.0, 1.0)
+        for cycle in range(8):
+            volts = -current * w * inductance + integral
+            integral -= current * w * resistance * period
+            for sub in range(fine):
+                at = speed + (target - speed) * (cycle + sub / fine) / 8.0
+                emf = 2.0 / 3.0 * kt * 2.0 * math.pi * at
+                slope = (volts - resistance * current - emf) / inductance
+                current += slope * period / fine
+        speed = target
+        bank.step(k * DT, ZERO, np.full(12, speed))
+        worst = max(worst, abs(loops[2, 0] - current))
+        largest = max(largest, abs(current))
+    assert largest > 4.0
+    assert worst < 0.15 * largest
 
 
 @pytest.mark.parametrize(

@@ -118,6 +118,7 @@ def test_without_its_velocity_limit_torque_mode_drives_beyond_it() -> None:
     for enabled in (True, False):
         bank = make_bank()
         bank.settings.fill("config.dc_max_negative_current", -math.inf)
+        bank.settings.fill("motor.config.current_lim_margin", math.inf)  # it starts at speed
         bank.settings.fill("controller.config.enable_torque_mode_vel_limit", enabled)
         bank.vel_gain[:] = 0.1
         bank.input_torque[:] = 1.0

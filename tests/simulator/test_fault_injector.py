@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from services.simulator.drives.axis_bank import AXIS_NAMES, AxisBank
-from services.simulator.drives.axis_faults import BOOT_S
+from services.simulator.drives.axis_faults import BOOT_S, TALKS_S
 from services.simulator.drives.axis_faults import AxisErrors as Registers
 from services.simulator.fault_injector import FaultInjector
 from shared.can.cansimple import (
@@ -161,19 +161,42 @@ def test_a_link_lost_for_longer_than_the_watchdog_leaves_both_axes_limp() -> Non
 
 
 def test_a_brown_out_ends_in_a_restart_in_idle_with_no_error_and_nothing_remembered() -> None:
-    scene = Scene(make_fault("brown_out", 2, duration=0.1))
+    scene = Scene(make_fault("brown_out", 2, duration=0.1), watchdog=False)
     scene.bank.vel_limit[2] = 3.0  # written, and never saved
-    scene.run(0.11 + BOOT_S - 0.01)
-    assert scene.bank.state[2] == AxisState.UNDEFINED
+    scene.run(0.11 + TALKS_S - 0.01)
     assert not scene.bank.is_responding(3)
     scene.bank.request_state(2, AxisState.CLOSED_LOOP_CONTROL)
     scene.run(0.11 + BOOT_S + 0.01)
     bank = scene.bank
-    assert bank.state[2:4] == [AxisState.IDLE] * 2
+    assert bank.state[2:4] == [AxisState.IDLE] * 2, "it did not hear"
     assert bank.is_responding(2)
     assert bank.faults[2] == bank.faults[3] == Registers()
     assert bank.input_torque[2] == bank.input_torque[3] == 0.0
     assert bank.vel_limit[2] == 60.0
+
+
+def test_20_ms_after_power_it_talks_without_an_error_and_keeps_the_last_request_for_its_axes() -> (
+    None
+):
+    scene = Scene(make_fault("brown_out", 2, duration=0.1), watchdog=False)
+    bank = scene.bank
+    scene.run(0.11 + TALKS_S + 0.01)
+    assert bank.is_responding(2)
+    assert bank.is_responding(3)
+    assert [bank.heartbeat(2)[:2], bank.heartbeat(3)[:2]] == [(0, AxisState.UNDEFINED)] * 2
+    bank.request_state(2, AxisState.IDLE)
+    bank.request_state(2, AxisState.CLOSED_LOOP_CONTROL)
+    scene.run(0.11 + BOOT_S - 0.01)
+    assert bank.state[2:4] == [AxisState.UNDEFINED] * 2
+    scene.run(0.11 + BOOT_S + 0.01)
+    assert bank.state[2:4] == [AxisState.CLOSED_LOOP_CONTROL, AxisState.IDLE], "armed by itself"
+
+
+def test_an_error_of_before_its_axes_run_is_shown_in_state_0() -> None:
+    scene = Scene(make_fault("brown_out", 2, duration=0.1), watchdog=False)
+    scene.run(0.2)
+    scene.bank.estop(2)
+    assert scene.bank.heartbeat(2)[:2] == (AxisError.ESTOP_REQUESTED, AxisState.UNDEFINED)
 
 
 def test_a_stage_near_its_limit_has_less_current() -> None:

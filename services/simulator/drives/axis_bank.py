@@ -25,6 +25,7 @@ from services.simulator.drives.axis_faults import (
     AXIS_NAMES,
     BUS_FAULTS,
     FAULTS,
+    SHARED_FAULTS,
     AxisErrors,
     Conditions,
     controller_fault,
@@ -100,6 +101,7 @@ class AxisBank:
         self.now_s = -math.inf
         self.calibration = Calibration(self.settings)
         self.conditions = Conditions(self.settings, control, encoders)
+        self._requested: dict[int, int] = {}
         self._fed_s = [0.0] * n
         self._timeouts_s = [math.inf] * n
         self._shortest_s = math.inf
@@ -121,6 +123,7 @@ class AxisBank:
             self.now_s = now_s
             self._fed_s = [now_s] * N_JOINTS
             self._encoders.start(pos_turns, vel_turns)
+            control.turn(vel_turns)
         else:
             dt_s = now_s - self.now_s
             self.now_s = now_s
@@ -129,10 +132,13 @@ class AxisBank:
         if self.calibration.running or not self.conditions.all_well:
             self._apply_conditions()
         self._check_watchdogs()
-        too_fast, least, most = control.control()
-        if too_fast:
+        control.turn(vel_turns)
+        beyond, least, most = control.control()
+        if beyond:
             for axis in control.overspeed():
                 self._fail(axis, FAULTS["OVERSPEED"])
+            for axis in control.over_current():
+                self._fail(axis, FAULTS["OVER_CURRENT"])
             _, least, most = control.control()
         control.integrate()
         for drive, why in self.bus.check(least, most).items():
@@ -151,9 +157,13 @@ class AxisBank:
 
         Closed loop with any error present is refused: the axis stays IDLE. Closed loop of an
         axis that is not calibrated, an encoder's calibration before its motor's, and any
-        other state is INVALID_STATE and leads to IDLE.
+        other state is INVALID_STATE and leads to IDLE. What an axis is asked for before it runs,
+        it does when it runs.
         """
-        if axis >> 1 in self.conditions.down:
+        drive = axis >> 1
+        if drive in self.conditions.starting:
+            if drive not in self.conditions.down and state != AxisState.UNDEFINED:
+                self._requested[axis] = state
             return
         fault = self.faults[axis]
         self.faults[axis] = fault = fault._replace(axis=fault.axis & ~AxisError.INVALID_STATE)
@@ -207,13 +217,16 @@ class AxisBank:
     def reboot(self, axis: int) -> None:
         """Restart the axis's ODrive.
 
-        Both axes float, inputs are zero, errors gone, settings as saved; it says nothing and
-        takes no request for `BOOT_S`, then it is IDLE.
+        Both axes float, inputs are zero, errors gone, settings as saved. It says nothing for
+        `TALKS_S`. From then on it answers, in state 0, and until `BOOT_S` it keeps the last state
+        that it was asked for.
         """
         drive = axis >> 1
         for each in _both(axis):
             self._disarm(each)
             self.state[each] = AxisState.UNDEFINED
+            self._requested.pop(each, None)
+            self._fed_s[each] = self.now_s
             self.faults[each] = AxisErrors()
             self.input_pos[each] = self.input_vel[each] = self.input_torque[each] = 0.0
             self._control.connected[each] = 0.0
@@ -251,7 +264,9 @@ class AxisBank:
             raise DriveError(f"no axis {axis!r}; there are {', '.join(AXIS_NAMES)}")
         if error not in FAULTS:
             raise DriveError(f"no fault {error!r} for {axis}; there are {', '.join(FAULTS)}")
-        self._fail(AXIS_NAMES.index(axis), FAULTS[error])
+        number = AXIS_NAMES.index(axis)
+        for each in _both(number) if error in SHARED_FAULTS else (number,):
+            self._fail(each, FAULTS[error])
 
     def supply(self, drive: int, volts: float) -> None:
         """Set the voltage of an ODrive's supply; below `DEAD_VOLTAGE` it is off, later boots."""
@@ -262,6 +277,7 @@ class AxisBank:
             self.conditions.power_off(drive)
         elif self.conditions.is_off(drive):
             self.conditions.boot(drive, self.now_s)
+            self._fed_s[2 * drive] = self._fed_s[2 * drive + 1] = self.now_s
 
     # ---- within a step
 
@@ -270,7 +286,9 @@ class AxisBank:
         for drive in self.conditions.finish_boots(self.now_s):
             for axis in _both(2 * drive):
                 self.state[axis] = AxisState.IDLE
-                self._fed_s[axis] = self.now_s
+                arms = self.settings.axis("config.startup_closed_loop_control")[axis] > 0.0
+                by_itself = AxisState.CLOSED_LOOP_CONTROL if arms else AxisState.IDLE
+                self.request_state(axis, self._requested.pop(axis, by_itself))
         for axis, fault in self.conditions.disarming():
             self._fail(axis, fault)
         self._check_odd_encoders()
@@ -332,7 +350,8 @@ class AxisBank:
 
     def _disarm(self, axis: int) -> None:
         """Let the phases float."""
-        self.state[axis] = AxisState.IDLE
+        if axis >> 1 not in self.conditions.starting:
+            self.state[axis] = AxisState.IDLE
         self._control.armed[axis] = 0.0
         self.torque[axis] = 0.0
 
@@ -340,7 +359,7 @@ class AxisBank:
         """Latch a fault and disarm this axis alone; a drive that is down has no registers."""
         if axis >> 1 in self.conditions.down:
             return
-        if self.state[axis] != AxisState.CLOSED_LOOP_CONTROL:
+        if not self._control.armed[axis]:
             fault = in_idle(fault, connected=self.connected[axis] > 0.0)
         self.faults[axis] = self.faults[axis].with_(fault)
         self.calibration.stop(axis)

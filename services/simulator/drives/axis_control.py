@@ -5,8 +5,11 @@ pos_gain (input_pos - pos)) - vel) + integrator, clamped to current_lim; input_v
 input_torque are each clamped to the same limits first. The firmware runs its loop at 8 kHz;
 here it is evaluated once a step.
 
-The current loop's 1 ms is left out, because it changes no joint's motion: a step's torque acts at
-once. The estimates are those of `services.simulator.drives.axis_encoders`.
+The current loop's 1 ms is left out of the torque, because it changes no joint's motion: a step's
+torque acts at once. The current that the firmware measures does follow the loop's bandwidth, and a
+change of the motor's speed drives it off by its EMF e until the loop has caught it, by
+e s / ((L s + R) (s + w)). Beyond current_lim and its margin of 8 A the firmware disarms. The
+estimates are those of `services.simulator.drives.axis_encoders`.
 
 Pure: no clock, no I/O. Arrays are indexed by axis, shape (12,). Units at the motor: turns,
 turn/s, N m, A.
@@ -23,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.simulator.drives.axis_encoders import AxisEncoders
-from services.simulator.drives.axis_settings import Settings
+from services.simulator.drives.axis_settings import PHASE_INDUCTANCE, Settings
 from shared.can.cansimple import ControlMode
 from shared.joints import N_JOINTS
 from shared.robot.compiled_graph import CompiledGraph
@@ -48,6 +51,8 @@ _SETTINGS: Final = (
     "motor.config.current_lim",
     "motor.config.torque_constant",
     "motor.config.phase_resistance",
+    "motor.config.current_lim_margin",
+    "motor.config.current_control_bandwidth",
 )
 """The axis settings that the law reads."""
 
@@ -63,8 +68,12 @@ class LawResults(NamedTuple):
     """Electrical power of each motor, W."""
     mechanical: Vector
     """Mechanical power of each motor, W."""
+    over_current: Vector
+    """1 beyond the limit of the current and its margin."""
+    loops: Vector
+    """(36,), three rows: current, what the EMF drives, and its rate; A, A, A/s."""
     extremes: Vector
-    """(3,): how many axes are too fast, the least and the most power."""
+    """(3,): how many axes are beyond a limit, the least and the most power."""
 
 
 class AxisControl:
@@ -85,12 +94,15 @@ class AxisControl:
         self.input_pos, self.input_vel, self.input_torque = np.zeros((3, N_JOINTS))
         self.armed, self.connected, self.integrator = np.zeros((3, N_JOINTS))
         self.derating = np.ones(N_JOINTS)
+        self._loops = np.zeros(3 * N_JOINTS)
+        self._speeds = np.zeros((2, N_JOINTS))  # of the motors, before and now, turn/s
         self._dt_s = 0.0
         self._graph = graph = CompiledGraph(law_graph())
         columns = [settings.axis(name) for name in _SETTINGS]
         live = (
             encoders.pos_estimate, encoders.vel_estimate, self.input_pos, self.input_vel,
             self.input_torque, self.armed, self.connected, self.derating, self.integrator,
+            self._loops, *self._speeds,
         )  # fmt: skip
         for index, array in enumerate((*columns, *live)):
             graph.bind(index, array)
@@ -115,27 +127,37 @@ class AxisControl:
         self.integrator[axis] = 0.0
         self.armed[axis] = self.connected[axis] = 1.0
 
+    def turn(self, vel_turns: Vector) -> None:
+        """Take the motors' true speeds after a step."""
+        self._speeds[0] = self._speeds[1]
+        self._speeds[1] = vel_turns
+
     def control(self) -> tuple[float, float, float]:
-        """Compute torques, powers and who is too fast; the integrators stay as they are.
+        """Compute torques, powers and who is beyond a limit; the integrators stay as they are.
 
         Returns:
-            How many axes are beyond their OVERSPEED limit (`overspeed` says which), and the least
-            and the most power of an axis, W.
+            How many axes are beyond their OVERSPEED or current limit (which: `overspeed` and
+            `over_current`), and the least and the most power of an axis, W.
         """
         if self._dt_s != self._encoders.dt_s:
             self._dt_s = self._encoders.dt_s
             self._step[:] = self._dt_s, INTEGRATOR_DECAY ** (FIRMWARE_RATE_HZ * self._dt_s)
         self._graph()
-        too_fast, least, most = self.results.extremes.tolist()
-        return too_fast, least, most
+        beyond, least, most = self.results.extremes.tolist()
+        return beyond, least, most
 
     def integrate(self) -> None:
-        """Take over the integrators that the last `control` arrived at."""
+        """Take over the integrators and currents that the last `control` arrived at."""
         self.integrator[:] = self.results.integrator
+        self._loops[:] = self.results.loops
 
     def overspeed(self) -> list[int]:
         """Return the axes beyond their OVERSPEED limit; in IDLE it is checked all the same."""
         return np.flatnonzero(self.results.too_fast).tolist()
+
+    def over_current(self) -> list[int]:
+        """Return the armed axes whose current is beyond its limit and margin."""
+        return np.flatnonzero(self.results.over_current).tolist()
 
 
 @functools.cache
@@ -147,6 +169,10 @@ def law_graph() -> ca.Function:
         "integrator",
     )  # fmt: skip
     of = {name: ca.SX.sym(name, N_JOINTS) for name in (*names, *inputs)}
+    loops, *speeds = (
+        ca.SX.sym("loops", 3 * N_JOINTS),
+        *(ca.SX.sym(name, N_JOINTS) for name in ("speed_before", "speed")),
+    )
     step = ca.SX.sym("step", 2)
     dt_s, decay = step[0], step[1]
     vel, vel_limit = of["vel"], of["vel_limit"]
@@ -176,18 +202,55 @@ def law_graph() -> ca.Function:
     mechanical = 2.0 * math.pi * vel * torque
     copper = 1.5 * of["phase_resistance"] / of["torque_constant"] ** 2
     power = copper * torque * torque + mechanical
-    extremes = ca.vertcat(ca.sum1(too_fast), ca.mmin(power), ca.mmax(power))
+    loops_next, over_current = _currents(of, torque, loops, speeds, dt_s)
+    beyond = ca.sum1(too_fast) + ca.sum1(over_current)
+    extremes = ca.vertcat(beyond, ca.mmin(power), ca.mmax(power))
     return ca.Function(
         "axes",
-        [*of.values(), step],
+        [*of.values(), loops, *speeds, step],
         [
             ca.densify(one)
             for one in (
-                torque, _clamp(integrator, -most, most), too_fast, power, mechanical, extremes,
+                torque, _clamp(integrator, -most, most), too_fast, power, mechanical, over_current,
+                loops_next, extremes,
             )
         ],
         {"cse": True},
     )  # fmt: skip
+
+
+def _currents(
+    of: dict[str, ca.SX], torque: ca.SX, loops: ca.SX, speeds: list[ca.SX], dt_s: ca.SX
+) -> tuple[ca.SX, ca.SX]:
+    """Return the current loops after the step, and who is beyond the limit and its margin.
+
+    The EMF's rate x1 and what it drives x2 follow x1' = z - R / L x1, x2' = x1 - w x2 for a speed
+    that ramps over the step, z = e' / L. A limit that was lowered is checked a cycle later.
+    """
+    current, x1, x2 = ca.vertsplit(loops, N_JOINTS)
+    w, kt, resistance = (
+        of[name] for name in ("current_control_bandwidth", "torque_constant", "phase_resistance")
+    )
+    wanted = torque / kt
+    first = wanted + (current - wanted) * ca.exp(-w / FIRMWARE_RATE_HZ)
+    current = wanted + (current - wanted) * ca.exp(-w * dt_s)
+    before, now = speeds
+    rate = ca.if_else(dt_s > 0.0, (now - before) / dt_s, 0.0)
+    z = -2.0 / 3.0 * kt * 2.0 * math.pi * rate / PHASE_INDUCTANCE
+    # a pole of the winding beside that of the loop; they are kept apart for the formula's sake
+    pole = resistance / PHASE_INDUCTANCE
+    pole = ca.if_else(ca.fabs(pole - w) < 1e-3 * w, 1.001 * w, pole)
+    pole = ca.fmax(pole, 1.0)
+    fade_1, fade_2 = ca.exp(-pole * dt_s), ca.exp(-w * dt_s)
+    rest = z / pole
+    x1_next = rest + (x1 - rest) * fade_1
+    x2_next = x2 * fade_2 + rest * (1.0 - fade_2) / w
+    x2_next += (x1 - rest) * (fade_1 - fade_2) / (w - pole)
+    limit = of["current_lim"] * of["derating"] + of["current_lim_margin"]
+    most = ca.fmax(ca.fabs(first), ca.fabs(current + x2_next))
+    over = ca.logic_and(of["armed"] > 0.0, most > limit)
+    kept = ca.if_else(of["armed"] > 0.0, 1.0, 0.0)
+    return ca.vertcat(current * kept, x1_next * kept, x2_next * kept), over
 
 
 def _clamp(value: ca.SX, low: ca.SX, high: ca.SX) -> ca.SX:

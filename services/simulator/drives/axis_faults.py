@@ -80,6 +80,7 @@ FAULTS: Final[Mapping[str, AxisErrors]] = {
     "OVERSPEED": controller_fault(ControllerError.OVERSPEED),
     "SPINOUT": controller_fault(ControllerError.SPINOUT_DETECTED),
     "DRV_FAULT": _motor(MotorError.DRV_FAULT),
+    "OVER_CURRENT": _motor(MotorError.CURRENT_LIMIT_VIOLATION),
     "REGENERATION": _motor(MotorError.I_BUS_OUT_OF_RANGE),
     "ENCODER": controller_fault(ControllerError.INVALID_ESTIMATE).with_(
         AxisErrors(AxisError.ENCODER_FAILED, encoder=EncoderError.ABS_SPI_COM_FAIL)
@@ -88,10 +89,13 @@ FAULTS: Final[Mapping[str, AxisErrors]] = {
     "WATCHDOG": AxisErrors(AxisError.WATCHDOG_TIMER_EXPIRED),
     "ESTOP": AxisErrors(AxisError.ESTOP_REQUESTED),
 }
-"""Faults of one axis by name, for `AxisBank.inject`; its sibling keeps its torque.
+"""Faults of an axis by name, for `AxisBank.inject`; its sibling keeps its torque unless shared.
 
 DISARM is the silent one: IDLE and no error at all.
 """
+
+SHARED_FAULTS: Final = frozenset({"DRV_FAULT"})
+"""Faults that both axes of an ODrive have at once: its gate drivers share their fault line."""
 
 
 def _system(error: OdriveError) -> AxisErrors:
@@ -106,8 +110,10 @@ BUS_FAULTS: Final[Mapping[str, AxisErrors]] = {
 }
 """Faults of the DC bus by name: they disarm both axes of an ODrive."""
 
-BOOT_S: Final = 1.5
-"""s from power to the first frame; the firmware waits so long before it starts its axes."""
+TALKS_S: Final = 0.02
+"""s from power to the first frame."""
+BOOT_S: Final = 1.54
+"""s from power to the start of the axes: so long the currents' zeros are measured."""
 ROOM_TEMPERATURE: Final = 25.0
 """C of the output stage."""
 OVER_TEMP_MARGIN: Final = 5.0
@@ -118,7 +124,8 @@ class Conditions:
     """Conditions of all drives.
 
     Attributes:
-        down: the drives (0 .. 5) that are without power or starting up.
+        down: the drives (0 .. 5) that are without power, or do not communicate yet.
+        starting: the drives whose axes do not run yet, and take no state.
         silent: the axes (0 .. 11) without communication: down, or the cable out.
         temperature: of each axis's output stage (12,), C.
     """
@@ -127,16 +134,17 @@ class Conditions:
         """Start without any condition."""
         self._settings, self._control, self._encoders = settings, control, encoders
         self.down: set[int] = set()
+        self.starting: set[int] = set()
         self.silent: set[int] = set()
         self.temperature = [ROOM_TEMPERATURE] * N_JOINTS
         self._hot: set[int] = set()
         self._linked = [True] * N_DRIVES
-        self._up_s = [-math.inf] * N_DRIVES  # when each will be up; inf: without power
+        self._on_s = [-math.inf] * N_DRIVES  # when each had its power; inf: it has none
 
     @property
     def all_well(self) -> bool:
         """True if no axis has to be looked at."""
-        return not (self.down or self._encoders.odd or self._hot)
+        return not (self.starting or self._encoders.odd or self._hot)
 
     def link(self, drive: int, *, up: bool) -> None:
         """Pull a drive's cable, or plug it in."""
@@ -146,26 +154,27 @@ class Conditions:
     def boot(self, drive: int, now_s: float) -> None:
         """Let a drive start up from now on."""
         self.down.add(drive)
-        self._up_s[drive] = now_s + BOOT_S
+        self.starting.add(drive)
+        self._on_s[drive] = now_s
         self._update_silent()
 
     def power_off(self, drive: int) -> None:
         """Keep a drive down until `boot`."""
-        self.down.add(drive)
-        self._up_s[drive] = math.inf
-        self._update_silent()
+        self.boot(drive, math.inf)
 
     def is_off(self, drive: int) -> bool:
         """Return True if a drive is without power."""
-        return self._up_s[drive] == math.inf
+        return self._on_s[drive] == math.inf
 
     def finish_boots(self, now_s: float) -> list[int]:
-        """Return the drives whose start-up is over by now; they are down no more."""
-        up = [drive for drive in self.down if self._up_s[drive] <= now_s]
+        """Return the drives whose axes begin to run by now; let others communicate."""
+        up = [drive for drive in self.down if self._on_s[drive] + TALKS_S <= now_s]
         if up:
             self.down.difference_update(up)
             self._update_silent()
-        return up
+        begin = [drive for drive in self.starting if self._on_s[drive] + BOOT_S <= now_s]
+        self.starting.difference_update(begin)
+        return begin
 
     def read_encoder(self, axis: int, words: Words) -> None:
         """Let an axis read no words of its encoder, zeros, or its own again."""

@@ -63,6 +63,8 @@ AXIS_SETTINGS: Final[Mapping[str, Value]] = {
     "motor.config.pole_pairs": 7,
     "motor.config.torque_constant": 0.04,
     "motor.config.current_lim": 10.0,
+    "motor.config.current_lim_margin": 8.0,
+    "motor.config.current_control_bandwidth": 1000.0,
     "motor.config.phase_resistance": 0.0,
     "motor.fet_thermistor.config.enabled": True,
     "motor.fet_thermistor.config.temp_limit_lower": 100.0,
@@ -95,6 +97,8 @@ NAMES: Final = (
 
 PHASE_RESISTANCE: Final = 0.1
 """ohm; assumed, of a motor with this torque constant. Calibration finds it, nobody sets it."""
+PHASE_INDUCTANCE: Final = 5e-5
+"""H; assumed as well."""
 DIRECTION: Final = 1
 """+1 or -1 by how a motor's phases are wired. Calibration finds it, nobody sets it."""
 
