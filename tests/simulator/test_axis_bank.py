@@ -45,6 +45,7 @@ def test_an_idle_axis_spun_too_fast_has_the_error_once_it_has_been_armed() -> No
     step_for(bank, 0.03, vel=np.full(12, 80.0))
     assert [axis for axis in range(12) if bank.faults[axis] != AxisErrors()] == [3]
     assert bank.faults[3].controller == ControllerError.OVERSPEED
+    assert bank.heartbeat(3).axis_error == AxisError.CONTROLLER_FAILED, "no motor missed a command"
 
 
 def test_speed_below_the_tolerance_keeps_the_axis_armed() -> None:
@@ -90,14 +91,97 @@ def test_watchdog_that_is_off_never_disarms() -> None:
     assert bank.step(1000.0, ZERO, ZERO) == pytest.approx(2.0)
 
 
-def test_closed_loop_is_refused_while_an_error_stands() -> None:
-    bank = make_bank()
-    bank.inject("knee_right.axis1", "DRV_FAULT")
+def test_closed_loop_with_an_error_is_state_8_for_1_ms_without_torque_and_moves_the_target() -> (
+    None
+):
+    bank = make_bank(ControlMode.POSITION)
+    bank.inject("knee_right.axis1", "SPINOUT")
+    bank.input_pos[3] = 5.0
     bank.request_state(3, CLOSED_LOOP)
+    assert (bank.state[3], bank.input_pos[3]) == (CLOSED_LOOP, 0.0)
+    bank.input_pos[3] = 1.0
+    assert step_for(bank, DT)[3] == 0.0
     assert bank.state[3] == IDLE
     bank.clear_errors(2)  # through the sibling: the firmware clears the whole ODrive
     bank.request_state(3, CLOSED_LOOP)
+    bank.input_pos[3] = 1.0
+    assert step_for(bank, 10 * DT)[3] != 0.0
     assert bank.state[3] == CLOSED_LOOP
+
+
+def test_closed_loop_asked_for_twice_lets_go_for_a_quarter_of_a_millisecond() -> None:
+    bank = make_bank(ControlMode.POSITION)
+    bank.input_torque[:] = 1.0
+    step_for(bank, DT)
+    bank.input_pos[4] = 3.0
+    bank.request_state(4, CLOSED_LOOP)
+    assert bank.input_pos[4] == 0.0
+    torque = bank.step(bank.now_s + DT, ZERO, ZERO)
+    assert (torque[4], torque[5]) == pytest.approx((0.75, 1.0))
+    assert step_for(bank, DT)[4] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("state", "becomes"), [(264, CLOSED_LOOP), (257, IDLE), (512, CLOSED_LOOP)]
+)
+def test_a_state_is_its_low_byte(state: int, becomes: AxisState) -> None:
+    bank = make_bank()
+    bank.request_state(7, IDLE if becomes == CLOSED_LOOP and state != 512 else CLOSED_LOOP)
+    bank.request_state(7, state)
+    assert bank.state[7] == becomes
+    assert bank.faults[7] == AxisErrors()
+
+
+@pytest.mark.parametrize(("lifting", "spins"), [(40.0, True), (2.0, False)])
+def test_disarmed_while_it_lifts_an_axis_that_sinks_spins_out_in_idle(
+    lifting: float, spins: bool
+) -> None:
+    """1 N m at 40 turn/s are 251 W, at 2 turn/s 13 W; the thresholds are 100 W."""
+    bank = make_bank(ControlMode.POSITION)
+    bank.settings.fill("motor.config.current_lim_margin", math.inf)
+    bank.vel_gain[:] = 0.1
+    bank.pos_gain[:] = 0.0
+    vel = np.zeros(12)
+    vel[4] = lifting
+    bank.input_vel[4], bank.input_torque[4] = lifting, 1.0
+    step_for(bank, 0.3, vel=vel)
+    bank.estop(4)
+    assert bank.heartbeat(4).axis_error == AxisError.ESTOP_REQUESTED
+    bank.input_vel[4] = 0.0
+    step_for(bank, 0.2, pos=0.3 * vel, vel=np.where(vel > 0.0, -30.0, 0.0))
+    assert bank.heartbeat(4).axis_error == (0x4200 if spins else 0x4000)
+    assert bool(bank.faults[4].controller & ControllerError.SPINOUT_DETECTED) == spins
+
+
+# ---- watchdogs
+
+
+def test_a_watchdog_enabled_before_it_was_fed_expires_at_once_whatever_its_timeout() -> None:
+    bank = idle_bank(watchdog=False)
+    bank.settings.fill("config.watchdog_timeout", 0.0)
+    bank.settings.save(1)
+    bank.reboot(2)
+    step_for(bank, 1.6)
+    bank.settings.set(1, "axis0.config.enable_watchdog", value=True)
+    bank.settings.set(1, "axis0.config.watchdog_timeout", 5.0)
+    bank.settings.set(1, "axis1.config.watchdog_timeout", 5.0)
+    bank.feed(3)
+    bank.settings.set(1, "axis1.config.enable_watchdog", value=True)
+    step_for(bank, 2 * DT)
+    assert bank.heartbeat(2).axis_error == AxisError.WATCHDOG_TIMER_EXPIRED
+    step_for(bank, 1.0)
+    assert bank.heartbeat(3).axis_error == 0
+
+
+def test_a_watchdog_that_is_off_does_not_count_down() -> None:
+    bank = make_bank(watchdog=True)
+    step_for(bank, 0.06)
+    for on in (False, True):
+        bank.settings.set(0, "axis0.config.enable_watchdog", value=on)
+        step_for(bank, 0.03)
+    assert bank.state[:2] == [CLOSED_LOOP, IDLE], "0.04 s were left"
+    step_for(bank, 0.02)
+    assert bank.state[0] == IDLE
 
 
 def test_rearming_brings_back_the_old_input_torque() -> None:
@@ -168,7 +252,7 @@ def test_a_current_limit_lowered_under_load_disarms_beyond_8_a(
     bank.current_lim[3] = lowered_to
     step_for(bank, DT)
     assert (bank.state[3] == IDLE) == disarms
-    assert bank.faults[3] == (FAULTS["OVER_CURRENT"] if disarms else AxisErrors())
+    assert bank.faults[3] == (FAULTS["CURRENT_LIMIT"] if disarms else AxisErrors())
     assert bank.state[2] == CLOSED_LOOP
 
 
@@ -182,14 +266,14 @@ def test_a_bump_under_load_disarms_where_the_emf_drives_the_current_beyond_its_l
         bumped = np.zeros(12)
         bumped[4] = speed
         step_for(bank, 0.005, vel=bumped)
-        assert (bank.faults[4] == FAULTS["OVER_CURRENT"]) == limp
+        assert (bank.faults[4] == FAULTS["CURRENT_LIMIT"]) == limp
 
 
 def test_the_current_that_an_emf_drives_is_that_of_the_loop_at_its_own_rate() -> None:
     """Winding and PI loop of the firmware at 8 kHz, against the bank's step of a millisecond."""
     bank = make_bank()
     bank.settings.fill("motor.config.current_lim_margin", math.inf)
-    loops = bank._control._loops.reshape(3, 12)
+    loops = bank._control._loops.reshape(4, 12)
     rng = np.random.default_rng(5)
     kt, resistance, inductance, w = 0.0827, 0.1, PHASE_INDUCTANCE, 1000.0
     fine = 64

@@ -7,7 +7,7 @@ import pytest
 
 from services.simulator.drives.axis_bank import AxisBank
 from services.simulator.drives.axis_calibration import ENCODER_S, MOTOR_S
-from shared.can.cansimple import AxisError, AxisState, EncoderError
+from shared.can.cansimple import AxisError, AxisState, EncoderError, MotorError
 from tests.simulator.banks import DT, make_bank, step_for
 
 
@@ -63,7 +63,9 @@ def test_under_a_load_the_encoders_calibration_fails_and_leaves_the_axis_uncalib
     assert bank.faults[2].encoder == EncoderError.CPR_POLEPAIRS_MISMATCH
     bank.clear_errors(2)
     bank.request_state(2, AxisState.CLOSED_LOOP_CONTROL)
+    step_for(bank, 2 * DT)
     assert bank.state[2] == AxisState.IDLE
+    assert bank.faults[2].motor == MotorError.UNKNOWN_PHASE_ESTIMATE, "and no INVALID_STATE"
 
 
 def test_another_request_breaks_a_calibration_off() -> None:

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from services.simulator.drives.axis_bank import AxisBank
-from shared.can.cansimple import AxisState, ControlMode, InputMode
+from shared.can.cansimple import AxisState, ControlMode, InputMode, MotorError
 from tests.simulator.banks import CPR, DRIVE, DT, ZERO, close_loop, make_bank
 from tests.simulator.firmware import FirmwareAxis
 
@@ -225,7 +225,7 @@ def test_axes_with_another_encoder_bandwidth_follow_by_their_own() -> None:
 
 @pytest.mark.parametrize("mode", [ControlMode.TORQUE, ControlMode.VELOCITY, ControlMode.POSITION])
 @pytest.mark.parametrize("column", ["input_pos", "input_vel", "input_torque"])
-def test_what_is_no_number_is_not_made_one(mode: ControlMode, column: str) -> None:
+def test_what_is_no_number_disarms_with_modulation_is_nan(mode: ControlMode, column: str) -> None:
     """The firmware's clamp passes NaN on; made the limit's torque, it would push a motor."""
     bank = make_bank()
     close_loop(bank, mode, range(2))
@@ -233,5 +233,17 @@ def test_what_is_no_number_is_not_made_one(mode: ControlMode, column: str) -> No
     getattr(bank, column)[0] = math.nan
     torque = bank.step(bank.now_s + 1e-3, ZERO, ZERO)
     used = {"input_torque": 1, "input_vel": 2, "input_pos": 3}[column] <= mode
-    assert math.isnan(torque[0]) == used
-    assert math.isfinite(torque[1])
+    assert (bank.faults[0].motor == MotorError.MODULATION_IS_NAN) == used
+    assert bank.faults[1].motor == 0
+    assert np.isfinite(torque).all(), "nothing reaches the shaft, in IDLE neither"
+    assert np.isfinite(bank.step(bank.now_s + 1e-3, ZERO, ZERO)).all()
+
+
+@pytest.mark.parametrize("limit", [-1.0, math.nan])
+def test_a_current_limit_that_is_negative_or_no_number_disarms(limit: float) -> None:
+    bank = make_bank()
+    bank.input_torque[:] = 0.5
+    bank.current_lim[3] = limit
+    torque = bank.step(bank.now_s + 1e-3, ZERO, ZERO)
+    assert bank.faults[3].motor & MotorError.MODULATION_IS_NAN
+    assert list(np.flatnonzero(torque == 0.0)) == [3]

@@ -105,9 +105,8 @@ def test_the_bank_acts_on_a_setting_from_the_next_step_on() -> None:
     torque = step_for(bank, DT)
     assert torque[1] == pytest.approx(10.0 * 0.0827)
     assert torque[0] == 2.0
-    bank.settings.set(0, "axis0.config.watchdog_timeout", 0.05)
     bank.settings.set(0, "axis0.config.enable_watchdog", value=True)
-    step_for(bank, 0.1)
+    step_for(bank, 0.12)
     assert bank.state[0] == AxisState.IDLE
     assert bank.state[1] == AxisState.CLOSED_LOOP_CONTROL
 

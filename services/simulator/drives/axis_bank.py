@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,9 @@ from services.simulator.drives.axis_faults import (
     in_idle,
 )
 from services.simulator.drives.axis_settings import configured
+from services.simulator.drives.axis_watchdogs import Watchdogs
 from services.simulator.drives.dc_bus import DEAD_VOLTAGE, DcBus
+from services.simulator.drives.spinout import Spinout
 from shared.can.cansimple import (
     AxisError,
     AxisState,
@@ -47,6 +50,12 @@ from shared.joints import N_JOINTS
 __all__ = ["AXIS_NAMES", "FAULTS", "AxisBank", "AxisErrors"]
 
 Vector = NDArray[np.float64]
+
+REFUSED_S: Final = 1e-3
+"""s for which an axis that has an error, or no phase, is in closed loop without torque."""
+REARM_S: Final = 0.25e-3
+"""s for which an armed axis that is asked for closed loop again gives no torque."""
+_EARLY_S: Final = 1e-6
 
 
 class AxisBank:
@@ -101,11 +110,11 @@ class AxisBank:
         self.now_s = -math.inf
         self.calibration = Calibration(self.settings)
         self.conditions = Conditions(self.settings, control, encoders)
+        self._watchdogs = Watchdogs(self.settings)
+        self._spinout = Spinout(self.settings)
         self._requested: dict[int, int] = {}
-        self._fed_s = [0.0] * n
-        self._timeouts_s = [math.inf] * n
-        self._shortest_s = math.inf
-        self._seen = -1
+        self._refused_s: dict[int, float] = {}  # until when each says that it is in closed loop
+        self._rearmed: set[int] = set()
 
     @property
     def regulates(self) -> bool:
@@ -121,7 +130,8 @@ class AxisBank:
         control = self._control
         if self.now_s == -math.inf:
             self.now_s = now_s
-            self._fed_s = [now_s] * N_JOINTS
+            for axis in range(N_JOINTS):
+                self._watchdogs.feed(axis, now_s)
             self._encoders.start(pos_turns, vel_turns)
             control.turn(vel_turns)
         else:
@@ -129,58 +139,68 @@ class AxisBank:
             self.now_s = now_s
             if dt_s > 0.0:
                 self._encoders.estimate(dt_s, pos_turns)
+        if self._refused_s or self._spinout.watched:
+            self._end_closed_loops()
         if self.calibration.running or not self.conditions.all_well:
             self._apply_conditions()
-        self._check_watchdogs()
+        for axis in self._watchdogs.expired(now_s):
+            self._fail(axis, FAULTS["WATCHDOG"])
         control.turn(vel_turns)
         beyond, least, most = control.control()
         if beyond:
             for axis in control.overspeed():
                 self._fail(axis, FAULTS["OVERSPEED"])
+            for axis in control.broken():
+                self._fail(axis, FAULTS["MODULATION_IS_NAN"])
             for axis in control.over_current():
-                self._fail(axis, FAULTS["OVER_CURRENT"])
+                self._fail(axis, FAULTS["CURRENT_LIMIT"])
             _, least, most = control.control()
         control.integrate()
         for drive, why in self.bus.check(least, most).items():
             for axis in _both(2 * drive):
                 self._fail(axis, BUS_FAULTS[why])
-        return self._commutated() if self._encoders.odd else self.torque
+        return self._at_shafts() if self._encoders.odd or self._rearmed else self.torque
 
     # ---- requests of a front
 
     def feed(self, axis: int) -> None:
         """Feed an axis's watchdog: any CAN frame to it does."""
-        self._fed_s[axis] = self.now_s
+        self._watchdogs.feed(axis, self.now_s)
 
     def request_state(self, axis: int, state: int) -> None:
-        """Ask for a state: IDLE, CLOSED_LOOP_CONTROL or a calibration.
+        """Ask for a state: IDLE, CLOSED_LOOP_CONTROL or a calibration; its low byte counts.
 
-        Closed loop with any error present is refused: the axis stays IDLE. Closed loop of an
-        axis that is not calibrated, an encoder's calibration before its motor's, and any
-        other state is INVALID_STATE and leads to IDLE. What an axis is asked for before it runs,
-        it does when it runs.
+        Closed loop with any error present, or without the encoder's calibration, is entered for
+        1 ms without torque. Closed loop without the motor's, an encoder's calibration before its
+        motor's, and any other state is INVALID_STATE and leads to IDLE. What an axis is asked for
+        before it runs, it does when it runs.
         """
-        drive = axis >> 1
+        drive, state = axis >> 1, state & 0xFF
+        if state == AxisState.UNDEFINED:
+            return
         if drive in self.conditions.starting:
-            if drive not in self.conditions.down and state != AxisState.UNDEFINED:
+            if drive not in self.conditions.down:
                 self._requested[axis] = state
             return
         fault = self.faults[axis]
-        self.faults[axis] = fault = fault._replace(axis=fault.axis & ~AxisError.INVALID_STATE)
+        self.faults[axis] = fault._replace(axis=fault.axis & ~AxisError.INVALID_STATE)
         self.calibration.stop(axis)
         if state == AxisState.IDLE:
             self._disarm(axis)
         elif state == AxisState.CLOSED_LOOP_CONTROL:
-            if not self.calibration.ready(axis):
-                self._fail(axis, AxisErrors(AxisError.INVALID_STATE))
-            elif fault == AxisErrors():
+            if (
+                self.calibration.motor[axis]
+                and self.settings.axis("encoder.config.direction")[axis]
+            ):
                 self._arm(axis)
+            else:
+                self._fail(axis, AxisErrors(AxisError.INVALID_STATE))
         elif state in SEQUENCES:
             self._disarm(axis)
             turns = float(self.encoder_turns[axis])
             states = SEQUENCES[AxisState(state)]
             self._become(axis, self.calibration.begin(axis, states, self.now_s, turns))
-        elif state != AxisState.UNDEFINED:
+        else:
             self._fail(axis, AxisErrors(AxisError.INVALID_STATE))
 
     def set_modes(self, axis: int, control_mode: int, input_mode: int) -> None:
@@ -188,6 +208,7 @@ class AxisBank:
 
         Position mode, also where it was on already, sets `input_pos` to where the motor is.
         """
+        control_mode, input_mode = control_mode & 0xFF, input_mode & 0xFF
         if input_mode != InputMode.PASSTHROUGH or control_mode not in (1, 2, 3):
             self._fail(axis, controller_fault(ControllerError.INVALID_INPUT_MODE))
             return
@@ -226,7 +247,7 @@ class AxisBank:
             self._disarm(each)
             self.state[each] = AxisState.UNDEFINED
             self._requested.pop(each, None)
-            self._fed_s[each] = self.now_s
+            self._spinout.armed(each)
             self.faults[each] = AxisErrors()
             self.input_pos[each] = self.input_vel[each] = self.input_torque[each] = 0.0
             self._control.connected[each] = 0.0
@@ -234,6 +255,7 @@ class AxisBank:
         for each in _both(axis):
             self.calibration.restart(each)
             self._encoders.forget_turns(each)
+            self._watchdogs.feed(each, self.now_s)
         self.conditions.boot(drive, self.now_s)
 
     def is_responding(self, axis: int) -> bool:
@@ -277,7 +299,8 @@ class AxisBank:
             self.conditions.power_off(drive)
         elif self.conditions.is_off(drive):
             self.conditions.boot(drive, self.now_s)
-            self._fed_s[2 * drive] = self._fed_s[2 * drive + 1] = self.now_s
+            for axis in _both(2 * drive):
+                self._watchdogs.feed(axis, self.now_s)
 
     # ---- within a step
 
@@ -312,28 +335,32 @@ class AxisBank:
             if checks and odd.peak > limit * column("encoder.config.cpr")[axis]:
                 self._fail(axis, FAULTS["OVERSPEED"])
 
-    def _commutated(self) -> Vector:
-        """Return the torques at the shafts: a rotor away from its last word is driven off phase."""
+    def _end_closed_loops(self) -> None:
+        """End what a closed loop leaves: the state of a refused one, the power of the last."""
+        for axis, until_s in list(self._refused_s.items()):
+            if until_s <= self.now_s + _EARLY_S:
+                del self._refused_s[axis]
+                if self.state[axis] == AxisState.CLOSED_LOOP_CONTROL:
+                    self.state[axis] = AxisState.IDLE
+        asked = {axis: self._control.asked_power(axis) for axis in self._spinout.watched}
+        for axis in self._spinout.check(self._encoders.dt_s, asked):
+            self._spinout.armed(axis)
+            self._fail(axis, FAULTS["SPINOUT"])
+
+    def _at_shafts(self) -> Vector:
+        """Return the torques at the shafts: a blind rotor is driven off phase.
+
+        An axis that was armed and is armed again lets go for a quarter of a millisecond.
+        """
         self._shaft[:] = self.torque
         for axis, odd in self._encoders.odd.items():
             poles = self.settings.axis("motor.config.pole_pairs")[axis]
             self._shaft[axis] *= math.cos(2.0 * math.pi * poles * odd.off_phase)
+        dt_s = self._encoders.dt_s
+        for axis in self._rearmed:
+            self._shaft[axis] *= max(0.0, 1.0 - REARM_S / dt_s) if dt_s else 1.0
+        self._rearmed.clear()
         return self._shaft
-
-    def _check_watchdogs(self) -> None:
-        """Disarm axes whose watchdog was not fed."""
-        if self._seen != self.settings.version:
-            self._seen = self.settings.version
-            enabled = self.settings.axis("config.enable_watchdog") > 0.0
-            timeouts = self.settings.axis("config.watchdog_timeout")
-            self._timeouts_s = np.where(enabled, timeouts, math.inf).tolist()
-            self._shortest_s = min(self._timeouts_s)
-        if min(self._fed_s) < self.now_s - self._shortest_s:
-            for axis, (fed_s, timeout_s) in enumerate(
-                zip(self._fed_s, self._timeouts_s, strict=True)
-            ):
-                if fed_s < self.now_s - timeout_s:
-                    self._fail(axis, FAULTS["WATCHDOG"])
 
     def _become(self, axis: int, outcome: AxisState | AxisErrors) -> None:
         """Take the state that a calibration is at, or the fault that it ended with."""
@@ -343,15 +370,31 @@ class AxisBank:
             self.state[axis] = outcome
 
     def _arm(self, axis: int) -> None:
-        """Enter closed loop; `input_torque` is left as it stands, as the firmware does."""
+        """Enter closed loop; `input_torque` is left as it stands, as the firmware does.
+
+        Without a phase, or with an error, the state lasts for as long as the firmware's thread
+        sleeps; its target moves to where the motor is all the same.
+        """
+        if self._control.armed[axis]:
+            self._rearmed.add(axis)
         self._control.arm(axis)
+        self._spinout.armed(axis)
         self.state[axis] = AxisState.CLOSED_LOOP_CONTROL
         self.feed(axis)
+        ready = self.calibration.encoder[axis]
+        if self.faults[axis].axis or not ready:
+            self._control.armed[axis] = 0.0
+            self._refused_s[axis] = self.now_s + REFUSED_S
+            if not ready:
+                self.faults[axis] = self.faults[axis].with_(FAULTS["NO_PHASE"])
 
     def _disarm(self, axis: int) -> None:
         """Let the phases float."""
         if axis >> 1 not in self.conditions.starting:
             self.state[axis] = AxisState.IDLE
+        if self._control.armed[axis]:
+            _, last = self.bus.powers(axis)
+            self._spinout.disarmed(axis, self._control.asked_power(axis), last)
         self._control.armed[axis] = 0.0
         self.torque[axis] = 0.0
 

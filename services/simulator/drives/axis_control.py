@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from services.simulator.drives.axis_encoders import AxisEncoders
 from services.simulator.drives.axis_settings import PHASE_INDUCTANCE, Settings
+from services.simulator.drives.spinout import BANDWIDTH
 from shared.can.cansimple import ControlMode
 from shared.joints import N_JOINTS
 from shared.robot.compiled_graph import CompiledGraph
@@ -57,6 +58,10 @@ _SETTINGS: Final = (
 """The axis settings that the law reads."""
 
 
+_ROWS: Final = 4
+"""Of the state of the current loops: see `LawResults.loops`."""
+
+
 class LawResults(NamedTuple):
     """What the law computes in a step; arrays (12,) but for the last."""
 
@@ -71,7 +76,10 @@ class LawResults(NamedTuple):
     over_current: Vector
     """1 beyond the limit of the current and its margin."""
     loops: Vector
-    """(36,), three rows: current, what the EMF drives, and its rate; A, A, A/s."""
+    """(48,), four rows: current, the EMF's rate behind the winding, the current that it drives, and
+    the filtered power of the torque that the controller asks for, armed or not; A, A/s, A, W."""
+    broken: Vector
+    """1 where the torque is no number, or the limit of the current none or negative."""
     extremes: Vector
     """(3,): how many axes are beyond a limit, the least and the most power."""
 
@@ -94,7 +102,7 @@ class AxisControl:
         self.input_pos, self.input_vel, self.input_torque = np.zeros((3, N_JOINTS))
         self.armed, self.connected, self.integrator = np.zeros((3, N_JOINTS))
         self.derating = np.ones(N_JOINTS)
-        self._loops = np.zeros(3 * N_JOINTS)
+        self._loops = np.zeros(_ROWS * N_JOINTS)
         self._speeds = np.zeros((2, N_JOINTS))  # of the motors, before and now, turn/s
         self._dt_s = 0.0
         self._graph = graph = CompiledGraph(law_graph())
@@ -124,7 +132,7 @@ class AxisControl:
     def arm(self, axis: int) -> None:
         """Let an axis's torque through, from where it is; `input_torque` stays as it stands."""
         self.hold_here(axis)
-        self.integrator[axis] = 0.0
+        self.integrator[axis] = self._loops[3 * N_JOINTS + axis] = 0.0
         self.armed[axis] = self.connected[axis] = 1.0
 
     def turn(self, vel_turns: Vector) -> None:
@@ -136,8 +144,9 @@ class AxisControl:
         """Compute torques, powers and who is beyond a limit; the integrators stay as they are.
 
         Returns:
-            How many axes are beyond their OVERSPEED or current limit (which: `overspeed` and
-            `over_current`), and the least and the most power of an axis, W.
+            How many axes are beyond their OVERSPEED or current limit or have no torque that is a
+            number (which: `overspeed`, `over_current` and `broken`), and the least and the most
+            power of an axis, W.
         """
         if self._dt_s != self._encoders.dt_s:
             self._dt_s = self._encoders.dt_s
@@ -155,6 +164,14 @@ class AxisControl:
         """Return the axes beyond their OVERSPEED limit; in IDLE it is checked all the same."""
         return np.flatnonzero(self.results.too_fast).tolist()
 
+    def broken(self) -> list[int]:
+        """Return the armed axes whose torque is no number."""
+        return np.flatnonzero(self.results.broken).tolist()
+
+    def asked_power(self, axis: int) -> float:
+        """Return the filtered power of the torque that an axis's controller asks for, W."""
+        return float(self._loops[3 * N_JOINTS + axis])
+
     def over_current(self) -> list[int]:
         """Return the armed axes whose current is beyond its limit and margin."""
         return np.flatnonzero(self.results.over_current).tolist()
@@ -170,7 +187,7 @@ def law_graph() -> ca.Function:
     )  # fmt: skip
     of = {name: ca.SX.sym(name, N_JOINTS) for name in (*names, *inputs)}
     loops, *speeds = (
-        ca.SX.sym("loops", 3 * N_JOINTS),
+        ca.SX.sym("loops", _ROWS * N_JOINTS),
         *(ca.SX.sym(name, N_JOINTS) for name in ("speed_before", "speed")),
     )
     step = ca.SX.sym("step", 2)
@@ -196,14 +213,21 @@ def law_graph() -> ca.Function:
     gained = v_err * of["vel_integrator_gain"] * dt_s * of["armed"]
     integrator = ca.if_else(saturated, integrator * decay, integrator + gained)
     most = of["vel_integrator_limit"]
-    torque = _clamp(torque, -limit, limit) * of["armed"]
+    asked = _clamp(torque, -limit, limit)
+    armed = of["armed"] > 0.0
+    broken = ca.logic_and(armed, ca.logic_not(ca.fabs(asked) <= limit))
+    torque = ca.if_else(armed, asked, 0.0)
     tolerance = ca.if_else(of["enable_overspeed_error"] > 0.0, of["vel_limit_tolerance"], ca.inf)
     too_fast = (ca.fabs(vel) > vel_limit * tolerance) * of["connected"]
     mechanical = 2.0 * math.pi * vel * torque
     copper = 1.5 * of["phase_resistance"] / of["torque_constant"] ** 2
     power = copper * torque * torque + mechanical
     loops_next, over_current = _currents(of, torque, loops, speeds, dt_s)
-    beyond = ca.sum1(too_fast) + ca.sum1(over_current)
+    asked_power = loops[3 * N_JOINTS :]
+    gain = (2.0 * math.pi * vel * asked - asked_power) * (1.0 - ca.exp(-BANDWIDTH * dt_s))
+    gain = ca.if_else(of["connected"] > 0.0, gain, 0.0)
+    loops_next = ca.vertcat(loops_next, asked_power + gain)
+    beyond = ca.sum1(too_fast) + ca.sum1(over_current) + ca.sum1(broken)
     extremes = ca.vertcat(beyond, ca.mmin(power), ca.mmax(power))
     return ca.Function(
         "axes",
@@ -212,7 +236,7 @@ def law_graph() -> ca.Function:
             ca.densify(one)
             for one in (
                 torque, _clamp(integrator, -most, most), too_fast, power, mechanical, over_current,
-                loops_next, extremes,
+                loops_next, broken, extremes,
             )
         ],
         {"cse": True},
@@ -227,7 +251,7 @@ def _currents(
     The EMF's rate x1 and what it drives x2 follow x1' = z - R / L x1, x2' = x1 - w x2 for a speed
     that ramps over the step, z = e' / L. A limit that was lowered is checked a cycle later.
     """
-    current, x1, x2 = ca.vertsplit(loops, N_JOINTS)
+    current, x1, x2 = ca.vertsplit(loops[: 3 * N_JOINTS], N_JOINTS)
     w, kt, resistance = (
         of[name] for name in ("current_control_bandwidth", "torque_constant", "phase_resistance")
     )

@@ -80,7 +80,9 @@ FAULTS: Final[Mapping[str, AxisErrors]] = {
     "OVERSPEED": controller_fault(ControllerError.OVERSPEED),
     "SPINOUT": controller_fault(ControllerError.SPINOUT_DETECTED),
     "DRV_FAULT": _motor(MotorError.DRV_FAULT),
-    "OVER_CURRENT": _motor(MotorError.CURRENT_LIMIT_VIOLATION),
+    "CURRENT_LIMIT": _motor(MotorError.CURRENT_LIMIT_VIOLATION),
+    "MODULATION_IS_NAN": _motor(MotorError.MODULATION_IS_NAN),
+    "NO_PHASE": _motor(MotorError.UNKNOWN_PHASE_ESTIMATE),
     "REGENERATION": _motor(MotorError.I_BUS_OUT_OF_RANGE),
     "ENCODER": controller_fault(ControllerError.INVALID_ESTIMATE).with_(
         AxisErrors(AxisError.ENCODER_FAILED, encoder=EncoderError.ABS_SPI_COM_FAIL)
