@@ -131,12 +131,14 @@ def drive_buses(robot: RobotConfig) -> dict[str, dict[int, int]]:
 def open_hubs(robot: RobotConfig, run_dir: Path, stack: ExitStack) -> dict[str, UnixCanHub]:
     """Return the CAN buses of the robot, simulated, by name."""
     run_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
-    names = [*drive_buses(robot), robot.harness.bus]
-    names += [robot.imu.bus] if robot.imu.fitted else []
-    return {
+    sensors = [robot.harness.bus, *([robot.imu.bus] if robot.imu.fitted else [])]
+    hubs = {
         name: stack.enter_context(UnixCanHub(Path(expand(robot.can[name].channel, run_dir))))
-        for name in dict.fromkeys(names)
+        for name in dict.fromkeys([*drive_buses(robot), *sensors])
     }
+    for name in sensors:
+        hubs[name].shared = True
+    return hubs
 
 
 def open_usb(robot: RobotConfig, bank: AxisBank, run_dir: Path, stack: ExitStack) -> list[FibreHub]:

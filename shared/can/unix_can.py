@@ -6,18 +6,29 @@ real bus through socketcan drives this one unchanged.
 
 On the wire: SOCK_SEQPACKET; a packet carries one or several 16-byte frames in the layout of
 SocketCAN's `struct can_frame` (id and flags, length, three pad bytes, eight data bytes),
-little-endian. Several frames in one packet cost one system call. Sending never blocks: a packet
-that does not fit into a socket is dropped and counted.
+little-endian. Several frames in one packet cost one system call. Sending never blocks: frames
+for which there is no room raise, as on socketcan.
+
+**A bus that does not acknowledge.** The hub then leaves the packets where they are: in the
+kernel, charged to the sender (`SO_SNDBUF`), also past its end, and in its order. So a CAN interface
+behaves, whose controller repeats its first frame until somebody acknowledges it. What else an
+interface knows, both sides share in `Interface`.
 """
 
 from __future__ import annotations
 
+import errno
+import fcntl
+import mmap
+import os
 import select
 import socket
 import struct
+import termios
 import time
 from collections import deque
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Final
 
 import can
@@ -35,6 +46,8 @@ _FRAME = struct.Struct("<IB3x8s")
 PACKET_BYTES: Final = 64 * _FRAME.size
 """Longest packet that either side sends."""
 _DRAIN = 1024  # packets in one call: more than a socket holds
+FRAME_TRUESIZE: Final = 768
+"""Bytes that a short packet takes of `SO_SNDBUF`: sk_buff and data; a CAN frame takes the same."""
 
 
 def pack_frames(frames: Iterable[Frame]) -> bytes:
@@ -49,24 +62,83 @@ def unpack_frames(packet: bytes) -> list[Frame]:
     return [(can_id, data[:length]) for can_id, length, data in _FRAME.iter_unpack(packet)]
 
 
+class Interface:
+    """State of an emulated CAN interface, in memory that the hub and its clients share."""
+
+    _FULL = 4
+
+    def __init__(self, channel: str | os.PathLike[str], *, create: bool = False) -> None:
+        """Open the state of the interface with this socket; the hub creates it.
+
+        Raises:
+            OSError: there is none.
+        """
+        self.path = Path(f"{os.fspath(channel)}.state")
+        if create:  # a client of the hub before may still have the old file mapped
+            self.path.unlink(missing_ok=True)
+        flags = os.O_RDWR | (os.O_CREAT | os.O_EXCL if create else 0)
+        descriptor = os.open(self.path, flags, 0o600)
+        try:
+            if create:
+                os.ftruncate(descriptor, self._FULL + 1)
+            self._memory = mmap.mmap(descriptor, self._FULL + 1)
+        finally:
+            os.close(descriptor)
+
+    @property
+    def full(self) -> bool:
+        """True while the send queue (`txqueuelen`) takes no frame: ENOBUFS."""
+        return self._memory[self._FULL] != 0
+
+    @full.setter
+    def full(self, full: bool) -> None:
+        self._memory[self._FULL] = full
+
+    @property
+    def restarts(self) -> int:
+        """How often the interface was taken down and up: each empties its queue."""
+        return int.from_bytes(self._memory[: self._FULL], "little")
+
+    def restart(self) -> None:
+        """Ask the hub to throw away all frames that wait."""
+        count = self.restarts + 1 & 0xFFFF_FFFF
+        self._memory[: self._FULL] = count.to_bytes(self._FULL, "little")
+
+    def close(self) -> None:
+        """Let go of the memory."""
+        self._memory.close()
+
+
 class UnixCanBus(can.BusABC):
     """Client of a `UnixCanHub`, declared to python-can as interface `xrl_unix`.
 
-    Unlike most interfaces, `send` drops a frame when the socket is full, counts it in `dropped`,
-    and does not raise: a control loop has a newer one in a millisecond.
+    Attributes:
+        dropped: frames for which there was no room: each `send` of such raised ENOBUFS.
+        socket: its `SO_SNDBUF` limits what may wait, as on socketcan.
     """
 
     def __init__(
-        self, channel: str, can_filters: can.typechecking.CanFilters | None = None, **kwargs: object
+        self,
+        channel: str,
+        can_filters: can.typechecking.CanFilters | None = None,
+        *,
+        receive_own_messages: bool = False,
+        **kwargs: object,
     ) -> None:
-        """Connect to the hub that listens on path `channel`, or can.CanInitializationError."""
+        """Connect to the hub that listens on path `channel`, or can.CanInitializationError.
+
+        With `receive_own_messages`, `recv_many` returns this client's own frames too, once the bus
+        has carried them (`CAN_RAW_RECV_OWN_MSGS`).
+        """
         self.dropped = 0
         self.channel_info = f"xrl_unix {channel}"
+        self._echoes = receive_own_messages
+        self._uncarried: deque[bytes] = deque()
         self._waiting: deque[can.Message] = deque()
         self._timeout_s: float | None = None
-        self._socket = _connect(channel)
+        self.socket, self._interface = _connect(channel)
         self._poll = select.poll()
-        self._poll.register(self._socket, select.POLLIN)
+        self._poll.register(self.socket, select.POLLIN)
         super().__init__(channel, can_filters, **kwargs)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:  # noqa: ARG002
@@ -74,7 +146,13 @@ class UnixCanBus(can.BusABC):
         self.send_many((msg,))
 
     def send_many(self, messages: Sequence[can.Message]) -> None:
-        """Send frames in one packet without waiting; can.CanOperationError once the hub is gone."""
+        """Send frames in one packet without waiting.
+
+        Raises:
+            can.CanOperationError: there is no room (ENOBUFS), or the hub is gone.
+        """
+        if self._interface.full:
+            raise self._no_room(messages)
         packet = b"".join(
             [
                 _FRAME.pack(_can_id(message), message.dlc, bytes(message.data))
@@ -82,11 +160,13 @@ class UnixCanBus(can.BusABC):
             ]
         )
         try:
-            self._socket.send(packet, socket.MSG_DONTWAIT)
+            self.socket.send(packet, socket.MSG_DONTWAIT)
         except BlockingIOError:
-            self.dropped += len(messages)
+            raise self._no_room(messages) from None
         except OSError as error:
-            raise can.CanOperationError(f"{self.channel_info}: {error}") from error
+            raise can.CanOperationError(f"{self.channel_info}: {error}", error.errno) from error
+        if self._echoes:
+            self._uncarried.append(packet)
 
     def recv_many(self, timeout: float) -> list[Frame]:
         """Wait for a packet and return the frames of all packets that are there, in order.
@@ -95,9 +175,10 @@ class UnixCanBus(can.BusABC):
         Raises can.CanOperationError once the hub is gone.
         """
         packet = self._receive(timeout)
+        frames = self._carried() if self._uncarried else []
         if packet is None:
-            return []
-        frames = unpack_frames(packet)
+            return frames
+        frames += unpack_frames(packet)
         for _ in range(_DRAIN):
             packet = self._receive(0.0)
             if packet is None:
@@ -105,14 +186,35 @@ class UnixCanBus(can.BusABC):
             frames += unpack_frames(packet)
         return frames
 
+    def restart(self) -> None:
+        """Take the interface down and up: what waits is thrown away, of every client."""
+        self._interface.restart()
+        self._uncarried.clear()
+
     def fileno(self) -> int:
         """Return the socket's descriptor."""
-        return self._socket.fileno()
+        return self.socket.fileno()
 
     def shutdown(self) -> None:
-        """Leave the bus."""
+        """Leave the bus; frames that wait go on waiting."""
         super().shutdown()
-        self._socket.close()
+        self.socket.close()
+        self._interface.close()
+
+    def _carried(self) -> list[Frame]:
+        """Return own frames that the hub has taken since the last call."""
+        waiting = struct.unpack("i", fcntl.ioctl(self.socket, termios.TIOCOUTQ, bytes(4)))[0]
+        packets = -(-waiting // FRAME_TRUESIZE)
+        frames: list[Frame] = []
+        while len(self._uncarried) > packets:
+            frames += unpack_frames(self._uncarried.popleft())
+        return frames
+
+    def _no_room(self, messages: Sequence[can.Message]) -> can.CanOperationError:
+        self.dropped += len(messages)
+        return can.CanOperationError(
+            f"{self.channel_info}: {os.strerror(errno.ENOBUFS)}", errno.ENOBUFS
+        )
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         """Return the next frame as python-can asks for it; filters are left to python-can."""
@@ -133,10 +235,10 @@ class UnixCanBus(can.BusABC):
             if not self._poll.poll(0):  # a third of the price of a BlockingIOError
                 return None
         elif timeout != self._timeout_s:
-            _set_receive_timeout(self._socket, timeout)
+            _set_receive_timeout(self.socket, timeout)
             self._timeout_s = timeout
         try:
-            packet = self._socket.recv(PACKET_BYTES)
+            packet = self.socket.recv(PACKET_BYTES)
         except BlockingIOError:
             return None
         except OSError as error:
@@ -170,19 +272,20 @@ def _message(frame: Frame, timestamp: float) -> can.Message:
     )
 
 
-def _connect(channel: str) -> socket.socket:
+def _connect(channel: str) -> tuple[socket.socket, Interface]:
     """Connect to a hub; a hub too busy to take us is an error, not a wait."""
     client = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     client.setblocking(False)
     try:
         client.connect(channel)
+        interface = Interface(channel)
     except OSError as error:
         client.close()
         raise can.CanInitializationError(
             f"no CAN hub listens on {channel} ({error}); start the simulator first"
         ) from error
     client.setblocking(True)
-    return client
+    return client, interface
 
 
 def _set_receive_timeout(client: socket.socket, timeout: float | None) -> None:

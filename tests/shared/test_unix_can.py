@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import can
 import pytest
 
-from services.simulator.fronts.unix_can_hub import UnixCanHub
+from services.simulator.fronts.unix_can_hub import TXQUEUELEN, UnixCanHub
 from shared.can.unix_can import REMOTE_FLAG, UnixCanBus, pack_frames, unpack_frames
 from shared.exceptions import FleetError
 
@@ -109,12 +111,98 @@ def test_client_that_does_not_read_neither_blocks_the_hub_nor_the_others(hub: Un
         assert len(stopped.recv_many(0.0)) == 5000 - hub.dropped
 
 
-def test_send_to_a_hub_that_does_not_read_drops_and_counts(hub: UnixCanHub) -> None:
-    with connect(hub) as bus:
-        for _ in range(5000):
+def fill(bus: UnixCanBus, frames: int) -> None:
+    """Send frames, whether there is room or not."""
+    for _ in range(frames):
+        with suppress(can.CanOperationError):
             bus.send(message(1, bytes(8)))
+
+
+def test_send_to_a_hub_that_does_not_read_raises_and_counts(hub: UnixCanHub) -> None:
+    with connect(hub) as bus:
+        fill(bus, 5000)
         assert bus.dropped > 0
         assert sum(map(len, iter(hub.poll, []))) == 5000 - bus.dropped
+        bus.send(message(1, b"there is room again"[:8]))
+
+
+# ---- a bus on which nobody acknowledges
+
+
+def test_frames_that_nobody_acknowledges_wait_in_order_and_outlive_their_sender(
+    hub: UnixCanHub,
+) -> None:
+    hub.acknowledged = False
+    with connect(hub) as bus:
+        bus.send(message(1, b"first"))
+        bus.send_many([message(2, b"second"), message(3, b"third")])
+    assert hub.poll() == []
+    with connect(hub) as late:
+        late.send(message(4, b"late"))
+        hub.acknowledged = True
+        frames = hub.poll()
+        frames.remove((4, b"late"))
+        assert frames == [(1, b"first"), (2, b"second"), (3, b"third")]
+
+
+def test_a_restart_of_the_interface_throws_away_what_all_clients_have_waiting(
+    hub: UnixCanHub,
+) -> None:
+    hub.acknowledged = False
+    with connect(hub) as bus:
+        dead = connect(hub)
+        dead.send(message(1, b"of the dead"))
+        dead.shutdown()
+        bus.send(message(2, b"old"))
+        bus.restart()
+        assert hub.poll() == []
+        hub.acknowledged = True
+        bus.send(message(3, b"new"))
+        assert hub.poll() == [(3, b"new")]
+        assert hub.clients == 1
+
+
+def test_the_send_queue_is_full_after_as_many_frames_as_the_interface_holds(
+    hub: UnixCanHub,
+) -> None:
+    hub.acknowledged = False
+    with connect(hub) as bus:
+        fill(bus, TXQUEUELEN)
+        assert bus.dropped == 0
+        hub.poll()
+        with pytest.raises(can.CanOperationError, match="No buffer space") as raised:
+            bus.send(message(1, b""))
+        assert raised.value.error_code == errno.ENOBUFS
+        hub.acknowledged = True
+        assert len(hub.poll()) == TXQUEUELEN
+        bus.send(message(1, b""))
+
+
+def test_a_queue_full_of_others_frames_refuses_ours_until_it_has_room(hub: UnixCanHub) -> None:
+    with connect(hub) as bus:
+        hub.choked = True
+        hub.poll()
+        fill(bus, 3)
+        assert hub.poll() == []
+        assert bus.dropped == 3
+        hub.choked = False
+        hub.poll()
+        bus.send(message(9, b""))
+        assert hub.poll() == [(9, b"")]
+
+
+def test_own_frames_come_back_once_the_bus_has_carried_them(hub: UnixCanHub) -> None:
+    with UnixCanBus(str(hub.path), receive_own_messages=True) as bus:
+        hub.poll()
+        hub.acknowledged = False
+        bus.send(message(1, b"a"))
+        bus.send_many([message(2, b"b"), message(3, b"c")])
+        hub.poll()
+        assert bus.recv_many(0.0) == []
+        hub.acknowledged = True
+        hub.poll()
+        assert bus.recv_many(0.0) == [(1, b"a"), (2, b"b"), (3, b"c")]
+        assert bus.recv_many(0.0) == []
 
 
 def test_hub_parts_with_clients_that_leave(hub: UnixCanHub) -> None:

@@ -21,7 +21,7 @@ from services.simulator.fronts.cansimple_dialects import (
 from services.simulator.fronts.cansimple_front import CanSimpleFront
 from services.simulator.fronts.unix_can_hub import UnixCanHub
 from shared.can import cansimple, cansimple_06
-from shared.can.cansimple import AxisState, Command, arbitration_id
+from shared.can.cansimple import AxisState, Command, arbitration_id, pack_float, pack_u32
 from shared.can.cansimple_06 import Command06, DriveError06, ProcedureResult, SdoOpcode
 from shared.can.unix_can import REMOTE_FLAG, UnixCanBus
 from tests.simulator.banks import CPR, DT, ZERO, make_bank
@@ -294,3 +294,31 @@ def test_a_period_of_zero_is_never(old: Bench) -> None:
 
 def test_the_node_ids_stand_in_the_settings(old: Bench) -> None:
     assert old.bank.settings.get(1, "axis1.config.can.node_id") == NODE
+
+
+def test_a_drive_that_is_back_gets_what_was_written_while_it_was_away(old: Bench) -> None:
+    """Nobody acknowledged it: the kernel kept it, an arming request too."""
+    old.bank.request_state(AXIS, AxisState.IDLE)
+    old.step()
+    old.bank.conditions.link(AXIS >> 1, up=False)
+    old.send(Command.SET_INPUT_TORQUE, pack_float(0.5))
+    old.send(Command.SET_AXIS_STATE, pack_u32(AxisState.CLOSED_LOOP_CONTROL))
+    old.step(3.0)
+    assert old.bank.state[AXIS] == AxisState.IDLE
+    old.bank.conditions.link(AXIS >> 1, up=True)
+    old.front.receive()
+    old.step()
+    assert old.bank.state[AXIS] == AxisState.CLOSED_LOOP_CONTROL
+    assert old.bank.input_torque[AXIS] == 0.5
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_a_bus_with_another_node_acknowledges_what_a_silent_drive_never_gets(
+    old: Bench, shared: bool
+) -> None:
+    old.hub.shared = shared
+    old.bank.conditions.link(AXIS >> 1, up=False)
+    old.send(Command.SET_INPUT_TORQUE, pack_float(0.5))
+    old.bank.conditions.link(AXIS >> 1, up=True)
+    old.front.receive()
+    assert old.bank.input_torque[AXIS] == (0.0 if shared else 0.5)

@@ -32,8 +32,9 @@ class CanSimpleFront:
     """Applies received frames to the bank and sends its estimates and heartbeats.
 
     `nodes[i]` maps the CAN node ids on `hubs[i]` to axes of the bank. A drive that does not
-    communicate (no power, starting up, cable out) neither receives nor sends. An axis's settings
-    give its rates: `config.can.encoder_rate_ms`, `config.can.heartbeat_rate_ms`.
+    communicate (no power, starting up, cable out) neither receives nor sends, nor acknowledges:
+    on a bus without any other node frames wait until it is back. An axis's settings give its
+    rates: `config.can.encoder_rate_ms`, `config.can.heartbeat_rate_ms`.
     """
 
     def __init__(
@@ -75,6 +76,7 @@ class CanSimpleFront:
         bank, silent = self._bank, self._bank.conditions.silent
         for bus in self._buses:
             mailboxes = bus.mailboxes
+            bus.hub.acknowledged = bus.hub.shared or not (silent and silent.issuperset(bus.axes))
             for can_id, data in bus.hub.poll():
                 mailbox = mailboxes.get(can_id)
                 if mailbox is None:

@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import select
 import socket
 import stat
+import struct
+import termios
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Final
 
-from shared.can.unix_can import PACKET_BYTES, Frame, pack_frames, unpack_frames
+from shared.can.unix_can import PACKET_BYTES, Frame, Interface, pack_frames, unpack_frames
 from shared.exceptions import FleetError
 from shared.run_directory import private_files
 
 _PATH_BYTES = 107  # sun_path less its closing zero
 _BACKLOG = 16
 _ROUNDS = 64  # a client that floods the bus must not hold up the simulator
+_FRAME_BYTES = 16
+_INT = struct.Struct("i")
+TXQUEUELEN: Final = 64
+"""Frames that wait in an interface's queue: what `xrl drive can setup` sets."""
 
 
 class UnixCanHub:
@@ -27,13 +35,22 @@ class UnixCanHub:
 
     Attributes:
         dropped: packets that were not handed on because a client's socket was full.
+        shared: True if nodes are on the bus that its owner does not know of; they acknowledge.
+        acknowledged: False while no node is there: frames wait in the clients' sockets, and reach
+            the bus in order when one is back, or never if the interface is restarted before.
+        choked: True while frames of others fill the send queue: clients' sends fail with ENOBUFS.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.dropped = 0
+        self.shared = False
+        self.acknowledged = True
+        self.choked = False
         self._clients: dict[int, socket.socket] = {}
         self._listener = listen(path, "CAN hub")
+        self._interface = Interface(path, create=True)
+        self._restarts = 0
         self._inode = path.stat().st_ino
         self._epoll = select.epoll()
         self._epoll.register(self._listener, select.EPOLLIN)
@@ -45,6 +62,16 @@ class UnixCanHub:
 
     def poll(self) -> list[Frame]:
         """Return the frames that clients have sent, in order; admit new clients. Never waits."""
+        interface = self._interface
+        if self._restarts != interface.restarts:
+            self._restarts = interface.restarts
+            self._discard()
+        if not self.acknowledged:
+            self._admit()
+            interface.full = self.choked or self._waiting() >= TXQUEUELEN
+            return []
+        if interface.full != self.choked:
+            interface.full = self.choked
         frames: list[Frame] = []
         wait = self._epoll.poll
         for _ in range(_ROUNDS):
@@ -77,8 +104,10 @@ class UnixCanHub:
             client.close()
         self._clients.clear()
         self._listener.close()
+        self._interface.close()
         if self.path.exists() and self.path.stat().st_ino == self._inode:
             self.path.unlink()
+            self._interface.path.unlink(missing_ok=True)
 
     def __enter__(self) -> UnixCanHub:
         """Return itself."""
@@ -112,6 +141,24 @@ class UnixCanHub:
                 if other is not client:
                     self._send(other, packet)
         return unpack_frames(packet)
+
+    def _waiting(self) -> int:
+        """Return how many frames clients have sent that no node has acknowledged."""
+        waiting = 0
+        for client in self._clients.values():
+            (size,) = _INT.unpack(fcntl.ioctl(client, termios.FIONREAD, bytes(_INT.size)))
+            waiting += int(size)
+        return waiting // _FRAME_BYTES
+
+    def _discard(self) -> None:
+        """Throw away what waits."""
+        for client in self._clients.values():
+            while True:
+                try:
+                    if not client.recv(PACKET_BYTES):
+                        break  # it has left; `poll` parts with it
+                except OSError:
+                    break
 
     def _send(self, client: socket.socket, packet: bytes) -> None:
         """Send without waiting; drop packets for which a slow client has no room.
