@@ -19,7 +19,7 @@ from services.joint.drive_setpoint import DriveSetpointLaw
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.neighbours import UNKNOWN, NeighbourView
 from services.joint.rearm_guard import LastState
-from shared.bus.messages import Cause, JointCommand, JointEvent, Mode, Pair
+from shared.bus.messages import LOST_DRIVE, Cause, JointCommand, JointEvent, Mode, Pair
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 
@@ -64,6 +64,8 @@ class ArmingInhibit(Enum):
     """The drive holds by its own loop; it is taken over once a planner is there."""
     FAILED = 6
     """The drive has errors: they are cleared, and it is armed if they stay away until then."""
+    UNACKNOWLEDGED = 7
+    """Its CAN bus carries no frame: nobody is there to acknowledge one."""
 
 
 class DriveAction(msgspec.Struct, gc=False, frozen=True):
@@ -84,7 +86,8 @@ _AT_ARMING: Final = {
 }
 _NO_TORQUE: Pair = (0.0, 0.0)
 _NOT_ARMED: Final = (DriveStatus.IDLE, DriveStatus.ERROR, DriveStatus.UNZEROED)
-_MAY_HOLD: Final = (DriveStatus.LOST, DriveStatus.HOLDING, DriveStatus.ARMED)
+_UNACKNOWLEDGED: Final = DriveStatus.UNACKNOWLEDGED
+_MAY_HOLD: Final = (*LOST_DRIVE, DriveStatus.HOLDING, DriveStatus.ARMED)
 _UNCONTROLLED: Final = (Mode.DISARMED, Mode.FAULT)
 
 # Compared in each cycle: docs/contributing.md, The control path.
@@ -126,6 +129,7 @@ class DriveManager:
 
     Attributes:
         controller: the control law and its state.
+        bus: name of the module's CAN bus.
         onboard: True if the motors' own loops hold the module.
     """
 
@@ -134,6 +138,7 @@ class DriveManager:
     ) -> None:
         """Take the last state of the service before this one; start DISARMED."""
         self.controller = JointController(config, name)
+        self.bus = config.module_named(name).bus
         self._fallback = DriveFallback(config, name)
         self.onboard = config.joint_service.loop == "onboard"
         drive = config.drive
@@ -319,6 +324,8 @@ class DriveManager:
         if reading is None or reading.status is DriveStatus.LOST:
             return None
         s.arm_at_ns = now_ns + ARM_EVERY_NS
+        if reading.status is _UNACKNOWLEDGED:
+            return ArmingInhibit.UNACKNOWLEDGED
         if reading.status is DriveStatus.HOLDING:
             return ArmingInhibit.WAITING if reading.torque is not None else None
         s.holding = False

@@ -42,6 +42,7 @@ _EVENT: Final = {
     DriveStatus.ERROR: Event.DRIVE_DISARMED,
     DriveStatus.UNZEROED: Event.POSITION_LOST,
     DriveStatus.HOLDING: Event.NONE,
+    DriveStatus.UNACKNOWLEDGED: Event.DRIVE_LOST,
 }
 
 

@@ -19,7 +19,7 @@ from services.joint.drive_manager import (
     DriveCommand,
     DriveManager,
 )
-from services.joint.drivers.base import Drive
+from services.joint.drivers.base import Drive, DriveStatus
 from services.joint.neighbours import UNKNOWN, NeighbourRow, NeighbourView
 from services.joint.pendant import PendantWatch
 from services.joint.rearm_guard import PENDANT, LastState, RearmGuard
@@ -50,6 +50,8 @@ _WHY_NOT: Final = {
     "there",
     ArmingInhibit.FAILED: "drive error 0x{error:x}; it is cleared, and the drive armed if it stays "
     "away",
+    ArmingInhibit.UNACKNOWLEDGED: "nobody acknowledges a frame on CAN bus {bus}: power of the "
+    "drive, its CAN cable, `xrl doctor`",
     ArmingInhibit.REFUSED: f"requested {ARM_TRIES} times: drive error 0x{{error:x}}",
 }
 
@@ -193,13 +195,17 @@ class JointLoop:
         if step.event is not None and step.event.cause == Cause.ESTOP and self._pendant.lost:
             log.get("xrl").error("emergency stop: the pendant is silent")
         if step.event is not None and step.event.mode_after == Mode.FAULT:
+            dead_bus = samples.status is DriveStatus.UNACKNOWLEDGED
             log.get("xrl").error(
-                "FAULT: %s, drive error 0x%x; restart this service to leave it",
+                "FAULT: %s, drive error 0x%x%s; restart this service to leave it",
                 Cause(step.event.cause).name,
                 samples.error,
+                f", nobody acknowledges on CAN bus {self.module.bus}" if dead_bus else "",
             )
         reported = step.inhibit is self._reported and now < self._report_at_ns
         if step.inhibit is not ArmingInhibit.NONE and not reported:
             self._reported, self._report_at_ns = step.inhibit, now + REPORT_EVERY_NS
-            why = _WHY_NOT[step.inhibit].format(q=samples.q, error=samples.error)
+            why = _WHY_NOT[step.inhibit].format(
+                q=samples.q, error=samples.error, bus=self.module.bus
+            )
             log.get("xrl").error("not armed: %s", why)

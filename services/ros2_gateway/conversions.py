@@ -9,6 +9,7 @@ import numpy as np
 
 from services.ros2_gateway.ros_types import RosTypes
 from shared.bus.messages import (
+    LOST_DRIVE,
     Cause,
     DriveStatus,
     JointState,
@@ -46,7 +47,7 @@ NOT_STOPPED: Final = "emergency stop"
 TIME_FIRST_NS: Final = 0
 TIME_LAST_NS: Final = (2**31 - 1) * NS_PER_S
 """Times of ROS 2 are 32-bit seconds since 1970: they end on 2038-01-19."""
-_UNKNOWN_POSITION: Final = (DriveStatus.LOST, DriveStatus.UNZEROED)
+_UNKNOWN_POSITION: Final = (*LOST_DRIVE, DriveStatus.UNZEROED)
 
 
 def knows_position(state: JointState) -> bool:

@@ -8,7 +8,7 @@ field is optional: a `null` in a payload can then only be a number that was not 
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import Annotated
+from typing import Annotated, Final
 
 import msgspec
 
@@ -155,6 +155,12 @@ class DriveStatus(IntEnum):
     """Both axes answer, but the zero was lost with the power."""
     HOLDING = 5
     """Both axes are in closed loop by an earlier service and wait for the take-over."""
+    UNACKNOWLEDGED = 6
+    """Lost, and the CAN bus carries no frame: nobody is there to acknowledge one."""
+
+
+LOST_DRIVE: Final = (DriveStatus.LOST, DriveStatus.UNACKNOWLEDGED)
+"""Statuses of a drive that is not heard, or cannot be told anything."""
 
 
 class PlannerMode(IntEnum):

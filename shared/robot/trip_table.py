@@ -128,6 +128,8 @@ def remedy_of(state: JointState) -> str:
         return RESTART
     if drive is DriveStatus.UNZEROED:
         return "hang the robot, xrl drive zero"
+    if drive is DriveStatus.UNACKNOWLEDGED:
+        return "nobody acknowledges on its CAN bus: power of drive and adapter, cable"
     if drive is DriveStatus.HOLDING:
         return "by itself, with the planner: the drive holds"
     if mode is Mode.DISARMED and drive in (DriveStatus.IDLE, DriveStatus.ERROR):

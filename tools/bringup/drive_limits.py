@@ -52,8 +52,8 @@ def _over_can(robot: RobotConfig, module: str, run_dir: Path) -> None:
     try:
         taken = link.connect()
         for _ in range(TIMES):
+            link.receive(_APART_S)  # nothing is sent to a drive that is not heard
             taken = taken and link.send(messages_of(wiring.node_ids, (limits,)))
-            link.receive(_APART_S)
     finally:
         link.close()
     if not taken:

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 
 from services.joint.differential import joint_from_motor
 from services.joint.drivers.base import Drive, DriveReading, DriveStatus
-from shared.bus.messages import Pair
+from shared.bus.messages import LOST_DRIVE, Pair
 from shared.clock import NS_PER_S, now_ns
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
@@ -95,10 +95,10 @@ class Interrupts:
 
 
 def await_reading(drive: Drive, clock: Clock = now_ns) -> DriveReading | None:
-    """Return a drive's first reading that is not LOST; None if it does not answer."""
+    """Return a drive's first reading that is not of a lost one; None if it does not answer."""
     until = clock() + _ns(ANSWER_S)
     reading = drive.read(READ_S)
-    while reading is None or reading.status is DriveStatus.LOST:
+    while reading is None or reading.status in LOST_DRIVE:
         if clock() > until:
             return None
         reading = drive.read(READ_S)

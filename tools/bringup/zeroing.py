@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 from services.joint.differential import joint_from_motor, motor_from_joint
 from services.joint.drivers.base import Drive, DriveStatus
 from services.joint.drivers.wired_drive import MotorFrame
-from shared.bus.messages import Pair
+from shared.bus.messages import LOST_DRIVE, Pair
 from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_S, now_ns
 from shared.config.robot_config import RobotConfig
@@ -99,7 +99,7 @@ def look(drive: Drive, mark_turns: float, gear_ratio: float) -> DriveLook:
 
 def refusal(seen: DriveLook) -> str:
     """Return why a drive cannot be zeroed now; "" if it can."""
-    if seen.status is DriveStatus.LOST:
+    if seen.status in LOST_DRIVE:
         return NO_ANSWER
     if seen.status is DriveStatus.ARMED:
         return "its drive is armed (closed loop); make it idle first"
@@ -137,7 +137,7 @@ def zero(drive: Drive, q: Pair, robot: RobotConfig) -> Back | None:
         until = time.monotonic() + SET_S
         while time.monotonic() < until:
             reading = drive.read(_READ_S)
-            if reading is None or reading.status is DriveStatus.LOST or reading.t_ns < taken_ns:
+            if reading is None or reading.status in LOST_DRIVE or reading.t_ns < taken_ns:
                 continue
             a, b = reading.pos_turns
             armed = reading.status is DriveStatus.ARMED

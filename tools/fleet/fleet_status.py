@@ -12,6 +12,7 @@ import msgspec
 from services.joint.rearm_guard import stop_source
 from shared import scheduling
 from shared.bus.messages import (
+    LOST_DRIVE,
     Cause,
     DriveStatus,
     JointState,
@@ -326,7 +327,7 @@ def module_status(
     if not isinstance(state, JointState):
         return ModuleStatus()
     mode = state.mode
-    knows = state.drive not in (DriveStatus.LOST, DriveStatus.UNZEROED)
+    knows = state.drive not in (*LOST_DRIVE, DriveStatus.UNZEROED)
     return ModuleStatus(
         mode=name_of(Mode, mode),
         tier=TIERS.get(Mode(mode)) if mode in tuple(Mode) else None,

@@ -9,7 +9,11 @@ from typing import Any, Final, TypeAlias
 
 import can
 
+from services.joint.drivers.bus_watch import BusWatch
 from shared.can import cansimple
+from shared.can.cansimple import Command
+from shared.can.cansimple_06 import Command06
+from shared.can.interface import limit_queue, restart
 from shared.can.unix_can import ERROR_FLAG, EXTENDED_FLAG
 from shared.clock import NS_PER_MS, now_ns
 from shared.config.sections import CanConfig
@@ -19,8 +23,19 @@ FRAMES_PER_READ: Final = 512
 """More than can wait in a socket; a flooded bus must not hold up the loop."""
 RETRY_MS: Final = 200
 """Between two attempts to open the bus: on socketcan an attempt may cost a millisecond."""
-COMMANDS_MS: Final = 100
+COMMANDS_MS: Final = 40
 """An order that the bus has not taken by then is given up: it belongs to another moment."""
+ECHOING: Final = ("socketcan", "xrl_unix")
+"""Interfaces that hand own frames back once the bus has carried them."""
+ECHOED: Final = (Command.SET_INPUT_POS, Command.SET_INPUT_TORQUE, Command06.GET_VERSION)
+"""Commands to axis0 that are awaited back: each row that a driver sends has one of them."""
+HEARD: Final = (
+    Command.HEARTBEAT,
+    Command.GET_ENCODER_ESTIMATES,
+    Command.GET_ENCODER_COUNT,
+    Command.GET_IQ,
+)
+"""Commands whose frames are the drive's own: it is there."""
 IN_KERNEL: Final = ("socketcan",)
 """Interfaces whose frames all wait in the kernel, behind one file descriptor: it throws other
 modules' frames away before a process is woken for them, and is waited for by `select`."""
@@ -57,9 +72,11 @@ class CanLink:
     """A bus that may not be there: what goes wrong on it is counted, and reads as silence.
 
     A bus that fails, or whose controller has gone off it (too many errors on the wire), is
-    closed, and opened again every `RETRY_MS`.
+    closed, and opened again every `RETRY_MS`. Nothing is sent that would have to wait for somebody
+    to acknowledge it (`services.joint.drivers.bus_watch`).
 
     Attributes:
+        watch: what is known of the bus.
         connections: how often the bus was opened.
         bus_offs: how often the controller went off the bus.
         error_frames: reports of any other trouble on the wire.
@@ -74,12 +91,23 @@ class CanLink:
         self._options: dict[str, Any] = {}
         if config.interface in IN_KERNEL:
             self._options["can_filters"] = filters(node_ids)
+        echoes = config.interface in ECHOING
+        if echoes:
+            self._options["receive_own_messages"] = True
+        self.watch = BusWatch(echoes=echoes)
+        self._own = {cansimple.arbitration_id(node_ids[0], command) for command in ECHOED}
+        self._drives = {
+            cansimple.arbitration_id(node, command) for node in node_ids for command in HEARD
+        }
+        self._probe = (message(node_ids[0], Command06.GET_VERSION, b""),)
+        self._greeting: Sequence[can.Message] = ()
         self._bus: can.BusABC | None = None
         self._receive: Receive = _nothing
         self._send: Send = _drop
         self._retry_at_ns = 0
         self._commands: Sequence[can.Message] = ()
         self._commands_until_ns = 0
+        self._commands_proven = False
 
     @property
     def is_open(self) -> bool:
@@ -111,6 +139,9 @@ class CanLink:
         except (can.CanError, OSError):
             return False
         self.connections += 1
+        self.watch.reopened()
+        with suppress(OSError):
+            limit_queue(self._bus)
         self._receive = receiver(self._bus, in_kernel=self._config.interface in IN_KERNEL)
         self._send = sender(self._bus)
         return True
@@ -130,6 +161,8 @@ class CanLink:
             return ()
         if off:
             self._go_off()
+        else:
+            self._look_after(frames)
         return frames
 
     def error_frame(self, can_id: int) -> None:
@@ -147,19 +180,40 @@ class CanLink:
         if self._commands and not self._send_commands():
             return False
         # A full queue comes here too. A dead link shows in receiving.
-        return self._send(messages) == len(messages)
+        return self._hand_over(messages, now_ns()) == len(messages)
 
-    def order(self, messages: Sequence[can.Message]) -> None:
+    def greet(self, messages: Sequence[can.Message]) -> None:
+        """Send the first requests on a newly opened bus.
+
+        They go before the drive was heard: whether they are carried shows if anybody is there, and
+        whether frames wait from an earlier process. After an outage they wait for the drive.
+        """
+        if self.watch.unacknowledged:
+            self._greeting = messages
+        else:
+            self._send(messages)
+            self._send_probe(now_ns())
+
+    def order(self, messages: Sequence[can.Message], *, proven: bool = False) -> None:
         """Send messages of which none may be missing, in this order.
 
         A row of a dozen can be longer than the queue of the interface (ten frames, unless
         set): the rest follows when there is room, within `COMMANDS_MS`. They take the place
         of an order that is still waiting.
+
+        Args:
+            messages: the row.
+            proven: send it only once the bus has just carried a frame: an arming request that had
+                to wait would arm a drive at another time.
         """
         if self._bus is None:
             return
-        self._commands = messages
-        self._commands_until_ns = now_ns() + COMMANDS_MS * NS_PER_MS
+        now = now_ns()
+        self._commands = [*messages, *self._probe] if proven and self.watch.echoes else messages
+        self._commands_until_ns = now + COMMANDS_MS * NS_PER_MS
+        self._commands_proven = proven
+        if proven and self.watch.may_send(now) and not self.watch.may_arm(now):
+            self._send_probe(now)
         self._send_commands()
 
     def close(self) -> None:
@@ -169,11 +223,57 @@ class CanLink:
 
     def _send_commands(self) -> bool:
         """Send as many frames as the bus has room for; True if none is left."""
-        if now_ns() > self._commands_until_ns:
+        now = now_ns()
+        if now > self._commands_until_ns:
             self._commands = ()
-        else:
-            self._commands = self._commands[self._send(self._commands) :]
+        elif not self._commands_proven or self.watch.may_arm(now):
+            self._commands = self._commands[self._hand_over(self._commands, now) :]
         return not self._commands
+
+    def _hand_over(self, messages: Sequence[can.Message], now: int) -> int:
+        """Hand frames to the bus if they would not wait there; return how many it took."""
+        watch = self.watch
+        if not watch.may_send(now):
+            return 0
+        taken = self._send(messages)
+        if watch.echoes:
+            for each in messages[:taken]:
+                if each.arbitration_id in self._own and not each.is_remote_frame:
+                    watch.sent(now)
+            if taken < len(messages):
+                watch.refused(now)
+        return taken
+
+    def _send_probe(self, now: int) -> None:
+        """Send a frame that changes nothing: that it comes back shows that the bus carries."""
+        if self._send(self._probe):
+            self.watch.sent(now)
+
+    def _look_after(self, frames: Sequence[Frame]) -> None:
+        """Take in what frames show of the bus; throw away what must not wait any longer."""
+        watch, now = self.watch, now_ns()
+        for can_id, _ in frames:
+            if can_id in self._drives:
+                watch.heard(now)
+            elif can_id in self._own:
+                watch.carried(now)
+        if watch.restart_due(now):
+            self._restart()
+        elif watch.probe_due(now):
+            self._send_probe(now)
+        elif self._greeting and watch.may_send(now):
+            self._greeting, greeting = (), self._greeting
+            self._send(greeting)
+
+    def _restart(self) -> None:
+        """Throw away what waits in the kernel and the adapter, of whatever process."""
+        self._commands = ()
+        done = True
+        try:
+            restart(self._bus, self._config.channel)
+        except OSError:
+            done = False
+        self.watch.restarted(now_ns(), done=done)
 
     def _go_off(self) -> None:
         self.bus_offs += 1
@@ -192,11 +292,20 @@ class CanLink:
 
 
 def filters(node_ids: Sequence[int]) -> list[dict[str, Any]]:
-    """Return python-can's filters for all frames of some nodes; error frames pass them."""
-    mask = cansimple.arbitration_id(cansimple.NODE_MASK, 0)
+    """Return python-can's filters for what drives send, and for own frames that are awaited back.
+
+    Error frames pass them.
+    """
+    mask = cansimple.arbitration_id(cansimple.NODE_MASK, cansimple.COMMAND_MASK)
+    wanted = [(node, command) for node in node_ids for command in (*HEARD, Command06.GET_VERSION)]
+    wanted += [(node_ids[0], command) for command in ECHOED[:-1]]
     return [
-        {"can_id": cansimple.arbitration_id(node, 0), "can_mask": mask, "extended": False}
-        for node in node_ids
+        {
+            "can_id": cansimple.arbitration_id(node, command),
+            "can_mask": mask,
+            "extended": False,
+        }
+        for node, command in wanted
     ]
 
 

@@ -36,6 +36,8 @@ from shared.exceptions import DriveError
 
 __all__ = ["RETRY_MS", "OdriveCan"]
 
+FRESH_S: Final = 0.05
+"""Time for which `set_position` waits for a frame of the drive, which is not sent to unheard."""
 CLOSE_MS: Final = 20
 """Time for which a command that the bus had no room for may hold up `close`."""
 
@@ -146,7 +148,9 @@ class OdriveCan:
                 if unheard and status is not _LOST:
                     self._forget()
                     status = _LOST
-                if status is not _ARMED and now < self._windows.feed_until_ns:
+                if self._link.watch.carries_nothing(now):
+                    status = DriveStatus.UNACKNOWLEDGED
+                elif status is not _ARMED and now < self._windows.feed_until_ns:
                     self._link.send(self._food)
                 return self._reading(status)
             if now >= deadline or not self._link.is_open:
@@ -192,7 +196,7 @@ class OdriveCan:
         otherwise bring back the earlier torque, and the factory gains have an integrator. `status`
         is IDLE until heartbeats show more.
         """
-        self._send(odrive_frames.arming(self._drive, onboard=onboard), armed=True)
+        self._send(odrive_frames.arming(self._drive, onboard=onboard), armed=True, proven=True)
         now = now_ns()
         self._due.armed(now)
         self._windows.armed(now)
@@ -215,6 +219,9 @@ class OdriveCan:
                 full.
         """
         frames = odrive_frames.positions(self._node_ids, turns, self.dialect, self._counts_per_turn)
+        if not self._link.watch.is_heard(now_ns()):  # a person was asked meanwhile
+            self._pump(0.0)
+            self._pump(FRESH_S)
         if not self._link.send(frames):
             first, second = self._node_ids
             raise DriveError(
@@ -229,12 +236,19 @@ class OdriveCan:
             time.sleep(1e-3)
         self._link.close()
 
-    def _send(self, commands: tuple[odrive_frames.CanCommand, ...], *, armed: bool) -> None:
+    def _send(
+        self,
+        commands: tuple[odrive_frames.CanCommand, ...],
+        *,
+        armed: bool,
+        proven: bool = False,
+    ) -> None:
         """Send commands to both axes and forget their earlier reports."""
         self._report.requested(armed=armed)
         self._answers.forget_torques()
         self._windows.ordered(now_ns())
-        self._link.order(odrive_frames.messages_of(self._node_ids, commands))
+        frames = odrive_frames.messages_of(self._node_ids, commands)
+        self._link.order(frames, proven=proven)
 
     def _pump(self, timeout_s: float) -> None:
         """Take in the frames of one wait; most of a shared bus's are other modules'."""
@@ -284,7 +298,7 @@ class OdriveCan:
             self._report.receive_version(data)
 
     def _silence(self, now: int) -> DriveReading | None:
-        """Return None while the drive may yet come back as it was, then LOST.
+        """Return None while the drive may yet come back as it was, then that it is lost.
 
         A link that failed counts as silence too: an interface that restarts is not a lost
         drive.
@@ -293,7 +307,8 @@ class OdriveCan:
             return None
         if self._times.may_have_restarted(now):
             self._forget()
-        return self._reading(DriveStatus.LOST)
+        dead = self._link.watch.unacknowledged
+        return self._reading(DriveStatus.UNACKNOWLEDGED if dead else DriveStatus.LOST)
 
     def _forget(self) -> None:
         """Forget the drive's reports: it may have been switched off and on."""
@@ -323,7 +338,6 @@ class OdriveCan:
         self._answers.forget_counts()
         if not self._times.has_recent_sample(now_ns()):
             self._report.forget()
-        if self._report.dialect == "":
-            self._link.send(self._answers.ask_version)
-        self._link.send(self._answers.ask_counts)
+        version = self._answers.ask_version if self._report.dialect == "" else []
+        self._link.greet([*version, *self._answers.ask_counts])
         return True

@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from services.joint.drivers.base import Drive, DriveReading, DriveStatus, MotorTarget
-from shared.bus.messages import Pair
+from shared.bus.messages import LOST_DRIVE, Pair
 
 Signs = tuple[int, int]
 """Signs of axis0 and axis1; -1: the motor counts down where the differential counts up."""
@@ -32,7 +32,7 @@ class MotorFrame(NamedTuple):
         a, b = a * sign_a - mark, b * sign_b - mark
         status, half, zero = reading.status, 0.5 * mark, reading.encoder_zero
         zeroed = mark == 0.0 or (-half < a < half and -half < b < half)
-        if not zeroed and status is not DriveStatus.LOST:
+        if not zeroed and status not in LOST_DRIVE:
             status = DriveStatus.UNZEROED
         return DriveReading(
             reading.t_ns,

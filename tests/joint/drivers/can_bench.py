@@ -83,6 +83,8 @@ class Bench:
         self.now_ns = 1
         self.buses: list[FakeBus] = []
         self.refuses: Exception | None = None
+        self.talks = True
+        """The drive is heard while the test waits."""
         for module in (odrive_can, can_link):
             monkeypatch.setattr(module, "now_ns", lambda: self.now_ns)
         monkeypatch.setattr(time, "sleep", self.wait)
@@ -103,6 +105,8 @@ class Bench:
 
     def wait(self, seconds: float) -> None:
         self.now_ns += round(seconds * 1e9)
+        if self.talks and self.buses:
+            self.driver._link.watch.heard(self.now_ns)
 
     def after(self, ms: float) -> DriveReading | None:
         """Read so much later what there is."""

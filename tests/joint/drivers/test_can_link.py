@@ -11,7 +11,7 @@ import can
 import pytest
 
 from services.joint.drivers.base import DriveStatus
-from services.joint.drivers.can_link import FRAMES_PER_READ, RETRY_MS, receiver
+from services.joint.drivers.can_link import ECHOED, FRAMES_PER_READ, HEARD, RETRY_MS, receiver
 from services.joint.drivers.odrive_can import OdriveCan
 from shared.can.cansimple import AxisState, Command, arbitration_id, pack_two_floats
 from shared.can.cansimple_06 import Command06
@@ -235,7 +235,11 @@ def test_the_kernel_filters_by_the_nodes_to_wake_for(monkeypatch: pytest.MonkeyP
         for each in found
         if can_id & each["can_mask"] == each["can_id"] & each["can_mask"]
     }
-    assert passing == {arbitration_id(node, command) for node in NODES for command in range(32)}
+    theirs = (*HEARD, Command06.GET_VERSION)
+    assert passing == {arbitration_id(node, command) for node in NODES for command in theirs} | {
+        arbitration_id(NODES[0], command) for command in ECHOED
+    }
+    assert bench.bus.options["receive_own_messages"] is True
     assert all(each["extended"] is False for each in found)
     bench.driver.close()
 

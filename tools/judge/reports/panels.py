@@ -59,6 +59,7 @@ COLOURS: Final[Mapping[type[IntEnum], Mapping[int, str]]] = {
     DriveStatus: {
         DriveStatus.LOST: "bad", DriveStatus.IDLE: "idle", DriveStatus.ARMED: "good",
         DriveStatus.ERROR: "odd", DriveStatus.UNZEROED: "warn", DriveStatus.HOLDING: "good",
+        DriveStatus.UNACKNOWLEDGED: "bad",
     },
     PlannerMode: {
         PlannerMode.WAITING: "idle", PlannerMode.ALIGNING: "warn", PlannerMode.LEADING: "good",

@@ -1,0 +1,411 @@
+"""A bus on which nobody acknowledges: what reaches the drive of what was sent, and how old."""
+
+from __future__ import annotations
+
+import itertools
+import random
+from collections.abc import Iterator
+from pathlib import Path
+
+import can
+import pytest
+
+from services.joint.drivers import can_link, odrive_can
+from services.joint.drivers.base import DriveReading, DriveStatus
+from services.joint.drivers.bus_watch import (
+    BLOCKED_MS,
+    PROBE_MS,
+    PROOF_MS,
+    QUIET_MS,
+    RESTART_MS,
+    STUCK_MS,
+    BusWatch,
+)
+from services.joint.drivers.odrive_can import OdriveCan
+from services.simulator.fronts.unix_can_hub import UnixCanHub
+from shared.can.cansimple import AxisState, Command, split_id
+from shared.can.cansimple_06 import Command06
+from shared.can.unix_can import Frame, UnixCanBus
+from shared.clock import NS_PER_MS
+from tests.joint.drivers.can_bench import Bench
+from tests.joint.drivers.rig import AXES, TARGET, Rig, make_driver
+
+OLD_MS = 50
+"""No frame that is older reaches a drive."""
+CYCLE_MS = 5
+"""Longest wait of a service's cycle for a frame."""
+
+
+def watch_at(ms: float, *, echoes: bool = True) -> BusWatch:
+    """Return a watch of a bus that carries, whose drive was heard at a time."""
+    watch = BusWatch(echoes=echoes)
+    watch.heard(round(ms * NS_PER_MS))
+    watch.sent(round(ms * NS_PER_MS))
+    watch.carried(round(ms * NS_PER_MS))
+    return watch
+
+
+# ---- the law, at each boundary
+
+
+@pytest.mark.parametrize("echoes", [False, True])
+@pytest.mark.parametrize("ms", [0, QUIET_MS, QUIET_MS + 1, 10_000])
+def test_nothing_is_sent_to_a_drive_that_was_not_heard(ms: int, echoes: bool) -> None:
+    assert watch_at(0, echoes=echoes).may_send(ms * NS_PER_MS) == (ms <= QUIET_MS)
+    assert not BusWatch(echoes=echoes).may_send(0), "nor before it was"
+
+
+@pytest.mark.parametrize("ms", [0, STUCK_MS, STUCK_MS + 1, RESTART_MS, RESTART_MS + 1])
+def test_nothing_is_sent_behind_a_frame_that_is_not_carried(ms: int) -> None:
+    watch, now = watch_at(0), ms * NS_PER_MS
+    watch.sent(0)
+    watch.heard(now)
+    assert watch.may_send(now) == (ms <= STUCK_MS)
+    assert watch.restart_due(now) == (ms > RESTART_MS)
+
+
+@pytest.mark.parametrize("ms", [0, PROOF_MS, PROOF_MS + 1])
+def test_arming_needs_a_frame_that_was_just_carried(ms: int) -> None:
+    watch, now = watch_at(0), ms * NS_PER_MS
+    watch.heard(now)
+    assert watch.may_arm(now) == (ms <= PROOF_MS)
+
+
+def test_after_an_outage_a_probe_is_carried_before_anything_is_sent() -> None:
+    watch = watch_at(0)
+    watch.sent(NS_PER_MS)
+    watch.restarted(40 * NS_PER_MS, done=True)
+    back = 3000 * NS_PER_MS
+    assert not watch.probe_due(back), "not before the drive is heard"
+    watch.heard(back)
+    assert not watch.may_send(back)
+    assert watch.probe_due(back)
+    watch.sent(back)
+    assert not watch.probe_due(back), "one at a time"
+    watch.carried(back + NS_PER_MS)
+    assert watch.may_arm(back + NS_PER_MS)
+    assert not watch.carries_nothing(back + NS_PER_MS)
+
+
+def test_a_bus_that_carries_nothing_though_the_drive_is_heard_counts_as_lost() -> None:
+    watch, told_ms, probes = watch_at(0), 0, 0
+    for ms in range(1, 1000, 2):
+        now = ms * NS_PER_MS
+        watch.heard(now)
+        if watch.restart_due(now):
+            watch.restarted(now, done=True)
+        if watch.may_send(now):
+            watch.sent(now)
+        if watch.probe_due(now):
+            watch.sent(now)
+            probes += 1
+        told_ms = told_ms or watch.carries_nothing(now) * ms
+    assert RESTART_MS + BLOCKED_MS < told_ms < 200
+    assert 4 <= probes <= 1000 // PROBE_MS
+
+
+def test_a_silent_bus_is_probed_once_unless_the_interface_cannot_be_restarted() -> None:
+    for done, probes in ((True, 1), (False, 0)):
+        watch = BusWatch(echoes=True)
+        watch.restarted(0, done=done)
+        watch.heard(0)
+        watch.carried(0)
+        due = [watch.probe_due(ms * NS_PER_MS) for ms in range(QUIET_MS + 1, 500)]
+        assert sum(due) == probes
+
+
+def test_lost_echoes_do_not_make_a_live_bus_a_dead_one() -> None:
+    watch, dice = watch_at(0), random.Random(0)
+    for ms in range(0, 20_000, 2):
+        now = ms * NS_PER_MS
+        watch.heard(now)
+        if dice.random() > 0.3:
+            watch.carried(now)
+        watch.sent(now)
+        assert not watch.restart_due(now)
+
+
+# ---- the driver, on a bus whose every answer the test writes; its interface cannot be restarted
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    bench = Bench(monkeypatch, "xrl_unix")
+    bench.bus.sent.clear()
+    bench.talks = False
+    yield bench
+    bench.driver.close()
+
+
+def echo(bench: Bench) -> None:
+    """Hand back what was sent."""
+    bench.bus.waiting.extend(bench.bus.sent)
+
+
+def test_an_arming_request_waits_for_a_frame_that_is_carried_and_is_followed_by_one(
+    bench: Bench,
+) -> None:
+    bench.driver._link.watch.carried(bench.now_ns)
+    bench.wait(1e-3 * (PROOF_MS + 1))
+    bench.receive()
+    bench.driver.arm(onboard=True)
+    echo(bench)
+    assert bench.commands() == [Command06.GET_VERSION], "the probe"
+    bench.after(2)
+    bench.after(2)
+    commands = bench.commands()
+    assert commands[-3:] == [*[Command.SET_AXIS_STATE] * 2, Command06.GET_VERSION]
+    assert commands[0] == Command.CLEAR_ERRORS
+
+
+def test_no_arming_request_is_left_on_a_bus_that_carries_nothing(bench: Bench) -> None:
+    """Even where nothing can be thrown away: the drive is gone since it was last heard."""
+    bench.driver._link.watch.carried(bench.now_ns)
+    bench.wait(1e-3 * (PROOF_MS + 1))
+    bench.receive()
+    for _ in range(200):
+        bench.driver.arm(onboard=True)
+        bench.after(CYCLE_MS)
+    assert set(bench.commands()) == {Command06.GET_VERSION}
+
+
+def test_where_nothing_can_be_thrown_away_a_dead_bus_gets_a_few_targets_and_no_more(
+    bench: Bench,
+) -> None:
+    bench.driver._link.watch.carried(bench.now_ns)
+    bench.receive()
+    for _ in range(600):
+        bench.driver.write(TARGET)
+        bench.after(CYCLE_MS)
+    assert 0 < len(bench.commands()) <= 40
+    assert bench.seen(CYCLE_MS).status is DriveStatus.UNACKNOWLEDGED
+
+
+# ---- the driver, on a bus as the kernel has it
+
+
+class StampingHub(UnixCanHub):
+    """A bus that notes when each frame was sent, and how old it was when a node took it.
+
+    Attributes:
+        ages_ms: of each frame that a node has taken, with its command.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.now_ms = 0.0
+        self.sent_ms: dict[bytes, float] = {}
+        self.ages_ms: list[tuple[int, float]] = []
+
+    def poll(self) -> list[Frame]:
+        frames = super().poll()
+        for can_id, data in frames:
+            sent = STAMPS.pop(0)
+            assert sent[0] == (can_id, data)
+            self.ages_ms.append((split_id(can_id & 0x7FF)[1], self.now_ms - sent[1]))
+        return frames
+
+
+STAMPS: list[tuple[Frame, float]] = []
+"""Frames that were sent and neither taken nor thrown away, with their times, ms."""
+
+
+class Cut:
+    """An emulated drive, its driver as a service uses it, and the power of their bus."""
+
+    def __init__(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        STAMPS.clear()
+        self.rig = Rig(path, hub=StampingHub)
+        assert isinstance(self.rig.hub, StampingHub)
+        self.hub = self.rig.hub
+        for module in (odrive_can, can_link):
+            monkeypatch.setattr(module, "now_ns", lambda: round(self.ms * NS_PER_MS) + NS_PER_MS)
+        send_many, restart = UnixCanBus.send_many, UnixCanBus.restart
+
+        def stamped(bus: UnixCanBus, messages: list[can.Message]) -> None:
+            send_many(bus, messages)
+            for each in messages:
+                flag = 0x4000_0000 if each.is_remote_frame else 0
+                data = bytes(each.data).ljust(each.dlc, b"\0")
+                STAMPS.append(((each.arbitration_id | flag, data), self.ms))
+
+        def restarted(bus: UnixCanBus) -> None:
+            restart(bus)
+            self.restarts += 1
+            STAMPS.clear()
+
+        monkeypatch.setattr(UnixCanBus, "send_many", stamped)
+        monkeypatch.setattr(UnixCanBus, "restart", restarted)
+        self.path, self.restarts = path, 0
+        self.driver: OdriveCan = make_driver(path)
+        self.reading: DriveReading | None = None
+
+    @property
+    def ms(self) -> float:
+        return self.rig.now_s * 1e3
+
+    def power(self, *, on: bool) -> None:
+        self.rig.bank.conditions.link(AXES[0] >> 1, up=on)
+
+    def step(self) -> None:
+        """Let a millisecond pass."""
+        self.hub.now_ms = self.ms
+        self.rig.step()
+
+    def cycle(self, write: bool = True) -> None:
+        """Run a cycle of the service: two milliseconds with the drive, five without."""
+        heard = self.rig.bank.is_responding(AXES[0])
+        for _ in range(2 if heard else CYCLE_MS):
+            self.step()
+        self.reading = self.driver.read(0.0)
+        if write:
+            self.driver.write(TARGET)
+
+    def run(self, ms: float, write: bool = True) -> None:
+        until = self.ms + ms
+        while self.ms < until:
+            self.cycle(write)
+
+    def oldest_ms(self) -> float:
+        """Return the age of the oldest frame that reached the drive, and forget them."""
+        oldest = max((age for _, age in self.hub.ages_ms), default=0.0)
+        self.hub.ages_ms.clear()
+        return oldest
+
+    @property
+    def states(self) -> list[AxisState]:
+        return [self.rig.bank.state[axis] for axis in AXES]
+
+
+@pytest.fixture
+def cut(path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cut]:
+    cut = Cut(path, monkeypatch)
+    cut.run(50, write=False)
+    yield cut
+    cut.driver.close()
+    cut.rig.hub.close()
+
+
+def armed(cut: Cut) -> None:
+    cut.driver.arm(onboard=True)
+    cut.run(40, write=False)
+    assert cut.states == [AxisState.CLOSED_LOOP_CONTROL] * 2
+    cut.run(40)
+    assert cut.oldest_ms() <= CYCLE_MS
+
+
+@pytest.mark.parametrize("lasts_ms", [7, 22, 35, 48, 60, 90, 130, 300, 3000])
+def test_no_old_frame_reaches_a_drive_after_a_power_cut_of_any_length(
+    cut: Cut, lasts_ms: int
+) -> None:
+    armed(cut)
+    cut.power(on=False)
+    cut.run(lasts_ms)
+    cut.power(on=True)
+    cut.run(100)
+    assert cut.oldest_ms() < OLD_MS - 5
+    assert cut.restarts == (1 if lasts_ms > RESTART_MS + 2 * CYCLE_MS else cut.restarts)
+    assert cut.reading is not None
+    assert cut.reading.status is DriveStatus.ARMED
+    before = cut.driver.write_failures
+    cut.run(50)
+    assert cut.driver.write_failures == before, "it is written to as before"
+
+
+def test_a_bus_without_acknowledgements_is_told_within_a_fifth_of_a_second(cut: Cut) -> None:
+    armed(cut)
+    cut.power(on=False)
+    start = cut.ms
+    while cut.reading is None or cut.reading.status is not DriveStatus.UNACKNOWLEDGED:
+        cut.cycle()
+    assert cut.ms - start < 200
+
+
+def test_nothing_is_sent_into_a_dead_bus_and_it_is_told_there_too(cut: Cut) -> None:
+    """A service that is not armed sends nothing: one probe shows that nobody is there."""
+    cut.power(on=False)
+    cut.run(190, write=False)
+    assert cut.reading is not None
+    assert cut.reading.status is DriveStatus.UNACKNOWLEDGED
+    assert (cut.restarts, STAMPS) == (1, [])
+    cut.driver.arm(onboard=True)
+    cut.driver.idle()
+    cut.run(3000)
+    assert STAMPS == []
+    cut.power(on=True)
+    cut.run(50, write=False)
+    assert cut.oldest_ms() <= CYCLE_MS
+    assert cut.states == [AxisState.IDLE] * 2
+
+
+@pytest.mark.parametrize("offset_ms", range(-3, 12))
+def test_no_arming_request_from_before_a_power_cut_reaches_the_drive(
+    cut: Cut, offset_ms: int
+) -> None:
+    """Whichever of its frames the cut meets: afterwards the drive is as it was, or was armed."""
+    steps = itertools.count()
+    cut.driver.read(0.0)
+    while next(steps) < max(0, -offset_ms):
+        cut.step()
+    if offset_ms < 0:
+        cut.power(on=False)
+    cut.driver.arm(onboard=True)
+    for _ in range(max(0, offset_ms)):
+        cut.step()
+        cut.driver.read(0.0)
+    before = cut.states
+    cut.power(on=False)
+    cut.run(3000, write=False)
+    assert STAMPS == [], "nothing is left to be delivered"
+    cut.power(on=True)
+    cut.run(300, write=False)
+    assert cut.states == before
+    assert cut.oldest_ms() < OLD_MS
+
+
+def test_frames_of_a_service_that_died_in_the_cut_are_thrown_away_by_the_next(
+    cut: Cut, path: Path
+) -> None:
+    armed(cut)
+    cut.power(on=False)
+    cut.driver.write(TARGET)
+    cut.driver.write(TARGET)
+    cut.driver.close()
+    assert STAMPS != []
+    cut.driver = make_driver(path)
+    cut.run(200, write=False)
+    assert STAMPS == []
+    assert cut.reading is not None
+    assert cut.reading.status is DriveStatus.UNACKNOWLEDGED
+
+
+def test_a_bus_that_is_full_in_bursts_is_written_to_between_them(cut: Cut) -> None:
+    armed(cut)
+    for _ in range(20):
+        for choked in (True, False):
+            cut.hub.choked = choked
+            cut.run(40)
+            assert cut.reading is not None
+            assert cut.reading.status is DriveStatus.ARMED
+    assert cut.oldest_ms() <= CYCLE_MS
+    assert cut.restarts == 0
+
+
+def test_a_bus_that_stays_full_counts_as_one_that_carries_nothing(cut: Cut) -> None:
+    armed(cut)
+    cut.hub.choked = True
+    cut.run(BLOCKED_MS + 20)
+    assert cut.reading is not None
+    assert cut.reading.status is DriveStatus.UNACKNOWLEDGED
+
+
+def test_a_bus_that_flaps_brings_no_old_frame(cut: Cut) -> None:
+    armed(cut)
+    dice = random.Random(0)
+    for _ in range(60):
+        cut.power(on=False)
+        cut.run(dice.uniform(1.0, 90.0))
+        cut.power(on=True)
+        cut.run(dice.uniform(1.0, 90.0))
+    assert Command.SET_AXIS_STATE not in {command for command, _ in cut.hub.ages_ms}
+    assert cut.oldest_ms() < OLD_MS
