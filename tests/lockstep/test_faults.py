@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import random
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Final, NamedTuple
 
 import numpy as np
 import pytest
@@ -31,6 +32,7 @@ LATE, AT_REST = 0.69, 2.99
 
 BLIND_S = 0.052
 """s for which a drive stays armed without words from its encoder."""
+NOTHING: Final = {"kill": (), "restart": (), "push": ()}
 
 
 def fault(kind: FaultKind, module: str, at: float, lasts: float | None = None) -> tuple[Fault]:
@@ -141,6 +143,60 @@ def test_a_drive_holds_by_its_own_loop_while_its_cable_is_out_and_after(robot: R
     assert outcome.stood
     assert set(outcome.lockstep.bank.state) == {CLOSED}
     assert outcome.modes[MODULE_INDEX["knee_right"]] is Mode.FAULT
+
+
+# ---- nobody acknowledges: what waits in the kernel, and what of it reaches a drive
+
+
+OLD_NS = 50_000_000
+"""No frame that is older reaches a drive."""
+
+
+def cut(modules: Sequence[str], at: float, lasts: float) -> tuple[Fault, ...]:
+    """Return a power cut of the CAN side of some drives, which hold by their own loops."""
+    return tuple(each for name in modules for each in fault("link_lost", name, at, lasts))
+
+
+@pytest.mark.parametrize("lasts", [0.03, 3.0])
+def test_a_power_cut_of_all_buses_in_a_squat_brings_no_old_frame(
+    robot: RobotConfig, lasts: float
+) -> None:
+    told_s = set()
+
+    def look(fleet: Lockstep, row: SimTruth) -> None:
+        statuses = {each.samples.status for each in fleet.controllers}
+        if statuses == {DriveStatus.UNACKNOWLEDGED}:
+            told_s.add(row.scenario_s - 1.5)
+
+    scenario = variant("squat", duration=2.0 + lasts, fault=cut(MODULES, 1.5, lasts), **NOTHING)
+    outcome = run(robot, scenario, each=look)
+    assert outcome.stood
+    for bus in outcome.lockstep.buses.values():
+        assert max(bus.ages_ns, default=0) < OLD_NS
+        assert bus.thrown_away > 0 or lasts < 0.05
+    assert min(told_s, default=0.0) < 0.2
+    assert bool(told_s) is (lasts > 0.1)
+
+
+@pytest.mark.parametrize("after_ms", [-10, -2, 0, 4])
+def test_a_power_cut_while_arming_leaves_no_request_behind(
+    robot: RobotConfig, after_ms: int
+) -> None:
+    """A limp module's service is restarted, and arms it; the cut comes about then."""
+    cut_s, waits = 1.024 + 1e-3 * after_ms, []
+
+    def look(fleet: Lockstep, row: SimTruth) -> None:
+        if row.scenario_s > cut_s + 0.05:
+            waits.append(fleet.buses[MODULE].waiting)
+
+    restarts = {"kill": kill(1.0, MODULE), "restart": restart(1.02, MODULE)}
+    dead = cut((MODULE,), cut_s, 1.0)
+    scenario = still(3.5, fault=(*fault("disarmed", MODULE, AT), *dead), **restarts)
+    outcome = run(robot, scenario, each=look)
+    assert max(outcome.lockstep.buses[MODULE].ages_ns, default=0) < OLD_NS
+    assert not any(waits), "nothing is left to be delivered"
+    assert waits
+    assert set(outcome.lockstep.bank.state[AXES]) == {CLOSED}, "armed anew, or all along"
 
 
 # ---- one module limp: the others stiffen and keep the robot up

@@ -44,6 +44,7 @@ from shared.exceptions import RunError
 from shared.joints import MODULE_INDEX, MODULES
 from tools.logs.hand_path import HandRow
 from tools.sim.network import BASE, VirtualNetwork
+from tools.sim.virtual_bus import VirtualBus
 from tools.sim.virtual_services import (
     SharedMemory,
     VirtualHarness,
@@ -113,6 +114,7 @@ class Lockstep:
     """A whole fleet in virtual time; a subclass may use other planners or joint services.
 
     Attributes:
+        buses: the drives' CAN buses by name.
         joints: the six joint services, in the order of `MODULES`.
         events: each change of mode, with its module.
         time: virtual time.
@@ -188,10 +190,23 @@ class Lockstep:
         self._torque = self.bank.torque
         self._faults = FaultInjector(scenario.fault, self.bank)
         self._memory = SharedMemory()
+        self.buses = {
+            name: VirtualBus(
+                self.bank,
+                [
+                    2 * at + side
+                    for at, each in enumerate(MODULES)
+                    if config.module_named(each).bus == name
+                    for side in (0, 1)
+                ],
+            )
+            for name in dict.fromkeys(row.bus for row in config.module)
+        }
         self.joints = [
             VirtualJoint(
                 config, index, functools.partial(self.module_type, config, name), self.bank,
-                self._memory, network_, record, time=time, clock=clock_of[name], traced=traced,
+                self.buses[config.module_named(name).bus], self._memory, network_, record,
+                time=time, clock=clock_of[name], traced=traced,
             )
             for index, name in enumerate(MODULES)
         ]  # fmt: skip
@@ -283,6 +298,8 @@ class Lockstep:
         if now % self._periods.cycle == 0:
             for fault in self._faults.advance(self.world.scenario_s):
                 self._put_event(RunEventKind.FAULTED, fault.module, fault.kind)
+            for bus in self.buses.values():
+                bus.advance(now)
             self._torque = self.bank.step(self.world.time, *self.world.motor_turns())
             self._cycle_joints()
         elif self.bank.regulates:

@@ -6,17 +6,20 @@ from collections.abc import Callable
 from typing import Final
 
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.bus_watch import BusWatch
 from services.simulator.drives.axis_bank import AxisBank
 from shared.bus.messages import Pair
 from shared.can.cansimple import AxisState, ControlMode, InputMode
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import DriveConfig
+from tools.sim.virtual_bus import Apply, VirtualBus
 
 ASK_EVERY_NS: Final = 100 * NS_PER_MS
 """A heartbeat's period: with each of an idle axis the CAN driver asks for its count."""
 
 # Compared in each cycle: docs/contributing.md, The control path.
 _LOST, _IDLE, _ARMED = DriveStatus.LOST, DriveStatus.IDLE, DriveStatus.ARMED
+_UNACKNOWLEDGED: Final = DriveStatus.UNACKNOWLEDGED
 _CLOSED_LOOP: Final = AxisState.CLOSED_LOOP_CONTROL
 
 
@@ -30,9 +33,15 @@ class VirtualDrive:
         drive: DriveConfig,
         clock: Callable[[], int],
         *,
+        bus: VirtualBus | None = None,
         counts_per_turn: int,
     ) -> None:
-        """Take the drives, which of them (0 .. 5), and the clock of the service's host."""
+        """Take the drives, which of them (0 .. 5), the clock of the service's host, and the bus.
+
+        Without a bus it has one of its own, on which somebody always acknowledges.
+        """
+        self._bus = bus or VirtualBus(bank, (2 * index, 2 * index + 1))
+        self._watch = BusWatch(echoes=True)
         self._bank = bank
         self._axes = (2 * index, 2 * index + 1)
         self._module = slice(2 * index, 2 * index + 2)
@@ -46,22 +55,30 @@ class VirtualDrive:
     def assume_heard(self) -> None:
         """Take now for the time of the drive's last sample."""
         self._sampled_ns = self._clock()
+        self._watch.heard(self._sampled_ns)
 
     def start_service(self) -> None:
         """Start with a new service, which reads the torques that an armed drive carries."""
         self._written = False
+        self._watch = BusWatch(echoes=True)
+        self._put(self._feed)  # its first request
 
     def read(self, timeout_s: float) -> DriveReading | None:  # noqa: ARG002 - it is there at once
         """Return what a driver would: None during a short silence, then LOST."""
         bank, (a, b), now_ns = self._bank, self._axes, self._clock()
         is_responding = bank.is_responding(a)
+        self._look_after(now_ns, is_responding=is_responding)
         if is_responding:
             self._sampled_ns = now_ns
         elif now_ns - self._sampled_ns <= self._lost_after_ns:
             return None
         armed = bank.state[a] == bank.state[b] == _CLOSED_LOOP
-        status = _LOST
-        if is_responding:
+        watch = self._watch
+        if not is_responding:
+            status = _UNACKNOWLEDGED if watch.unacknowledged else _LOST
+        elif watch.carries_nothing(now_ns):
+            status = _UNACKNOWLEDGED
+        else:
             status = _ARMED if armed else _IDLE
         errors = 0 if armed else bank.heartbeat(a).errors | bank.heartbeat(b).errors
         pos, vel = bank.pos_estimate, bank.vel_estimate
@@ -91,19 +108,24 @@ class VirtualDrive:
 
     def write_torque(self, torque: Pair) -> None:
         """See `Drive.write_torque`."""
-        if self._receives():
+
+        def apply() -> None:
             self._bank.input_torque[self._module] = torque
+
+        self._send(apply)
 
     def write(self, target: MotorTarget) -> None:
         """See `Drive.write`; number by number, which costs a third of writing slices."""
-        if not self._receives():
-            return
         bank, (a, b) = self._bank, self._axes
-        bank.input_pos[a], bank.input_pos[b] = target.pos_turns
-        bank.input_vel[a], bank.input_vel[b] = target.vel_turns
-        bank.input_torque[a], bank.input_torque[b] = target.torque
-        bank.pos_gain[a], bank.pos_gain[b] = target.pos_gain
-        bank.vel_gain[a], bank.vel_gain[b] = target.vel_gain
+
+        def apply() -> None:
+            bank.input_pos[a], bank.input_pos[b] = target.pos_turns
+            bank.input_vel[a], bank.input_vel[b] = target.vel_turns
+            bank.input_torque[a], bank.input_torque[b] = target.torque
+            bank.pos_gain[a], bank.pos_gain[b] = target.pos_gain
+            bank.vel_gain[a], bank.vel_gain[b] = target.vel_gain
+
+        self._send(apply)
 
     def clear_errors(self) -> None:
         """See `Drive.clear_errors`."""
@@ -113,44 +135,80 @@ class VirtualDrive:
 
     def idle(self) -> None:
         """See `Drive.idle`."""
-        if self._receives():
+
+        def apply() -> None:
             self._bank.input_torque[self._module] = 0.0
             for axis in self._axes:
                 self._bank.request_state(axis, AxisState.IDLE)
 
+        self._send(apply)
+
     def set_position(self, turns: Pair) -> None:
         """See `Drive.set_position`."""
-        if self._receives():
+
+        def apply() -> None:
             for axis, turn in zip(self._axes, turns, strict=True):
                 self._bank.set_count(axis, turn * self._counts_per_turn)
+
+        self._send(apply)
 
     def close(self) -> None:
         """See `Drive.close`: there is no link."""
 
-    def _receives(self) -> bool:
-        """Return True if a frame is received; each one feeds the axes' watchdogs."""
-        bank, (a, b) = self._bank, self._axes
-        if not bank.is_responding(a):
-            return False
-        self._written = True
-        bank.feed(a)
-        bank.feed(b)
-        return True
-
     def arm(self, *, onboard: bool) -> None:
         """See `Drive.arm`; applies the settings of the drivers' arming frames."""
-        if not self._receives():
-            return
         bank, module = self._bank, self._module
+
+        def apply() -> None:
+            for axis in self._axes:
+                bank.clear_errors(axis)
+                mode = ControlMode.POSITION if onboard else ControlMode.TORQUE
+                bank.set_modes(axis, mode, InputMode.PASSTHROUGH)
+            bank.vel_limit[module] = self._drive.vel_limit
+            bank.current_lim[module] = self._drive.current_lim
+            zero: Pair = (0.0, 0.0)
+            bank.input_torque[module] = zero
+            if onboard:
+                bank.pos_gain[module] = bank.vel_gain[module] = zero
+            for axis in self._axes:
+                bank.request_state(axis, AxisState.CLOSED_LOOP_CONTROL)
+
+        # Between the probe and its echo lie two cycles at most: they are left out here.
+        self._send(apply)
+
+    def _send(self, apply: Apply) -> None:
+        """Send a row of frames if it would not have to wait, as the CAN link does."""
+        if self._watch.may_send(self._clock()):
+            self._written = True
+            self._put(apply)
+
+    def _put(self, apply: Apply) -> None:
+        """Hand a row to the bus; the drive takes it if it is there, and feeds its watchdogs."""
+        now_ns, bus = self._clock(), self._bus
+        if not bus.acknowledged:
+            self._watch.sent(now_ns)
+        bus.put(now_ns, lambda: self._receive(apply))
+
+    def _receive(self, apply: Apply) -> None:
+        bank, (a, _) = self._bank, self._axes
+        if bank.is_responding(a) and a not in bank.conditions.deaf:
+            self._feed()
+            apply()
+
+    def _feed(self) -> None:
         for axis in self._axes:
-            bank.clear_errors(axis)
-            mode = ControlMode.POSITION if onboard else ControlMode.TORQUE
-            bank.set_modes(axis, mode, InputMode.PASSTHROUGH)
-        bank.vel_limit[module] = self._drive.vel_limit
-        bank.current_lim[module] = self._drive.current_lim
-        zero: Pair = (0.0, 0.0)
-        bank.input_torque[module] = zero
-        if onboard:
-            bank.pos_gain[module] = bank.vel_gain[module] = zero
-        for axis in self._axes:
-            bank.request_state(axis, AxisState.CLOSED_LOOP_CONTROL)
+            self._bank.feed(axis)
+
+    def _look_after(self, now_ns: int, *, is_responding: bool) -> None:
+        """Watch the bus as the CAN link does, whose own frames come back once they are carried."""
+        watch, bus = self._watch, self._bus
+        if is_responding:
+            watch.heard(now_ns)
+        if bus.acknowledged and watch.waits:
+            watch.carried(now_ns)
+        elif watch.restart_due(now_ns):
+            bus.restart()
+            watch.restarted(now_ns, done=True)
+        elif watch.probe_due(now_ns):
+            watch.sent(now_ns)
+            bus.put(now_ns, lambda: self._receive(self._feed))

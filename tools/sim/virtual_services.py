@@ -34,6 +34,7 @@ from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
 from tools.sim.network import VirtualNetwork
+from tools.sim.virtual_bus import VirtualBus
 from tools.sim.virtual_drive import VirtualDrive
 from tools.sim.virtual_time import HostClock, LinkInbox, Record, RecordOutbox, VirtualTime
 
@@ -93,6 +94,7 @@ class VirtualJoint:
         index: int,
         make: Callable[[], DriveManager],
         bank: AxisBank,
+        bus: VirtualBus,
         memory: SharedMemory,
         network: VirtualNetwork,
         record: Record,
@@ -108,6 +110,7 @@ class VirtualJoint:
             index: of the module in `MODULES`.
             make: makes the service's decisions, now and at each restart.
             bank: the drives.
+            bus: the module's CAN bus.
             memory: of the host.
             network: its links.
             record: takes every message.
@@ -123,6 +126,7 @@ class VirtualJoint:
             index,
             config.drive,
             self._clock,
+            bus=bus,
             counts_per_turn=config.joint.encoder_counts_per_turn,
         )
         frame = MotorFrame(config.drive.zero_mark_turns, config.module_named(name).motor_signs)

@@ -108,6 +108,11 @@ class BusWatch:
         """Return True if for `BLOCKED_MS` no own frame was carried that the bus was to carry."""
         return bool(self._blocked_ns) and now_ns - self._blocked_ns > BLOCKED_MS * NS_PER_MS
 
+    @property
+    def waits(self) -> bool:
+        """True while own frames have not come back."""
+        return bool(self._waiting)
+
     def restart_due(self, now_ns: int) -> bool:
         """Return True if frames wait that must not reach the drive any more."""
         waiting = self._waiting

@@ -129,6 +129,7 @@ class Conditions:
         down: the drives (0 .. 5) that are without power, or do not communicate yet.
         starting: the drives whose axes do not run yet, and take no state.
         silent: the axes (0 .. 11) without communication: down, or the cable out.
+        deaf: the axes (0 .. 11) that hear and acknowledge nothing, and send all the same.
         temperature: of each axis's output stage (12,), C.
     """
 
@@ -138,6 +139,7 @@ class Conditions:
         self.down: set[int] = set()
         self.starting: set[int] = set()
         self.silent: set[int] = set()
+        self.deaf: set[int] = set()
         self.temperature = [ROOM_TEMPERATURE] * N_JOINTS
         self._hot: set[int] = set()
         self._linked = [True] * N_DRIVES
@@ -152,6 +154,11 @@ class Conditions:
         """Pull a drive's cable, or plug it in."""
         self._linked[drive] = up
         self._update_silent()
+
+    def deafen(self, drive: int, *, deaf: bool) -> None:
+        """Break a drive's receiver, or mend it."""
+        axes = (2 * drive, 2 * drive + 1)
+        (self.deaf.update if deaf else self.deaf.difference_update)(axes)
 
     def boot(self, drive: int, now_s: float) -> None:
         """Let a drive start up from now on."""

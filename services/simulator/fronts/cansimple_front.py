@@ -73,7 +73,8 @@ class CanSimpleFront:
 
     def receive(self) -> None:
         """Apply all frames that have arrived; in each mailbox the newest wins."""
-        bank, silent = self._bank, self._bank.conditions.silent
+        bank = self._bank
+        silent = bank.conditions.silent | bank.conditions.deaf
         for bus in self._buses:
             mailboxes = bus.mailboxes
             bus.hub.acknowledged = bus.hub.shared or not (silent and silent.issuperset(bus.axes))
@@ -149,7 +150,10 @@ class CanSimpleFront:
         """Answer a frame that sets nothing, if it is one that has an answer."""
         node, command = cansimple.split_id(can_id)
         axis = bus.nodes.get(node)
-        if axis is None or can_id & ~_FLAGGED_ID or not self._bank.is_responding(axis):
+        bank = self._bank
+        if axis is None or can_id & ~_FLAGGED_ID or not bank.is_responding(axis):
+            return
+        if axis in bank.conditions.deaf:
             return
         self._bank.feed(axis)
         answer = self._dialect.answers.get(command)

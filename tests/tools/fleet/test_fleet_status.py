@@ -14,6 +14,7 @@ import msgspec
 import pytest
 
 from shared.bus.messages import (
+    LOST_DRIVE,
     Cause,
     DriveStatus,
     JointState,
@@ -69,7 +70,7 @@ def test_a_way_out_is_given_only_where_a_person_must_act(
     waits = (DriveStatus.IDLE, DriveStatus.ERROR)
     helpless = (
         mode in (Mode.FAULT, Mode.DAMP)
-        or drive in (DriveStatus.UNZEROED, DriveStatus.HOLDING)
+        or drive in (DriveStatus.UNZEROED, DriveStatus.HOLDING, DriveStatus.UNACKNOWLEDGED)
         or (mode is Mode.DISARMED and drive in waits)
         or (mode is Mode.HOLD and cause in JOINT_TRIPS)
     )
@@ -83,7 +84,7 @@ def test_a_way_out_is_given_only_where_a_person_must_act(
 @pytest.mark.parametrize("drive", DriveStatus)
 def test_angles_are_reported_only_where_the_drive_knows_them(drive: DriveStatus) -> None:
     status = module_status(state(Mode.DISARMED, Cause.NONE, drive))
-    assert (status.q is None) is (drive in (DriveStatus.LOST, DriveStatus.UNZEROED))
+    assert (status.q is None) is (drive in (*LOST_DRIVE, DriveStatus.UNZEROED))
 
 
 @pytest.mark.parametrize("outside", [each for each in Outside if each])
