@@ -89,7 +89,7 @@ class VirtualDrive:
             status,
             int(errors),
             None if self._written else (float(bank.torque[a]), float(bank.torque[b])),
-            None if armed or status is _LOST else self._encoder_zero(now_ns),
+            None if armed or not is_responding else self._encoder_zero(now_ns),
         )
 
     def _encoder_zero(self, now_ns: int) -> Pair | None:
@@ -129,9 +129,12 @@ class VirtualDrive:
 
     def clear_errors(self) -> None:
         """See `Drive.clear_errors`."""
-        if self._receives():
+
+        def apply() -> None:
             for axis in self._axes:
                 self._bank.clear_errors(axis)
+
+        self._send(apply)
 
     def idle(self) -> None:
         """See `Drive.idle`."""
