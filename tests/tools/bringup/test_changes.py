@@ -128,7 +128,7 @@ def test_a_backup_is_never_overwritten(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("text", "says"),
-    [("{", "no backup"), ('{"version": 1}', "no backup"), (None, "cannot be read")],
+    [("{", "not a backup"), ('{"version": 1}', "not a backup"), (None, "cannot be read")],
 )
 def test_a_file_that_is_no_backup_is_refused(tmp_path: Path, text: str | None, says: str) -> None:
     path = tmp_path / "b.json"

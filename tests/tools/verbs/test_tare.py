@@ -70,7 +70,7 @@ def test_a_harness_that_is_held_is_not_tared(up: float, refused: bool) -> None:
 
     service = Service(answer)
     if refused:
-        with pytest.raises(FleetError, match=r"30\.1 N.*let go.*--anyway"):
+        with pytest.raises(FleetError, match=r"30\.1 N.*release it.*--anyway"):
             tare.tare(service, service, anyway=False)
         assert service.requests == []
     service = Service(answer)
@@ -85,7 +85,7 @@ def test_a_harness_that_is_held_is_not_tared(up: float, refused: bool) -> None:
         (wrench(), "did not begin"),
         (wrench(0.0, Tare.UNSTEADY), "the forces move"),
         (wrench(0.0, Tare.RUNNING, saturated=True), "end of its range"),
-        (wrench(0.0, Tare.RUNNING), "send nothing"),
+        (wrench(0.0, Tare.RUNNING), "do not send steadily"),
     ],
 )
 def test_a_tare_that_does_not_come_names_the_reason(said: Wrench | None, words: str) -> None:

@@ -84,4 +84,4 @@ def test_it_only_looks_and_leaves_records_to_foxglove(
     words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert exit_code(["view", "--foxglove", *words]) == 2
-    assert "--foxglove only looks" in capsys.readouterr().err
+    assert "--foxglove shows a fleet" in capsys.readouterr().err
