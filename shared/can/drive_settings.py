@@ -92,11 +92,11 @@ class WantedSetting(NamedTuple):
 
 
 AXIS_TABLE: Final[tuple[Setting, ...]] = (
+    Setting("config.watchdog_timeout", lambda need: need.drive.watchdog_timeout,
+        "a drive left alone stops after this; too short, a hiccup disarms"),
     Setting("config.enable_watchdog",
         lambda need: need.watchdog and need.drive.watchdog_timeout > 0.0,
         "a watchdog that fires lets the module go limp: off with the onboard loop, else on"),
-    Setting("config.watchdog_timeout", lambda need: need.drive.watchdog_timeout,
-        "a drive left alone stops after this; too short, a hiccup disarms"),
     Setting("config.startup_motor_calibration", lambda _: False,
         "the motor would move by itself at power-up"),
     Setting("config.startup_encoder_offset_calibration", lambda _: False,
@@ -142,7 +142,8 @@ AXIS_TABLE: Final[tuple[Setting, ...]] = (
     Setting("encoder.config.pre_calibrated", lambda _: True,
         "after each power-up the motor would have to turn by itself before it arms"),
 )  # fmt: skip
-"""Settings of each axis."""
+"""Settings of each axis, in the order in which they are written: a watchdog that is enabled before
+its timeout is there has nothing to count down, and expires at once."""
 
 DRIVE_TABLE: Final[tuple[Setting, ...]] = (
     Setting("config.dc_max_negative_current", lambda need: need.drive.dc_max_negative_current,

@@ -110,6 +110,13 @@ def test_each_axis_is_wanted_at_its_own_node(robot: RobotConfig) -> None:
     assert (rows["axis0.config.can.node_id"], rows["axis1.config.can.node_id"]) == (4, 5)
 
 
+def test_a_watchdogs_timeout_is_written_before_it_is_enabled(robot: RobotConfig) -> None:
+    names = [row.name for row in of_module(robot, "knee_left")]
+    for axis in ("axis0", "axis1"):
+        timeout = names.index(f"{axis}.config.watchdog_timeout")
+        assert timeout < names.index(f"{axis}.config.enable_watchdog")
+
+
 @pytest.mark.parametrize("timeout_s", [0.0, 0.1])
 def test_the_watchdog_runs_only_if_the_robot_file_gives_it_a_time(
     robot: RobotConfig, timeout_s: float

@@ -109,6 +109,40 @@ def test_requests_are_answered_from_the_registers(benches: Callable[..., Bench])
     assert old.ask(Command.GET_ENCODER_ERROR) == struct.pack("<II", 0x80, 0)
 
 
+def test_0_5_answers_for_its_sensorless_estimator_and_its_pins(old: Bench) -> None:
+    for command in (Command.GET_SENSORLESS_ERROR, Command.GET_SENSORLESS_ESTIMATES):
+        assert old.ask(command) == bytes(8)
+    for pin, volts in ((1, 0.0), (6, -3.3)):
+        old.send(Command.GET_ADC_VOLTAGE, bytes([pin]))
+        assert old.heard()[0][1] == struct.pack("<ff", volts, 0.0)
+    old.send(Command.GET_ADC_VOLTAGE, bytes([9]))
+    assert old.heard() == []
+
+
+@pytest.mark.parametrize("length", [0, 1, 8])
+def test_a_controllers_error_is_told_to_a_frame_of_any_length_a_motors_to_an_empty_one(
+    old: Bench, length: int
+) -> None:
+    old.bank.inject("knee_right.axis1", "OVERSPEED")
+    old.send(Command.GET_CONTROLLER_ERROR, bytes(length))
+    assert [data for _, data in old.heard()] == [struct.pack("<II", 1, 0)]
+    old.send(Command.GET_MOTOR_ERROR, bytes(length))
+    assert len(old.heard()) == (length == 0)
+
+
+def test_of_requests_at_1_khz_six_in_a_thousand_have_no_answer(old: Bench) -> None:
+    """Those that meet the heartbeats and encoder frames of both axes: three mailboxes are full."""
+    answers = 0
+    count = arbitration_id(NODE, Command.GET_ENCODER_COUNT)
+    for _ in range(2000):
+        old.step()
+        old.front.send_encoders()
+        old.front.send_heartbeats(old.bank.now_s)
+        old.send(Command.GET_ENCODER_COUNT, remote=True)
+        answers += sum(can_id == count for can_id, _ in old.heard())
+    assert 2000 - answers == 12
+
+
 def test_a_frame_of_another_node_changes_nothing(old: Bench) -> None:
     can_id = arbitration_id(NODE + 4, Command.SET_INPUT_TORQUE)
     data = struct.pack("<f", 9.0)

@@ -135,7 +135,24 @@ def test_an_exchange_returns_what_was_there_before(client: Client, bank: AxisBan
 def test_the_answer_is_no_longer_than_asked_for_and_than_a_packet_holds(client: Client) -> None:
     number = client.endpoints["vbus_voltage"]["id"]
     assert [len(client.operate(number, size)) for size in (0, 2, 4, 8)] == [0, 2, 4, 4]
-    assert client.operate(0, 512, struct.pack("<I", 3)) == client.front.descriptor[3:65]
+    assert client.operate(0, 512, struct.pack("<I", 3)) == client.front.descriptor[3:64]
+
+
+def test_error_registers_may_be_written_and_what_stands_in_the_axiss_own_disarms_it(
+    client: Client,
+) -> None:
+    bank, axis = client.front.board.bank, 2 * MODULE
+    for each in (axis, axis + 1):
+        bank.request_state(each, AxisState.CLOSED_LOOP_CONTROL)
+    client.exchange("axis0.motor.error", 0x8)
+    assert bank.faults[axis].motor == 0x8
+    assert bank.state[axis] == AxisState.CLOSED_LOOP_CONTROL, "no other register does"
+    client.exchange("axis0.error", 0x40)
+    assert bank.state[axis : axis + 2] == [AxisState.IDLE, AxisState.CLOSED_LOOP_CONTROL]
+    for name in ("axis0.error", "axis0.motor.error"):
+        client.exchange(name, 0)
+    client.exchange("error", 2)
+    assert bank.faults[axis] == bank.faults[axis + 1] == (0, 0, 0, 0, 2)
 
 
 def test_an_endpoint_that_does_not_exist_has_an_empty_answer(client: Client) -> None:

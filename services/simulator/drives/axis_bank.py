@@ -231,6 +231,16 @@ class AxisBank:
             self.faults[each] = AxisErrors()
             self._encoders.clear_errors(each)
 
+    def set_error(self, axis: int, register: str, error: int) -> None:
+        """Write an error register by its name in `AxisErrors`: over USB all of them may be written.
+
+        What stands in the axis's own disarms it, as if it had occurred; the filter of an encoder's
+        missing words, and the sibling, are left alone.
+        """
+        self.faults[axis] = self.faults[axis]._replace(**{register: error})
+        if self.faults[axis].axis:
+            self._disarm(axis)
+
     def estop(self, axis: int) -> None:
         """Disarm one axis with ESTOP_REQUESTED; its sibling goes on."""
         self._fail(axis, FAULTS["ESTOP"])
@@ -321,18 +331,13 @@ class AxisBank:
 
     def _check_odd_encoders(self) -> None:
         """Check speeds within the step; an estimate that is valid again ends its error."""
-        column = self.settings.axis
         for axis, odd in self._encoders.odd.items():
-            if odd.fails:
-                continue
             fault = self.faults[axis]
-            if fault.controller & ControllerError.INVALID_ESTIMATE:
+            if fault.controller & ControllerError.INVALID_ESTIMATE and not odd.fails:
                 valid = fault.controller & ~ControllerError.INVALID_ESTIMATE
                 self.faults[axis] = fault._replace(controller=valid)
-            limit = column("controller.config.vel_limit")[axis]
-            limit *= column("controller.config.vel_limit_tolerance")[axis]
-            checks = column("controller.config.enable_overspeed_error")[axis] * self.connected[axis]
-            if checks and odd.peak > limit * column("encoder.config.cpr")[axis]:
+        for axis in self._encoders.overspeed():
+            if self.connected[axis]:
                 self._fail(axis, FAULTS["OVERSPEED"])
 
     def _end_closed_loops(self) -> None:
@@ -341,7 +346,7 @@ class AxisBank:
             if until_s <= self.now_s + _EARLY_S:
                 del self._refused_s[axis]
                 if self.state[axis] == AxisState.CLOSED_LOOP_CONTROL:
-                    self.state[axis] = AxisState.IDLE
+                    self._disarm(axis)
         asked = {axis: self._control.asked_power(axis) for axis in self._spinout.watched}
         for axis in self._spinout.check(self._encoders.dt_s, asked):
             self._spinout.armed(axis)
@@ -353,9 +358,7 @@ class AxisBank:
         An axis that was armed and is armed again lets go for a quarter of a millisecond.
         """
         self._shaft[:] = self.torque
-        for axis, odd in self._encoders.odd.items():
-            poles = self.settings.axis("motor.config.pole_pairs")[axis]
-            self._shaft[axis] *= math.cos(2.0 * math.pi * poles * odd.off_phase)
+        self._encoders.commutate(self._shaft)
         dt_s = self._encoders.dt_s
         for axis in self._rearmed:
             self._shaft[axis] *= max(0.0, 1.0 - REARM_S / dt_s) if dt_s else 1.0
@@ -379,6 +382,7 @@ class AxisBank:
             self._rearmed.add(axis)
         self._control.arm(axis)
         self._spinout.armed(axis)
+        self._refused_s.pop(axis, None)
         self.state[axis] = AxisState.CLOSED_LOOP_CONTROL
         self.feed(axis)
         ready = self.calibration.encoder[axis]

@@ -135,6 +135,25 @@ class AxisEncoders:
             self._run_odd(dt_s)
         rows[:2] = self._next
 
+    def overspeed(self) -> list[int]:
+        """Return the odd axes whose estimate was beyond the OVERSPEED limit within the step."""
+        column = self._settings.axis
+        checked = column("controller.config.enable_overspeed_error")
+        limits = column("controller.config.vel_limit") * column(
+            "controller.config.vel_limit_tolerance"
+        )
+        return [
+            axis
+            for axis, odd in self.odd.items()
+            if checked[axis] and odd.peak > limits[axis] * self._cpr[axis]
+        ]
+
+    def commutate(self, torque: Vector) -> None:
+        """Turn the odd axes' torques to what a rotor gives that is away from its last word."""
+        poles = self._settings.axis("motor.config.pole_pairs")
+        for axis, odd in self.odd.items():
+            torque[axis] *= math.cos(2.0 * math.pi * poles[axis] * odd.off_phase)
+
     def _run_odd(self, dt_s: float) -> None:
         """Run the odd encoders over the step, in place of their PLLs."""
         for axis, odd in list(self.odd.items()):

@@ -72,6 +72,9 @@ SDO_ENDPOINTS: Final[Mapping[int, str]] = dict(
 )
 """Endpoint ids of the emulated 0.6 drive; an axis's settings are those of the addressed node."""
 
+GPIOS: Final = 9
+ANALOG_GPIOS: Final = range(1, 6)
+
 _READINGS: Final = ("vbus_voltage", "ibus")
 
 
@@ -83,6 +86,8 @@ class Dialect(NamedTuple):
     """Position and velocity of all axes (12,) as their frames have them."""
     answers: Mapping[int, Answer]
     """By command, to a request for data."""
+    asked: Mapping[int, Callable[[AxisBank, int, bytes], bytes | None]]
+    """By command, to a frame of any length and its eight bytes; None: no answer."""
     sdo: Callable[[AxisBank, int, bytes], bytes | None] | None
     """Takes 0x004 and returns the payload of 0x005, if there is an answer."""
     setters: Mapping[int, Setter]
@@ -137,6 +142,14 @@ def _encoder_count(bank: AxisBank, axis: int) -> bytes:
     per_turn = int(bank.settings.axis("encoder.config.cpr")[axis])
     count = round(bank.encoder_turns[axis] * per_turn)
     return cansimple.pack_two_ints(count, bank.encoder_angle(axis))
+
+
+def _adc_voltage(_bank: AxisBank, _axis: int, data: bytes) -> bytes | None:
+    """Return a pin's voltage: 0 V on GPIO 1 to 5, -3.3 V where a pin cannot measure."""
+    pin = data[0]
+    if pin >= GPIOS:
+        return None
+    return cansimple.pack_two_floats(0.0 if pin in ANALOG_GPIOS else -3.3, 0.0)
 
 
 def _twice(value: float) -> bytes:
@@ -194,8 +207,13 @@ _ANSWERS_05: Final[Mapping[int, Answer]] = {
     Command.GET_ENCODER_ESTIMATES: _estimates_of_one(_estimates_05),
     Command.GET_ENCODER_COUNT: _encoder_count,
     Command.GET_MOTOR_ERROR: lambda b, axis: cansimple.pack_motor_error(b.faults[axis].motor),
+    Command.GET_SENSORLESS_ERROR: lambda _bank, _axis: bytes(8),
+    Command.GET_SENSORLESS_ESTIMATES: lambda _bank, _axis: bytes(8),
     Command.GET_ENCODER_ERROR: lambda b, axis: struct.pack("<II", b.faults[axis].encoder, 0),
-    Command.GET_CONTROLLER_ERROR: lambda b, axis: struct.pack("<II", b.faults[axis].controller, 0),
+}
+_ASKED_05: Final[Mapping[int, Callable[[AxisBank, int, bytes], bytes | None]]] = {
+    Command.GET_CONTROLLER_ERROR: lambda b, a, _: struct.pack("<II", b.faults[a].controller, 0),
+    Command.GET_ADC_VOLTAGE: _adc_voltage,
 }
 _ANSWERS_06: Final[Mapping[int, Answer]] = {
     Command.GET_ENCODER_ESTIMATES: _estimates_of_one(_estimates_06),
@@ -211,6 +229,7 @@ DIALECTS: Final[Mapping[DialectName, Dialect]] = {
         heartbeat=lambda bank, axis: cansimple.pack_heartbeat(bank.heartbeat(axis)),
         estimates=_estimates_05,
         answers={**_BOTH, **_ANSWERS_05},
+        asked=_ASKED_05,
         sdo=None,
         setters={},
     ),
@@ -218,6 +237,7 @@ DIALECTS: Final[Mapping[DialectName, Dialect]] = {
         heartbeat=_heartbeat_06,
         estimates=_estimates_06,
         answers={**_BOTH, **_ANSWERS_06},
+        asked={},
         sdo=_sdo,
         setters={Command06.SET_ABSOLUTE_POSITION: _set_absolute_position},
     ),

@@ -22,6 +22,7 @@ from shared.joints import N_JOINTS
 
 _DATA_BYTES = 8
 _SDO_BYTES = 4
+_MAILBOXES = 3
 _EARLY_S = 1e-6  # a period that is over but for rounding is over
 _S_PER_MS = 1e-3
 _FLOAT = struct.Struct("<f").unpack_from
@@ -62,6 +63,8 @@ class CanSimpleFront:
         self._next_heartbeat_s = [-math.inf] * N_JOINTS
         self._next_encoder_s = [-math.inf] * N_JOINTS
         self._heartbeat_from_s = -math.inf
+        self._sent = [(-math.inf, 0)] * N_DRIVES  # when heartbeats left last, frames with them
+        self._crowded = 0
         self._seen = -1
         if heartbeat_period_ms is not None:
             bank.settings.fill("config.can.heartbeat_rate_ms", heartbeat_period_ms)
@@ -122,12 +125,20 @@ class CanSimpleFront:
                 if now_s >= due_s[axis]:
                     due_s[axis] = max(due_s[axis], now_s) + self._heartbeat_periods_s[axis]
                     if bank.is_responding(axis):
+                        self._count(axis, now_s)
                         can_id = cansimple.arbitration_id(node, Command.HEARTBEAT)
                         frames.append((can_id, self._dialect.heartbeat(bank, axis)))
             if frames:
                 bus.hub.broadcast(frames)
         due = (due_s[axis] for bus in self._buses for axis in bus.axes)
         self._heartbeat_from_s = min(due, default=math.inf)
+
+    def _count(self, axis: int, now_s: float) -> None:
+        """Count a heartbeat, and an encoder frame that left with it, into the mailboxes."""
+        sent_s, frames = self._sent[axis >> 1]
+        since_s = now_s - (self._next_encoder_s[axis] - self._encoder_periods_s[axis])
+        frames = 1 + (abs(since_s) < _EARLY_S) + (frames if sent_s == now_s else 0)
+        self._sent[axis >> 1] = now_s, frames
 
     def _read_periods(self) -> None:
         """Take the periods from the settings, if these have changed; 0 is never."""
@@ -158,13 +169,29 @@ class CanSimpleFront:
         self._bank.feed(axis)
         answer = self._dialect.answers.get(command)
         reply: bytes | None = None
-        if answer is not None and (can_id & REMOTE_FLAG or not data):
-            reply_id, reply = can_id & ~REMOTE_FLAG, answer(self._bank, axis)
+        asked = self._dialect.asked.get(command)
+        reply_id = can_id & ~REMOTE_FLAG
+        if asked is not None:
+            reply = asked(self._bank, axis, data.ljust(_DATA_BYTES, b"\0"))
+        elif answer is not None and (can_id & REMOTE_FLAG or not data):
+            reply = answer(self._bank, axis)
         elif command == Command06.RX_SDO and self._dialect.sdo is not None:
             reply_id = cansimple.arbitration_id(node, Command06.TX_SDO)
             reply = self._dialect.sdo(self._bank, axis, data.ljust(_SDO_BYTES, b"\0"))
-        if reply is not None:
+        if reply is not None and not self._is_lost(axis):
             bus.hub.broadcast_packet(pack_frames([(reply_id, reply)]))
+
+    def _is_lost(self, axis: int) -> bool:
+        """Return True for an answer that finds all of its drive's three mailboxes full.
+
+        So they are while heartbeats and encoder frames of both axes leave, for some three fifths of
+        a millisecond: at 1 kHz 0.6 % of the requests have no answer, and none is repeated.
+        """
+        sent_s, frames = self._sent[axis >> 1]
+        if frames < _MAILBOXES or sent_s != self._bank.now_s:
+            return False
+        self._crowded = (self._crowded + 1) % 5
+        return self._crowded < 3
 
 
 def _periods_s(periods_ms: NDArray[np.float64]) -> list[float]:

@@ -25,7 +25,7 @@ from shared.can.cansimple import AxisState, InputMode
 from shared.exceptions import DriveError
 
 PROTOCOL_VERSION: Final = 1
-ANSWER_BYTES: Final = 62
+ANSWER_BYTES: Final = 61
 """Bytes after the sequence number in a packet of 64 bytes; a longer reply is cut."""
 
 _CRC16_POLYNOMIAL = 0x3D65
@@ -125,7 +125,7 @@ def endpoints() -> list[Endpoint]:
         *_version("hw_version_", ("major", "minor", "variant"), HARDWARE),
         *_version("fw_version_", ("major", "minor", "revision"), FIRMWARE),
         *_version("fw_version_", ("unreleased",), (0,)),
-        Property("error", "uint8", lambda b: b.bank.faults[b.axis(0)].odrive),
+        Property("error", "uint8", lambda b: b.bank.faults[b.axis(0)].odrive, _set_odrive_error),
         *(_setting(name, default) for name, default in DRIVE_SETTINGS.items()),
         Function("clear_errors", lambda b: b.bank.clear_errors(b.axis(0))),
         Function("save_configuration", EmulatedBoard.save),
@@ -189,7 +189,18 @@ def _version(prefix: str, parts: tuple[str, ...], numbers: tuple[int, ...]) -> l
 
 
 def _fault(name: str, kind: str, i: int, register: str) -> Property:
-    return Property(name, kind, lambda b: int(getattr(b.bank.faults[b.axis(i)], register)))
+    """Return an error register's endpoint, which may be written as well."""
+
+    def write(board: EmulatedBoard, value: Value) -> None:
+        board.bank.set_error(board.axis(i), register, int(value))
+
+    read = lambda b: int(getattr(b.bank.faults[b.axis(i)], register))  # noqa: E731
+    return Property(name, kind, read, write)
+
+
+def _set_odrive_error(board: EmulatedBoard, value: Value) -> None:
+    for i in AXES:
+        board.bank.set_error(board.axis(i), "odrive", int(value))
 
 
 def _current(board: EmulatedBoard, i: int) -> float:
