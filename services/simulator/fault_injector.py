@@ -19,6 +19,8 @@ from shared.joints import MODULE_INDEX
 
 _AT_ONCE: Final = {"watchdog": "WATCHDOG", "disarmed": "DISARM", "overspeed": "OVERSPEED"}
 """Momentary kinds, with the bank's fault."""
+_PULSED: Final = {"bus_full": (0.04, 0.1), "bus_flap": (0.06, 0.15)}
+"""Lasting kinds that come and go: how long each time, and how often, s."""
 _ABOVE: Final = 5.0
 """V or C beyond the limit."""
 
@@ -47,6 +49,10 @@ class FaultInjector:
             else:
                 self._lasting.append(fault)
                 self._act(fault, begins=True)
+        for fault in self._lasting:
+            if fault.kind in _PULSED:
+                lasts_s, period_s = _PULSED[fault.kind]
+                self._act(fault, begins=(scenario_s - fault.at) % period_s < lasts_s)
         return begun
 
     def _act(self, fault: Fault, *, begins: bool) -> None:
@@ -61,8 +67,12 @@ class FaultInjector:
             case "encoder" | "encoder_gap" | "encoder_zero":
                 wrong = Words.ZERO if fault.kind == "encoder_zero" else Words.NONE
                 bank.conditions.read_encoder(axis, wrong if begins else Words.TRUE)
-            case "link_lost":
+            case "link_lost" | "bus_flap":
                 bank.conditions.link(drive, up=not begins)
+            case "no_ack":
+                bank.conditions.deafen(drive, deaf=begins)
+            case "bus_full":
+                bank.conditions.choke(drive, full=begins)
             case "over_voltage":
                 limit = bank.settings.drive("config.dc_bus_overvoltage_trip_level")[drive]
                 bank.supply(drive, float(limit) + _ABOVE if begins else SUPPLY_VOLTAGE)

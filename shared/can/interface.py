@@ -1,11 +1,11 @@
 """A CAN interface of the kernel: how many frames may wait in it, and how they are thrown away.
 
 Facts, by Linux' sources (net/can/raw.c, include/linux/can/skb.h, drivers/net/can/dev): a frame
-waits in the interface's queue (pfifo_fast, `txqueuelen`), charged to its socket (`SO_SNDBUF`),
+waits in the interface's queue (pfifo_fast, txqueuelen), charged to its socket (SO_SNDBUF),
 then in the adapter, charged to nobody. Both outlive the socket. Neither drops a frame for its age;
 taking the interface down does, and resets the adapter. SIOCOUTQ is not for CAN sockets, and
-`SO_MEMINFO` does not count what the adapter has: an own frame that comes back
-(`CAN_RAW_RECV_OWN_MSGS`) is the only sign that it was transmitted.
+SO_MEMINFO does not count what the adapter has: an own frame that comes back
+(CAN_RAW_RECV_OWN_MSGS) is the only sign that it was transmitted.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ little-endian. Several frames in one packet cost one system call. Sending never 
 for which there is no room raise, as on socketcan.
 
 **A bus that does not acknowledge.** The hub then leaves the packets where they are: in the
-kernel, charged to the sender (`SO_SNDBUF`), also past its end, and in its order. So a CAN interface
+kernel, charged to the sender (SO_SNDBUF), also past its end, and in its order. So a CAN interface
 behaves, whose controller repeats its first frame until somebody acknowledges it. What else an
 interface knows, both sides share in `Interface`.
 """
@@ -47,7 +47,7 @@ PACKET_BYTES: Final = 64 * _FRAME.size
 """Longest packet that either side sends."""
 _DRAIN = 1024  # packets in one call: more than a socket holds
 FRAME_TRUESIZE: Final = 768
-"""Bytes that a short packet takes of `SO_SNDBUF`: sk_buff and data; a CAN frame takes the same."""
+"""Bytes that a short packet takes of SO_SNDBUF: sk_buff and data; a CAN frame takes the same."""
 
 
 def pack_frames(frames: Iterable[Frame]) -> bytes:
@@ -87,7 +87,7 @@ class Interface:
 
     @property
     def full(self) -> bool:
-        """True while the send queue (`txqueuelen`) takes no frame: ENOBUFS."""
+        """True while the send queue (txqueuelen) takes no frame: ENOBUFS."""
         return self._memory[self._FULL] != 0
 
     @full.setter
@@ -114,7 +114,7 @@ class UnixCanBus(can.BusABC):
 
     Attributes:
         dropped: frames for which there was no room: each `send` of such raised ENOBUFS.
-        socket: its `SO_SNDBUF` limits what may wait, as on socketcan.
+        socket: its SO_SNDBUF limits what may wait, as on socketcan.
     """
 
     def __init__(
@@ -128,7 +128,7 @@ class UnixCanBus(can.BusABC):
         """Connect to the hub that listens on path `channel`, or can.CanInitializationError.
 
         With `receive_own_messages`, `recv_many` returns this client's own frames too, once the bus
-        has carried them (`CAN_RAW_RECV_OWN_MSGS`).
+        has carried them (CAN_RAW_RECV_OWN_MSGS).
         """
         self.dropped = 0
         self.channel_info = f"xrl_unix {channel}"

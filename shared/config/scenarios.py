@@ -79,6 +79,9 @@ FaultKind = Literal[
     "brown_out",
     "encoder_zero",
     "encoder_gap",
+    "no_ack",
+    "bus_full",
+    "bus_flap",
 ]
 
 
@@ -105,6 +108,11 @@ FAULT_KINDS: Final[Mapping[str, FaultTraits]] = {
     "encoder_gap": FaultTraits(
         "a gap in an encoder's words, too short for an error", 0.045, whole=False
     ),
+    "no_ack": FaultTraits("it sends, and hears and acknowledges nothing", 0.5, whole=True),
+    "bus_full": FaultTraits(
+        "its bus's send queue full for 40 ms of each 100 ms (ENOBUFS)", 2.0, whole=True
+    ),
+    "bus_flap": FaultTraits("its bus dead for 60 ms of each 150 ms", 2.0, whole=True),
 }
 """Faults by name. An axis that disarms floats; its sibling keeps its torque."""
 

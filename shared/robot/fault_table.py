@@ -21,9 +21,9 @@ class DriveFault(NamedTuple):
     """A fault of a module's ODrive.
 
     The module goes to FAULT, and the planner holds the other five, so that no leg works against
-    the other. If a knee may be limp the other five stiffen: its leg then stands as a strut between
-    a stiff ankle and a stiff hip. If an ankle may be limp the knees stiffen
-    (`shared.robot.hold_rules`).
+    the other. Without a `cause` it stays in control, or all six hold for a while. If a knee may be
+    limp the other five stiffen: its leg then stands as a strut between a stiff ankle and a stiff
+    hip. If an ankle may be limp the knees stiffen (`shared.robot.hold_rules`).
     """
 
     drive: str
@@ -31,7 +31,7 @@ class DriveFault(NamedTuple):
     limp: bool
     """True if the module gives no torque; False if the drive goes on holding it."""
     cause: Cause | None
-    """Cause of FAULT, as `xrl status` and the service's log show it; None: nothing notices it."""
+    """Cause of FAULT, as `xrl status` and the service's log show it; None: no FAULT."""
     zero_lost: bool
     """True if the joint must be zeroed (`xrl drive zero`) before it can be armed again."""
     recovery: str
@@ -89,6 +89,19 @@ DRIVE_FAULTS: Final[dict[FaultKind, DriveFault]] = {
         "be missing then, it is idled and forgets its zero", limp=False, cause=None,
         zero_lost=False,
         recovery="repair the encoder's cable",
+    ),
+    "no_ack": DriveFault(
+        "its own loop holds the last target; what waits for it in the kernel is thrown away",
+        limp=False, cause=Cause.DRIVE_LOST, zero_lost=False,
+        recovery="mend its CAN receiver or the wires; then as for link_lost",
+    ),
+    "bus_full": DriveFault(
+        "its own loop holds the last target for 40 ms at a time", limp=False, cause=None,
+        zero_lost=False, recovery="take other traffic off the bus; `xrl doctor`: send queue",
+    ),
+    "bus_flap": DriveFault(
+        "its own loop holds the last target for 60 ms at a time; no old frame reaches it",
+        limp=False, cause=None, zero_lost=False, recovery="mend the adapter, its channel or cable",
     ),
 }  # fmt: skip
 """By the name that scenarios and `--fault` use."""

@@ -64,6 +64,9 @@ OUTCOMES = {
     "overspeed": Outcome(AxisState.IDLE, OVERSPEED),
     "encoder_zero": Outcome(AxisState.IDLE, OVERSPEED),
     "encoder_gap": Outcome(AxisState.CLOSED_LOOP_CONTROL, Registers()),
+    "no_ack": Outcome(AxisState.CLOSED_LOOP_CONTROL, Registers()),
+    "bus_full": Outcome(AxisState.CLOSED_LOOP_CONTROL, Registers()),
+    "bus_flap": Outcome(AxisState.CLOSED_LOOP_CONTROL, Registers(), is_responding=False),
     "brown_out": Outcome(
         AxisState.UNDEFINED, Registers(), sibling=AxisState.UNDEFINED, is_responding=False
     ),
@@ -207,3 +210,17 @@ def test_a_stage_near_its_limit_has_less_current() -> None:
     torque = bank.step(DT, ZERO, ZERO)
     assert torque[3] == pytest.approx(0.5 * 60.0 * 0.0827)
     assert torque[2] == pytest.approx(60.0 * 0.0827)
+
+
+@pytest.mark.parametrize(("kind", "share"), [("bus_full", 0.4), ("bus_flap", 0.4), ("no_ack", 1.0)])
+def test_a_buss_fault_comes_and_goes_and_is_over_at_its_end(kind: str, share: float) -> None:
+    scene, axis = Scene(make_fault(kind, 6, duration=3.0), watchdog=False), 6
+    conditions = scene.bank.conditions
+    struck = []
+    while scene.steps * DT < 3.01:
+        scene.run(scene.steps * DT + 0.01)
+        hit = (conditions.silent, conditions.deaf, conditions.choked)
+        struck.append(any(axis in axes for axes in hit))
+    assert sum(struck) / 300 == pytest.approx(share, abs=0.05)
+    scene.run(3.05)
+    assert not conditions.silent | conditions.deaf | conditions.choked

@@ -16,6 +16,7 @@ class VirtualBus:
 
     Attributes:
         acknowledged: True while some node is there.
+        choked: True while frames of others fill the send queue: it takes none of ours.
         at_once: how many rows were carried at once.
         ages_ns: of each row that waited and reached its drive then.
         thrown_away: how many rows waited and were thrown away.
@@ -23,7 +24,7 @@ class VirtualBus:
 
     def __init__(self, bank: AxisBank, axes: Sequence[int]) -> None:
         """Take the drives, and the axes (0 .. 11) on this bus."""
-        self.acknowledged = True
+        self.acknowledged, self.choked = True, False
         self.at_once = self.thrown_away = 0
         self.ages_ns: list[int] = []
         self._conditions, self._axes = bank.conditions, frozenset(axes)
@@ -34,6 +35,7 @@ class VirtualBus:
         conditions = self._conditions
         deaf = conditions.silent | conditions.deaf
         self.acknowledged = not (deaf and deaf.issuperset(self._axes))
+        self.choked = not conditions.choked.isdisjoint(self._axes)
         if self._waiting and self.acknowledged:
             waiting, self._waiting = self._waiting, []
             for sent_ns, apply in waiting:

@@ -188,7 +188,12 @@ class VirtualDrive:
     def _put(self, apply: Apply) -> None:
         """Hand a row to the bus; the drive takes it if it is there, and feeds its watchdogs."""
         now_ns, bus = self._clock(), self._bus
-        if not bus.acknowledged:
+        if bus.choked:
+            self._watch.refused(now_ns)
+            return
+        if bus.acknowledged:
+            self._watch.carried(now_ns)
+        else:
             self._watch.sent(now_ns)
         bus.put(now_ns, lambda: self._receive(apply))
 

@@ -63,7 +63,7 @@ def run(flags: FaultsFlags) -> int:
         limp = "limp" if row.limp else "held"
         console.print(marked("[bold]{}[/]: {}", kind, FAULT_KINDS[kind].about))
         _say(console, "the drive", f"{row.drive} ({limp})")
-        _say(console, "because", row.cause.name if row.cause else "nothing notices it")
+        _say(console, "because", row.cause.name if row.cause else "no FAULT: it stays in control")
         _say(console, "way out", row.recovery)
     console.print(marked("\n[bold]What else can be lost.[/]\n"))
     for name, loss in LOSSES.items():

@@ -6,7 +6,7 @@ socket, and all of them reach the drive when its power is back. The kernel drops
 So the link hands over no frame that might have to wait:
 
 - nothing goes out unless the drive was heard within `QUIET_MS`;
-- nothing goes out while an own frame has not come back (`CAN_RAW_RECV_OWN_MSGS`: the adapter has
+- nothing goes out while an own frame has not come back (CAN_RAW_RECV_OWN_MSGS: the adapter has
   transmitted it) within `STUCK_MS`;
 - what has not come back within `RESTART_MS` is thrown away, by a restart of the interface;
 - an arming request needs an own frame that was carried within `PROOF_MS`.

@@ -130,6 +130,7 @@ class Conditions:
         starting: the drives whose axes do not run yet, and take no state.
         silent: the axes (0 .. 11) without communication: down, or the cable out.
         deaf: the axes (0 .. 11) that hear and acknowledge nothing, and send all the same.
+        choked: the axes (0 .. 11) to which the bus takes no frame: its send queue is full.
         temperature: of each axis's output stage (12,), C.
     """
 
@@ -140,6 +141,7 @@ class Conditions:
         self.starting: set[int] = set()
         self.silent: set[int] = set()
         self.deaf: set[int] = set()
+        self.choked: set[int] = set()
         self.temperature = [ROOM_TEMPERATURE] * N_JOINTS
         self._hot: set[int] = set()
         self._linked = [True] * N_DRIVES
@@ -159,6 +161,11 @@ class Conditions:
         """Break a drive's receiver, or mend it."""
         axes = (2 * drive, 2 * drive + 1)
         (self.deaf.update if deaf else self.deaf.difference_update)(axes)
+
+    def choke(self, drive: int, *, full: bool) -> None:
+        """Fill the send queue of a drive's bus with frames of others, or empty it."""
+        axes = (2 * drive, 2 * drive + 1)
+        (self.choked.update if full else self.choked.difference_update)(axes)
 
     def boot(self, drive: int, now_s: float) -> None:
         """Let a drive start up from now on."""

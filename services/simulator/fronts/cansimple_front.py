@@ -77,9 +77,10 @@ class CanSimpleFront:
     def receive(self) -> None:
         """Apply all frames that have arrived; in each mailbox the newest wins."""
         bank = self._bank
-        silent = bank.conditions.silent | bank.conditions.deaf
+        silent, choked = bank.conditions.silent | bank.conditions.deaf, bank.conditions.choked
         for bus in self._buses:
             mailboxes = bus.mailboxes
+            bus.hub.choked = not choked.isdisjoint(bus.axes)
             bus.hub.acknowledged = bus.hub.shared or not (silent and silent.issuperset(bus.axes))
             for can_id, data in bus.hub.poll():
                 mailbox = mailboxes.get(can_id)

@@ -51,7 +51,7 @@ def _lines() -> Iterator[str]:
             _cleaned(
                 f"`{kind}`", FAULT_KINDS[kind].about, row.drive, "yes" if row.limp else "no",
                 "yes" if row.zero_lost else "no",
-                f"`{row.cause.name}`" if row.cause else "nothing notices it", row.recovery,
+                f"`{row.cause.name}`" if row.cause else "no FAULT", row.recovery,
             )
             for kind, row in DRIVE_FAULTS.items()
         ),

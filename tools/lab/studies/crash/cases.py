@@ -158,7 +158,11 @@ LEFT_ONLY: Final[tuple[tuple[FaultKind, str], ...]] = (
 """Faults that leave a module limp as `disarmed` does: left and right are mirrored, and one
 module is enough where only the error's name differs."""
 
-_LASTING: Final = ("encoder", "encoder_zero", "link_lost", "over_temperature")
+DEAD_BUS: Final[tuple[FaultKind, ...]] = ("no_ack", "bus_full", "bus_flap")
+"""Faults of a module's CAN bus; its drive holds its last target meanwhile."""
+_LASTING: Final = ("encoder", "encoder_zero", "link_lost", "over_temperature", *DEAD_BUS)
+_THROUGH: Final = ("encoder_gap", "bus_full")
+"""Faults through which the robot is led on."""
 _FREE: Final = "each drive holds by its own loop, and needs neither its service nor the others'"
 _NEITHER: Final = "HOLD needs neither"
 
@@ -200,11 +204,11 @@ def _faulted(module: str, kind: FaultKind, *, quick: bool, sort: str = "") -> Cr
     """Return the case of one drive's fault; `sort` of crash, if it is not its own."""
     name: str = kind
     expected = CrashVerdict.STOOD
-    if kind == "link_lost":
-        name = "unplugged"
-        why = "the drive holds its last target; its service has lost contact"
-    elif not DRIVE_FAULTS[kind].limp:
+    if kind == "encoder_gap":
         why = f"{FAULT_KINDS[kind].about}: the drive holds through it"
+    elif not DRIVE_FAULTS[kind].limp:
+        name = "unplugged" if kind == "link_lost" else kind
+        why = "the drive holds its last target; its service has lost contact"
     else:
         expected, reason = LIMP[kind_of(module)]
         why = f"limp ({FAULT_KINDS[kind].about}): {reason}"
@@ -214,7 +218,7 @@ def _faulted(module: str, kind: FaultKind, *, quick: bool, sort: str = "") -> Cr
         crash=(fault(module, kind),),
         expected=expected,
         why=why,
-        holds=DRIVE_FAULTS[kind].cause is not None,
+        holds=kind not in _THROUGH,
         leads_again=not DRIVE_FAULTS[kind].zero_lost,
         quick=quick,
     )
@@ -263,6 +267,7 @@ CASES: Final[Sequence[CrashCase]] = (
         )
         for kind, module in LEFT_ONLY
     ),
+    *(_faulted("knee_left", kind, quick=kind == "no_ack", sort="dead bus") for kind in DEAD_BUS),
     _reengaging("first", "the first module tracks, and others may hold: all hold again", 1, 0.0),
     _reengaging("blend", "half way from HOLD to TRACK: the blend freezes where it is", 6, 0.15),
     _all_joints("kill-all-joints", *killed(*MODULES), quick=True),
