@@ -4,7 +4,7 @@ An intent that is not repeated goes stale: an operator who requested 100 N and l
 lifted forever. It fades out slowly, because somebody may still lean on the robot:
 
     request = intent                                       younger than `assist.stale_ms`
-    request = intent max(0, 1 - (age - stale) / fade)      older; a probe ends then
+    request = intent max(0, 1 - (age - stale) / fade)      older; a probe, or sinking, ends then
 """
 
 from __future__ import annotations
@@ -32,6 +32,8 @@ class OperatorRequest(NamedTuple):
     """Row of p that is probed; `NO_ROW`: none."""
     probe: float = 0.0
     """Its offset, m or rad."""
+    sit: bool = False
+    """Go down by itself to the lowest pose (`services.planner.law.height`)."""
 
 
 class Intents:
@@ -49,7 +51,12 @@ class Intents:
         finite = all(map(math.isfinite, (intent.assist_n, *intent.shift, intent.probe)))
         if finite and NO_ROW <= intent.probe_row < P_ROWS:
             self._request = OperatorRequest(
-                intent.assist_n, intent.shift, intent.source, intent.probe_row, intent.probe
+                intent.assist_n,
+                intent.shift,
+                intent.source,
+                intent.probe_row,
+                intent.probe,
+                intent.sit,
             )
             self._received_ns = now_ns
 

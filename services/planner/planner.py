@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from services.planner.controller import Controller, Observation
 from services.planner.intents import OperatorRequest
 from services.planner.law.assist import Overload, OverloadState, force_up
+from services.planner.law.height import DOWN, STAY
 from services.planner.law.hocca import Hocca, LawOutput, LawState
 from services.planner.state_phases import PhasesState, StatePhases
 from services.planner.watch.controller_guard import ControllerGuard, GuardState
@@ -235,6 +236,7 @@ class Planner:
             dt,
             shift_requested=self._state.request.shift,
             probe=(self._state.request.probe_row, self._state.request.probe),
+            toward=DOWN if self._state.request.sit else STAY,
             align=engagement.hold,
             wrench=self._usable_wrench(now_ns),
             up_torso=self._usable_up(now_ns),
@@ -376,7 +378,7 @@ class Planner:
     def _drift(self, now_ns: int, lifted: float | None) -> float:
         """Return how far the robot has drifted since a hand was last felt, m."""
         wrench, output = self._usable_wrench(now_ns), self._output
-        if wrench is None or lifted is None or output is None:
+        if wrench is None or lifted is None or output is None or self._state.request.sit:
             force = moment = math.nan
         else:
             force, moment = lifted, wrench.moment[1]
@@ -470,6 +472,7 @@ class Planner:
             or (self._guard.why if self._guard is not None else ""),
             trip=int(self._trips.tripped),
             refused=self._plausible.refused,
+            sit=s.request.sit,
         )
 
 

@@ -177,11 +177,14 @@ class SimulatorLoop:
             self._unasked = 0
             most = self._config.assist.force_max, self._config.law.shift_max
             world.outside.asked = granted(other, *most)
+            world.outside.holds = world.scenario.hand and not other.sit
             return
         self._unasked += 1
         if world.outside.asked is not None and self._unasked < SILENT_INTENTS:
             return
-        world.outside.asked = None
+        if world.outside.asked is not None:
+            world.outside.asked = None
+            world.outside.holds = world.scenario.hand
         self._intents += 1
         wanted = world.lead()
         intent = OperatorIntent(

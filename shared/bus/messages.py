@@ -469,6 +469,8 @@ class PlannerStatus(Message, frozen=True):
     """The offset that is asked for, m or rad."""
     refused: Int64 = 0
     """States, wrenches and attitudes refused so far: no sensor can have measured them."""
+    sit: bool = False
+    """True while it is asked to go down by itself (`OperatorIntent.sit`)."""
 
 
 class OperatorIntent(Message, frozen=True):
@@ -484,6 +486,8 @@ class OperatorIntent(Message, frozen=True):
     """Row of p whose reference is offset to measure the answer; -1: none (`xrl drive tune`)."""
     probe: float = 0.0
     """Its offset, m or rad."""
+    sit: bool = False
+    """The robot is to go down by itself to its lowest pose, and hold there (`xrl down`)."""
 
 
 class HandLead(Message, frozen=True):

@@ -109,11 +109,15 @@ def update(hosts: Hosts, remote: Remote, files: list[HostFile], *, while_up: boo
     return f"{len(files)} files"
 
 
+def is_up(remote: Remote) -> bool:
+    """Return True unless a host's services are known to be down."""
+    return _state(remote) not in _AT_REST
+
+
 def refuse_up(remote: Remote, why: str) -> None:
     """Refuse to go on while a host's services are up."""
-    state = _state(remote)
-    if state not in _AT_REST:
-        text = f"{remote.host.name}: its unit is {state}: {why}"
+    if is_up(remote):
+        text = f"{remote.host.name}: its unit is {_state(remote)}: {why}"
         raise FleetError(f"{text}; `xrl hosts down` first, or --while-up")
 
 

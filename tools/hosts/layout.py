@@ -75,7 +75,7 @@ Type=forking
 PIDFile={RUN_DIR}/supervisord.pid
 ExecStart={xrl} up --no-sim --disarmed --config {hosts.folder}/{ROBOT_FILE} \\
   --run-dir {RUN_DIR} --only {",".join(host.processes)}
-ExecStop={xrl} down --keep-stops --run-dir {RUN_DIR}
+ExecStop={xrl} down --limp --keep-stops --run-dir {RUN_DIR}
 Restart=always
 RestartSec=2
 # A start that is cut short would idle the drives of what is up.

@@ -67,12 +67,7 @@ class Remote:
             FleetError: the host is not reached, or the command does not end in time.
         """
         timeout_s = manner.get("timeout_s", TIMEOUT_S)
-        before = [
-            *(self._in_network if manner.get("on_bus") else []),
-            *(self._as_user if manner.get("as_user") else []),
-        ]
-        command = [*self._begin, shlex.join([*before, *words])]
-        name = self.host.name
+        command, name = self._command(words, manner), self.host.name
         try:
             done = subprocess.run(
                 command, input=manner.get("content", b""), capture_output=True, timeout=timeout_s,
@@ -86,6 +81,35 @@ class Remote:
         if done.returncode == 255:  # ssh's own
             raise FleetError(f"{name}: {self.host.ssh} is not reached: {_last(errors)}")
         return Said(done.returncode, done.stdout.decode(errors="replace"), errors)
+
+    def follow(self, *words: str, tell: Callable[[str], None], **manner: Unpack[Manner]) -> None:
+        """Run a command that has to succeed, and hand on each line as it prints it.
+
+        Raises:
+            FleetError: the host is not reached, or the command fails.
+        """
+        pipe = subprocess.PIPE
+        command, name = self._command(words, manner), self.host.name
+        try:
+            process = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, text=True
+            )
+        except OSError as error:
+            raise FleetError(f"{name}: {command[0]}: {error.strerror}") from None
+        with process:
+            for line in process.stdout or ():
+                tell(f"{name}: {printable(line.rstrip())}")
+            errors = process.stderr.read() if process.stderr is not None else ""
+        if process.returncode != 0:
+            raise FleetError(f"{name}: {_last(errors)}")
+
+    def _command(self, words: Sequence[str], manner: Manner) -> list[str]:
+        """Return what this computer runs to have a host run words."""
+        before = [
+            *(self._in_network if manner.get("on_bus") else []),
+            *(self._as_user if manner.get("as_user") else []),
+        ]
+        return [*self._begin, shlex.join([*before, *words])]
 
     def must(self, *words: str, **manner: Unpack[Manner]) -> str:
         """Run a command that has to succeed, and return what it printed."""

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Final
 
 import msgspec
 
 from services.joint.drivers.base import DriveStatus
 from shared.bus.messages import Mode
+from shared.bus.topics import OPERATOR
 from shared.exceptions import FleetError
 from shared.joints import MODULES
 from tools.fleet.fleet_status import FleetStatus, ModuleStatus
 from tools.hosts.hosts_file import Hosts
+from tools.hosts.installation import is_up
 from tools.hosts.layout import RUN_DIR, UNIT
 from tools.hosts.remote import Remote
 
@@ -76,10 +78,29 @@ def estop(hosts: Hosts, remote: Remote) -> str:
     return remote.must(_xrl(hosts), *words, as_user=True, timeout_s=ESTOP_S).strip()
 
 
+def lower(
+    hosts: Hosts, remotes: Iterable[Remote], tell: Callable[[str], None], *, wait_s: float
+) -> None:
+    """Have one host lower the robot until nothing bears on its legs; none is up: do nothing.
+
+    Raises:
+        FleetError: it bears weight, or nobody knows.
+    """
+    try:
+        up = [remote for remote in remotes if is_up(remote)]
+        if not up:
+            return
+        first = min(up, key=lambda remote: OPERATOR not in remote.host.tools)
+        words = ("down", "--lower-only", "--wait", f"{wait_s:g}", "--run-dir", RUN_DIR)
+        first.follow(_xrl(hosts), *words, tell=tell, as_user=True, on_bus=True)
+    except FleetError as error:
+        raise FleetError(f"nothing was stopped: {error} (here: `xrl hosts down --limp`)") from None
+
+
 def down(hosts: Hosts, remote: Remote) -> str:
     """Stop a host's services, and forget an emergency stop: a person asks for that."""
     remote.must("systemctl", "stop", UNIT)
-    remote.must(_xrl(hosts), "down", "--run-dir", RUN_DIR, as_user=True)
+    remote.must(_xrl(hosts), "down", "--limp", "--run-dir", RUN_DIR, as_user=True)
     return "down"
 
 

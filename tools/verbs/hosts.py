@@ -14,7 +14,7 @@ from shared.config import files as config_file
 from shared.config import gain_schedule
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, FleetError, RunError
-from tools.flags import ConfigFlags, Folder, option, positional
+from tools.flags import ConfigFlags, Duration, Folder, option, positional
 from tools.fleet.status_table import tables
 from tools.hosts import hosts_file, installation, records, running
 from tools.hosts.hosts_file import Hosts
@@ -35,7 +35,8 @@ xrl hosts up
 xrl hosts status
 xrl hosts records -o out/lab               # copies the newest records here, joins them into a run
 xrl hosts estop
-xrl hosts down
+xrl hosts down                             # goes down first, and waits until a hoist bears it
+xrl hosts down --limp                      # idles the drives at once: a standing robot falls
 """
 
 
@@ -76,6 +77,15 @@ class HostsUpFlags(HostsFlags):
 
     disarmed: bool = False
     """leave drives idle that do not hold"""
+
+
+class HostsDownFlags(HostsFlags):
+    """What becomes of a robot that bears weight."""
+
+    limp: bool = False
+    """idle the drives at once, whatever they bear: a standing robot falls"""
+    wait: Duration = 60.0
+    """once it is down, how long its weight may take to be taken, s"""
 
 
 class _Given(NamedTuple):
@@ -179,9 +189,12 @@ def estop(flags: HostsFlags) -> int:
     return failed
 
 
-def down(flags: HostsFlags) -> int:
-    """Stop all services."""
+def down(flags: HostsDownFlags) -> int:
+    """Lower the robot, whose legs may be several hosts', then stop all services."""
     given = _given(flags)
+    if not flags.limp:
+        everyone = [Remote(given.hosts, host) for host in given.hosts.host]
+        running.lower(given.hosts, everyone, _progress, wait_s=flags.wait)
     return _each(given, lambda remote: running.down(given.hosts, remote))
 
 
@@ -256,6 +269,10 @@ def _each(given: _Given, work: Callable[[Remote], str]) -> int:
     found = on_all(given.remotes, work, _tell)
     failed = any(isinstance(result, FleetError) for result in found.values())
     return FAULT_EXIT_CODE if failed else 0
+
+
+def _progress(line: str) -> None:
+    print(line, flush=True)
 
 
 def _tell(name: str, result: str | FleetError) -> None:

@@ -36,6 +36,7 @@ from services.planner.law.assist import (
 )
 from services.planner.law.coupling import CouplingFilter
 from services.planner.law.gains import GainLaw
+from services.planner.law.height import STAY, HeightReference, HeightState
 from services.planner.law.kinematics import Measured
 from services.planner.law.law_terms import LawAtReference
 from services.planner.law.levelling import Levelling
@@ -47,7 +48,7 @@ from services.planner.law.split import GainSplit, LocalGains
 from services.planner.law.stance import FOLLOW_S, Stance
 from shared.bus.messages import AS_CONFIGURED, STRAIGHT, Pair, Vector3, Vector4, Vector6, Wrench
 from shared.config.robot_config import GRAVITY, RobotConfig
-from shared.joints import N_JOINTS
+from shared.joints import MODULE_INDEX, N_JOINTS, SIDES
 from shared.state import copied
 
 Array = NDArray[np.float64]
@@ -57,6 +58,9 @@ RECENTRED = np.array([True, True, False, True, False, True])
 """Rows of p whose closed-loop reference returns to zero: no roll or yaw, and the COM above the
 ankles along gravity. Along the floor's normal the COM is off them by its height times the floor's
 slope."""
+
+KNEES = tuple(2 * MODULE_INDEX[f"knee_{side}"] + 1 for side in SIDES)
+"""Indices of the knees' theta among the joints."""
 
 KEPT = np.where(RECENTRED, 0.0, 1.0)
 """1 for the rows of p_C that stay."""
@@ -109,6 +113,7 @@ class LawState(msgspec.Struct):
     """State of `Stance`: the adopted stance, m and rad, and True if it is refused."""
     load: LoadState = msgspec.field(default_factory=LoadState)
     probe: ProbeState = msgspec.field(default_factory=ProbeState)
+    height: HeightState = msgspec.field(default_factory=HeightState)
 
 
 class Hocca:
@@ -127,6 +132,8 @@ class Hocca:
         self._levelling = Levelling(config.imu.levelling_s)
         self._shift = ShiftReference(config.law.shift_max)
         self._probe = ReferenceProbe(config.law.probe_max, config.law.S)
+        low, high = config.joint_service.damp_knee_stop, config.limits.knee.theta[1]
+        self._height = HeightReference((low, high))
         self._stance = Stance(config.law.stance_max)
         self._weight = config.total_mass * GRAVITY
         self._F_O: Array = np.zeros(6)
@@ -149,6 +156,7 @@ class Hocca:
             shift=self._shift.state,
             load=self._load.state,
             probe=self._probe.state,
+            height=self._height.state,
         )
 
     @property
@@ -184,6 +192,7 @@ class Hocca:
         *,
         shift_requested: Vector4 = STRAIGHT,
         probe: tuple[int, float] = (NO_ROW, 0.0),
+        toward: int = STAY,
         align: bool = False,
         wrench: Wrench | None = None,
         up_torso: Vector3 | None = None,
@@ -199,6 +208,7 @@ class Hocca:
             shift_requested: requested x, y (m), roll and yaw (rad) of the shift; limited here.
             probe: row of p whose reference is offset, and by how much, m or rad
                 (`services.planner.law.probe`).
+            toward: go down or up without a hand (`services.planner.law.height`).
             align: start from the measured pose, so that engaging makes no step. p_C starts at the
                 measured pose and returns to zero (COM over the ankles, no roll, no yaw; height and
                 pitch stay) during `law.recentre_s` of ticks without `align`. A planner that was
@@ -223,10 +233,13 @@ class Hocca:
             self._align(q)
             self._shift.rest()
             self._probe.reset()
+            self._height.reset()
         else:
             self._state.has_led = True
             self._probe.advance(*probe, measured.p, measured.pdot, dt)
             self._shift.advance(shift_requested, dt)
+            knees = float(q[KNEES[0]]), float(q[KNEES[1]])
+            self._height.advance(toward, measured.p, measured.pdot, knees, dt)
         pdot = measured.pdot
         p_C, pdot_C = self._closed_loop_reference(dt)
         self._shift.add_to(p_C, pdot_C)
@@ -236,6 +249,7 @@ class Hocca:
         p_ref = self._S_perp * p_C + self._S * measured.p
         pdot_ref = self._S_perp * pdot_C + self._S * pdot
         self._probe.apply(p_ref, pdot_ref, measured.p, pdot)
+        self._height.apply(p_ref, pdot_ref)
         force, moment_pitch = None, 0.0
         if wrench is not None:
             force = force_up(wrench.force, measured.p[3], measured.p[4])
@@ -366,7 +380,7 @@ class Hocca:
             own.easing,
             own.shift,
         )
-        self._load.state, self._probe.state = own.load, own.probe
+        self._load.state, self._probe.state, self._height.state = own.load, own.probe, own.height
         self._p_C0 = np.array(own.p_C0)
         self._reference.start[:] = own.q
         self._coupling.restore(own.coupling)

@@ -237,6 +237,34 @@ def test_a_host_that_is_not_reached_is_told_and_the_others_go_on(
     assert "no such host; one of body, right, left" in capsys.readouterr().err
 
 
+def test_down_stops_no_host_before_one_of_them_has_lowered_the_robot(
+    file: Path, base: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = base / "told"
+    program = base / "co/.venv/bin/xrl"
+    program.write_text(
+        f"#!/bin/bash\necho $ROOT $* >>{told}\n"
+        "[[ $* == *--lower-only* ]] || exit 0\n"
+        'echo "going down"; echo "xrl: it still holds: --limp" >&2; exit 2\n',
+        encoding="utf-8",
+    )
+    for host in ("body", "left"):
+        run_dir = base / host / "var/lib/xrl/run"
+        run_dir.mkdir(parents=True)
+        (run_dir / "supervisord.pid").touch()
+    assert xrl("down", base, "left", "--wait", "5") == 2
+    said = capsys.readouterr()
+    assert said.out == "body: going down\n"
+    assert "nothing was stopped: body: xrl: it still holds" in said.err
+    (line,) = told.read_text(encoding="utf-8").splitlines()
+    assert line.startswith(f"{base}/body down --lower-only --wait 5 ")
+    assert "stop" not in (base / "left/calls").read_text(encoding="utf-8")
+    assert xrl("down", base, "left", "--limp") == 0
+    assert "systemctl stop xrl.service" in (base / "left/calls").read_text(encoding="utf-8")
+    shutil.rmtree(base / "right")
+    assert xrl("down", base) == 2, "a host that is not reached may hold a leg"
+
+
 def test_a_key_that_is_lost_is_told_until_every_host_knows(
     base: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -37,6 +37,8 @@ REFUSALS: Final = {
     "up --accept estop": "--accept is for the gateway to ROS 2: add --ros2",
     "status --json --traffic": "--traffic is a screen for people",
     "status --json --watch": "not allowed with",
+    "down --limp --sit": "not allowed with",
+    "down --wait 0": "a number of at least 0.001 s",
     "pendant": "no joint service",
     "pendant --for 0": "a number of at least 0.001 s",
     "estop --partly knee_left": "--partly goes with --local",

@@ -171,6 +171,7 @@ class PlannerExecution:
             source=status.requested_by,
             probe_row=status.probe_row,
             probe=status.probe,
+            sit=status.sit,
         )
         return given
 

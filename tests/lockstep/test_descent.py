@@ -1,0 +1,226 @@
+"""`xrl down` in virtual time: the way down, and what bears the robot when its drives go limp."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+import pytest
+
+from services.planner.intents import OperatorRequest
+from services.simulator.physics.plant import PlantConfig
+from shared.bus.messages import JointState, Message, Mode, PlannerStatus, SimTruth
+from shared.bus.topics import Topic
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Scenario
+from shared.exceptions import FleetError
+from shared.joints import MODULE_INDEX, MODULES
+from tests.lockstep.runs import kill, led_to, modes_of, push, run, still
+from tools.fleet.descent import LIGHT_FRACTION, Ask, Descent, Phase
+from tools.lab.studies.sweeps import plants
+from tools.sim.lockstep import Lockstep
+
+AT_S = 1.0
+HEARD_S = 0.1
+
+
+class Descending(Lockstep):
+    """A fleet in which `xrl down` was typed at `AT_S`.
+
+    Attributes:
+        error: what it gave up with.
+        asks: what it asked for, in order.
+        interrupt: Ctrl-C at a scenario's time.
+    """
+
+    def __init__(self, robot: RobotConfig, *args: Any, **how: Any) -> None:
+        self.descent = Descent(robot, wait_s=8.0)
+        self.states: list[JointState | None] = [None] * len(MODULES)
+        self.status: PlannerStatus | None = None
+        self.asks: list[Ask] = []
+        self.error = ""
+        self.interrupt_s = np.inf
+        super().__init__(robot, *args, record=self.hear, **how)
+
+    def hear(self, _topic: Topic, module: str, message: Message) -> None:
+        if isinstance(message, JointState):
+            self.states[MODULE_INDEX[module]] = message
+        elif isinstance(message, PlannerStatus):
+            self.status = message
+
+    def _request(self) -> OperatorRequest:
+        sits = bool(self.asks) and self.asks[-1] is Ask.SIT and not self.error
+        sits &= self.world.scenario_s < self.interrupt_s
+        return super()._request()._replace(sit=sits)
+
+    def look(self) -> Ask:
+        """Look once, as the verb does."""
+        now_s = 1e-9 * self.now_ns
+
+        def fresh(message: Any) -> Any:
+            old = message is None or now_s - 1e-9 * message.t_ns > HEARD_S
+            return None if old else message
+
+        try:
+            ask = self.descent.step(now_s, [fresh(s) for s in self.states], fresh(self.status))
+        except FleetError as error:
+            self.error, ask = str(error), Ask.NOTHING
+        if not self.asks or ask is not self.asks[-1]:
+            self.asks.append(ask)
+        self.estop |= ask is Ask.STOP
+        return ask
+
+
+class Descended(NamedTuple):
+    """What came of it."""
+
+    fleet: Descending
+    rows: list[SimTruth]
+
+    @property
+    def speed(self) -> float:
+        """Fastest way down of the torso, m/s."""
+        return float((-np.gradient([row.torso[2] for row in self.rows], 0.01)).max())
+
+    @property
+    def height(self) -> float:
+        return self.rows[-1].torso[2]
+
+
+def go_down(
+    robot: RobotConfig,
+    scenario: Scenario,
+    plant: PlantConfig | None = None,
+    each: Any = lambda _fleet, _row: None,
+    interrupt_s: float = np.inf,
+) -> Descended:
+    """Type `xrl down` at `AT_S`; go on for a second after its end."""
+    ended: list[float] = []
+
+    def look(fleet: Descending, row: SimTruth) -> bool:
+        fleet.interrupt_s = interrupt_s
+        if row.scenario_s < AT_S:
+            return False
+        each(fleet, row)
+        if not ended and (fleet.error or fleet.look() is Ask.IDLE):
+            ended.append(row.scenario_s)
+        return bool(ended) and row.scenario_s > ended[0] + 1.0
+
+    outcome = run(robot, scenario, plant=plant, fleet_type=Descending, each=look)
+    assert not outcome.rows[-1].fallen
+    on_feet = [row for row in outcome.rows if row.hoist == 0.0]
+    assert max(max(row.foot_left_tilt, row.foot_right_tilt) for row in on_feet) < 0.05
+    return Descended(outcome.lockstep, outcome.rows)
+
+
+def alone(duration: float = 40.0, **changes: Any) -> Scenario:
+    return msgspec.structs.replace(still(duration, **changes), hand=False)
+
+
+HOISTED_M = 1.45
+HOIST_M = 0.003
+"""In 10 ms."""
+
+
+def hang(fleet: Descending, row: SimTruth) -> None:
+    """Once it is down, have a hoist lift it until its feet are in the air."""
+    hoist = fleet.world.outside.hoist
+    if fleet.descent.phase is Phase.RESTING and hoist.share == 0.0:
+        hoist.position = np.array(row.torso)
+        hoist.share, hoist.releasing = 1.0, False
+    elif hoist.share > 0.0:
+        hoist.position[2] = min(HOISTED_M, hoist.position[2] + HOIST_M)
+
+
+@pytest.mark.sampled(20)
+@pytest.mark.parametrize("number", range(40))
+def test_it_goes_down_and_holds_until_a_hoist_bears_it(robot: RobotConfig, number: int) -> None:
+    found = go_down(robot, alone(), plants.draw(f"down {number}"), hang)
+    assert found.fleet.asks[-1] is Ask.IDLE
+    assert found.fleet.error == ""
+    assert found.speed < 0.2
+    lowest = min(row.torso[2] for row in found.rows)
+    assert lowest < 0.85, "the lowest pose"
+
+
+def test_with_nothing_to_bear_it_it_holds_and_says_what_helps(robot: RobotConfig) -> None:
+    """Idled there it would tip: the torso meets the floor at 2.8 m/s, as from a stand."""
+    found = go_down(robot, alone())
+    assert found.speed < 0.2
+    assert "still holds: the legs bear 9" in found.fleet.error
+    assert "stand under its torso" in found.fleet.error
+    assert Ask.IDLE not in found.fleet.asks
+    assert found.height < 0.85
+    assert {*modes_of(found.fleet)} == {Mode.DAMP}
+
+
+def test_without_a_planner_it_sinks_in_damp(robot: RobotConfig) -> None:
+    found = go_down(robot, alone(kill=kill(0.5)), each=hang)
+    assert found.fleet.asks == [Ask.NOTHING, Ask.STOP, Ask.NOTHING, Ask.IDLE]
+    assert found.speed < 0.2
+
+
+def test_a_planner_that_dies_on_the_way_does_not_keep_it_up(robot: RobotConfig) -> None:
+    found = go_down(robot, alone(kill=kill(3.5)), each=hang)
+    assert Ask.SIT in found.fleet.asks
+    assert found.fleet.asks[-1] is Ask.IDLE
+
+
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize("at", [2.5, 4.5])
+def test_interrupted_it_stands_where_it_is(robot: RobotConfig, at: float) -> None:
+    heights = []
+
+    def stop(fleet: Descending, row: SimTruth) -> None:
+        if row.scenario_s > at:
+            fleet.error = fleet.error or "interrupted"
+            heights.append(row.torso[2])
+
+    found = go_down(robot, alone(), each=stop, interrupt_s=at)
+    assert heights[0] - found.height < 0.05
+    assert found.height > 0.9
+    assert not {*modes_of(found.fleet)} - {Mode.TRACK, Mode.HOLD}
+
+
+def test_a_hand_that_holds_it_up_is_not_pressed_down(robot: RobotConfig) -> None:
+    found = go_down(robot, still(40.0))
+    assert "held up" in found.fleet.error
+    assert max(abs(row.operator_force[2]) for row in found.rows) < 90.0
+    assert found.height > 1.05
+
+
+def test_a_person_who_goes_along_takes_it_down(robot: RobotConfig) -> None:
+    scenario = led_to((AT_S, 1.188), (7.0, 0.83), duration=40.0)
+    found = go_down(robot, scenario, each=hang)
+    assert found.fleet.asks[-1] is Ask.IDLE
+
+
+@pytest.mark.sampled(8)
+@pytest.mark.parametrize("number", range(8))
+def test_pushed_on_its_way_it_does_not_tip(robot: RobotConfig, number: int) -> None:
+    pushes = (push(3.0, 30.0, 0.0, 0.0), push(4.0, 0.0, 30.0, 0.0), push(5.5, -30.0, 0.0, 0.0))
+    found = go_down(robot, alone(push=pushes), plants.draw(f"pushed {number}"), hang)
+    assert found.fleet.asks[-1] is Ask.IDLE
+
+
+def test_a_hanging_robot_is_idled_at_once(robot: RobotConfig) -> None:
+    def hung(fleet: Descending, row: SimTruth) -> None:
+        hoist = fleet.world.outside.hoist
+        if hoist.share == 0.0:
+            hoist.position = np.array(row.torso) + np.array((0.0, 0.0, 0.2))
+            hoist.share, hoist.releasing = 1.0, False
+
+    found = go_down(robot, alone(), each=hung)
+    assert found.fleet.asks == [Ask.NOTHING, Ask.IDLE]
+    assert LIGHT_FRACTION < 0.5, "what a robot without its payload still bears"
+
+
+def test_beside_a_limp_module_it_is_refused(robot: RobotConfig) -> None:
+    def idle(fleet: Descending, _row: SimTruth) -> None:
+        if fleet.states[2] is not None and fleet.descent.phase is Phase.LOOKING:
+            fleet.states[2] = msgspec.structs.replace(fleet.states[2], mode=int(Mode.FAULT))
+
+    found = go_down(robot, alone(), each=idle)
+    assert found.fleet.error.startswith("hip_right FAULT: it may bear weight on the others")
+    assert found.fleet.asks == [Ask.NOTHING]
