@@ -122,6 +122,8 @@ class MotorError(IntFlag):
     """The part of `motor.error` that this project names."""
 
     NONE = 0
+    PHASE_RESISTANCE_OUT_OF_RANGE = 0x0000_0001
+    PHASE_INDUCTANCE_OUT_OF_RANGE = 0x0000_0002
     DRV_FAULT = 0x0000_0008
     CURRENT_LIMIT_VIOLATION = 0x0000_1000
     MODULATION_IS_NAN = 0x0001_0000

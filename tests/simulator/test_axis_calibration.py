@@ -1,83 +1,258 @@
-"""Calibration: what it takes, and what it refuses."""
+"""Calibration: how long it takes, what it finds, and what it leaves behind when it fails.
+
+Each motor has a rotor of its own here, free, loaded or blocked; the field has to turn it.
+"""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import pytest
 
-from services.simulator.drives.axis_bank import AxisBank
-from services.simulator.drives.axis_calibration import ENCODER_S, MOTOR_S
-from shared.can.cansimple import AxisError, AxisState, EncoderError, MotorError
-from tests.simulator.banks import DT, make_bank, step_for
+from services.simulator.drives.axis_bank import AxisErrors
+from services.simulator.drives.axis_calibration import INDUCTANCE_S, LOCK_S, RESISTANCE_S
+from services.simulator.drives.axis_settings import PHASE_INDUCTANCE, PHASE_RESISTANCE, POLE_PAIRS
+from shared.can.cansimple import AxisError, AxisState, ControlMode, EncoderError, MotorError
+from tests.simulator.banks import CPR, DT, make_bank
+
+INERTIA = 2.5e-4
+"""kg m^2 of a rotor."""
+FRICTION = 2e-3
+"""N m s/rad"""
+MOTOR_S = RESISTANCE_S + INDUCTANCE_S
+ENCODER_S = LOCK_S + 8.0
+"""At 4 pi rad/s, 16 pi out and 16 pi back."""
+AT = 64.28
+"""turns; a zero of 64 turns and a joint that is not quite there."""
+MOTOR, ENCODER = AxisState.MOTOR_CALIBRATION, AxisState.ENCODER_OFFSET_CALIBRATION
+FULL = AxisState.FULL_CALIBRATION_SEQUENCE
 
 
-def uncalibrated() -> AxisBank:
-    """Return a bank whose axis 2 has not been calibrated."""
-    bank = make_bank()
-    for name in ("motor", "encoder"):
-        bank.settings.set(1, f"axis0.{name}.config.pre_calibrated", value=False)
-    bank.settings.save(1)
-    bank.reboot(2)
-    step_for(bank, 1.6)
-    assert bank.state[2] == AxisState.IDLE
-    return bank
+class Rotor:
+    """Axis 2, uncalibrated, and its rotor; the other axes stand still.
+
+    Attributes:
+        load: torque against the shaft, N m per turn away from where it is at the start.
+        blocked: it does not turn at all.
+        turned: farthest turns either way.
+    """
+
+    def __init__(self, **settings: float) -> None:
+        self.bank = bank = make_bank(ControlMode.POSITION)
+        bank.counts_from[2], bank.encoder_mount[2] = 64 * CPR, 0.0
+        for name in ("motor.config.pre_calibrated", "encoder.config.pre_calibrated"):
+            bank.settings.set(1, f"axis0.{name}", value=False)
+        bank.settings.set(1, "axis0.encoder.config.direction", 0)
+        for name, value in settings.items():
+            bank.settings.set(1, f"axis0.{name.replace('__', '.config.')}", value)
+        bank.settings.save(1)
+        bank.reboot(2)
+        self.pos, self.vel, self.load, self.blocked, self.turned = 0.28, 0.0, 0.0, False, 0.0
+        self.run(1.6)
+        assert bank.state[2] == AxisState.IDLE
+        bank.set_count(2, round(AT * CPR))
+
+    def run(self, seconds: float) -> None:
+        """Let time pass."""
+        bank, pos, vel = self.bank, np.zeros(12), np.zeros(12)
+        for _ in range(round(seconds / DT)):
+            pos[2], vel[2] = self.pos, self.vel
+            torque = bank.step(bank.now_s + DT, pos, vel)[2] - self.load * (self.pos - 0.28)
+            rate = (self.vel + torque / (2.0 * math.pi * INERTIA) * DT) / (
+                1.0 + FRICTION / INERTIA * DT
+            )
+            self.vel = 0.0 if self.blocked else rate
+            self.pos += self.vel * DT
+            self.turned = max(self.turned, abs(self.pos - 0.28))
+
+    def ask(self, state: AxisState) -> None:
+        self.bank.request_state(2, state)
+
+    def found(self, name: str) -> float:
+        return float(self.bank.settings.axis(name)[2])
+
+    @property
+    def calibrated(self) -> tuple[bool, bool]:
+        return self.bank.calibration.motor[2], self.bank.calibration.encoder[2]
+
+
+def test_the_full_sequence_takes_its_time_turns_the_shaft_out_and_back_and_finds_what_is() -> None:
+    rotor = Rotor()
+    rotor.ask(FULL)
+    rotor.run(MOTOR_S - 0.01)
+    assert rotor.bank.state[2] == MOTOR
+    assert rotor.bank.encoder_turns[2] == pytest.approx(AT, abs=0.5 / POLE_PAIRS)
+    rotor.run(0.02)
+    assert rotor.bank.state[2] == ENCODER
+    rotor.run(ENCODER_S - 0.02)
+    assert rotor.bank.state[2] == ENCODER
+    rotor.run(0.03)
+    assert (rotor.bank.state[2], rotor.bank.faults[2]) == (AxisState.IDLE, AxisErrors())
+    assert rotor.calibrated == (True, True)
+    assert rotor.turned == pytest.approx(8.0 / POLE_PAIRS, abs=0.5 / POLE_PAIRS)
+    assert rotor.found("motor.config.phase_resistance") == pytest.approx(PHASE_RESISTANCE)
+    assert rotor.found("motor.config.phase_inductance") == PHASE_INDUCTANCE
+    assert rotor.found("encoder.config.direction") == 1.0
+    poles = rotor.found("encoder.config.phase_offset") / CPR * POLE_PAIRS
+    assert poles == pytest.approx(round(poles), abs=0.1), "the field's zero is at one of the poles"
+    rotor.ask(AxisState.CLOSED_LOOP_CONTROL)
+    assert rotor.bank.state[2] == AxisState.CLOSED_LOOP_CONTROL
+
+
+def test_an_encoders_calibration_forgets_the_turns_in_the_moment_it_begins() -> None:
+    rotor = Rotor()
+    rotor.bank.calibration.motor[2] = True
+    rotor.ask(ENCODER)
+    assert rotor.bank.encoder_turns[2] == pytest.approx(0.28, abs=1e-3)
+    rotor.run(DT)
+    assert rotor.bank.pos_estimate[2] == pytest.approx(0.28, abs=1e-2)
+    assert abs(rotor.bank.vel_estimate[2]) < 0.1, "and its rate knows nothing of it"
 
 
 @pytest.mark.parametrize(
-    "state",
-    [AxisState.CLOSED_LOOP_CONTROL, AxisState.ENCODER_OFFSET_CALIBRATION],
-    ids=["closed loop", "the encoder's calibration before the motor's"],
+    ("motor", "direction", "fault"),
+    [
+        (False, 1, AxisErrors(AxisError.INVALID_STATE)),
+        (True, 0, AxisErrors(AxisError.INVALID_STATE)),
+        (True, 1, AxisErrors(AxisError.MOTOR_FAILED, motor=MotorError.UNKNOWN_PHASE_ESTIMATE)),
+    ],
 )
-def test_an_uncalibrated_axis_refuses_a_state_as_invalid_and_its_sibling_does_not(
-    state: AxisState,
+def test_closed_loop_says_what_is_not_calibrated(
+    motor: bool, direction: int, fault: AxisErrors
 ) -> None:
-    bank = uncalibrated()
-    bank.request_state(2, state)
-    assert bank.state[2] == AxisState.IDLE
-    assert bank.faults[2].axis == AxisError.INVALID_STATE
-    bank.request_state(3, state)
-    assert bank.state[3] == state
+    rotor = Rotor(encoder__direction=direction)
+    rotor.bank.calibration.motor[2] = motor
+    rotor.ask(AxisState.CLOSED_LOOP_CONTROL)
+    rotor.run(2 * DT)
+    assert (rotor.bank.state[2], rotor.bank.faults[2]) == (AxisState.IDLE, fault)
+    moved = rotor.bank.input_pos[2] != 0.0
+    assert moved == bool(fault.motor), "it armed for a cycle, from where it is"
 
 
-def test_the_full_sequence_takes_its_time_and_then_closed_loop_is_granted() -> None:
-    bank = uncalibrated()
-    bank.request_state(2, AxisState.FULL_CALIBRATION_SEQUENCE)
-    step_for(bank, 0.5 * MOTOR_S)
-    assert bank.state[2] == AxisState.MOTOR_CALIBRATION
-    step_for(bank, 0.5 * MOTOR_S + 2 * DT)
-    assert bank.state[2] == AxisState.ENCODER_OFFSET_CALIBRATION
-    step_for(bank, ENCODER_S)
-    assert bank.state[2] == AxisState.IDLE
-    bank.request_state(2, AxisState.CLOSED_LOOP_CONTROL)
-    assert bank.state[2] == AxisState.CLOSED_LOOP_CONTROL
+def test_an_encoder_is_not_calibrated_before_its_motor() -> None:
+    rotor = Rotor()
+    rotor.ask(ENCODER)
+    assert rotor.bank.faults[2].axis == AxisError.INVALID_STATE
+    assert rotor.bank.encoder_turns[2] == pytest.approx(AT, abs=1e-3)
+    rotor.bank.request_state(3, ENCODER)
+    assert rotor.bank.state[3] == ENCODER, "its sibling's motor is calibrated"
 
 
-def test_under_a_load_the_encoders_calibration_fails_and_leaves_the_axis_uncalibrated() -> None:
-    bank = uncalibrated()
-    bank.request_state(2, AxisState.MOTOR_CALIBRATION)
-    step_for(bank, MOTOR_S + DT)
-    bank.request_state(2, AxisState.ENCODER_OFFSET_CALIBRATION)
-    sinking = np.zeros(12)
-    sinking[2] = 0.1
-    step_for(bank, 1.0, vel=sinking)
-    assert bank.faults[2].encoder == EncoderError.CPR_POLEPAIRS_MISMATCH
-    bank.clear_errors(2)
-    bank.request_state(2, AxisState.CLOSED_LOOP_CONTROL)
-    step_for(bank, 2 * DT)
-    assert bank.state[2] == AxisState.IDLE
-    assert bank.faults[2].motor == MotorError.UNKNOWN_PHASE_ESTIMATE, "and no INVALID_STATE"
+VIOLATION = AxisErrors(AxisError.MOTOR_FAILED, motor=MotorError.CURRENT_LIMIT_VIOLATION)
+RESISTANCE = AxisErrors(AxisError.MOTOR_FAILED, motor=MotorError.PHASE_RESISTANCE_OUT_OF_RANGE)
+MISMATCH = AxisErrors(AxisError.ENCODER_FAILED, encoder=EncoderError.CPR_POLEPAIRS_MISMATCH)
+NO_RESPONSE = AxisErrors(AxisError.ENCODER_FAILED, encoder=EncoderError.NO_RESPONSE)
 
 
-def test_another_request_breaks_a_calibration_off() -> None:
-    bank = uncalibrated()
-    bank.request_state(2, AxisState.MOTOR_CALIBRATION)
-    bank.request_state(2, AxisState.IDLE)
-    step_for(bank, MOTOR_S + DT)
-    assert not bank.calibration.motor[2]
+@pytest.mark.parametrize(
+    ("settings", "load", "blocked", "fault", "within_s"),
+    [
+        ({"motor__calibration_current": 30.0}, 0.0, False, RESISTANCE, 0.2),
+        ({"motor__resistance_calib_max_voltage": 0.9}, 0.0, False, RESISTANCE, 0.3),
+        ({"motor__calibration_current": 19.0, "motor__current_lim": 10.0}, 0.0, False,
+         VIOLATION, 0.4),
+        ({"motor__pole_pairs": 14}, 0.0, False, MISMATCH, MOTOR_S + 5.1),
+        ({"motor__pole_pairs": 8}, 0.0, False, MISMATCH, MOTOR_S + 5.1),
+        ({"encoder__cpr": CPR // 2}, 0.0, False, MISMATCH, MOTOR_S + 5.1),
+        ({}, 0.0, True, NO_RESPONSE, MOTOR_S + 5.1),
+        ({}, 2.0, False, MISMATCH, MOTOR_S + 5.1),
+    ],
+    ids=["more current than volts", "few volts", "beyond the current limit", "twice the poles",
+         "one pole pair more", "half the counts", "blocked", "loaded"],
+)  # fmt: skip
+def test_a_calibration_that_fails_says_why_stops_there_and_leaves_the_axis_uncalibrated(
+    settings: dict[str, float], load: float, blocked: bool, fault: AxisErrors, within_s: float
+) -> None:
+    rotor = Rotor(**settings)
+    rotor.load, rotor.blocked = load, blocked
+    rotor.ask(FULL)
+    rotor.run(within_s)
+    assert (rotor.bank.state[2], rotor.bank.faults[2]) == (AxisState.IDLE, fault)
+    assert rotor.calibrated == (bool(fault.encoder), False)
+    assert math.isnan(rotor.found("motor.config.phase_resistance")) == (fault == RESISTANCE)
+    rotor.run(0.5)
+    assert rotor.bank.torque[2] == 0.0
 
 
-def test_an_axis_that_calibrates_makes_no_torque() -> None:
-    bank = make_bank()
-    bank.input_torque[2] = 1.0
-    bank.request_state(2, AxisState.MOTOR_CALIBRATION)
-    assert step_for(bank, DT)[2] == 0.0
+def test_a_broken_phase_has_no_resistance_and_a_board_keeps_even_that() -> None:
+    """Saved without a look, the NaN is there after the restart, and no current has gains."""
+    rotor = Rotor()
+    rotor.bank.calibration.resistance[2] = 1e6
+    rotor.ask(MOTOR)
+    rotor.run(0.25)
+    assert rotor.bank.faults[2] == RESISTANCE
+    rotor.bank.settings.save(1)
+    rotor.bank.reboot(2)
+    rotor.run(1.6)
+    assert math.isnan(rotor.found("motor.config.phase_resistance"))
+    assert rotor.bank.bus.state(1)[0] == pytest.approx(48.0), "no power is computed from it"
+
+
+LOST_INDUCTANCE = AxisErrors(motor=MotorError.PHASE_INDUCTANCE_OUT_OF_RANGE)
+
+
+@pytest.mark.parametrize(
+    ("state", "after_s", "fault", "motor", "encoder"),
+    [
+        (MOTOR, 0.05, LOST_INDUCTANCE, False, False),
+        (MOTOR, 3.5, AxisErrors(), True, False),
+        (FULL, MOTOR_S + 0.5, AxisErrors(), True, False),
+        (FULL, MOTOR_S + 3.0, MISMATCH, True, False),
+        (FULL, MOTOR_S + 7.0, AxisErrors(), True, True),
+    ],
+    ids=["resistance", "inductance", "lock", "way out", "way back"],
+)
+def test_what_a_request_for_idle_leaves_behind_is_half_a_measurement(
+    state: AxisState, after_s: float, fault: AxisErrors, motor: bool, encoder: bool
+) -> None:
+    """Twice it even counts as calibrated: whoever stops one has to restart the board."""
+    rotor = Rotor()
+    rotor.ask(state)
+    rotor.run(after_s)
+    rotor.ask(AxisState.IDLE)
+    rotor.run(DT)
+    assert (rotor.bank.state[2], rotor.bank.faults[2]) == (AxisState.IDLE, fault)
+    assert rotor.calibrated == (motor, encoder)
+    assert rotor.bank.torque[2] == 0.0
+    if fault == LOST_INDUCTANCE:
+        assert 0.0 < rotor.found("motor.config.phase_resistance") < 0.5 * PHASE_RESISTANCE
+    rotor.bank.reboot(2)
+    assert rotor.calibrated == (False, False)
+    assert rotor.found("motor.config.phase_resistance") == PHASE_RESISTANCE, "as it was saved"
+
+
+def test_a_watchdog_that_is_not_fed_ends_a_calibration() -> None:
+    """Native (USB) writes do not feed it."""
+    rotor = Rotor()
+    rotor.ask(MOTOR)
+    rotor.run(1.0)
+    rotor.bank.settings.set(1, "axis0.config.watchdog_timeout", 0.1)
+    rotor.bank.settings.set(1, "axis0.config.enable_watchdog", value=True)
+    rotor.run(2 * DT)
+    assert rotor.bank.faults[2] == AxisErrors(AxisError.WATCHDOG_TIMER_EXPIRED)
+    assert (rotor.bank.state[2], rotor.calibrated) == (AxisState.IDLE, (False, False))
+
+
+@pytest.mark.parametrize("state", [MOTOR, ENCODER])
+def test_with_an_error_latched_nothing_is_measured_and_nothing_said(state: AxisState) -> None:
+    rotor = Rotor()
+    rotor.bank.calibration.motor[2] = state == ENCODER
+    rotor.bank.estop(2)
+    latched = rotor.bank.faults[2]
+    rotor.ask(state)
+    rotor.run(DT)
+    assert (rotor.bank.state[2], rotor.bank.faults[2]) == (AxisState.IDLE, latched)
+    assert rotor.calibrated == (state == ENCODER, False)
+    if state == MOTOR:
+        assert rotor.found("motor.config.phase_resistance") == 0.0
+    else:
+        assert rotor.bank.encoder_turns[2] == pytest.approx(0.28, abs=1e-3), "the zero is gone"
+
+
+def test_an_axis_that_calibrates_takes_no_torque_from_its_inputs() -> None:
+    rotor = Rotor()
+    rotor.bank.input_torque[2] = 1.0
+    rotor.ask(MOTOR)
+    rotor.run(MOTOR_S - 0.5)
+    assert rotor.bank.torque[2] == pytest.approx(0.0, abs=1e-6)

@@ -188,6 +188,26 @@ def test_a_heartbeat_of_0_6_is_busy_in_closed_loop_and_a_success_in_idle(new: Be
     assert heartbeat.trajectory_done
 
 
+@pytest.mark.parametrize(
+    ("volts", "result"), [(0.5, "PHASE_RESISTANCE_OUT_OF_RANGE"), (2.0, "NO_RESPONSE")]
+)
+def test_a_heartbeat_of_0_6_says_how_a_calibration_went(
+    new: Bench, volts: float, result: str
+) -> None:
+    """Here no shaft turns."""
+    name = "axis1.motor.config.resistance_calib_max_voltage"
+    new.bank.settings.set(AXIS // 2, name, volts)
+    asked = struct.pack("<I", AxisState.FULL_CALIBRATION_SEQUENCE)
+    new.send(Command.SET_AXIS_STATE, asked)
+    new.step(0.0)
+    assert cansimple_06.unpack_heartbeat(new.heartbeat()).procedure_result == ProcedureResult.BUSY
+    for _ in range(4):
+        new.step(5.0)
+    heartbeat = cansimple_06.unpack_heartbeat(new.heartbeat())
+    assert heartbeat.procedure_result == ProcedureResult[result]
+    assert heartbeat.axis_error == DriveError06.CALIBRATION_ERROR
+
+
 def test_set_points_and_gains_are_taken_alike_in_both_dialects(old: Bench, new: Bench) -> None:
     for each in (old, new):
         each.send(Command.SET_INPUT_POS, struct.pack("<fhh", 1.5, 250, -500))

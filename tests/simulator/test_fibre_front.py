@@ -263,3 +263,18 @@ def test_a_restart_forgets_what_was_not_saved(client: Client, bank: AxisBank) ->
     before = client.exchange("axis0.controller.config.vel_limit", 7.0)
     client.call("reboot")
     assert bank.settings.get(MODULE, "axis0.controller.config.vel_limit") == before
+
+
+def test_a_mark_of_calibration_is_believed_of_a_motor_and_of_an_encoder_that_is_ready(
+    client: Client,
+) -> None:
+    for name in ("motor.config.pre_calibrated", "encoder.config.pre_calibrated"):
+        client.exchange(f"axis1.{name}", False)
+    client.call("save_configuration")
+    assert client.exchange("axis1.motor.is_calibrated") is False
+    for name in ("motor", "encoder"):
+        client.exchange(f"axis1.{name}.config.pre_calibrated", True)
+    assert client.exchange("axis1.motor.is_calibrated") is True
+    assert client.exchange("axis1.motor.config.pre_calibrated") is True
+    assert client.exchange("axis1.encoder.is_ready") is False
+    assert client.exchange("axis1.encoder.config.pre_calibrated") is False

@@ -108,7 +108,7 @@ class AxisBank:
         self.encoder_mount, self.encoder_angle = encoders.mount, encoders.angle
         self._shaft = np.zeros(n)
         self.now_s = -math.inf
-        self.calibration = Calibration(self.settings)
+        self.calibration = Calibration(self.settings, encoders, drive.torque_constant)
         self.conditions = Conditions(self.settings, control, encoders)
         self._watchdogs = Watchdogs(self.settings)
         self._spinout = Spinout(self.settings)
@@ -118,8 +118,8 @@ class AxisBank:
 
     @property
     def regulates(self) -> bool:
-        """True if any axis has a position or velocity loop: it wants every step of the world."""
-        return self._control.regulates()
+        """True if any axis has a loop, or calibrates: it wants every step of the world."""
+        return bool(self.calibration.running) or self._control.regulates()
 
     def step(self, now_s: float, pos_turns: Vector, vel_turns: Vector) -> Vector:
         """Advance to `now_s`: true motor position and velocity in, motor torque out.
@@ -156,6 +156,9 @@ class AxisBank:
                 self._fail(axis, FAULTS["CURRENT_LIMIT"])
             _, least, most = control.control()
         control.integrate()
+        for axis in self.calibration.running:
+            pos, vel = float(pos_turns[axis]), float(vel_turns[axis])
+            self.torque[axis] = self.calibration.torque(axis, pos, vel)
         for drive, why in self.bus.check(least, most).items():
             for axis in _both(2 * drive):
                 self._fail(axis, BUS_FAULTS[why])
@@ -183,23 +186,22 @@ class AxisBank:
                 self._requested[axis] = state
             return
         fault = self.faults[axis]
-        self.faults[axis] = fault._replace(axis=fault.axis & ~AxisError.INVALID_STATE)
-        self.calibration.stop(axis)
+        broken_off = self.calibration.stop(axis, requested=True)
+        fault = fault._replace(axis=fault.axis & ~AxisError.INVALID_STATE).with_(broken_off)
+        self.faults[axis] = fault
         if state == AxisState.IDLE:
             self._disarm(axis)
         elif state == AxisState.CLOSED_LOOP_CONTROL:
-            if (
-                self.calibration.motor[axis]
-                and self.settings.axis("encoder.config.direction")[axis]
-            ):
-                self._arm(axis)
-            else:
+            if self.calibration.refuses(axis):
                 self._fail(axis, AxisErrors(AxisError.INVALID_STATE))
+            else:
+                self._arm(axis)
         elif state in SEQUENCES:
             self._disarm(axis)
-            turns = float(self.encoder_turns[axis])
             states = SEQUENCES[AxisState(state)]
-            self._become(axis, self.calibration.begin(axis, states, self.now_s, turns))
+            latched = fault.axis != 0
+            outcome = self.calibration.begin(axis, states, self.now_s, latched=latched)
+            self._become(axis, outcome)
         else:
             self._fail(axis, AxisErrors(AxisError.INVALID_STATE))
 
@@ -326,8 +328,7 @@ class AxisBank:
             self._fail(axis, fault)
         self._check_odd_encoders()
         for axis in list(self.calibration.running):
-            turns = float(self.encoder_turns[axis])
-            self._become(axis, self.calibration.advance(axis, self.now_s, turns))
+            self._become(axis, self.calibration.advance(axis, self.now_s))
 
     def _check_odd_encoders(self) -> None:
         """Check speeds within the step; an estimate that is valid again ends its error."""
@@ -408,8 +409,8 @@ class AxisBank:
             return
         if not self._control.armed[axis]:
             fault = in_idle(fault, connected=self.connected[axis] > 0.0)
-        self.faults[axis] = self.faults[axis].with_(fault)
-        self.calibration.stop(axis)
+        broken_off = self.calibration.stop(axis)
+        self.faults[axis] = self.faults[axis].with_(fault).with_(broken_off)
         self._disarm(axis)
 
 

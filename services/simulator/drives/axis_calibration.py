@@ -1,22 +1,47 @@
-"""Calibration of the emulated axes: what each has, and the sequences that calibrate.
+"""Calibration of the emulated axes: what each has, and how it is found (docs/drives.md).
 
-The shaft is not turned here. An encoder's calibration fails if the shaft moves by itself, as under
-a load: the firmware finds that it did not follow.
+Firmware 0.5.6, `Motor::run_calibration` and `Encoder::run_offset_calibration`. The drive turns a
+field, and the rotor follows it as that of a synchronous motor: with the torque of the current
+times the sine of the electrical angle that it lags by. A shaft that is blocked, or loaded beyond
+that torque, does not follow, and the drive finds that by its encoder's count.
+
+Traps that are kept: an encoder's calibration forgets the turns as it begins. A request for IDLE
+in the motor's second part or on the encoder's way back leaves the axis calibrated, by half a
+measurement. Without a current a resistance is NaN, and `save_configuration` keeps it. With an
+error latched nothing is measured, and no error is added.
 """
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+import math
+from typing import Final
 
+import msgspec
+import numpy as np
+
+from services.simulator.drives.axis_encoders import AxisEncoders
 from services.simulator.drives.axis_faults import AxisErrors
-from services.simulator.drives.axis_settings import Settings
-from shared.can.cansimple import AxisError, AxisState, EncoderError
+from services.simulator.drives.axis_settings import (
+    DIRECTION,
+    PHASE_INDUCTANCE,
+    PHASE_RESISTANCE,
+    POLE_PAIRS,
+    Settings,
+)
+from shared.can.cansimple import AxisError, AxisState, EncoderError, MotorError
 from shared.joints import N_JOINTS
 
-SLIP: Final = 0.05
-"""turn; a shaft that moves further by itself fails the encoder's calibration."""
-MOTOR_S: Final = 3.0
-ENCODER_S: Final = 8.0
+RESISTANCE_S: Final = 3.0
+INDUCTANCE_S: Final = 1.25
+"""Both parts of the motor's calibration."""
+LOCK_S: Final = 1.0
+"""The encoder's begins so: the field stands, and its current comes up in the first half."""
+RESPONSE_COUNTS: Final = 8
+"""An encoder that counts no more than this on the way out has not answered."""
+VOLTAGE_GAIN: Final = 1.0
+"""V/s per A that the test current lacks, until it is there."""
+CURRENT_MARGIN: Final = 8.0
+"""A beyond `current_lim` that disarm, as shipped."""
 
 SEQUENCES: Final = {
     AxisState.FULL_CALIBRATION_SEQUENCE: (
@@ -28,68 +53,251 @@ SEQUENCES: Final = {
 }
 """The states that each request runs through."""
 
+_MOTOR: Final = AxisState.MOTOR_CALIBRATION
+_ENCODER: Final = AxisState.ENCODER_OFFSET_CALIBRATION
+_NONE: Final = AxisErrors()
 
-class _Task(NamedTuple):
-    """What an axis is at, since when it may end, and what comes after."""
+
+class _Task(msgspec.Struct):
+    """What an axis is at."""
 
     state: AxisState
-    until_s: float
-    start_turns: float
     rest: tuple[AxisState, ...]
+    begun_s: float
+    stage: int = 0
+    """Motor: resistance, inductance. Encoder: lock, way out, way back."""
+    current: float = 0.0
+    """Of the field, A."""
+    phase: float = 0.0
+    """Of the field, electrical rad."""
+    count: int = 0
+    """The encoder's."""
+    locked_count: int = 0
+    total: int = 0
+    """Sum of counts over the scan, of so many samples."""
+    samples: int = 0
 
 
 class Calibration:
-    """Which axes are calibrated, and which are at it."""
+    """Which axes are calibrated, and which are at it.
 
-    def __init__(self, settings: Settings) -> None:
-        """Start with what is `pre_calibrated`."""
-        self._settings = settings
+    Attributes:
+        motor: `motor.is_calibrated` of each axis.
+        encoder: `encoder.is_ready` of each axis.
+        running: what the axes are at that calibrate now.
+        resistance: of each motor's phases in truth, ohm; a broken wire has a great one.
+    """
+
+    def __init__(self, settings: Settings, encoders: AxisEncoders, torque_constant: float) -> None:
+        """Start with what is `pre_calibrated`; `torque_constant` is the motors' own, N m/A."""
+        self._settings, self._encoders = settings, encoders
+        self._torque_constant = torque_constant
         self.motor = [False] * N_JOINTS
-        """`motor.is_calibrated`"""
         self.encoder = [False] * N_JOINTS
-        """`encoder.is_ready`"""
         self.running: dict[int, _Task] = {}
+        self.resistance = np.full(N_JOINTS, PHASE_RESISTANCE)
         for axis in range(N_JOINTS):
             self.restart(axis)
 
     def restart(self, axis: int) -> None:
         """Reset an axis's calibration to what its settings keep."""
-        column = self._settings.axis
-        self.motor[axis] = bool(column("motor.config.pre_calibrated")[axis])
-        self.encoder[axis] = bool(column("encoder.config.pre_calibrated")[axis])
-        self.stop(axis)
-
-    def stop(self, axis: int) -> None:
-        """Break off what an axis is at."""
         self.running.pop(axis, None)
+        self.motor[axis] = self._setting(axis, "motor.config.pre_calibrated") > 0.0
+        self.encoder[axis] = self._setting(axis, "encoder.config.pre_calibrated") > 0.0
+
+    def take_mark(self, axis: int, name: str) -> None:
+        """Act on a written `pre_calibrated`: a motor believes it, an encoder that is not ready not.
+
+        Args:
+            axis: 0 .. 11.
+            name: of the setting, below the axis.
+        """
+        if name == "motor.config.pre_calibrated":
+            self.motor[axis] = self.motor[axis] or self._setting(axis, name) > 0.0
+        elif not self.encoder[axis]:
+            self._settings.find(axis, name, 0.0)
 
     def ready(self, axis: int) -> bool:
         """Return True if closed loop may be entered."""
         return self.motor[axis] and self.encoder[axis]
 
+    def refuses(self, axis: int) -> bool:
+        """Return True if closed loop is refused; without an encoder that is ready it ends."""
+        return not self.motor[axis] or self._setting(axis, "encoder.config.direction") == 0.0
+
     def begin(
-        self, axis: int, states: tuple[AxisState, ...], now_s: float, turns: float
+        self, axis: int, states: tuple[AxisState, ...], now_s: float, *, latched: bool = False
     ) -> AxisState | AxisErrors:
-        """Begin the first of the states; return it, IDLE if there is none, or why not."""
-        self.stop(axis)
+        """Begin the first of the states; return it, IDLE if there is none, or why not.
+
+        Args:
+            axis: 0 .. 11.
+            states: one after the other.
+            now_s: time of the bank.
+            latched: the axis has an error, which disarms it in the first cycle.
+        """
         if not states:
             return AxisState.IDLE
         state, *rest = states
-        of_encoder = state == AxisState.ENCODER_OFFSET_CALIBRATION
-        if of_encoder and not self.motor[axis]:
+        if state == _ENCODER and not self.motor[axis]:
             return AxisErrors(AxisError.INVALID_STATE)
-        duration_s = ENCODER_S if of_encoder else MOTOR_S
-        self.running[axis] = _Task(state, now_s + duration_s, turns, tuple(rest))
+        if state == _ENCODER:
+            self._encoders.wrap_turns(axis)
+        if latched:
+            if state == _MOTOR:
+                self._settings.find(axis, "motor.config.phase_resistance", 0.0)
+            return AxisState.IDLE
+        count = self._count(axis)
+        self.running[axis] = _Task(state, tuple(rest), now_s, count=count, locked_count=count)
         return state
 
-    def advance(self, axis: int, now_s: float, turns: float) -> AxisState | AxisErrors:
+    def advance(self, axis: int, now_s: float) -> AxisState | AxisErrors:
         """Go on with what an axis is at; return its state, or why it failed."""
         task = self.running[axis]
-        of_encoder = task.state == AxisState.ENCODER_OFFSET_CALIBRATION
-        if of_encoder and abs(turns - task.start_turns) > SLIP:
-            failed = AxisError.ENCODER_FAILED
-            return AxisErrors(failed, encoder=EncoderError.CPR_POLEPAIRS_MISMATCH)
-        if now_s < task.until_s:
+        procedure = self._measure if task.state == _MOTOR else self._scan
+        outcome = procedure(axis, task, now_s - task.begun_s)
+        if outcome is None:
             return task.state
-        (self.encoder if of_encoder else self.motor)[axis] = True
-        return self.begin(axis, task.rest, now_s, turns)
+        del self.running[axis]
+        return self.begin(axis, task.rest, now_s) if outcome == _NONE else outcome
+
+    def stop(self, axis: int, *, requested: bool = False) -> AxisErrors:
+        """Break off what an axis is at; return the error that the firmware makes of the half.
+
+        Args:
+            axis: 0 .. 11.
+            requested: by a request for another state, else it was disarmed.
+        """
+        task = self.running.pop(axis, None)
+        if task is None:
+            return _NONE
+        if task.state == _MOTOR:
+            if task.stage > 0:
+                self._settings.find(axis, "motor.config.phase_inductance", PHASE_INDUCTANCE)
+                self.motor[axis] = self.motor[axis] or requested
+                return _NONE
+            self._keep_resistance(axis, task)
+            if requested:  # the inductance is not measured at all
+                self._settings.find(axis, "motor.config.phase_inductance", math.nan)
+                return AxisErrors(motor=MotorError.PHASE_INDUCTANCE_OUT_OF_RANGE)
+            return _NONE
+        if task.stage == 1 and (error := self._judge(axis, task)) != _NONE:
+            return error
+        if task.stage > 0 and requested:
+            self._keep_offset(axis, task)
+        return _NONE
+
+    def torque(self, axis: int, pos_turns: float, vel_turns: float) -> float:
+        """Return the torque on the shaft of an axis that calibrates, N m.
+
+        The motor's calibration sets voltages, so its windings brake the rotor as if they were
+        short-circuited. The encoder's sets currents, and nothing but friction brakes.
+
+        Args:
+            axis: 0 .. 11.
+            pos_turns: where the rotor truly is, turns.
+            vel_turns: its rate, turn/s.
+        """
+        task, constant = self.running[axis], self._torque_constant
+        rotor = 2.0 * math.pi * POLE_PAIRS * DIRECTION * pos_turns
+        torque = DIRECTION * constant * task.current * math.sin(task.phase - rotor)
+        if task.state == _MOTOR:
+            torque -= constant**2 / (1.5 * self.resistance[axis]) * 2.0 * math.pi * vel_turns
+        return float(torque)
+
+    # ---- procedures: None while they run, then no error, or why they failed
+
+    def _measure(self, axis: int, task: _Task, elapsed_s: float) -> AxisErrors | None:
+        """Drive a standing current up to its set-point, then shake it."""
+        if task.stage == 0:
+            ohm = float(self.resistance[axis])
+            asked = self._setting(axis, "motor.config.calibration_current")
+            task.current = -asked * math.expm1(-elapsed_s * VOLTAGE_GAIN / ohm)
+            if error := self._too_much(axis, task.current):
+                self._keep_resistance(axis, task)
+                return error
+            if ohm * task.current > self._setting(
+                axis, "motor.config.resistance_calib_max_voltage"
+            ):
+                self._settings.find(axis, "motor.config.phase_resistance", math.nan)
+                return _motor(MotorError.PHASE_RESISTANCE_OUT_OF_RANGE)
+            if elapsed_s >= RESISTANCE_S:
+                self._keep_resistance(axis, task)
+                task.stage, task.current = 1, 0.0  # the shaking has no torque
+        elif elapsed_s >= RESISTANCE_S + INDUCTANCE_S:
+            self._settings.find(axis, "motor.config.phase_inductance", PHASE_INDUCTANCE)
+            self.motor[axis] = True
+            return _NONE
+        return None
+
+    def _scan(self, axis: int, task: _Task, elapsed_s: float) -> AxisErrors | None:
+        """Lock the rotor, lead it some electrical turns out, and back."""
+        asked = self._setting(axis, "motor.config.calibration_current")
+        task.current = asked * min(1.0, 2.0 * elapsed_s / LOCK_S)
+        if error := self._too_much(axis, task.current):
+            return error
+        distance = self._setting(axis, "encoder.config.calib_scan_distance")
+        rate = self._setting(axis, "encoder.config.calib_scan_omega")
+        scanned = max(0.0, rate * (elapsed_s - LOCK_S))
+        task.phase = -0.5 * distance + distance - abs(distance - min(scanned, 2.0 * distance))
+        task.count = self._count(axis)
+        if task.stage == 0 and elapsed_s >= LOCK_S:
+            task.stage, task.locked_count = 1, task.count
+        elif task.stage == 1 and scanned >= distance:
+            if (error := self._judge(axis, task)) != _NONE:
+                return error
+            task.stage = 2
+        if task.stage > 0:
+            task.total += task.count
+            task.samples += 1
+        if task.stage == 2 and scanned >= 2.0 * distance:
+            self._keep_offset(axis, task)
+            return _NONE
+        return None
+
+    def _judge(self, axis: int, task: _Task) -> AxisErrors:
+        """Judge the way out by the encoder's count, and find its direction."""
+        response = task.count - task.locked_count
+        if abs(response) <= RESPONSE_COUNTS:
+            return _encoder(EncoderError.NO_RESPONSE)
+        self._settings.find(axis, "encoder.config.direction", math.copysign(1.0, response))
+        turns = self._setting(axis, "encoder.config.calib_scan_distance") / (
+            2.0 * math.pi * self._setting(axis, "motor.config.pole_pairs")
+        )
+        expected = turns * self._setting(axis, "encoder.config.cpr")
+        within = self._setting(axis, "encoder.config.calib_range")
+        if abs(abs(response) - expected) > within * expected:
+            return _encoder(EncoderError.CPR_POLEPAIRS_MISMATCH)
+        return _NONE
+
+    def _too_much(self, axis: int, current: float) -> AxisErrors | None:
+        """Return an error if the field's current is beyond what the drive lets flow."""
+        if current <= self._setting(axis, "motor.config.current_lim") + CURRENT_MARGIN:
+            return None
+        return _motor(MotorError.CURRENT_LIMIT_VIOLATION)
+
+    def _keep_resistance(self, axis: int, task: _Task) -> None:
+        """Keep the voltage there is now over the current that was asked for, there or not."""
+        volts = float(self.resistance[axis]) * task.current
+        asked = self._setting(axis, "motor.config.calibration_current")
+        self._settings.find(axis, "motor.config.phase_resistance", volts / asked)
+
+    def _keep_offset(self, axis: int, task: _Task) -> None:
+        """Keep the scan's mean count as the electrical zero: the axis is ready."""
+        mean = task.total // max(task.samples, 1)
+        self._settings.find(axis, "encoder.config.phase_offset", float(mean))
+        self.encoder[axis] = True
+
+    def _count(self, axis: int) -> int:
+        return round(float(self._encoders.turns[axis]) * self._setting(axis, "encoder.config.cpr"))
+
+    def _setting(self, axis: int, name: str) -> float:
+        return float(self._settings.axis(name)[axis])
+
+
+def _motor(error: MotorError) -> AxisErrors:
+    return AxisErrors(AxisError.MOTOR_FAILED, motor=error)
+
+
+def _encoder(error: EncoderError) -> AxisErrors:
+    return AxisErrors(AxisError.ENCODER_FAILED, encoder=error)

@@ -26,7 +26,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.simulator.drives.axis_encoders import AxisEncoders
-from services.simulator.drives.axis_settings import PHASE_INDUCTANCE, Settings
+from services.simulator.drives.axis_settings import (
+    PHASE_INDUCTANCE,
+    PHASE_RESISTANCE,
+    Settings,
+)
 from services.simulator.drives.spinout import BANDWIDTH
 from shared.can.cansimple import ControlMode
 from shared.joints import N_JOINTS
@@ -92,6 +96,7 @@ class AxisControl:
         connected: 1.0 once in closed loop since it started up: from then on the controller sees the
             encoder, in IDLE as well.
         derating: fraction of current_lim that heat leaves.
+        resistance: of each motor's phases in truth, ohm.
     """
 
     def __init__(self, settings: Settings, encoders: AxisEncoders) -> None:
@@ -104,9 +109,12 @@ class AxisControl:
         self.derating = np.ones(N_JOINTS)
         self._loops = np.zeros(_ROWS * N_JOINTS)
         self._speeds = np.zeros((2, N_JOINTS))  # of the motors, before and now, turn/s
+        self.resistance = np.full(N_JOINTS, PHASE_RESISTANCE)
         self._dt_s = 0.0
         self._graph = graph = CompiledGraph(law_graph())
         columns = [settings.axis(name) for name in _SETTINGS]
+        # what heats is the winding, whatever a calibration has found
+        columns[_SETTINGS.index("motor.config.phase_resistance")] = self.resistance
         live = (
             encoders.pos_estimate, encoders.vel_estimate, self.input_pos, self.input_vel,
             self.input_torque, self.armed, self.connected, self.derating, self.integrator,

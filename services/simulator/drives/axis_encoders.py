@@ -93,6 +93,10 @@ class AxisEncoders:
         odd = self.odd.get(axis)
         return odd.angle if odd is not None else self._raw(axis) % self._counts_per_turn
 
+    def wrap_turns(self, axis: int) -> None:
+        """Make an axis's count its angle within the turn, as its encoder's calibration does."""
+        self.set_count(axis, self.angle(axis))
+
     def read_words(self, axis: int, words: Words) -> None:
         """Let an axis read no words of its encoder, zeros, or its own again."""
         if self._seen != self._settings.version:

@@ -8,8 +8,8 @@ Source: the configuration structs of firmware 0.5.6 (odriverobotics/ODrive). The
 level is that of the 56 V board.
 
 The spinout thresholds are kept and not acted on: the emulated windings do not warm, so that
-SPINOUT_DETECTED comes by injection only. `encoder.config.direction` has no effect on the motion,
-as on a calibrated drive; it is the sign that currents are reported with.
+SPINOUT_DETECTED comes by injection only. `encoder.config.direction` and `phase_offset` have no
+effect on the motion, as on a calibrated drive; currents are reported with the sign of the first.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from shared.exceptions import DriveError
 from shared.joints import MODULE_INDEX, MODULES, N_JOINTS
 
 __all__ = [
-    "AXIS_SETTINGS", "DRIVE_SETTINGS", "NAMES", "N_DRIVES", "PHASE_RESISTANCE", "Settings", "Value",
-    "configured", "preset",
+    "AXIS_SETTINGS", "DIRECTION", "DRIVE_SETTINGS", "NAMES", "N_DRIVES", "PHASE_INDUCTANCE",
+    "PHASE_RESISTANCE", "POLE_PAIRS", "Settings", "Value", "configured", "preset",
 ]  # fmt: skip
 
 Vector = NDArray[np.float64]
@@ -61,11 +61,14 @@ AXIS_SETTINGS: Final[Mapping[str, Value]] = {
     "controller.config.spinout_mechanical_power_threshold": -10.0,
     "motor.config.pre_calibrated": False,
     "motor.config.pole_pairs": 7,
+    "motor.config.calibration_current": 10.0,
+    "motor.config.resistance_calib_max_voltage": 2.0,
     "motor.config.torque_constant": 0.04,
     "motor.config.current_lim": 10.0,
     "motor.config.current_lim_margin": 8.0,
     "motor.config.current_control_bandwidth": 1000.0,
     "motor.config.phase_resistance": 0.0,
+    "motor.config.phase_inductance": 0.0,
     "motor.fet_thermistor.config.enabled": True,
     "motor.fet_thermistor.config.temp_limit_lower": 100.0,
     "motor.fet_thermistor.config.temp_limit_upper": 120.0,
@@ -73,6 +76,10 @@ AXIS_SETTINGS: Final[Mapping[str, Value]] = {
     "encoder.config.cpr": 8192,
     "encoder.config.bandwidth": 1000.0,
     "encoder.config.direction": 0,
+    "encoder.config.phase_offset": 0,
+    "encoder.config.calib_range": 0.02,
+    "encoder.config.calib_scan_distance": 16.0 * math.pi,
+    "encoder.config.calib_scan_omega": 4.0 * math.pi,
     "encoder.config.pre_calibrated": False,
 }
 """Settings of each axis, below `axis0.` and `axis1.`: the default, whose type is the setting's."""
@@ -98,7 +105,11 @@ NAMES: Final = (
 PHASE_RESISTANCE: Final = 0.1
 """ohm; assumed, of a motor with this torque constant. Calibration finds it, nobody sets it."""
 PHASE_INDUCTANCE: Final = 5e-5
-"""H; assumed as well."""
+"""H; assumed, likewise."""
+POLE_PAIRS: Final = 7
+"""Of the motors themselves, whatever a drive's setting says; assumed."""
+ENCODER_MODE: Final = 257
+"""Absolute over SPI, AMS; set by hand before anything is calibrated."""
 DIRECTION: Final = 1
 """+1 or -1 by how a motor's phases are wired. Calibration finds it, nobody sets it."""
 
@@ -154,6 +165,11 @@ class Settings:
         column[row] = bool(value) if isinstance(default, bool) else number
         self.version += 1
 
+    def find(self, axis: int, name: str, value: float) -> None:
+        """Set what a calibration of an axis (0 .. 11) found; NaN where it found nothing."""
+        self._axes[name][axis] = value
+        self.version += 1
+
     def current(self, axis: int, torque: float) -> float:
         """Return the current that an axis (0 .. 11) reports for a motor torque, A.
 
@@ -174,7 +190,9 @@ class Settings:
     def restore(self, drive: int) -> None:
         """Restore a drive's saved settings, as a restart does."""
         for name, value in self._saved[drive].items():
-            self.set(drive, name, value)
+            column, row, _ = self._find(drive, name)
+            column[row] = value  # a NaN as well
+        self.version += 1
 
     def _find(self, drive: int, name: str) -> tuple[Vector, int, Value]:
         """Return the column, the row in it, and the default of a setting."""
@@ -200,7 +218,9 @@ def configured(
     for name, value in drive_settings.of_every_drive(need).items():
         settings.fill(name, value)
     settings.fill("motor.config.phase_resistance", PHASE_RESISTANCE)
+    settings.fill("motor.config.phase_inductance", PHASE_INDUCTANCE)
     settings.fill("encoder.config.direction", DIRECTION)
+    settings.fill("encoder.config.mode", ENCODER_MODE)
     for index in range(N_DRIVES):
         settings.save(index)
     return settings

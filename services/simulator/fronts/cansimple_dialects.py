@@ -57,6 +57,9 @@ _ERRORS_06: Final[tuple[tuple[str, int, DriveError06], ...]] = (
     ("motor", MotorError.I_BUS_OUT_OF_RANGE, DriveError06.DC_BUS_OVER_REGEN_CURRENT),
     ("encoder", EncoderError.ABS_SPI_COM_FAIL, DriveError06.MISSING_ESTIMATE),
     ("encoder", EncoderError.CPR_POLEPAIRS_MISMATCH, DriveError06.CALIBRATION_ERROR),
+    ("encoder", EncoderError.NO_RESPONSE, DriveError06.CALIBRATION_ERROR),
+    ("motor", MotorError.PHASE_RESISTANCE_OUT_OF_RANGE, DriveError06.CALIBRATION_ERROR),
+    ("motor", MotorError.PHASE_INDUCTANCE_OUT_OF_RANGE, DriveError06.CALIBRATION_ERROR),
     ("controller", ControllerError.OVERSPEED, DriveError06.VELOCITY_LIMIT_VIOLATION),
     ("controller", ControllerError.INVALID_INPUT_MODE, DriveError06.BAD_CONFIG),
     ("controller", ControllerError.SPINOUT_DETECTED, DriveError06.SPINOUT_DETECTED),
@@ -66,6 +69,23 @@ _ERRORS_06: Final[tuple[tuple[str, int, DriveError06], ...]] = (
     ("odrive", OdriveError.DC_BUS_OVER_CURRENT, DriveError06.DC_BUS_OVER_CURRENT),
 )
 """A bit of a 0.5 register, and what 0.6 calls it."""
+
+_RESULTS_06: Final[tuple[tuple[str, int, ProcedureResult], ...]] = (
+    ("encoder", EncoderError.CPR_POLEPAIRS_MISMATCH, ProcedureResult.POLE_PAIR_CPR_MISMATCH),
+    ("encoder", EncoderError.NO_RESPONSE, ProcedureResult.NO_RESPONSE),
+    ("motor", MotorError.UNKNOWN_PHASE_ESTIMATE, ProcedureResult.NOT_CALIBRATED),
+    (
+        "motor",
+        MotorError.PHASE_RESISTANCE_OUT_OF_RANGE,
+        ProcedureResult.PHASE_RESISTANCE_OUT_OF_RANGE,
+    ),
+    (
+        "motor",
+        MotorError.PHASE_INDUCTANCE_OUT_OF_RANGE,
+        ProcedureResult.PHASE_INDUCTANCE_OUT_OF_RANGE,
+    ),
+)
+"""A bit of a 0.5 register, and what 0.6 says of the procedure that ended with it."""
 
 SDO_ENDPOINTS: Final[Mapping[int, str]] = dict(
     enumerate(("vbus_voltage", "ibus", *DRIVE_SETTINGS, *AXIS_SETTINGS), start=1)
@@ -111,10 +131,9 @@ def _heartbeat_06(bank: AxisBank, axis: int) -> bytes:
     elif fault.axis & AxisError.INVALID_STATE:
         ready = bank.calibration.ready(axis)
         result = ProcedureResult.INVALID_STATE if ready else ProcedureResult.NOT_CALIBRATED
-    elif fault.encoder & EncoderError.CPR_POLEPAIRS_MISMATCH:
-        result = ProcedureResult.POLE_PAIR_CPR_MISMATCH
     elif fault != AxisErrors():
-        result = ProcedureResult.DISARMED
+        found = (each for register, bit, each in _RESULTS_06 if getattr(fault, register) & bit)
+        result = next(found, ProcedureResult.DISARMED)
     return cansimple_06.pack_heartbeat(
         Heartbeat06(errors_06(fault), bank.state[axis], result, trajectory_done=True)
     )

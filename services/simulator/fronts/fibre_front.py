@@ -156,7 +156,7 @@ def _axis(i: int) -> list[Property | Function]:
         Property(
             "motor.is_armed",
             "bool",
-            lambda b: b.bank.state[b.axis(i)] == AxisState.CLOSED_LOOP_CONTROL,
+            lambda b: b.bank.state[b.axis(i)] not in (AxisState.IDLE, AxisState.UNDEFINED),
         ),
         Property(
             "motor.fet_thermistor.temperature",
@@ -243,6 +243,8 @@ def _set(board: EmulatedBoard, name: str, value: Value) -> None:
     axis, _, below = name.partition(".")
     if below not in _MODES or (below == _INPUT_MODE and value == InputMode.PASSTHROUGH):
         board.bank.settings.set(board.drive, name, value)
+        if below.endswith(".pre_calibrated"):
+            board.bank.calibration.take_mark(board.axis(int(axis[-1])), below)
         return
     modes = [int(board.bank.settings.get(board.drive, f"{axis}.{mode}")) for mode in _MODES]
     modes[_MODES.index(below)] = int(value)
