@@ -95,7 +95,7 @@ VERBS: Final = (
     Verb("new", "make a robot's own directory: robot file, gains, scenarios, plants"),
     Verb("doctor", "check drives, buses and computer against the robot file"),
     Verb("faults", "list the faults: what the robot does, and how to recover"),
-    Verb("drive configure", "write the drives' settings, after a backup of the old ones"),
+    Verb("drive configure", "write the drives' settings, after a backup; calibrate them"),
     Verb("drive zero", "write each joint's position to its drive"),
     Verb("drive jog", "move one joint of one module a little and judge the response"),
     Verb("drive tare", "set the harness's zero from its unloaded reading"),

@@ -54,6 +54,40 @@ def make_bank(
     return bank
 
 
+class FreeRotors:
+    """Twelve rotors that a bank turns, or its field; nothing hangs on them.
+
+    Attributes:
+        pos: where they are (12,), turns.
+        load: torque against each, N m per turn from where it was at the start.
+        blocked: axes that do not turn.
+        farthest: from where each was at the start (12,), turns.
+    """
+
+    INERTIA = 2.5e-4
+    """kg m^2"""
+    FRICTION = 2e-3
+    """N m s/rad"""
+
+    def __init__(self, bank: AxisBank, pos: NDArray[np.float64], dt_s: float = DT) -> None:
+        self.bank, self._start, self._dt_s = bank, pos.copy(), dt_s
+        self.pos, self._vel, self.load, self.farthest = pos.copy(), *np.zeros((3, 12))
+        self.blocked: set[int] = set()
+
+    def run(self, seconds: float) -> None:
+        """Let time pass, a step after the other."""
+        dt_s = self._dt_s
+        fade = 1.0 + self.FRICTION / self.INERTIA * dt_s
+        gain = dt_s / (2.0 * np.pi * self.INERTIA)
+        for _ in range(round(seconds / dt_s)):
+            torque = self.bank.step(self.bank.now_s + dt_s, self.pos, self._vel)
+            away = self.pos - self._start
+            self._vel = (self._vel + gain * (torque - self.load * away)) / fade
+            self._vel[list(self.blocked)] = 0.0
+            self.pos = self.pos + dt_s * self._vel
+            np.maximum(self.farthest, np.abs(away), out=self.farthest)
+
+
 def step_for(
     bank: AxisBank,
     seconds: float,

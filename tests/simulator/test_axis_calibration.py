@@ -14,12 +14,8 @@ from services.simulator.drives.axis_bank import AxisErrors
 from services.simulator.drives.axis_calibration import INDUCTANCE_S, LOCK_S, RESISTANCE_S
 from services.simulator.drives.axis_settings import PHASE_INDUCTANCE, PHASE_RESISTANCE, POLE_PAIRS
 from shared.can.cansimple import AxisError, AxisState, ControlMode, EncoderError, MotorError
-from tests.simulator.banks import CPR, DT, make_bank
+from tests.simulator.banks import CPR, DT, FreeRotors, make_bank
 
-INERTIA = 2.5e-4
-"""kg m^2 of a rotor."""
-FRICTION = 2e-3
-"""N m s/rad"""
 MOTOR_S = RESISTANCE_S + INDUCTANCE_S
 ENCODER_S = LOCK_S + 8.0
 """At 4 pi rad/s, 16 pi out and 16 pi back."""
@@ -30,17 +26,11 @@ FULL = AxisState.FULL_CALIBRATION_SEQUENCE
 
 
 class Rotor:
-    """Axis 2, uncalibrated, and its rotor; the other axes stand still.
-
-    Attributes:
-        load: torque against the shaft, N m per turn away from where it is at the start.
-        blocked: it does not turn at all.
-        turned: farthest turns either way.
-    """
+    """Axis 2, uncalibrated, on a rotor of its own."""
 
     def __init__(self, **settings: float) -> None:
         self.bank = bank = make_bank(ControlMode.POSITION)
-        bank.counts_from[2], bank.encoder_mount[2] = 64 * CPR, 0.0
+        bank.encoder_mount[2] = 0.0
         for name in ("motor.config.pre_calibrated", "encoder.config.pre_calibrated"):
             bank.settings.set(1, f"axis0.{name}", value=False)
         bank.settings.set(1, "axis0.encoder.config.direction", 0)
@@ -48,23 +38,15 @@ class Rotor:
             bank.settings.set(1, f"axis0.{name.replace('__', '.config.')}", value)
         bank.settings.save(1)
         bank.reboot(2)
-        self.pos, self.vel, self.load, self.blocked, self.turned = 0.28, 0.0, 0.0, False, 0.0
+        for axis in {*range(12)} - {2}:
+            bank.request_state(axis, AxisState.IDLE)
+        self.rotors = FreeRotors(bank, np.full(12, AT - 64.0))
         self.run(1.6)
         assert bank.state[2] == AxisState.IDLE
         bank.set_count(2, round(AT * CPR))
 
     def run(self, seconds: float) -> None:
-        """Let time pass."""
-        bank, pos, vel = self.bank, np.zeros(12), np.zeros(12)
-        for _ in range(round(seconds / DT)):
-            pos[2], vel[2] = self.pos, self.vel
-            torque = bank.step(bank.now_s + DT, pos, vel)[2] - self.load * (self.pos - 0.28)
-            rate = (self.vel + torque / (2.0 * math.pi * INERTIA) * DT) / (
-                1.0 + FRICTION / INERTIA * DT
-            )
-            self.vel = 0.0 if self.blocked else rate
-            self.pos += self.vel * DT
-            self.turned = max(self.turned, abs(self.pos - 0.28))
+        self.rotors.run(seconds)
 
     def ask(self, state: AxisState) -> None:
         self.bank.request_state(2, state)
@@ -90,7 +72,7 @@ def test_the_full_sequence_takes_its_time_turns_the_shaft_out_and_back_and_finds
     rotor.run(0.03)
     assert (rotor.bank.state[2], rotor.bank.faults[2]) == (AxisState.IDLE, AxisErrors())
     assert rotor.calibrated == (True, True)
-    assert rotor.turned == pytest.approx(8.0 / POLE_PAIRS, abs=0.5 / POLE_PAIRS)
+    assert rotor.rotors.farthest[2] == pytest.approx(8.0 / POLE_PAIRS, abs=0.5 / POLE_PAIRS)
     assert rotor.found("motor.config.phase_resistance") == pytest.approx(PHASE_RESISTANCE)
     assert rotor.found("motor.config.phase_inductance") == PHASE_INDUCTANCE
     assert rotor.found("encoder.config.direction") == 1.0
@@ -165,7 +147,8 @@ def test_a_calibration_that_fails_says_why_stops_there_and_leaves_the_axis_uncal
     settings: dict[str, float], load: float, blocked: bool, fault: AxisErrors, within_s: float
 ) -> None:
     rotor = Rotor(**settings)
-    rotor.load, rotor.blocked = load, blocked
+    rotor.rotors.load[2] = load
+    rotor.rotors.blocked = {2} if blocked else set()
     rotor.ask(FULL)
     rotor.run(within_s)
     assert (rotor.bank.state[2], rotor.bank.faults[2]) == (AxisState.IDLE, fault)

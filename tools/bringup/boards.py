@@ -69,6 +69,12 @@ class Board(Protocol):
     def save(self) -> None:
         """Save the configuration, which restarts the board, and wait until it is back."""
 
+    def restart(self) -> None:
+        """Restart the board without saving, and wait until it is back: settings as saved."""
+
+    def clear_errors(self) -> None:
+        """Clear the errors of both axes."""
+
     def states(self) -> tuple[int, int]:
         """Return `AxisState` of both axes."""
 

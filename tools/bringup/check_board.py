@@ -26,10 +26,7 @@ TEMPERATURES: Final = (-10.0, 70.0)
 _DIRECTION: Final = "encoder.config.direction"
 
 FIND_CAUSE: Final = "find the cause; arming by `xrl up` clears it, and so does power off and on"
-CALIBRATE: Final = (
-    "unload the joint, `odrivetool`: requested_state = AXIS_STATE_FULL_CALIBRATION_SEQUENCE, "
-    "then pre_calibrated = True on motor and encoder"
-)
+CALIBRATE: Final = "hang the leg, `xrl drive configure --apply --calibrate`"
 
 
 def firmware_row(module: str, firmware: tuple[int, int, int]) -> Finding:

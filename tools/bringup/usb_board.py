@@ -92,8 +92,8 @@ class UsbBus:
         serial = before.serial_number
         if not await self._until(lambda: self._present.get(serial) is not before.device, LEAVE_S):
             raise DriveError(
-                f"ODrive {serial} did not restart {LEAVE_S:g} s after save_configuration: "
-                "nothing may be saved; is one of its axes armed?"
+                f"ODrive {serial} did not restart within {LEAVE_S:g} s: nothing may be saved; "
+                "is one of its axes armed?"
             )
         if not await self._until(lambda: serial in self._present, RETURN_S):
             raise DriveError(f"ODrive {serial} did not come back {RETURN_S:g} s after its restart")
@@ -204,7 +204,15 @@ class UsbBoard:
 
     def save(self) -> None:
         """See `Board`."""
-        self.device = self._run(self._save(), "save_configuration", LEAVE_S + RETURN_S + CONNECT_S)
+        self._restart("save_configuration")
+
+    def restart(self) -> None:
+        """See `Board`."""
+        self._restart("reboot")
+
+    def clear_errors(self) -> None:
+        """See `Board`."""
+        self._run(self.device.call_function("clear_errors"), "clear_errors")
 
     def states(self) -> tuple[int, int]:
         """See `Board`."""
@@ -229,10 +237,14 @@ class UsbBoard:
             else:
                 await self.device.write(entry, value)
 
-    async def _save(self) -> RuntimeDevice:
+    def _restart(self, function: str) -> None:
+        """Call a function that restarts the board, and connect to it again."""
+        self.device = self._run(self._left(function), function, LEAVE_S + RETURN_S + CONNECT_S)
+
+    async def _left(self, function: str) -> RuntimeDevice:
         # The board restarts before it has answered.
         with contextlib.suppress(Exception):
-            await asyncio.wait_for(self.device.call_function("save_configuration"), LEAVE_S)
+            await asyncio.wait_for(self.device.call_function(function), LEAVE_S)
         return await self._bus.connect_again(self.device)
 
     def _named(self, value: Any) -> Value:

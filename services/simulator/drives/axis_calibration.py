@@ -85,6 +85,7 @@ class Calibration:
         motor: `motor.is_calibrated` of each axis.
         encoder: `encoder.is_ready` of each axis.
         running: what the axes are at that calibrate now.
+        response: counts of each encoder's last way out; 0: none since the start.
         resistance: of each motor's phases in truth, ohm; a broken wire has a great one.
     """
 
@@ -95,6 +96,7 @@ class Calibration:
         self.motor = [False] * N_JOINTS
         self.encoder = [False] * N_JOINTS
         self.running: dict[int, _Task] = {}
+        self.response = [0.0] * N_JOINTS
         self.resistance = np.full(N_JOINTS, PHASE_RESISTANCE)
         for axis in range(N_JOINTS):
             self.restart(axis)
@@ -102,6 +104,7 @@ class Calibration:
     def restart(self, axis: int) -> None:
         """Reset an axis's calibration to what its settings keep."""
         self.running.pop(axis, None)
+        self.response[axis] = 0.0
         self.motor[axis] = self._setting(axis, "motor.config.pre_calibrated") > 0.0
         self.encoder[axis] = self._setting(axis, "encoder.config.pre_calibrated") > 0.0
 
@@ -265,6 +268,7 @@ class Calibration:
             2.0 * math.pi * self._setting(axis, "motor.config.pole_pairs")
         )
         expected = turns * self._setting(axis, "encoder.config.cpr")
+        self.response[axis] = float(abs(response))
         within = self._setting(axis, "encoder.config.calib_range")
         if abs(abs(response) - expected) > within * expected:
             return _encoder(EncoderError.CPR_POLEPAIRS_MISMATCH)

@@ -110,6 +110,8 @@ POLE_PAIRS: Final = 7
 """Of the motors themselves, whatever a drive's setting says; assumed."""
 ENCODER_MODE: Final = 257
 """Absolute over SPI, AMS; set by hand before anything is calibrated."""
+CALIBRATION_CURRENT: Final = 15.0
+"""A; set by hand as well: the 10 A as shipped do not turn a knee that hangs on its stop."""
 DIRECTION: Final = 1
 """+1 or -1 by how a motor's phases are wired. Calibration finds it, nobody sets it."""
 
@@ -221,6 +223,7 @@ def configured(
     settings.fill("motor.config.phase_inductance", PHASE_INDUCTANCE)
     settings.fill("encoder.config.direction", DIRECTION)
     settings.fill("encoder.config.mode", ENCODER_MODE)
+    settings.fill("motor.config.calibration_current", CALIBRATION_CURRENT)
     for index in range(N_DRIVES):
         settings.save(index)
     return settings

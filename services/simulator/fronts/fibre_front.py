@@ -169,6 +169,11 @@ def _axis(i: int) -> list[Property | Function]:
         Property("encoder.is_ready", "bool", lambda b: b.bank.calibration.encoder[b.axis(i)]),
         Property("encoder.shadow_count", "int32", lambda b: _count(b, i)),
         Property("encoder.count_in_cpr", "int32", lambda b: b.bank.encoder_angle(b.axis(i))),
+        Property(
+            "encoder.calib_scan_response",
+            "float",
+            lambda b: b.bank.calibration.response[b.axis(i)],
+        ),
         Property("encoder.pos_estimate", "float", lambda b: float(b.bank.pos_estimate[b.axis(i)])),
         Property("encoder.vel_estimate", "float", lambda b: float(b.bank.vel_estimate[b.axis(i)])),
         Function(

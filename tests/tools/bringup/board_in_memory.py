@@ -67,6 +67,12 @@ class BoardInMemory:
         self.saves += 1
         self.kept = dict(self.now)
 
+    def restart(self) -> None:
+        self.now = dict(self.kept)
+
+    def clear_errors(self) -> None:
+        self.readings |= {name: 0 for name in self.readings if name.endswith("error")}
+
     def states(self) -> tuple[int, int]:
         first, second = (self.readings[f"{axis}.current_state"] for axis in AXES)
         assert isinstance(first, int)

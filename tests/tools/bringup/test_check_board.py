@@ -107,7 +107,7 @@ def test_a_setting_that_this_firmware_does_not_have_is_a_warning(robot: RobotCon
 
 def test_a_missing_calibration_is_not_a_matter_of_writing_settings(robot: RobotConfig) -> None:
     rows = rows_of(robot, {PRE_CALIBRATED: False})
-    assert all("CALIBRATION" in row.fix for row in rows if row.verdict is WRONG)
+    assert all("--calibrate" in row.fix for row in rows if row.verdict is WRONG)
 
 
 def test_an_error_is_named_as_its_firmware_names_it_and_unknown_bits_in_hex() -> None:
@@ -146,7 +146,7 @@ def test_over_can_currents_must_count_as_the_encoders_do(
     assert [(row.subject, row.verdict) for row in rows] == [(AXIS1, one) for one in verdicts]
     if verdicts == [WRONG]:
         assert ("two of the motor's phases" in rows[0].fix) == (direction == -1)
-        assert "configure" not in rows[0].fix
+        assert ("--calibrate" in rows[0].fix) == (direction == 0)
 
 
 @pytest.mark.parametrize(

@@ -69,11 +69,17 @@ def test_what_is_written_is_lost_by_a_restart_and_what_is_saved_is_not(
     board.save()
     assert board.read([VEL_LIMIT])[VEL_LIMIT] == 7.5
     board.write({VEL_LIMIT: 3.5})
+    board.restart()
+    assert board.read([VEL_LIMIT])[VEL_LIMIT] == 7.5
+
+
+def test_errors_of_both_axes_are_cleared(usb: UsbRobot, board: UsbBoard) -> None:
+    board.write({f"axis{i}.config.enable_watchdog": False for i in (0, 1)})
     with usb.lock:
-        usb.bank.reboot(AXIS)
-    assert eventually(lambda: usb.bank.is_responding(AXIS))
-    with usb.lock:
-        assert usb.bank.settings.get(MODULE, VEL_LIMIT) == 7.5
+        usb.bank.estop(AXIS)
+        usb.bank.estop(AXIS - 1)
+    board.clear_errors()
+    assert board.read(["axis0.error", "axis1.error"]) == {"axis0.error": 0, "axis1.error": 0}
 
 
 def test_a_name_that_the_board_does_not_have_is_refused_before_anything_is_written(

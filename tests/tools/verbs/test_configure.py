@@ -104,6 +104,21 @@ def test_traps_are_taken_out_and_a_backup_brings_them_back(run_dir: Path, tmp_pa
     assert "hip_right" not in back.stdout
 
 
+@pytest.mark.system
+@pytest.mark.wide
+@pytest.mark.timeout(180)
+def test_an_axis_that_is_not_calibrated_is_led_through_it_and_no_other(
+    run_dir: Path, tmp_path: Path
+) -> None:
+    plant = f"--plant={MODULE}.axis1.encoder.config.pre_calibrated=false"
+    asked = ["--apply", "--calibrate", "--yes", "--module", MODULE]
+    result = verb(run_dir, tmp_path, *asked, plant)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert f"{MODULE}.axis1: 0.1 ohm, 40 uH, direction 1" in result.stdout
+    assert f"{MODULE}.axis0" not in result.stdout
+    assert f"without a zero: {MODULE}; next `xrl drive zero`" in result.stdout
+
+
 @pytest.fixture
 def flags(tmp_path: Path) -> configure.ConfigureFlags:
     return configure.ConfigureFlags(restore=tmp_path / "b.json")

@@ -78,6 +78,8 @@ REFUSALS: Final = {
     "drive jog knee_left --torque-limit 0.5": "--torque-limit",
     "drive configure --dry-run --apply": "not allowed with",
     "drive configure --restore none.json": "none.json",
+    "drive configure --apply --again": "--again and --yes go with --calibrate",
+    "drive configure --calibrate --restore none.json": "leave --restore out",
     "drive can test --bus foot": "--bus foot: the robot has ",
     "drive can latency --count 0": "a whole number from 1",
     "drive identify body --level 0": "a number from 1e-06 to 0.1 rad",

@@ -1,4 +1,4 @@
-"""`xrl drive configure`: write the drives' settings; the difference first, and a backup."""
+"""`xrl drive configure`: write the drives' settings, after a backup; calibrate what is not."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, DriveError, FleetError
 from shared.joints import MODULES
-from tools.bringup import backup, changes, drive_access
+from tools.bringup import backup, calibrate_robot, calibration, changes, drive_access
 from tools.bringup.boards import FIRMWARE, Board, FoundBoards, describe_firmware, is_known
 from tools.bringup.changes import ChangeResult, SettingChange
 from tools.bringup.check_robot import joint_services, services_up
@@ -25,6 +25,7 @@ from tools.bringup.drive_access import (
     drives_within_reach,
     no_fleet_meanwhile,
 )
+from tools.bringup.module_motion import LIFTED, exit_if_interrupted
 from tools.bringup.motion_runner import Interrupts
 from tools.flags import Arg, FleetRobotFlags, Folder, Module
 from tools.fleet.process_table import is_simulated
@@ -37,6 +38,7 @@ EXAMPLES: Final = """
 xrl drive configure                          # shows what it would change, writes nothing
 xrl drive configure --apply
 xrl drive configure --apply --module knee_left
+xrl drive configure --apply --calibrate --module knee_left     # a new board; its leg hangs
 xrl drive configure --restore out/drive-backups/20260301-101500.json --apply
 """
 
@@ -60,6 +62,21 @@ class ConfigureFlags(FleetRobotFlags, DriveSettingFlags):
     """write a backup's settings instead of the robot file's"""
     out: Folder = BACKUPS
     """where the backup is written"""
+    calibrate: bool = False
+    """then calibrate the axes that are not, their leg hanging: each motor turns by about a turn and
+    back; the drive forgets its zero"""
+    again: bool = False
+    """with --calibrate: those as well that are calibrated"""
+    yes: bool = False
+    """with --calibrate: do not ask"""
+
+    def check(self) -> None:
+        """Refuse flags that mean nothing without a calibration, or with it."""
+        super().check()
+        if (self.again or self.yes) and not self.calibrate:
+            raise DriveError("--again and --yes go with --calibrate")
+        if self.calibrate and self.restore:
+            raise DriveError("--calibrate finds what no backup knows; leave --restore out")
 
 
 def run(flags: ConfigureFlags) -> int:
@@ -73,7 +90,7 @@ def run(flags: ConfigureFlags) -> int:
     with contextlib.ExitStack() as stack:
         if flags.apply:
             stack.enter_context(no_fleet_meanwhile(robot, flags.run_dir))
-            refuse_services(robot, flags.run_dir, modules)
+            refuse_services(robot, flags.run_dir, MODULES if flags.calibrate else modules)
         return look_and_write(flags, console, robot, path, modules, saved)
 
 
@@ -85,32 +102,57 @@ def look_and_write(
     modules: Sequence[str],
     saved: backup.Backup | None,
 ) -> int:
-    """Show what differs; with `--apply` keep a backup, write it and read it back."""
+    """Show what is to do; with `--apply` keep a backup, write, read back, and calibrate."""
+    lifted = LIFTED if flags.calibrate else 0.0
+    looked_at = MODULES if flags.calibrate else modules
     with (
-        drives_within_reach(robot, path, flags.run_dir, flags.plant) as started,
-        boards_on_usb(robot, flags.run_dir, modules) as found,
+        drives_within_reach(robot, path, flags.run_dir, flags.plant, lifted=lifted) as started,
+        boards_on_usb(robot, flags.run_dir, looked_at) as found,
     ):
         boards = boards_of(robot, modules, found)
+        axes = calibrate_robot.to_calibrate(boards, again=flags.again) if flags.calibrate else {}
+        marks = {
+            (module, f"{axis}.{mark}")
+            for module, those in axes.items()
+            for axis in those
+            for mark in calibration.MARKS
+        }
         difference = differences(robot, boards, saved)
+        difference = [each for each in difference if (each.module, each.name) not in marks]
         console.print(changes.difference_table(difference) if difference else "nothing to change")
-        if not flags.apply or not difference:
-            if difference:
-                console.print("\nnothing was written; `--apply` writes it")
-            return FAULT_EXIT_CODE if difference else 0
+        for module, those in axes.items():
+            console.print(f"to be calibrated: {module}, {' and '.join(those)}")
+        if flags.calibrate and not axes:
+            console.print("every axis is calibrated; --again calibrates them once more")
+        if not flags.apply or not (difference or axes):
+            if difference or axes:
+                console.print("\nnothing was written; `--apply` does it")
+            return FAULT_EXIT_CODE if difference or axes else 0
         for module, board in boards.items():
             changes.refuse_armed(module, board)
+        if axes:
+            calibrate_robot.refuse_standing(robot, flags.run_dir, found, axes)
         kept = keep(flags.out, boards, path)
         restore = f"`xrl drive configure --restore {kept}`"
         console.print(f"\nwhat the boards had: {kept}; {restore} shows it")
         interrupts = Interrupts()
         with interrupts.kept():
             outcomes = apply(console, boards, difference, interrupts)
-    code = conclude(console, robot, outcomes, emulated=started)
-    if interrupts.number:
-        begun = {outcome.change.module for outcome in outcomes}
-        rest = dict.fromkeys(c.module for c in difference if c.module not in begun)
-        console.print(f"stopped before {', '.join(rest)}" if rest else "nothing was left to do")
-        sys.exit(128 + interrupts.number)
+        code = conclude(console, robot, outcomes) if difference else 0
+        if interrupts.number:
+            begun = {outcome.change.module for outcome in outcomes}
+            rest = dict.fromkeys(c.module for c in difference if c.module not in begun)
+            console.print(f"stopped before {', '.join(rest)}" if rest else "nothing was left to do")
+            sys.exit(128 + interrupts.number)
+        if axes and not code:
+            code = calibrate_robot.calibrate(
+                console, robot, {module: (boards[module], axes[module]) for module in axes},
+                interrupts, yes=flags.yes,
+                check=lambda: refuse_services(robot, flags.run_dir, MODULES),
+            )  # fmt: skip
+    if started and is_simulated(robot):
+        console.print(drive_access.GONE)
+    exit_if_interrupted(interrupts)
     return code
 
 
@@ -256,9 +298,7 @@ def apply(
     return outcomes
 
 
-def conclude(
-    console: Console, robot: RobotConfig, outcomes: Sequence[ChangeResult], *, emulated: bool
-) -> int:
+def conclude(console: Console, robot: RobotConfig, outcomes: Sequence[ChangeResult]) -> int:
     """Say what came of it and return the exit code."""
     bad = [outcome for outcome in outcomes if not outcome.good]
     for change, now, _ in bad:
@@ -272,6 +312,4 @@ def conclude(
         written = (outcome.change for outcome in outcomes if not outcome.change.inhibit)
         restarted = dict.fromkeys(change.module for change in written)
         console.print(f"restarted and therefore unzeroed: {', '.join(restarted)}; `xrl drive zero`")
-    if emulated and is_simulated(robot):
-        console.print(drive_access.GONE)
     return FAULT_EXIT_CODE if bad else 0

@@ -1,0 +1,225 @@
+"""Calibrating a board: done and saved whole, or as it was before; and what is refused."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from services.joint.differential import motor_from_joint
+from shared.can.cansimple import AxisState
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import DECLINED_EXIT_CODE, DriveError
+from shared.joints import MODULES
+from tests.tools.bringup.bank_board import FIRST, BankBoard
+from tests.tools.bringup.board_in_memory import BoardInMemory, as_wanted
+from tools.bringup import calibrate_robot, calibration
+from tools.bringup.boards import FoundBoards
+from tools.bringup.calibration import BoardResult, Procedure
+from tools.bringup.motion_runner import Interrupts
+from tools.terminal import Console
+
+AXES = ("axis0", "axis1")
+MODULE = "knee_left"
+IDLE = (AxisState.IDLE, AxisState.IDLE)
+
+
+def run(board: BankBoard, at_s: float = 1e9, interrupts: Interrupts | None = None) -> BoardResult:
+    """Calibrate both axes; a signal comes at a time of the course."""
+    interrupts = interrupts or Interrupts()
+    begun_s, told = board.clock(), list[tuple[str, str]]()
+
+    def progress(axis: str, procedure: Procedure, _: float) -> None:
+        told.append((axis, procedure.what))
+        if board.clock() - begun_s > at_s:
+            interrupts.number = signal.SIGINT
+
+    result = calibration.calibrate_board(
+        board, AXES, interrupts, progress, board.clock, board.pause
+    )
+    if not result.why:
+        expected = [(axis, what) for axis in AXES for what in ("motor", "encoder")]
+        assert list(dict.fromkeys(told)) == expected
+    return result
+
+
+def test_a_new_board_is_calibrated_marked_saved_and_ready_after_power_up() -> None:
+    board = BankBoard()
+    assert calibration.uncalibrated(board) == AXES
+    before = board.table()
+    assert before["axis0.config.enable_watchdog"] == 1.0, "USB does not feed it"
+    result = run(board)
+    assert result.why == ""
+    for found in result.found.values():
+        assert found == pytest.approx((0.1, 4e-5, 1))
+    board.restart()
+    assert calibration.uncalibrated(board) == ()
+    changed = {name.partition(".")[2] for name, v in board.table().items() if before[name] != v}
+    assert changed == {
+        "motor.config.pre_calibrated", "motor.config.phase_resistance",
+        "encoder.config.pre_calibrated", "encoder.config.direction", "encoder.config.phase_offset",
+    }  # fmt: skip
+    board.write(dict.fromkeys([f"{axis}.config.enable_watchdog" for axis in AXES], False))
+    board.clear_errors()
+    board.write({f"{axis}.requested_state": 8 for axis in AXES})
+    assert board.states() == (8, 8)
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"motor__config__calibration_current": 30.0}, r"PHASE_RESISTANCE_OUT_OF_RANGE; look at"),
+        ({"motor__config__pole_pairs": 14}, r"0\.2.. turns where 0\.143.* with 7 pole pairs: is"),
+        ({"encoder__config__cpr": 8192}, r"0\.5.. turns where 0\.286 .*: is .* or encoder"),
+        ({"load": 2.0}, r"CPR_POLEPAIRS_MISMATCH; its encoder counted .*hang the leg"),
+        ({"blocked": 1.0}, r"NO_RESPONSE; the encoder counts nothing.*blocked"),
+        ({"broken": 1e6}, r"motor: error MOTOR_FAILED, .*three phase wires"),
+    ],
+)  # fmt: skip
+def test_one_that_fails_says_why_and_what_to_do_and_leaves_the_board_as_it_was(
+    settings: dict[str, float], says: str
+) -> None:
+    board = BankBoard(**{name: v for name, v in settings.items() if "__" in name})
+    board.rotors.load[FIRST + 1] = settings.get("load", 0.0)
+    board.rotors.blocked = {FIRST + 1} if "blocked" in settings else set()
+    board.bank.calibration.resistance[FIRST + 1] = settings.get("broken", 0.1)
+    before = board.table()
+    result = run(board)
+    assert not result.not_idle
+    first_fails = any("__" in name for name in settings)
+    assert result.why.startswith("axis0" if first_fails else "axis1")
+    with pytest.raises(AssertionError, match=says):
+        raise AssertionError(result.why)
+    assert board.states() == IDLE
+    assert board.table() == before, "nothing is half saved"
+    assert calibration.uncalibrated(board) == AXES
+
+
+@pytest.mark.parametrize(
+    "at_s",
+    [3.0, 5.8, 7.5, *(pytest.param(s, marks=pytest.mark.wide) for s in (8.4, 9.4, 12.0)), 18.0],
+)
+def test_ctrl_c_idles_the_axis_and_leaves_the_board_as_it_was(at_s: float) -> None:
+    """A drive that is told to stop counts some halves as calibrated (docs/drives.md#traps)."""
+    board = BankBoard()
+    before = board.table()
+    result = run(board, at_s)
+    assert "stopped by SIGINT" in result.why
+    assert not result.not_idle
+    assert board.clock() < at_s + 6.0
+    assert board.states() == IDLE
+    assert board.table() == before
+    assert calibration.uncalibrated(board) == AXES
+    assert board.restarts == 2
+
+
+def test_an_axis_that_does_not_become_idle_is_told_and_its_board_not_restarted() -> None:
+    board = BankBoard()
+    board.deaf = True
+    assert run(board, 3.0).not_idle
+    assert board.restarts == 1
+
+
+def test_a_calibration_that_somebody_else_breaks_off_is_not_taken_for_one() -> None:
+    """In the motor's second part the firmware calls it done."""
+    board = BankBoard()
+    steps = board.pause
+
+    def pause(seconds: float) -> None:
+        steps(seconds)
+        state = board.bank.state[FIRST]
+        if state == AxisState.MOTOR_CALIBRATION and board.clock() - begun_s > 5.9:
+            board.bank.request_state(FIRST, AxisState.IDLE)
+
+    begun_s = board.clock()
+    nothing: Any = lambda *_: None  # noqa: E731
+    result = calibration.calibrate_board(board, AXES, Interrupts(), nothing, board.clock, pause)
+    assert "without an error: something else gives it orders" in result.why
+    assert calibration.uncalibrated(board) == AXES
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"encoder__config__mode": 0}, r"encoder\.config\.mode is 0: no absolute encoder"),
+        ({"motor__config__current_lim": 6.0}, r"calibration_current is 15 A; .*at most 14 A"),
+        ({"motor__config__calibration_current": 0.0}, "more than 0"),
+        ({"motor__config__pole_pairs": 0}, r"would be turned by inf turns"),
+        ({"volts": 3.0}, r"its supply has 3\.0 V"),
+        ({"load": 3.0}, "its motors move by themselves"),
+    ],
+)
+def test_a_board_that_is_not_set_up_or_does_not_stand_still_is_refused(
+    settings: dict[str, float], says: str
+) -> None:
+    board = BankBoard(**{name: v for name, v in settings.items() if "__" in name})
+    board.bank.supply(FIRST >> 1, settings.get("volts", 48.0))
+    if "load" in settings:  # a pendulum that was let go
+        board.rotors.load[:], board.rotors.FRICTION = settings["load"], 1e-5
+        board.rotors.pos = board.rotors.pos + 0.5
+    before = board.table()
+    with pytest.raises(DriveError, match=says):
+        calibration.refuse_unfit(MODULE, board, AXES, board.pause)
+    assert board.table() == before
+
+
+def boards(**readings: float) -> dict[str, BoardInMemory]:
+    """Return all six boards, zeroed at q = 0 or where the readings of knee_left say."""
+    made = {}
+    for n, module in enumerate(MODULES):
+        at = {f"{axis}.encoder.pos_estimate": 64.0 for axis in AXES}
+        own = readings if module == MODULE else {}
+        made[module] = BoardInMemory(as_wanted(), **(at | own))  # type: ignore[arg-type]
+        made[module].serial_number = f"3A000000000{n + 1}"
+    return made
+
+
+def refuse(robot: RobotConfig, made: dict[str, BoardInMemory], module: str, run_dir: Path) -> None:
+    found = FoundBoards({b.serial_number: b for b in made.values()}, {}, ())
+    calibrate_robot.refuse_standing(robot, run_dir, found, {module: AXES})
+
+
+def test_a_robot_one_of_whose_drives_is_armed_is_refused(
+    robot: RobotConfig, tmp_path: Path
+) -> None:
+    made = boards()
+    refuse(robot, made, "hip_right", tmp_path)
+    made[MODULE].readings["axis1.current_state"] = 8
+    with pytest.raises(DriveError, match="knee_left is armed: the robot may stand"):
+        refuse(robot, made, "hip_right", tmp_path)
+
+
+@pytest.mark.parametrize(("theta", "refused"), [(0.85, True), (-0.05, False), (None, False)])
+def test_a_limp_leg_that_rests_on_something_is_refused_where_it_knows_its_angles(
+    robot: RobotConfig, tmp_path: Path, theta: float | None, refused: bool
+) -> None:
+    made = boards()
+    signs = robot.module_named("hip_left").motor_signs
+    for axis, sign, turns in zip(
+        AXES, signs, motor_from_joint((0.0, theta or 0.0), robot.joint.gear_ratio), strict=True
+    ):
+        at = 0.3 if theta is None else sign * (turns + robot.drive.zero_mark_turns)
+        made["hip_left"].readings[f"{axis}.encoder.pos_estimate"] = at
+    if not refused:
+        refuse(robot, made, "hip_left", tmp_path)
+        return
+    with pytest.raises(
+        DriveError, match=r"hip_left is limp at theta 0\.85 rad.* rests on something"
+    ):
+        refuse(robot, made, "hip_left", tmp_path)
+    refuse(robot, made, "hip_right", tmp_path)
+
+
+def test_whoever_says_no_has_nothing_calibrated(
+    robot: RobotConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    board = BankBoard()
+    monkeypatch.setattr(calibrate_robot.drive_access, "confirm", lambda *_, **__: False)
+    monkeypatch.setattr(calibration, "_await_still", lambda *_: "")
+    code = calibrate_robot.calibrate(
+        Console(quiet=True), robot, {MODULE: (board, AXES)}, Interrupts(),
+        yes=False, check=lambda: None,
+    )  # fmt: skip
+    assert (code, board.restarts) == (DECLINED_EXIT_CODE, 0)

@@ -1,0 +1,347 @@
+"""Leads a board's axes through the calibrations of their motors and encoders, and judges them.
+
+A board is restarted before: errors are gone, and nothing has been connected. Its marks are written
+and saved once both axes are done. Whatever ends it before, another restart forgets what was
+measured: a calibration that fails or is broken off leaves halves that count as whole
+(docs/drives.md#traps).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from enum import IntFlag
+from typing import Final, NamedTuple
+
+from services.joint.differential import joint_from_motor
+from shared.bus.messages import Pair
+from shared.can.cansimple import AxisState, EncoderError, MotorError, OdriveError
+from shared.can.drive_settings import AXES
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import DriveError
+from tools.bringup.boards import AXIS_ERRORS, Board, Value, number
+from tools.bringup.check_board import describe_flags, trip_levels_of
+from tools.bringup.motion_runner import Interrupts
+
+MOTOR_S: Final = 4.25
+"""Resistance 3 s, inductance 1.25 s."""
+LOCK_S: Final = 1.0
+"""Before the encoder's way out and back."""
+CURRENT_MARGIN: Final = 8.0
+"""A beyond `current_lim` at which a drive disarms, as shipped."""
+POLL_S: Final = 0.1
+OVERTIME_S: Final = 3.0
+IDLE_S: Final = 2.0
+STILL_S: Final = 0.5
+STILL_WAIT_S: Final = 20.0
+STILL_TURNS: Final = 0.02
+"""turns that a motor may move in `STILL_S` by itself."""
+SHARE_MIN: Final = 0.98
+"""A procedure that ends after less of its time was broken off."""
+POLES_WITHIN: Final = 0.04
+"""How near a response must be to that of another number of pole pairs to be put down to it."""
+
+_ABSOLUTE: Final = 0x100
+"""Bit of `encoder.config.mode`."""
+_WATCHDOG: Final = "config.enable_watchdog"
+MARKS: Final = ("motor.config.pre_calibrated", "encoder.config.pre_calibrated")
+_READY: Final = ("motor.is_calibrated", "encoder.is_ready")
+_LOOK: Final = (
+    "encoder.config.mode", "encoder.config.cpr", "encoder.config.calib_scan_distance",
+    "encoder.config.calib_scan_omega", "motor.config.pole_pairs",
+    "motor.config.calibration_current", "motor.config.current_lim", "current_state",
+)  # fmt: skip
+
+_STOPPED: Final = (
+    "the joint is blocked, at its stop or loaded: hang the leg, clear of the floor; then raise "
+    "motor.config.calibration_current (15 A turns a leg that 10 A do not)"
+)
+ADVICE: Final[Mapping[tuple[str, IntFlag], str]] = {
+    ("motor.error", MotorError.PHASE_RESISTANCE_OUT_OF_RANGE):
+        "look at the three phase wires: one is loose or broken. Else the motor has more ohms than "
+        "resistance_calib_max_voltage / calibration_current: less current, or more volts, at most "
+        "half the supply's",
+    ("motor.error", MotorError.PHASE_INDUCTANCE_OUT_OF_RANGE):
+        "look at the three phase wires: two touch, or one is loose",
+    ("motor.error", MotorError.UNBALANCED_PHASES):
+        "look at the three phase wires: one is loose",
+    ("motor.error", MotorError.CURRENT_LIMIT_VIOLATION):
+        "motor.config.calibration_current is more than current_lim and its margin, or a winding "
+        "has a short circuit",
+    ("motor.error", MotorError.DRV_FAULT):
+        "a short circuit of the phases, or the board is broken: measure between the phases",
+    ("motor.error", MotorError.MODULATION_MAGNITUDE):
+        "the supply has too few volts: resistance_calib_max_voltage is at most half of them",
+    ("encoder.error", EncoderError.NO_RESPONSE):
+        f"the encoder counts nothing while the field turns: {_STOPPED}. If the shaft did turn: "
+        "the encoder's magnet or its plug",
+    ("encoder.error", EncoderError.ABS_SPI_COM_FAIL):
+        "the encoder does not answer: its plug and wires, encoder.config.abs_spi_cs_gpio_pin, mode",
+}  # fmt: skip
+"""By register and bit: what to look at."""
+
+
+class Found(NamedTuple):
+    """What an axis's calibrations have found."""
+
+    resistance: float
+    inductance: float
+    direction: int
+
+
+class BoardResult(NamedTuple):
+    """What came of a board."""
+
+    found: dict[str, Found]
+    """By axis; saved only where nothing went wrong."""
+    why: str = ""
+    """What went wrong, and what to do; "" if nothing did."""
+    not_idle: bool = False
+    """An axis does not say that it is idle."""
+
+
+class Procedure(NamedTuple):
+    """One requested state."""
+
+    state: AxisState
+    what: str
+    seconds: float
+
+
+Progress = Callable[[str, Procedure, float], None]
+"""Of the axis, what it is at, and for how many seconds."""
+
+
+def uncalibrated(board: Board) -> tuple[str, ...]:
+    """Return the axes of a board that do not arm for want of a calibration."""
+    values = board.read([f"{axis}.{name}" for axis in AXES for name in _READY])
+    return tuple(axis for axis in AXES if not all(values.get(f"{axis}.{n}") for n in _READY))
+
+
+def procedures(board: Board, axis: str) -> tuple[Procedure, Procedure]:
+    """Return both calibrations of an axis, with the time that each takes."""
+    names = [f"{axis}.encoder.config.calib_scan_{name}" for name in ("distance", "omega")]
+    values = board.read(names)
+    distance, rate = (number(values, name) for name in names)
+    if not (distance > 0.0 and rate > 0.0):
+        raise DriveError(f"{axis}: {names[0]} and omega are {distance:g} and {rate:g}: not > 0")
+    scan_s = LOCK_S + 2.0 * distance / rate
+    return (
+        Procedure(AxisState.MOTOR_CALIBRATION, "motor", MOTOR_S),
+        Procedure(AxisState.ENCODER_OFFSET_CALIBRATION, "encoder", scan_s),
+    )
+
+
+def scan_turns(values: Mapping[str, Value], axis: str) -> float:
+    """Return how many turns an encoder's calibration leads the motor out, and back."""
+    distance = number(values, f"{axis}.encoder.config.calib_scan_distance")
+    poles = number(values, f"{axis}.motor.config.pole_pairs")
+    return distance / (2.0 * math.pi * poles) if poles > 0.0 else math.inf
+
+
+def refuse_unfit(
+    module: str, board: Board, axes: Sequence[str], pause: Callable[[float], None] = time.sleep
+) -> None:
+    """Refuse a board that cannot be calibrated as it is set up, or whose joint moves.
+
+    Raises:
+        DriveError: naming what, and what would be right.
+    """
+    names = [f"{axis}.{name}" for axis in axes for name in _LOOK]
+    levels = [f"config.dc_bus_{name}voltage_trip_level" for name in ("under", "over")]
+    values = board.read([*names, *levels, "vbus_voltage"])
+    low, high = trip_levels_of(values)
+    volts = number(values, "vbus_voltage")
+    faults = []
+    if not low < volts < high:
+        faults.append(f"its supply has {volts:.1f} V, outside of {low:g} to {high:g} V")
+    for axis in axes:
+        mode = int(number(values, f"{axis}.encoder.config.mode"))
+        if not mode & _ABSOLUTE:
+            faults.append(
+                f"{axis}.encoder.config.mode is {mode}: no absolute encoder; 257 is right for AMS "
+                "over SPI (docs/bring-up.md, section 5)"
+            )
+        current = number(values, f"{axis}.motor.config.calibration_current")
+        most = number(values, f"{axis}.motor.config.current_lim") + CURRENT_MARGIN
+        if not 0.0 < current <= most:
+            faults.append(
+                f"{axis}.motor.config.calibration_current is {current:g} A; more than 0, and with "
+                f"this current_lim at most {most:g} A are right"
+            )
+        if scan_turns(values, axis) > 2.0:
+            faults.append(
+                f"{axis} would be turned by {scan_turns(values, axis):.1f} turns and back: are "
+                "motor.config.pole_pairs and encoder.config.calib_scan_distance right?"
+            )
+    if moves := _await_still(board, pause):
+        faults.append(moves)
+    if faults:
+        raise DriveError(f"{module}: {'; '.join(faults)}; nothing was calibrated")
+
+
+def calibrate_board(
+    board: Board,
+    axes: Sequence[str],
+    interrupts: Interrupts,
+    progress: Progress,
+    clock: Callable[[], float] = time.monotonic,
+    pause: Callable[[float], None] = time.sleep,
+) -> BoardResult:
+    """Calibrate axes of a board one after the other, mark and save them; or leave it as it was.
+
+    Args:
+        board: idle; it restarts before and after.
+        axes: "axis0", "axis1" or both.
+        interrupts: read all the time; one ends it, idles the axis and saves nothing.
+        progress: is told of the course.
+        clock: monotonic, s.
+        pause: waits so many seconds.
+    """
+    board.restart()
+    # a watchdog is fed over CAN only, and would end it
+    watchdogs = board.read([f"{axis}.{_WATCHDOG}" for axis in AXES])
+    board.write(dict.fromkeys(watchdogs, False))
+    board.clear_errors()
+    found: dict[str, Found] = {}
+    for axis in axes:
+        for procedure in procedures(board, axis):
+            why = _await_still(board, pause)  # the axis before has let the leg swing
+            why = why or _run(board, axis, procedure, interrupts, progress, clock, pause)
+            if why:
+                idle = _idle(board, axis, clock, pause)
+                if idle:
+                    board.restart()
+                return BoardResult(found, f"{axis}, {procedure.what}: {why}", not_idle=not idle)
+        found[axis] = _found(board, axis)
+    marks: dict[str, Value] = {f"{axis}.{mark}": True for axis in axes for mark in MARKS}
+    board.write(marks | watchdogs)
+    board.save()
+    lost = [axis for axis in uncalibrated(board) if axis in axes]
+    after = board.read(list(marks))
+    lost += [name for name in marks if after.get(name) is not True]
+    why = f"after the restart not calibrated: {', '.join(lost)}; once more" if lost else ""
+    return BoardResult(found, why)
+
+
+def zeroed_angles(robot: RobotConfig, module: str, board: Board) -> Pair | None:
+    """Return where a board's joint is, (phi, theta), rad; None if it does not know."""
+    values = board.read([f"{axis}.encoder.pos_estimate" for axis in AXES])
+    if len(values) < len(AXES):
+        return None
+    mark, signs = robot.drive.zero_mark_turns, robot.module_named(module).motor_signs
+    a, b = (number(values, name) * sign - mark for name, sign in zip(values, signs, strict=True))
+    zeroed = mark == 0.0 or max(abs(a), abs(b)) < 0.5 * mark
+    return joint_from_motor((a, b), robot.joint.gear_ratio) if zeroed else None
+
+
+def _run(
+    board: Board,
+    axis: str,
+    procedure: Procedure,
+    interrupts: Interrupts,
+    progress: Progress,
+    clock: Callable[[], float],
+    pause: Callable[[float], None],
+) -> str:
+    """Run one calibration; return why it failed, "" if it did not."""
+    begun_s = clock()
+    board.write({f"{axis}.requested_state": int(procedure.state)})
+    while True:
+        if interrupts.number:
+            return interrupts.words
+        pause(POLL_S)
+        passed_s = clock() - begun_s
+        progress(axis, procedure, passed_s)
+        state = board.states()[AXES.index(axis)]
+        if state == AxisState.IDLE:
+            return why_failed(board, axis, procedure, passed_s)
+        if passed_s > procedure.seconds + OVERTIME_S:
+            return (
+                f"it is in state {state} after {passed_s:.0f} s; {procedure.seconds:.0f} are right"
+            )
+
+
+def why_failed(board: Board, axis: str, procedure: Procedure, passed_s: float) -> str:
+    """Return why an axis that is idle again has failed its calibration; "" if it has not."""
+    flag = _READY[0] if procedure.what == "motor" else _READY[1]
+    names = [*(f"{axis}.{register}" for register in AXIS_ERRORS), f"{axis}.{flag}"]
+    values = board.read(["error", *names])
+    errors, advice = [], []
+    if bits := int(number(values, "error")):
+        errors.append(f"error {describe_flags(OdriveError, bits)}")
+    for register, kind in AXIS_ERRORS.items():
+        bits = int(number(values, f"{axis}.{register}"))
+        if bits:
+            errors.append(f"{register} {describe_flags(kind, bits)}")
+        advice += [text for (name, bit), text in ADVICE.items() if name == register and bits & bit]
+        if kind is EncoderError and bits & EncoderError.CPR_POLEPAIRS_MISMATCH:
+            advice.append(_mismatch(board, axis))
+    if errors:
+        return "; ".join([", ".join(errors), *advice])
+    if passed_s < SHARE_MIN * procedure.seconds:
+        return (
+            f"it ended after {passed_s:.1f} s, not after {procedure.seconds:.1f}, and without an "
+            "error: something else gives it orders"
+        )
+    return "" if values.get(f"{axis}.{flag}") else f"it ended without an error, and {flag} is False"
+
+
+def _mismatch(board: Board, axis: str) -> str:
+    """Return how far the shaft has turned, whose pole pairs would fit, and what else it may be."""
+    name = f"{axis}.encoder.calib_scan_response"
+    values = board.read([name, *(f"{axis}.{each}" for each in _LOOK)])
+    if not values.get(name):
+        return _STOPPED
+    turned = number(values, name) / number(values, f"{axis}.encoder.config.cpr")
+    expected, poles = scan_turns(values, axis), number(values, f"{axis}.motor.config.pole_pairs")
+    words = f"its encoder counted {turned:.3f} turns where {expected:.3f} are right"
+    other = round(expected * poles / turned)
+    if other not in (0, poles) and abs(turned * other / (expected * poles) - 1.0) < POLES_WITHIN:
+        words += f", as those of a motor with {other} pole pairs"
+    if turned > expected:
+        return f"{words}: is motor.config.pole_pairs or encoder.config.cpr wrong?"
+    return f"{words}: {_STOPPED}. Else motor.config.pole_pairs or encoder.config.cpr is wrong"
+
+
+def _found(board: Board, axis: str) -> Found:
+    names = [
+        f"{axis}.{name}"
+        for name in (
+            "motor.config.phase_resistance",
+            "motor.config.phase_inductance",
+            "encoder.config.direction",
+        )
+    ]
+    values = board.read(names)
+    ohm, henry, direction = (number(values, name) for name in names)
+    return Found(ohm, henry, int(direction))
+
+
+def _idle(
+    board: Board, axis: str, clock: Callable[[], float], pause: Callable[[float], None]
+) -> bool:
+    """Ask an axis for idle; return False if it does not say that it is."""
+    until_s = clock() + IDLE_S
+    board.write({f"{axis}.requested_state": int(AxisState.IDLE)})
+    while board.states()[AXES.index(axis)] != AxisState.IDLE:
+        if clock() > until_s:
+            return False
+        pause(POLL_S)
+    return True
+
+
+def _await_still(board: Board, pause: Callable[[float], None]) -> str:
+    """Wait until a board's motors stand; return how they move if they do not."""
+    names = [f"{axis}.encoder.pos_estimate" for axis in AXES]
+    moved = math.inf
+    for _ in range(round(STILL_WAIT_S / STILL_S)):
+        first, moved = board.read(names), 0.0
+        for _ in range(round(STILL_S / POLL_S)):
+            pause(POLL_S)
+            now = board.read(names)
+            moved = max(moved, *(abs(number(now, n) - number(first, n)) for n in names))
+        if moved <= STILL_TURNS:
+            return ""
+    return f"its motors move by themselves, {moved:.2f} turns in {STILL_S:g} s: hold it still"
