@@ -107,7 +107,7 @@ def refuse_armed(module: str, board: Board) -> None:
 
 def apply(board: Board, changes: Sequence[SettingChange]) -> list[ChangeResult]:
     """Write a board's changes, save them, and read them back after the restart."""
-    to_write = [change for change in changes if not change.inhibit]
+    to_write = sorted((change for change in changes if not change.inhibit), key=_watchdog_order)
     if to_write:
         board.write({change.name: change.after for change in to_write})
         board.save()
@@ -118,6 +118,13 @@ def apply(board: Board, changes: Sequence[SettingChange]) -> list[ChangeResult]:
         )
         for change in changes
     ]
+
+
+def _watchdog_order(change: SettingChange) -> int:
+    """Return a change's rank: a watchdog is off before its timeout changes, and on after that."""
+    if not change.name.endswith(".config.enable_watchdog"):
+        return 0
+    return 1 if change.after else -1
 
 
 def describe(value: Value) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from shared.can.cansimple import AxisState
@@ -44,6 +45,26 @@ def test_only_what_differs_is_written_saved_once_and_read_back(robot: RobotConfi
     assert board.writes == [VEL_LIMIT, PERIOD]
     assert board.saves == 1
     assert board.kept == as_wanted() | {"config.other": 7}
+
+
+@pytest.mark.parametrize("restored", [False, True], ids=["wanted", "of a backup"])
+@pytest.mark.parametrize(("on", "timeout"), [(True, 0.1), (False, 0.0)], ids=["on", "off"])
+def test_a_watchdog_never_runs_with_a_timeout_that_is_not_its_own(
+    robot: RobotConfig, on: bool, timeout: float, restored: bool
+) -> None:
+    """With 0 s it expires at once; the firmware's own order of the names is the wrong one."""
+    drive = msgspec.structs.replace(robot.drive, watchdog_timeout=timeout)
+    names = [f"axis0.config.{name}" for name in ("enable_watchdog", "watchdog_timeout")]
+    wanted: dict[str, Value] = dict(zip(names, (on, timeout), strict=True))
+    board = BoardInMemory(as_wanted() | dict(zip(names, (not on, 0.1 - timeout), strict=True)))
+    with_it = msgspec.structs.replace(robot, drive=drive)
+    found = (
+        changes.against_backup(MODULE, wanted, board) if restored else difference(with_it, board)
+    )
+    changes.apply(board, found)
+    order = names[::-1] if on else names
+    assert [name for name in board.writes if name in names] == order
+    assert board.kept.items() >= wanted.items()
 
 
 def test_a_value_that_the_board_does_not_take_is_not_called_good(robot: RobotConfig) -> None:
