@@ -91,6 +91,7 @@ def main() -> int:
             robot.drive,
             encoder_counts_per_turn=robot.joint.encoder_counts_per_turn,
             motor_signs=robot.motor_signs(),
+            heat=true_plant.heat,
         )
         front = CanSimpleFront(
             bank,

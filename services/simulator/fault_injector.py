@@ -6,11 +6,8 @@ from collections.abc import Sequence
 from typing import Final
 
 from services.simulator.drives.axis_bank import AxisBank
-from services.simulator.drives.axis_faults import (
-    AXIS_NAMES,
-    OVER_TEMP_MARGIN,
-    ROOM_TEMPERATURE,
-)
+from services.simulator.drives.axis_faults import AXIS_NAMES
+from services.simulator.drives.axis_heat import OVER_TEMP_MARGIN
 from services.simulator.drives.dc_bus import SUPPLY_VOLTAGE
 from services.simulator.drives.odd_encoder import Words
 from shared.config.scenarios import Fault
@@ -63,7 +60,7 @@ class FaultInjector:
             case "over_temperature":
                 limit = bank.settings.axis("motor.fet_thermistor.config.temp_limit_upper")[axis]
                 hot = float(limit) + OVER_TEMP_MARGIN + _ABOVE
-                bank.conditions.heat(axis, hot if begins else ROOM_TEMPERATURE)
+                bank.heat.force(axis, hot if begins else None)
             case "encoder" | "encoder_gap" | "encoder_zero":
                 wrong = Words.ZERO if fault.kind == "encoder_zero" else Words.NONE
                 bank.conditions.read_encoder(axis, wrong if begins else Words.TRUE)

@@ -29,6 +29,7 @@ def read_state(world: World, bank: AxisBank, t_ns: int, seq: int) -> SimState:
         armed=tuple(int(state == AxisState.CLOSED_LOOP_CONTROL) for state in bank.state),
         hidden=world.hidden(),
         hand=(world.outside.led_hand or LedHand()).numbers(),
+        heat=bank.heat.numbers(),
         **{name: tuple(getattr(bank, name).tolist()) for name in _COLUMNS},
     )
 
@@ -39,6 +40,7 @@ def write_state(world: World, bank: AxisBank, state: SimState) -> None:
     Errors and conditions of the drives are not in it: an axis that is not armed is idle.
     """
     world.resume(state)
+    bank.heat.set_numbers(state.heat)
     bank.counts_from[:] = state.counts_from
     bank.step(world.time, *world.motor_turns())
     for axis in range(N_JOINTS):

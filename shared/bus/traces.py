@@ -106,6 +106,8 @@ class SimState(Message, frozen=True):
     hand: tuple[float, ...] = (0.0,) * 11
     """State of the hand that somebody leads in place of the scenario, as the fields of `LedHand`;
     all zero: nobody does."""
+    heat: tuple[float, ...] = ()
+    """Temperatures of windings, housings and output stages, C, 12 each; empty: not known."""
 
 
 class LinkEvent(Message, frozen=True):

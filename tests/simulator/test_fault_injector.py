@@ -32,17 +32,18 @@ OVERSPEED = Registers(
 
 
 class Outcome(NamedTuple):
-    """What a kind leaves behind 60 ms after it began."""
+    """What a kind leaves behind `after_s` after it began."""
 
     state: AxisState
     registers: Registers
     sibling: AxisState = AxisState.CLOSED_LOOP_CONTROL
     is_responding: bool = True
+    after_s: float = 0.06
 
 
 OUTCOMES = {
     "over_temperature": Outcome(
-        AxisState.IDLE, Registers(FAILED, MotorError.FET_THERMISTOR_OVER_TEMP)
+        AxisState.IDLE, Registers(FAILED, MotorError.FET_THERMISTOR_OVER_TEMP), after_s=0.5
     ),
     "over_voltage": Outcome(
         AxisState.IDLE,
@@ -111,7 +112,7 @@ def test_a_fault_leaves_these_registers_this_state_and_this_sibling(kind: str, a
     scene, outcome = Scene(make_fault(kind, axis)), OUTCOMES[kind]
     scene.run(0.009)
     assert scene.bank.state == [AxisState.CLOSED_LOOP_CONTROL] * 12, "not before its time"
-    scene.run(0.07)
+    scene.run(0.01 + outcome.after_s)
     bank, sibling = scene.bank, axis ^ 1
     assert bank.state[axis] == outcome.state
     assert bank.faults[axis] == outcome.registers
@@ -128,24 +129,25 @@ def test_a_fault_leaves_these_registers_this_state_and_this_sibling(kind: str, a
 
 @pytest.mark.parametrize("kind", ["over_temperature", "over_voltage"])
 def test_errors_cleared_while_the_fault_lasts_are_back_at_once(kind: str) -> None:
-    scene = Scene(make_fault(kind, 4, duration=0.2))
-    scene.run(0.1)
+    lasts = 0.1 + OUTCOMES[kind].after_s
+    scene = Scene(make_fault(kind, 4, duration=lasts + 0.1))
+    scene.run(lasts)
     scene.bank.clear_errors(4)
     scene.bank.request_state(4, AxisState.CLOSED_LOOP_CONTROL)
-    scene.run(0.102)
+    scene.run(lasts + 0.002)
     assert scene.bank.state[4] == AxisState.IDLE
     assert scene.bank.faults[4] == OUTCOMES[kind].registers
 
 
 @pytest.mark.parametrize("kind", [k for k in FAULT_KINDS if k != "brown_out"])
 def test_after_it_an_axis_stays_as_it_is_until_it_is_cleared_and_asked_to_arm(kind: str) -> None:
-    lasts = None if FAULT_KINDS[kind].duration is None else 0.06 if kind == "encoder" else 0.05
+    lasts = None if FAULT_KINDS[kind].duration is None else 0.05 + OUTCOMES[kind].after_s
     scene = Scene(make_fault(kind, 7, duration=lasts))
-    scene.run(0.2)
+    scene.run(1.5)
     assert scene.bank.state[7] == OUTCOMES[kind].state, "it does not recover by itself"
     scene.bank.clear_errors(7)
     scene.bank.request_state(7, AxisState.CLOSED_LOOP_CONTROL)
-    scene.run(0.22)
+    scene.run(1.52)
     assert scene.bank.state[7] == AxisState.CLOSED_LOOP_CONTROL
     assert scene.bank.faults[7] == Registers()
     assert scene.torque[7] == 1.0, "the trap: the input torque of before is in force again"
@@ -200,16 +202,6 @@ def test_an_error_of_before_its_axes_run_is_shown_in_state_0() -> None:
     scene.run(0.2)
     scene.bank.estop(2)
     assert scene.bank.heartbeat(2)[:2] == (AxisError.ESTOP_REQUESTED, AxisState.UNDEFINED)
-
-
-def test_a_stage_near_its_limit_has_less_current() -> None:
-    bank = make_bank()
-    bank.vel_gain[:] = 10.0  # else the velocity limit of torque mode clamps first
-    bank.input_torque[:] = 99.0
-    bank.conditions.heat(3, 110.0)  # halfway from 100 to 120
-    torque = bank.step(DT, ZERO, ZERO)
-    assert torque[3] == pytest.approx(0.5 * 60.0 * 0.0827)
-    assert torque[2] == pytest.approx(60.0 * 0.0827)
 
 
 @pytest.mark.parametrize(("kind", "share"), [("bus_full", 0.4), ("bus_flap", 0.4), ("no_ack", 1.0)])

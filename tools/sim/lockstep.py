@@ -186,6 +186,7 @@ class Lockstep:
             config.drive,
             encoder_counts_per_turn=config.joint.encoder_counts_per_turn,
             motor_signs=config.motor_signs(),
+            heat=self.plant.heat,
         )
         self._torque = self.bank.torque
         self._faults = FaultInjector(scenario.fault, self.bank)

@@ -32,6 +32,7 @@ from services.simulator.drives.axis_faults import (
     controller_fault,
     in_idle,
 )
+from services.simulator.drives.axis_heat import AxisHeat, Heat
 from services.simulator.drives.axis_settings import configured
 from services.simulator.drives.axis_watchdogs import Watchdogs
 from services.simulator.drives.dc_bus import DEAD_VOLTAGE, DcBus
@@ -73,6 +74,7 @@ class AxisBank:
         encoder_counts_per_turn: int,
         watchdog: bool = True,
         motor_signs: Sequence[int] = (1,) * N_JOINTS,
+        heat: Heat | None = None,
     ) -> None:
         """Power the drives up, calibrated, zeroed (`drive.zero_mark_turns`), in IDLE.
 
@@ -81,6 +83,7 @@ class AxisBank:
             encoder_counts_per_turn: of the encoders themselves.
             watchdog: True if the drives' watchdogs run.
             motor_signs: sign of each motor's count and of its zero mark.
+            heat: how motors and output stages warm up; None: the default.
         """
         self.settings = configured(
             drive, encoder_counts_per_turn=encoder_counts_per_turn, watchdog=watchdog
@@ -109,7 +112,8 @@ class AxisBank:
         self._shaft = np.zeros(n)
         self.now_s = -math.inf
         self.calibration = Calibration(self.settings, encoders, drive.torque_constant)
-        self.conditions = Conditions(self.settings, control, encoders)
+        self.heat = AxisHeat(self.settings, control, heat or Heat())
+        self.conditions = Conditions(self.heat, encoders)
         self._watchdogs = Watchdogs(self.settings)
         self._spinout = Spinout(self.settings)
         self._requested: dict[int, int] = {}
@@ -139,6 +143,7 @@ class AxisBank:
             self.now_s = now_s
             if dt_s > 0.0:
                 self._encoders.estimate(dt_s, pos_turns)
+                self.heat.advance(dt_s)
         if self._refused_s or self._spinout.watched:
             self._end_closed_loops()
         if self.calibration.running or not self.conditions.all_well:

@@ -97,6 +97,7 @@ class AxisControl:
             encoder, in IDLE as well.
         derating: fraction of current_lim that heat leaves.
         resistance: of each motor's phases in truth, ohm.
+        warmth: resistance of each winding over that at 25 C.
     """
 
     def __init__(self, settings: Settings, encoders: AxisEncoders) -> None:
@@ -106,7 +107,7 @@ class AxisControl:
         self._mode = settings.axis("controller.config.control_mode")
         self.input_pos, self.input_vel, self.input_torque = np.zeros((3, N_JOINTS))
         self.armed, self.connected, self.integrator = np.zeros((3, N_JOINTS))
-        self.derating = np.ones(N_JOINTS)
+        self.derating, self.warmth = np.ones((2, N_JOINTS))
         self._loops = np.zeros(_ROWS * N_JOINTS)
         self._speeds = np.zeros((2, N_JOINTS))  # of the motors, before and now, turn/s
         self.resistance = np.full(N_JOINTS, PHASE_RESISTANCE)
@@ -118,7 +119,7 @@ class AxisControl:
         live = (
             encoders.pos_estimate, encoders.vel_estimate, self.input_pos, self.input_vel,
             self.input_torque, self.armed, self.connected, self.derating, self.integrator,
-            self._loops, *self._speeds,
+            self.warmth, self._loops, *self._speeds,
         )  # fmt: skip
         for index, array in enumerate((*columns, *live)):
             graph.bind(index, array)
@@ -191,7 +192,7 @@ def law_graph() -> ca.Function:
     names = [name.rpartition(".")[2] for name in _SETTINGS]
     inputs = (
         "pos", "vel", "input_pos", "input_vel", "input_torque", "armed", "connected", "derating",
-        "integrator",
+        "integrator", "warmth",
     )  # fmt: skip
     of = {name: ca.SX.sym(name, N_JOINTS) for name in (*names, *inputs)}
     loops, *speeds = (
@@ -228,7 +229,7 @@ def law_graph() -> ca.Function:
     tolerance = ca.if_else(of["enable_overspeed_error"] > 0.0, of["vel_limit_tolerance"], ca.inf)
     too_fast = (ca.fabs(vel) > vel_limit * tolerance) * of["connected"]
     mechanical = 2.0 * math.pi * vel * torque
-    copper = 1.5 * of["phase_resistance"] / of["torque_constant"] ** 2
+    copper = 1.5 * of["phase_resistance"] * of["warmth"] / of["torque_constant"] ** 2
     power = copper * torque * torque + mechanical
     loops_next, over_current = _currents(of, torque, loops, speeds, dt_s)
     asked_power = loops[3 * N_JOINTS :]

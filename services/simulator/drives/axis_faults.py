@@ -14,9 +14,9 @@ import math
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 
-from services.simulator.drives.axis_control import AxisControl
 from services.simulator.drives.axis_encoders import AxisEncoders
-from services.simulator.drives.axis_settings import N_DRIVES, Settings
+from services.simulator.drives.axis_heat import AxisHeat
+from services.simulator.drives.axis_settings import N_DRIVES
 from services.simulator.drives.odd_encoder import Words
 from shared.can.cansimple import (
     AxisError,
@@ -25,7 +25,6 @@ from shared.can.cansimple import (
     MotorError,
     OdriveError,
 )
-from shared.clamp import clamp
 from shared.joints import MODULES, N_JOINTS
 
 AXIS_NAMES: Final = tuple(f"{module}.axis{index}" for module in MODULES for index in (0, 1))
@@ -88,6 +87,7 @@ FAULTS: Final[Mapping[str, AxisErrors]] = {
         AxisErrors(AxisError.ENCODER_FAILED, encoder=EncoderError.ABS_SPI_COM_FAIL)
     ),
     "OVER_TEMP": _motor(MotorError.FET_THERMISTOR_OVER_TEMP),
+    "MOTOR_OVER_TEMP": _motor(MotorError.MOTOR_THERMISTOR_OVER_TEMP),
     "WATCHDOG": AxisErrors(AxisError.WATCHDOG_TIMER_EXPIRED),
     "ESTOP": AxisErrors(AxisError.ESTOP_REQUESTED),
 }
@@ -116,10 +116,6 @@ TALKS_S: Final = 0.02
 """s from power to the first frame."""
 BOOT_S: Final = 1.54
 """s from power to the start of the axes: so long the currents' zeros are measured."""
-ROOM_TEMPERATURE: Final = 25.0
-"""C of the output stage."""
-OVER_TEMP_MARGIN: Final = 5.0
-"""C beyond `temp_limit_upper` at which the firmware disarms."""
 
 
 class Conditions:
@@ -131,26 +127,24 @@ class Conditions:
         silent: the axes (0 .. 11) without communication: down, or the cable out.
         deaf: the axes (0 .. 11) that hear and acknowledge nothing, and send all the same.
         choked: the axes (0 .. 11) to which the bus takes no frame: its send queue is full.
-        temperature: of each axis's output stage (12,), C.
+        heat: motors, output stages and their thermistors.
     """
 
-    def __init__(self, settings: Settings, control: AxisControl, encoders: AxisEncoders) -> None:
+    def __init__(self, heat: AxisHeat, encoders: AxisEncoders) -> None:
         """Start without any condition."""
-        self._settings, self._control, self._encoders = settings, control, encoders
+        self.heat, self._encoders = heat, encoders
         self.down: set[int] = set()
         self.starting: set[int] = set()
         self.silent: set[int] = set()
         self.deaf: set[int] = set()
         self.choked: set[int] = set()
-        self.temperature = [ROOM_TEMPERATURE] * N_JOINTS
-        self._hot: set[int] = set()
         self._linked = [True] * N_DRIVES
         self._on_s = [-math.inf] * N_DRIVES  # when each had its power; inf: it has none
 
     @property
     def all_well(self) -> bool:
         """True if no axis has to be looked at."""
-        return not (self.starting or self._encoders.odd or self._hot)
+        return not (self.starting or self._encoders.odd or self.heat.hot)
 
     def link(self, drive: int, *, up: bool) -> None:
         """Pull a drive's cable, or plug it in."""
@@ -196,23 +190,13 @@ class Conditions:
         """Let an axis read no words of its encoder, zeros, or its own again."""
         self._encoders.read_words(axis, words)
 
-    def heat(self, axis: int, celsius: float) -> None:
-        """Bring an axis's output stage to a temperature; near its limit the current is less."""
-        self.temperature[axis] = celsius
-        below = "motor.fet_thermistor.config."
-        enabled = self._settings.axis(below + "enabled")[axis] > 0.0
-        low = float(self._settings.axis(below + "temp_limit_lower")[axis])
-        high = float(self._settings.axis(below + "temp_limit_upper")[axis])
-        share = clamp((high - celsius) / (high - low), 0.0, 1.0) if enabled else 1.0
-        self._control.derating[axis] = share
-        over = enabled and celsius >= high + OVER_TEMP_MARGIN
-        (self._hot.add if over else self._hot.discard)(axis)
-
     def disarming(self) -> list[tuple[int, AxisErrors]]:
         """Return the axes that a condition disarms, and with what."""
         odd = self._encoders.odd
         failing = [(axis, FAULTS["ENCODER"]) for axis in sorted(odd) if odd[axis].fails]
-        return failing + [(axis, FAULTS["OVER_TEMP"]) for axis in sorted(self._hot)]
+        names = {False: "OVER_TEMP", True: "MOTOR_OVER_TEMP"}
+        hot = self.heat.hot.items()
+        return failing + [(axis, FAULTS[names[motor]]) for axis, motor in sorted(hot)]
 
     def _update_silent(self) -> None:
         """Work out who is silent."""

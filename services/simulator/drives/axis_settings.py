@@ -7,9 +7,8 @@ its limits from the columns, a front reads and writes single values by name.
 Source: the configuration structs of firmware 0.5.6 (odriverobotics/ODrive). The over-voltage
 level is that of the 56 V board.
 
-The spinout thresholds are kept and not acted on: the emulated windings do not warm, so that
-SPINOUT_DETECTED comes by injection only. `encoder.config.direction` and `phase_offset` have no
-effect on the motion, as on a calibrated drive; currents are reported with the sign of the first.
+`encoder.config.direction` and `phase_offset` have no effect on the motion, as on a calibrated
+drive; currents are reported with the sign of the first.
 """
 
 from __future__ import annotations
@@ -72,6 +71,9 @@ AXIS_SETTINGS: Final[Mapping[str, Value]] = {
     "motor.fet_thermistor.config.enabled": True,
     "motor.fet_thermistor.config.temp_limit_lower": 100.0,
     "motor.fet_thermistor.config.temp_limit_upper": 120.0,
+    "motor.motor_thermistor.config.enabled": False,
+    "motor.motor_thermistor.config.temp_limit_lower": 100.0,
+    "motor.motor_thermistor.config.temp_limit_upper": 120.0,
     "encoder.config.mode": 0,
     "encoder.config.cpr": 8192,
     "encoder.config.bandwidth": 1000.0,

@@ -238,7 +238,9 @@ _ANSWERS_06: Final[Mapping[int, Answer]] = {
     Command.GET_ENCODER_ESTIMATES: _estimates_of_one(_estimates_06),
     Command06.GET_VERSION: lambda _bank, _axis: cansimple_06.pack_version(VERSION_06),
     Command06.GET_ERROR: lambda b, axis: cansimple_06.pack_error(*[errors_06(b.faults[axis])] * 2),
-    Command06.GET_TEMPERATURE: lambda bank, axis: _twice(bank.conditions.temperature[axis]),
+    Command06.GET_TEMPERATURE: lambda bank, axis: cansimple.pack_two_floats(
+        bank.heat.fet[axis], bank.heat.motor[axis]
+    ),
     Command06.GET_TORQUES: lambda bank, axis: _twice(bank.torque[axis]),
     Command06.GET_POWERS: lambda bank, axis: cansimple.pack_two_floats(*bank.bus.powers(axis)),
 }

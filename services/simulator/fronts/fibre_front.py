@@ -161,7 +161,12 @@ def _axis(i: int) -> list[Property | Function]:
         Property(
             "motor.fet_thermistor.temperature",
             "float",
-            lambda b: b.bank.conditions.temperature[b.axis(i)],
+            lambda b: float(b.bank.heat.fet[b.axis(i)]),
+        ),
+        Property(
+            "motor.motor_thermistor.temperature",
+            "float",
+            lambda b: float(b.bank.heat.motor[b.axis(i)]),
         ),
         Property("motor.current_control.Iq_setpoint", "float", lambda b: _current(b, i)),
         Property("motor.current_control.Iq_measured", "float", lambda b: _current(b, i)),

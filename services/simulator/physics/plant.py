@@ -19,6 +19,7 @@ from typing import Annotated, Any, Final
 import msgspec
 import tomli_w
 
+from services.simulator.drives.axis_heat import Heat
 from shared.exceptions import ConfigError
 from shared.joints import N_JOINTS
 from shared.toml_file import Range, Section, parse_toml, read_toml
@@ -149,6 +150,7 @@ class PlantConfig(Section, frozen=True):
     floor: Floor = Floor()
     feet: Feet = Feet()
     person: Person = Person()
+    heat: Heat = Heat()
     steps: Annotated[int, Range(1, 64, "1")] = 1
     """Steps of world and drivetrain in a `simulation.timestep`: more show whether one is enough."""
     seed: Annotated[int, Range(0, 1 << 31, "1")] = 0

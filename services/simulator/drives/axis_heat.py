@@ -1,0 +1,203 @@
+"""Heat of the emulated axes: motors, output stages, thermistors, and derating. Pure.
+
+Two nodes for each motor, one for each output stage; Iq is the motor's current:
+
+    C_w T_w' = 1.5 R Iq^2 - (T_w - T_h) / R_wh        R = R_25 (1 + alpha (T_w - 25 C))
+    C_h T_h' = (T_w - T_h) / R_wh - (T_h - T_a) / R_ha
+    t_s T_s' = T_a + k_s Iq^2 - T_s
+
+A thermistor's reading passes two low-passes of 0.1 s, as in firmware 0.5.6. Between its two limits
+the current limit falls in proportion to nothing; `OVER_TEMP_MARGIN` beyond the upper one the axis
+disarms. So a stage that is heated at once derates first and disarms 0.5 s later.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.simulator.drives.axis_control import AxisControl
+from services.simulator.drives.axis_settings import PHASE_RESISTANCE, Settings
+from shared.joints import N_JOINTS
+from shared.toml_file import Range, Section
+
+Vector = NDArray[np.float64]
+
+OVER_TEMP_MARGIN: Final = 5.0
+"""C beyond `temp_limit_upper` at which the firmware disarms."""
+FILTER_S: Final = 0.1
+"""Time constant of each of a thermistor's two low-passes."""
+SETTLED: Final = 0.05
+"""C; a reading nearer to the truth than this is taken as the truth."""
+EVERY_S: Final = 0.1
+"""Step of the slow temperatures."""
+COPPER: Final = 0.00393
+"""1/K, resistance of copper at 25 C."""
+REFERENCE: Final = 25.0
+"""C at which the resistance is given."""
+_FET: Final = "motor.fet_thermistor.config."
+_MOTOR: Final = "motor.motor_thermistor.config."
+
+Kelvins = Annotated[float, Range(-50.0, 200.0, "K")]
+
+
+class Heat(Section, frozen=True):
+    """How motors and output stages warm up: each motor, and each axis of a drive, alike.
+
+    Assumed, but for the output stage: measure the motors.
+    """
+
+    ambient: Annotated[float, Range(-40.0, 60.0, "C")] = 25.0
+    warm: Kelvins = 0.0
+    """Motors and output stages begin this much warmer than the air."""
+    resistance: Annotated[float, Range(0.001, 10.0, "ohm")] = PHASE_RESISTANCE
+    """Of a phase at 25 C. Assumed, of an outrunner with 100 rpm/V and some 80 mm."""
+    winding_capacity: Annotated[float, Range(1.0, 1e4, "J/K")] = 100.0
+    """0.2 kg of copper (385 J/(kg K)) and its share of the teeth. Assumed."""
+    winding_to_housing: Annotated[float, Range(0.01, 20.0, "K/W")] = 0.5
+    """With the winding's capacity a time constant of 50 s, usual for this size. Assumed."""
+    housing_capacity: Annotated[float, Range(1.0, 1e5, "J/K")] = 1500.0
+    """Half of a module's 8.73 kg belongs to each motor; 3 kg of steel and aluminium take part.
+    Assumed."""
+    housing_to_air: Annotated[float, Range(0.01, 50.0, "K/W")] = 1.2
+    """0.08 m^2 of housing and links at 10 W/(m^2 K), free convection and radiation. Assumed."""
+    stage_per_square_ampere: Annotated[float, Range(0.0, 1.0, "K/A^2")] = 0.054
+    """Rise of an output stage as its thermistor reads it. 40 A for ever, heat sink in still air at
+    13 C, is the most that a user measured on a v3.5 with 48 V (ODrive's forum, thread 972): there
+    it is taken to read 100 C."""
+    stage_s: Annotated[float, Range(1.0, 1e4, "s")] = 200.0
+    """Time constant of the heat sink. Assumed."""
+    motor_thermistor: bool = False
+    """True if each winding has a thermistor, wired to its drive; the drive's setting
+    `motor.motor_thermistor.config.enabled` makes it count."""
+
+
+class AxisHeat:
+    """Temperatures of the twelve axes; every array is indexed by axis, (12,), C.
+
+    Attributes:
+        winding: of the motors.
+        housing: of the motors.
+        stage: of the output stages.
+        fet: what the output stages' thermistors read.
+        motor: what the motors' thermistors read; 0 where there is none.
+        hot: axes whose firmware disarms them, with True if it is for the motor.
+    """
+
+    def __init__(self, settings: Settings, control: AxisControl, heat: Heat) -> None:
+        """Begin at the plant's temperatures; derate the current limits of `control`."""
+        self._settings, self._control, self._heat = settings, control, heat
+        start = heat.ambient + heat.warm
+        self.winding, self.housing, self.stage = np.full((3, N_JOINTS), start)
+        self.fet = self.stage.copy()
+        self.motor = self.winding.copy() if heat.motor_thermistor else np.zeros(N_JOINTS)
+        self.hot: dict[int, bool] = {}
+        self._forced: dict[int, float] = {}
+        self._half = self.fet.copy()
+        self._filtering = False
+        self._torque = control.results.torque
+        self._square: Vector = np.zeros(N_JOINTS)
+        """Integral of the squared torque since the last slow step."""
+        self._passed_s = 0.0
+        self._warm_up()
+
+    def advance(self, dt_s: float) -> None:
+        """Advance by dt, s, under the torques of the step before."""
+        torque = self._torque
+        self._square += dt_s * torque * torque
+        self._passed_s += dt_s
+        if self._passed_s >= EVERY_S:
+            square = self._square / self._passed_s
+            self._slow_step(square, self._passed_s)
+            self._square[:] = self._passed_s = 0.0
+            self._read()
+        if self._filtering:
+            self._filter(dt_s)
+
+    def skip(self, square: Vector, seconds: float) -> None:
+        """Let time pass for the temperatures alone, under a mean squared torque (12,), (N m)^2."""
+        while seconds > 0.0:
+            step_s = min(1.0, seconds)
+            self._slow_step(square, step_s)
+            seconds -= step_s
+        self._read()
+
+    def force(self, axis: int, celsius: float | None) -> None:
+        """Bring an axis's output stage to a temperature, and keep it there; None: let it go."""
+        if celsius is None:
+            self._forced.pop(axis, None)
+        else:
+            self._forced[axis] = celsius
+        self._filtering = True
+
+    def numbers(self) -> tuple[float, ...]:
+        """Return the temperatures, for `set_numbers`: windings, housings, output stages."""
+        return tuple(np.concatenate((self.winding, self.housing, self.stage)).tolist())
+
+    def set_numbers(self, numbers: tuple[float, ...]) -> None:
+        """Continue from another's temperatures; none: stay at the plant's."""
+        if numbers:
+            self.winding[:], self.housing[:], self.stage[:] = np.array(numbers).reshape(3, -1)
+            self._read()
+
+    def _slow_step(self, square: Vector, dt_s: float) -> None:
+        """Advance the temperatures under a mean squared torque (12,), (N m)^2."""
+        heat, winding, housing = self._heat, self.winding, self.housing
+        amperes2 = square / self._settings.axis("motor.config.torque_constant") ** 2
+        copper = 1.5 * heat.resistance * (1.0 + COPPER * (winding - REFERENCE)) * amperes2
+        inwards = (winding - housing) / heat.winding_to_housing
+        winding += dt_s / heat.winding_capacity * (copper - inwards)
+        outwards = (housing - heat.ambient) / heat.housing_to_air
+        housing += dt_s / heat.housing_capacity * (inwards - outwards)
+        end = heat.ambient + heat.stage_per_square_ampere * amperes2
+        self.stage += min(1.0, dt_s / heat.stage_s) * (end - self.stage)
+        self._warm_up()
+
+    def _warm_up(self) -> None:
+        np.subtract(self.winding, REFERENCE, out=self._control.warmth)
+        self._control.warmth *= COPPER
+        self._control.warmth += 1.0
+
+    def _raw(self) -> Vector:
+        if not self._forced:
+            return self.stage
+        raw = self.stage.copy()
+        for axis, celsius in self._forced.items():
+            raw[axis] = celsius
+        return raw
+
+    def _read(self) -> None:
+        """Read the thermistors, where nothing steps: the filters lag by less than can be seen."""
+        if self._heat.motor_thermistor:
+            self.motor[:] = self.winding
+        if not self._filtering:
+            self.fet[:] = self._half[:] = self._raw()
+        self._derate()
+
+    def _filter(self, dt_s: float) -> None:
+        """Pass the readings of the output stages through their two low-passes."""
+        raw, share = self._raw(), 1.0 - np.exp(-dt_s / FILTER_S)
+        self._half += share * (raw - self._half)
+        self.fet += share * (self._half - self.fet)
+        self._filtering = bool(np.abs(raw - self.fet).max() > SETTLED)
+        self._derate()
+
+    def _derate(self) -> None:
+        """Derate the current limits, and find out who disarms."""
+        settings, derating = self._settings, self._control.derating
+        derating[:] = 1.0
+        self.hot.clear()
+        for below, reading, is_motor in ((_FET, self.fet, False), (_MOTOR, self.motor, True)):
+            enabled = settings.axis(below + "enabled") > 0.0
+            low = settings.axis(below + "temp_limit_lower")
+            high = settings.axis(below + "temp_limit_upper")
+            if not (enabled & (reading > low)).any():
+                continue
+            for axis in np.flatnonzero(enabled):
+                margin, span = high[axis] - reading[axis], high[axis] - low[axis]
+                share = margin / span if span != 0.0 else 0.0
+                derating[axis] = min(derating[axis], max(0.0, share))
+                if margin <= -OVER_TEMP_MARGIN:
+                    self.hot[int(axis)] = is_motor
