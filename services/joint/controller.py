@@ -11,10 +11,11 @@ from typing import Final
 import msgspec
 
 from services.joint import pd_law
-from services.joint.differential import joint_torque
+from services.joint.differential import joint_torque, motor_torque
 from services.joint.drivers.base import DriveReading
 from services.joint.envelope import Envelope
 from services.joint.failsafe import Event, Failsafe, timing_of
+from services.joint.heat import HeatEstimate, HeatState
 from services.joint.joint_estimate import JointEstimate
 from services.joint.neighbours import UNKNOWN, NeighbourRow, NeighbourView
 from services.joint.pd_law import Setpoint
@@ -63,6 +64,7 @@ class ControllerState(msgspec.Struct, kw_only=True):
     clock: SampleClock = msgspec.field(default_factory=SampleClock)
     events: int = 0
     states: int = 0
+    heat: HeatState = msgspec.field(default_factory=HeatState)
 
 
 class ControllerSnapshot(msgspec.Struct, kw_only=True):
@@ -74,6 +76,9 @@ class ControllerSnapshot(msgspec.Struct, kw_only=True):
 
 class JointController:
     """The control law of one module.
+
+    Attributes:
+        heat: how warm its motors are.
 
     All that changes from cycle to cycle is one struct (`ControllerState`) and the setpoint law's.
     """
@@ -91,7 +96,10 @@ class JointController:
         self._period_ns = round(NS_PER_S / service.rate_hz)
         self._state_every = round(service.rate_hz / service.state_rate_hz)
         self._law = SetpointLaw(config, module)
-        self._state = ControllerState(estimate=JointEstimate(config.joint.gear_ratio))
+        self.heat = HeatEstimate(config)
+        self._state = ControllerState(
+            estimate=JointEstimate(config.joint.gear_ratio), heat=self.heat.state
+        )
 
     def step(
         self,
@@ -132,6 +140,8 @@ class JointController:
         else:
             wanted = self._wanted(now_ns, setpoint)
             s.tau = limit_torque(wanted, s.estimate.q, tau_before, self._limits)
+        if self.heat.enabled:
+            self._warm(now_ns, reading)
         event = None if cause is None else self._event(now_ns, before, cause, tau_before)
         return CycleResult(s.tau, event)
 
@@ -242,6 +252,8 @@ class JointController:
             state_phase=self._state_phase,
             refusal=int(refusal),
             refused_session=refused_session,
+            celsius=s.heat.shown,
+            heat_left_s=s.heat.left_s,
         )
 
     def snapshot(self) -> ControllerSnapshot:
@@ -251,6 +263,10 @@ class JointController:
     def restore(self, snapshot: ControllerSnapshot) -> None:
         """Continue from a copy of a state."""
         self._state = copied(snapshot.state)
+        if self._state.heat.stepped_ns:
+            self.heat.state = self._state.heat
+        else:  # a log from before there was an estimate
+            self._state.heat = self.heat.state
         self._law.restore(copied(snapshot.law))
 
     def inside_limits(self) -> bool:
@@ -321,6 +337,13 @@ class JointController:
         carried = pd_law.take_over(q, v, s.initial_torque, k_p, k_d)
         law.start(s.failsafe.mode, now_ns, carried)
         s.tau = s.initial_torque  # the limiter takes it for the last torque
+
+    def _warm(self, now_ns: int, reading: DriveReading | None) -> None:
+        """Update the estimate of the module's heat."""
+        fet = motor = None
+        if reading is not None:
+            fet, motor = reading.fet_celsius, reading.motor_celsius
+        self.heat.advance(now_ns, motor_torque(self._state.tau, self._gear_ratio), fet, motor)
 
     def _wanted(self, now_ns: int, setpoint: Setpoint) -> Pair:
         """Return the law's torque, N m, with the rest of a take-over's difference."""

@@ -71,6 +71,8 @@ class Tracer:
                 near.stiffen,
                 malformed,
                 (r and r.encoder_zero) or _UNTOLD,
+                _NOTHING if r is None else r.fet_celsius or _NOTHING,
+                _NOTHING if r is None else r.motor_celsius or _NOTHING,
             )
         )
         return self.take() if len(self._cycles) == CYCLES else None

@@ -22,6 +22,7 @@ from services.planner.law.hocca import Hocca, LawOutput, LawState
 from services.planner.state_phases import PhasesState, StatePhases
 from services.planner.watch.controller_guard import ControllerGuard, GuardState
 from services.planner.watch.engagement_fsm import Engagement
+from services.planner.watch.heat import HeatWatch, HeatWatchState
 from services.planner.watch.limp_leg_watch import LimpLegWatch
 from services.planner.watch.plausible import Plausible
 from services.planner.watch.rival_watch import RivalWatch
@@ -85,6 +86,7 @@ class PlannerState(msgspec.Struct, kw_only=True):
     unattended: UnattendedState = msgspec.field(default_factory=UnattendedState)
     phases: PhasesState = msgspec.field(default_factory=PhasesState)
     rival: RivalWatch = msgspec.field(default_factory=RivalWatch)
+    heat: HeatWatchState = msgspec.field(default_factory=HeatWatchState)
     guard: GuardState | None = None
     """None without a controller of somebody's own."""
     refused: int = 0
@@ -132,6 +134,7 @@ class Planner:
         self._overload = Overload.of(config.harness)
         self._trips = PlannerTrips(config)
         self._unattended = Unattended()
+        self._heat = HeatWatch(config.heat)
         service = config.joint_service
         self._phases = StatePhases(service.rate_hz, service.state_rate_hz)
         self._period_s = 1.0 / config.planner.rate_hz
@@ -141,6 +144,7 @@ class Planner:
             trips=self._trips.state,
             unattended=self._unattended.state,
             phases=self._phases.state,
+            heat=self._heat.state,
             guard=None if self._guard is None else self._guard.state,
         )
         self._q: Array = np.zeros(N_JOINTS)
@@ -227,16 +231,19 @@ class Planner:
         )
         self._support = self._state.limp_legs.advance(now_ns, states)
         self._phases.advance(states, self._state.arrived_ns, last_ns)
+        request = self._state.request
+        heat = self._heat.advance(now_ns, states, request.assist_n, self._lifted(now_ns), dt)
         # until all engage, the law restarts from the measured pose each tick: there is no
         # step
         self._output = self._law.tick(
             self._q,
             self._v,
-            self._state.request.assist_n,
+            heat.assist,
             dt,
-            shift_requested=self._state.request.shift,
-            probe=(self._state.request.probe_row, self._state.request.probe),
-            toward=DOWN if self._state.request.sit else STAY,
+            shift_requested=request.shift,
+            probe=(request.probe_row, request.probe),
+            lift=heat.direction,
+            toward=DOWN if request.sit and heat.direction is None else STAY,
             align=engagement.hold,
             wrench=self._usable_wrench(now_ns),
             up_torso=self._usable_up(now_ns),
@@ -255,7 +262,10 @@ class Planner:
             self._law.pause_load_estimate()
         rate = self._law.harness_rate(self._v)
         drift = self._drift(now_ns, lifted)
-        values = values_of(self._output, self._q, loads, lifted, rate, drift, leads=leads)
+        moves = self._heat.moves
+        values = values_of(
+            self._output, self._q, loads, lifted, rate, drift, leads=leads, moves=moves
+        )
         self._trips.advance(now_ns, values, leads=leads)
         self._state.seq += 1
         if self._state.rival.yields:
@@ -279,6 +289,7 @@ class Planner:
         self._law.restore(own.law)
         self._overload.state, self._trips.state = own.overload, own.trips
         self._unattended.state, self._phases.state = own.unattended, own.phases
+        self._heat.state = own.heat
         if self._guard is not None:
             if own.guard is not None:
                 self._guard.state = own.guard
@@ -469,10 +480,13 @@ class Planner:
             or self._law.stance_refusal()
             or self._law.load_refusal()
             or self._trips.why
+            or self._heat.describe()
             or (self._guard.why if self._guard is not None else ""),
             trip=int(self._trips.tripped),
             refused=self._plausible.refused,
             sit=s.request.sit,
+            heat=int(self._heat.state.action),
+            heat_left_s=self._heat.state.left_s,
         )
 
 

@@ -162,6 +162,8 @@ class Conversions:
             "commands refused": state.refused,
             "recent drop-outs": state.dropouts,
             "late cycles": f"{state.late} of {state.cycle}",
+            "windings, C": f"{state.celsius[0]:.0f}, {state.celsius[1]:.0f}",
+            "seconds left at this load": f"{state.heat_left_s:.0f}",
         }
         return self._row(name, MODE_LEVEL[mode], f"{said}; {remedy}" if remedy else said, values)
 

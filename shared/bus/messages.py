@@ -20,6 +20,8 @@ Pair = tuple[float, float]
 Vector3 = tuple[float, float, float]
 Vector4 = tuple[float, float, float, float]
 Vector6 = tuple[float, float, float, float, float, float]
+LEFT_MAX_S = 3600.0
+"""Seconds left at a load beyond which they are not told apart: an hour or more."""
 STRAIGHT: Vector4 = (0.0, 0.0, 0.0, 0.0)
 """No shift of x, y, roll and yaw."""
 AS_CONFIGURED: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -188,6 +190,18 @@ class PlannerMode(IntEnum):
     ended."""
 
 
+class HeatAction(IntEnum):
+    """What the planner does before a motor is too warm (docs/law.md#heat)."""
+
+    NONE = 0
+    EASES = 1
+    """The assist goes, as far as nobody rests on it, and the person is told."""
+    STANDS_UP = 2
+    """It stands up by itself; height and pitch are not the person's."""
+    RESTS = 3
+    """It stays straight until it has cooled; height and pitch are not the person's."""
+
+
 class SplitSource(IntEnum):
     """Source of a tick's local gains (docs/law.md#gain-split)."""
 
@@ -297,6 +311,11 @@ class JointState(Message, frozen=True):
     """Cause of the newest refusal of a command, for a second; 0 if there was none."""
     refused_session: Int64 = 0
     """Session of that command: of whom it came."""
+    celsius: Pair = (0.0, 0.0)
+    """Estimated temperature of both windings, C; 0 if it is not estimated."""
+    heat_left_s: float = -1.0
+    """Seconds left at this load until a winding or an output stage is too warm; 3600: an hour or
+    more; -1: not estimated."""
 
 
 class JointCommand(Message, frozen=True):
@@ -471,6 +490,10 @@ class PlannerStatus(Message, frozen=True):
     """States, wrenches and attitudes refused so far: no sensor can have measured them."""
     sit: bool = False
     """True while it is asked to go down by itself (`OperatorIntent.sit`)."""
+    heat: Int64 = 0
+    """What is done before a motor is too warm."""
+    heat_left_s: float = -1.0
+    """Least of the modules' seconds left at this load; 3600: an hour or more; -1: not estimated."""
 
 
 class OperatorIntent(Message, frozen=True):

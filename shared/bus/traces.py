@@ -53,6 +53,10 @@ class CycleTrace(msgspec.Struct, gc=False, frozen=True):
     """What came as a command in this cycle and was none."""
     encoder_zero: Pair = (-1.0, -1.0)
     """Where the motors' encoders read 0, turns modulo one; -1: not answered in this cycle."""
+    fet_celsius: Pair = (0.0, 0.0)
+    """Reported temperatures of the output stages, C; 0: not with this sample."""
+    motor_celsius: Pair = (0.0, 0.0)
+    """Reported temperatures of the motors, C; 0: not with this sample."""
 
 
 class JointTrace(Message, frozen=True):

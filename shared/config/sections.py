@@ -293,6 +293,37 @@ class TripsConfig(Section, frozen=True):
     unattended: TripLimit = TripLimit(limit=0.03, after_ms=20.0)
 
 
+Celsius = Annotated[float, Range(-40.0, 200.0, "C")]
+
+
+class HeatConfig(Section, frozen=True):
+    """What motors and output stages are, to estimate how warm they get (docs/results.md)."""
+
+    estimate: bool = False
+    """False: nothing is known of them, nothing estimated, and the robot stands up for no heat."""
+    ambient: Celsius = 40.0
+    """Air at the robot on the hottest day."""
+    winding_max: Celsius = 100.0
+    """No winding is to be warmer: below the insulation's class by what the estimate may be off, and
+    no more than the `temp_limit_lower` of a motor's thermistor."""
+    stage_max: Celsius = 90.0
+    """No output stage is to be warmer: below the drives' `temp_limit_lower`."""
+    resistance: Annotated[float, Range(0.001, 10.0, "ohm")] = 0.1
+    """Of a phase at 25 C; the drive's calibration finds it (`phase_resistance`)."""
+    winding_capacity: Annotated[float, Range(1.0, 1e4, "J/K")] = 100.0
+    winding_to_housing: Annotated[float, Range(0.01, 20.0, "K/W")] = 0.5
+    housing_capacity: Annotated[float, Range(1.0, 1e5, "J/K")] = 1500.0
+    housing_to_air: Annotated[float, Range(0.01, 50.0, "K/W")] = 1.2
+    stage_per_square_ampere: Annotated[float, Range(0.0, 1.0, "K/A^2")] = 0.054
+    """Rise of an output stage with the square of its current."""
+    stage_s: Annotated[float, Range(1.0, 1e4, "s")] = 200.0
+    """Time constant of the output stages."""
+    ease_s: Annotated[float, Range(5.0, 600.0, "s")] = 60.0
+    """Seconds left at this load below which the assist goes, and the person is told."""
+    stand_s: Annotated[float, Range(5.0, 600.0, "s")] = 30.0
+    """Seconds left below which the robot moves to where it stays cooler by itself."""
+
+
 class PlannerConfig(Section, frozen=True):
     """Planner timing."""
 

@@ -33,6 +33,7 @@ ENUMERATIONS: Final[dict[tuple[type, str], type[IntEnum]]] = {
     (messages.JointState, "outside"): messages.Outside,
     (messages.JointState, "refusal"): messages.Refusal,
     (messages.PlannerStatus, "trip"): messages.Trip,
+    (messages.PlannerStatus, "heat"): messages.HeatAction,
     (messages.RunEvent, "kind"): messages.RunEventKind,
 }
 """Fields that are plain integers on the bus and enumerations in the mind."""

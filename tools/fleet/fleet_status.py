@@ -110,6 +110,10 @@ class ModuleStatus(msgspec.Struct, frozen=True):
     """Commands that it refuses now, by cause and sender."""
     stopped_by: str = ""
     """Who engaged the emergency stop that holds, if its service is on this host."""
+    celsius: tuple[float, float] | None = None
+    """Estimated temperature of both windings, C; None: not estimated."""
+    heat_left_s: float | None = None
+    """Seconds left at this load, 3600 for an hour or more; None: not estimated."""
 
 
 class LeadStatus(msgspec.Struct, frozen=True):
@@ -340,6 +344,8 @@ def module_status(
         session=state.session,
         refusals=refusals,
         stopped_by=stopped_by if state.cause == Cause.ESTOP else "",
+        celsius=state.celsius if state.heat_left_s >= 0.0 else None,
+        heat_left_s=state.heat_left_s if state.heat_left_s >= 0.0 else None,
     )
 
 

@@ -11,7 +11,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from shared.bus.messages import DriveStatus, Refusal
+from shared.bus.messages import LEFT_MAX_S, DriveStatus, Refusal
 from tools.fleet import procfs
 from tools.fleet.fleet_status import OPEN, SILENT_PROXY, FleetStatus, LeadStatus
 from tools.fleet.procfs import ProcessUse
@@ -144,7 +144,7 @@ def tables(status: FleetStatus) -> Group:
             row.last_exit,
         )
     modules = Table(title="modules", title_justify="left", box=box.SIMPLE_HEAD)
-    for heading in ("module", "mode", "tier", "because", "drive", "phi", "theta"):
+    for heading in ("module", "mode", "tier", "because", "drive", "phi", "theta", "heat"):
         modules.add_column(heading, no_wrap=True)
     for name, module in status.modules.items():
         drive = module.drive or "-"
@@ -155,6 +155,7 @@ def tables(status: FleetStatus) -> Group:
             module.cause or "",
             drive if drive == DriveStatus.ARMED.name else Text(drive, "bold red"),
             *(("-", "-") if module.q is None else (f"{a:+.3f}" for a in module.q)),
+            _heat_cell(module.celsius, module.heat_left_s),
         )
     return Group(services, modules, *_lines(status))
 
@@ -215,6 +216,20 @@ def process_table(
             str(row.restarts),
         )
     return table
+
+
+HOT_S: Final = 60.0
+"""Seconds left at this load below which a module's heat is shown in red."""
+
+
+def _heat_cell(celsius: tuple[float, float] | None, left_s: float | None) -> str | Text:
+    """Return the warmer winding, and the seconds left at this load where they are few."""
+    if celsius is None or left_s is None:
+        return "-"
+    words = f"{max(celsius):.0f} C"
+    if left_s < LEFT_MAX_S:
+        words += f", {left_s:.0f} s left"
+    return Text(words, "bold red") if left_s < HOT_S else words
 
 
 def _state_cell(state: str) -> str | Text:

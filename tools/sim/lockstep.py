@@ -335,6 +335,15 @@ class Lockstep:
         self.world.take_hand(hand)
         self._record(topics.OPERATOR_HAND, "", hand)
 
+    def skip_heat(self, seconds: float) -> None:
+        """Let time pass for the temperatures alone, true and estimated, under the present load.
+
+        For a pose that is held: thermal time constants are minutes.
+        """
+        self.bank.heat.skip(self.bank.heat.load, seconds)
+        for joint in self.joints:
+            joint.manager.controller.heat.skip(seconds)
+
     def act(self, row: Happening) -> None:
         """Carry out a row of the scenario, or of somebody who looks on, and record it."""
         if isinstance(row, HandRow):

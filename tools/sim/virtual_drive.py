@@ -5,7 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
-from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.base import (
+    HEAT_EVERY_NS,
+    DriveReading,
+    DriveStatus,
+    MotorTarget,
+    real_readings,
+)
 from services.joint.drivers.bus_watch import BusWatch
 from services.simulator.drives.axis_bank import AxisBank
 from shared.bus.messages import Pair
@@ -35,10 +41,12 @@ class VirtualDrive:
         *,
         bus: VirtualBus | None = None,
         counts_per_turn: int,
+        tells_heat: bool = False,
     ) -> None:
         """Take the drives, which of them (0 .. 5), the clock of the service's host, and the bus.
 
         Without a bus it has one of its own, on which somebody always acknowledges.
+        `tells_heat`: it reports its thermistors once a second, as firmware 0.6 does.
         """
         self._bus = bus or VirtualBus(bank, (2 * index, 2 * index + 1))
         self._watch = BusWatch(echoes=True)
@@ -49,6 +57,7 @@ class VirtualDrive:
         self._lost_after_ns = round(drive.lost_after_s * NS_PER_S)
         self._sampled_ns = clock()
         self._ask_at_ns = 0
+        self._heat_at_ns = clock() if tells_heat else None
         self._written = True
         """False: the service is new, and reads the torques of a drive that it finds armed."""
 
@@ -82,6 +91,12 @@ class VirtualDrive:
             status = _ARMED if armed else _IDLE
         errors = 0 if armed else bank.heartbeat(a).errors | bank.heartbeat(b).errors
         pos, vel = bank.pos_estimate, bank.vel_estimate
+        fet = motor = None
+        if self._heat_at_ns is not None and is_responding and now_ns >= self._heat_at_ns:
+            self._heat_at_ns = now_ns + HEAT_EVERY_NS
+            heat = bank.heat
+            fet = (float(heat.fet[a]), float(heat.fet[b]))
+            motor = real_readings(float(heat.motor[a]), float(heat.motor[b]))
         return DriveReading(
             self._sampled_ns,
             (float(pos[a]), float(pos[b])),
@@ -90,6 +105,8 @@ class VirtualDrive:
             int(errors),
             None if self._written else (float(bank.torque[a]), float(bank.torque[b])),
             None if armed or not is_responding else self._encoder_zero(now_ns),
+            fet,
+            motor,
         )
 
     def _encoder_zero(self, now_ns: int) -> Pair | None:

@@ -128,6 +128,7 @@ class VirtualJoint:
             self._clock,
             bus=bus,
             counts_per_turn=config.joint.encoder_counts_per_turn,
+            tells_heat=config.simulation.can_dialect == "0.6",
         )
         frame = MotorFrame(config.drive.zero_mark_turns, config.module_named(name).motor_signs)
         self._wired = WiredDrive(self.drive, frame)

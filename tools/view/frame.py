@@ -132,6 +132,8 @@ class PlannerShown(msgspec.Struct, frozen=True):
     assist_n: float
     height_ref: float
     """COM height that it follows, m."""
+    heat_left_s: float = -1.0
+    """Seconds left at this load, as in `PlannerStatus`."""
 
 
 class ShownProcess(msgspec.Struct, frozen=True):
@@ -307,6 +309,7 @@ def _shown(status: PlannerStatus) -> PlannerShown:
         tick_us=status.tick_us,
         assist_n=status.assist_n,
         height_ref=status.p_ref[2],
+        heat_left_s=status.heat_left_s,
     )
 
 

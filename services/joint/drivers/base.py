@@ -2,13 +2,30 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+import math
+from typing import Final, Protocol
 
 import msgspec
 
 from shared.bus.messages import DriveStatus, Pair
+from shared.clock import NS_PER_S
 
-__all__ = ["Drive", "DriveReading", "DriveStatus", "MotorTarget"]
+__all__ = [
+    "HEAT_EVERY_NS", "Drive", "DriveReading", "DriveStatus", "MotorTarget", "real_readings",
+]  # fmt: skip
+
+HEAT_EVERY_NS: Final = NS_PER_S
+"""How often a driver asks its drive for the temperatures, ns, where the firmware tells them."""
+CELSIUS: Final = (-40.0, 200.0)
+"""What a thermistor that is there reads; a pin without one reads 0 or nonsense."""
+
+
+def real_readings(first: float, second: float) -> Pair | None:
+    """Return both axes' readings of a thermistor, C; None if one of them is no reading."""
+    low, high = CELSIUS
+    both = (first, second)
+    real = all(math.isfinite(one) and low < one < high and one != 0.0 for one in both)
+    return both if real else None
 
 
 class DriveReading(msgspec.Struct, gc=False, frozen=True):
@@ -28,6 +45,10 @@ class DriveReading(msgspec.Struct, gc=False, frozen=True):
     encoder_zero: Pair | None = None
     """Where the encoders' angles within the turn are 0, turns modulo one, when the drive has just
     answered that; `drive.set_position` moves it."""
+    fet_celsius: Pair | None = None
+    """What the thermistors of the output stages read, C; None: not with this sample."""
+    motor_celsius: Pair | None = None
+    """What the motors' thermistors read, C; None: not with this sample, or there are none."""
 
 
 class MotorTarget(msgspec.Struct, gc=False, frozen=True):

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Final
 
 from services.joint.drivers import odrive_frames
-from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.base import HEAT_EVERY_NS, DriveReading, DriveStatus, MotorTarget
 from services.joint.drivers.can_link import RETRY_MS, CanLink, message
 from services.joint.drivers.encoder_pair import EncoderPair
 from services.joint.drivers.firmware import (
@@ -93,6 +93,7 @@ class OdriveCan:
             Command.HEARTBEAT: self._take_heartbeat,
             Command.GET_IQ: self._answers.take_current,
             Command06.GET_VERSION: self._take_version,
+            Command06.GET_TEMPERATURE: self._answers.take_heat,
         }
         self._takers = {
             cansimple.arbitration_id(node, command): (axis, taker)
@@ -104,6 +105,7 @@ class OdriveCan:
         self._due = ResendPolicy()
         self._first = 0  # the axis that is written first
         self._windows = OrderWindows()
+        self._heat_at_ns = 0
         self._encoders = EncoderPair()
         self._times = FrameTimes(round(drive.lost_after_s * NS_PER_S), now_ns())
         self._connect()
@@ -152,6 +154,9 @@ class OdriveCan:
                     status = DriveStatus.UNACKNOWLEDGED
                 elif status is not _ARMED and now < self._windows.feed_until_ns:
                     self._link.send(self._food)
+                if now >= self._heat_at_ns and self._report.dialect == "0.6":
+                    self._heat_at_ns = now + HEAT_EVERY_NS
+                    self._link.send(self._answers.ask_heat)
                 return self._reading(status)
             if now >= deadline or not self._link.is_open:
                 break
@@ -326,6 +331,7 @@ class OdriveCan:
             self._report.errors,
             self._answers.torques if self._due.gains is None else None,
             self._answers.encoder_zero(),
+            *self._answers.heat(),
         )
 
     def _connect(self) -> bool:

@@ -26,7 +26,7 @@ from odrive.device_manager import DeviceManager, get_device_manager
 from odrive.runtime_device import RuntimeDevice
 
 from services.joint.drivers.axes_status import AxesStatus
-from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.base import HEAT_EVERY_NS, DriveReading, DriveStatus, MotorTarget
 from services.joint.drivers.odrive_v3 import OdriveV3
 from shared import log
 from shared.bus.messages import Pair
@@ -85,6 +85,7 @@ class _Exchanged:
         self.axes = AxesStatus()
         self.status, self.errors = DriveStatus.LOST, 0
         self.count = 0  # of exchanges
+        self.heat_at_ns = 0
         self.feed_until_ns = 0  # later than 0: arm was asked for, and no idle since
 
 
@@ -341,9 +342,15 @@ class OdriveUsb:
                 torque = await board.torques(self._drive.torque_constant)
             if done.status is not DriveStatus.ARMED and done.count % COUNTS_EVERY == 1:
                 zero = await board.encoder_zero()
+        fet = motor = None
+        if t_ns >= done.heat_at_ns:
+            done.heat_at_ns = t_ns + HEAT_EVERY_NS
+            fet, motor = await board.heat()
         if all(map(isfinite, values)):  # else it is no sample
             pos, vel = (values[0], values[1]), (values[2], values[3])
-            self._sample = DriveReading(t_ns, pos, vel, done.status, done.errors, torque, zero)
+            self._sample = DriveReading(
+                t_ns, pos, vel, done.status, done.errors, torque, zero, fet, motor
+            )
             if wanted.target is not None:
                 self._awaited = asyncio.get_running_loop().create_future()
             self._fresh.set()

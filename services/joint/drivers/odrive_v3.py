@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from math import isfinite
 from typing import Any, Final
 
-from services.joint.drivers.base import MotorTarget
+from services.joint.drivers.base import MotorTarget, real_readings
 from shared.bus.messages import Pair
 from shared.can.cansimple import AxisState, ControlMode, InputMode
 from shared.exceptions import DriveError
@@ -28,6 +28,7 @@ IDLE_SETTINGS: Final = ("controller.input_torque", "requested_state")
 _AXES = ("axis0", "axis1")
 _DIRECTION = "encoder.config.direction"
 _COUNTS = ("encoder.shadow_count", "encoder.count_in_cpr", "encoder.config.cpr")
+_THERMISTORS = ("motor.fet_thermistor.temperature", "motor.motor_thermistor.temperature")
 
 
 class EndpointBatch:
@@ -155,6 +156,10 @@ class OdriveV3:
             self._directions = EndpointBatch(device, self._both((_DIRECTION,)))
         self._signs = (1, 1)
         self._counts = EndpointBatch(device, self._both(_COUNTS))
+        # not in the tree of firmware before 0.5.2 either
+        self._heat: EndpointBatch | None = None
+        if all(f"{axis}.{name}" in device.properties for axis in _AXES for name in _THERMISTORS):
+            self._heat = EndpointBatch(device, self._both(_THERMISTORS))
 
     async def look(self) -> None:
         """Read saved settings: watchdogs, and the direction of the currents."""
@@ -185,6 +190,13 @@ class OdriveV3:
         count, in_turn, per_turn, count_1, in_turn_1, per_turn_1 = await self._counts.read()
         zero_1 = (count_1 - in_turn_1) % per_turn_1 / per_turn_1
         return (count - in_turn) % per_turn / per_turn, zero_1
+
+    async def heat(self) -> tuple[Pair | None, Pair | None]:
+        """Return what the thermistors of output stages and motors read, C; None: nothing."""
+        if self._heat is None:
+            return None, None
+        fet_0, motor_0, fet_1, motor_1 = await self._heat.read()
+        return real_readings(fet_0, fet_1), real_readings(motor_0, motor_1)
 
     @property
     def hungry(self) -> bool:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from math import isfinite
 from typing import Final
 
+from services.joint.drivers.base import real_readings
 from services.joint.drivers.can_link import request_of
 from shared.bus.messages import Pair
 from shared.can import cansimple
@@ -28,6 +29,7 @@ class Replies:
         ask_version: requests for the firmware's version.
         ask_currents: requests for the currents.
         ask_counts: requests for the encoders' counts.
+        ask_heat: requests for the temperatures, which firmware 0.6 knows.
         counted: position in turns, without velocity, of an axis that sends no estimates; None: no
     answer, or estimates have arrived.
     """
@@ -45,7 +47,9 @@ class Replies:
         self.ask_version = [request_of(n, Command06.GET_VERSION) for n in node_ids]
         self.ask_currents = [request_of(n, Command.GET_IQ) for n in node_ids]
         self.ask_counts = [request_of(n, Command.GET_ENCODER_COUNT) for n in node_ids]
+        self.ask_heat = [request_of(n, Command06.GET_TEMPERATURE) for n in node_ids]
         self.counted: list[Pair | None] = [None, None]
+        self._heat: list[Pair | None] = [None, None]
         self._torques: list[float | None] = [None, None]
         self._zeros: list[float | None] = [None, None]
         self._torque_constant = torque_constant
@@ -56,6 +60,19 @@ class Replies:
         """Torque of both motors' own loops, N m; None: unknown."""
         a, b = self._torques
         return (a, b) if a is not None and b is not None else None
+
+    def heat(self) -> tuple[Pair | None, Pair | None]:
+        """Return what the thermistors of output stages and motors read, C, once both axes told."""
+        first, second = self._heat
+        if first is None or second is None:
+            return None, None
+        self._heat[:] = None, None
+        return real_readings(first[0], second[0]), real_readings(first[1], second[1])
+
+    def take_heat(self, axis: int, data: bytes) -> None:
+        """Take the temperatures of axis 0 or 1: output stage, motor."""
+        if len(data) == _BYTES:
+            self._heat[axis] = cansimple.unpack_two_floats(data)
 
     def forget_counts(self) -> None:
         """Forget the counts: the drive may have restarted, or be another one."""

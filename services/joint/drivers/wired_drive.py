@@ -44,6 +44,8 @@ class MotorFrame(NamedTuple):
             None
             if zero is None
             else ((zero[0] * sign_a - mark) % 1.0, (zero[1] * sign_b - mark) % 1.0),
+            reading.fet_celsius,
+            reading.motor_celsius,
         )
 
     def target(self, target: MotorTarget) -> MotorTarget:

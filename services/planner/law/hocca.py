@@ -40,6 +40,7 @@ from services.planner.law.height import STAY, HeightReference, HeightState
 from services.planner.law.kinematics import Measured
 from services.planner.law.law_terms import LawAtReference
 from services.planner.law.levelling import Levelling
+from services.planner.law.lift import Lift, LiftState
 from services.planner.law.load import Load, LoadState
 from services.planner.law.probe import NO_ROW, ProbeState, ReferenceProbe
 from services.planner.law.reference import Reference
@@ -114,6 +115,7 @@ class LawState(msgspec.Struct):
     load: LoadState = msgspec.field(default_factory=LoadState)
     probe: ProbeState = msgspec.field(default_factory=ProbeState)
     height: HeightState = msgspec.field(default_factory=HeightState)
+    lift: LiftState = msgspec.field(default_factory=LiftState)
 
 
 class Hocca:
@@ -148,6 +150,7 @@ class Hocca:
             assist.force_max, assist.rate_max, assist.integral_max, assist.integral_s
         )
         self._easing = LeadEasing(config.law.lead_easing)
+        self._lift = Lift()
         self._recentre_s = config.law.recentre_s
         self._p_C0: Array = np.zeros(6)
         self._state = LawState(
@@ -157,6 +160,7 @@ class Hocca:
             load=self._load.state,
             probe=self._probe.state,
             height=self._height.state,
+            lift=self._lift.state,
         )
 
     @property
@@ -193,6 +197,7 @@ class Hocca:
         shift_requested: Vector4 = STRAIGHT,
         probe: tuple[int, float] = (NO_ROW, 0.0),
         toward: int = STAY,
+        lift: float | None = None,
         align: bool = False,
         wrench: Wrench | None = None,
         up_torso: Vector3 | None = None,
@@ -209,6 +214,8 @@ class Hocca:
             probe: row of p whose reference is offset, and by how much, m or rad
                 (`services.planner.law.probe`).
             toward: go down or up without a hand (`services.planner.law.height`).
+            lift: 1 to stand up by itself, 0 to stay; None: height and pitch are the person's
+                (`services.planner.law.lift`).
             align: start from the measured pose, so that engaging makes no step. p_C starts at the
                 measured pose and returns to zero (COM over the ankles, no roll, no yaw; height and
                 pitch stay) during `law.recentre_s` of ticks without `align`. A planner that was
@@ -234,6 +241,7 @@ class Hocca:
             self._shift.rest()
             self._probe.reset()
             self._height.reset()
+            self._lift.reset()
         else:
             self._state.has_led = True
             self._probe.advance(*probe, measured.p, measured.pdot, dt)
@@ -255,14 +263,23 @@ class Hocca:
             force = force_up(wrench.force, measured.p[3], measured.p[4])
             moment_pitch = wrench.moment[1]
         still = not align and is_still(pdot[2], pdot[4])
+        lifts = lift is not None or self._lift.is_holding
+        if lifts:
+            force = None  # the hand leads nothing now, and what it does is no error of the assist
         measured_assist = None if force is None else -force
         assist_rate = self._assist.advance(assist_wanted, measured_assist, dt, still=still)
-        ease_z, ease_pitch = self._easing.ease(force, moment_pitch, self._assist.assist, dt)
+        assist, F_O = self._assist.assist, self._F_O
+        if lifts and not align:
+            lift_n = self._lift.advance(lift, measured.p, reference.T[:, 2], dt)
+            self._lift.apply(p_ref, pdot_ref, measured.p, pdot)
+            F_O = F_O.copy()
+            F_O[:3] += lift_n * up
+        ease_z, ease_pitch = self._easing.ease(force, moment_pitch, assist, dt)
 
         reference.load(
             pdot_ref,
-            self._F_O,
-            (self._assist.assist + self._load.force()) * up,
+            F_O,
+            (assist + self._load.force()) * up,
             assist_rate * up,
             measured.D_left,
         )
@@ -285,7 +302,7 @@ class Hocca:
             pdot=pdot.copy(),
             p_ref=p_ref,
             closure=measured.closure.copy(),
-            assist=self._assist.assist,
+            assist=assist + self._lift.state.force,
             slope=self._levelling.slope,
             stance=self._stance.taken,
             ik_iterations=result.iterations,
@@ -381,6 +398,7 @@ class Hocca:
             own.shift,
         )
         self._load.state, self._probe.state, self._height.state = own.load, own.probe, own.height
+        self._lift.state = own.lift
         self._p_C0 = np.array(own.p_C0)
         self._reference.start[:] = own.q
         self._coupling.restore(own.coupling)

@@ -44,7 +44,7 @@ LEAD_S: Final = 0.0015
 """A world's step holds a torque, and its current loop's lag delays it: by so much, together. The
 field's torque follows the angle at once; late, it would shake the rotor out of step."""
 BRAKING: Final = 0.05
-"""Of a short circuit's, that a current loop of 1000 rad/s leaves at a rotor's 30 Hz in the field."""
+"""Share of a short circuit's that a current loop of 1000 rad/s leaves at a rotor's 30 Hz."""
 CURRENT_MARGIN: Final = 8.0
 """A beyond `current_lim` that disarm, as shipped."""
 

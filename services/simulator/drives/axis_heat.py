@@ -83,6 +83,7 @@ class AxisHeat:
         stage: of the output stages.
         fet: what the output stages' thermistors read.
         motor: what the motors' thermistors read; 0 where there is none.
+        load: mean squared torques of the last slow step, (N m)^2.
         hot: axes whose firmware disarms them, with True if it is for the motor.
     """
 
@@ -98,6 +99,7 @@ class AxisHeat:
         self._half = self.fet.copy()
         self._filtering = False
         self._torque = control.results.torque
+        self.load: Vector = np.zeros(N_JOINTS)
         self._square: Vector = np.zeros(N_JOINTS)
         """Integral of the squared torque since the last slow step."""
         self._passed_s = 0.0
@@ -109,8 +111,8 @@ class AxisHeat:
         self._square += dt_s * torque * torque
         self._passed_s += dt_s
         if self._passed_s >= EVERY_S:
-            square = self._square / self._passed_s
-            self._slow_step(square, self._passed_s)
+            self.load = self._square / self._passed_s
+            self._slow_step(self.load, self._passed_s)
             self._square[:] = self._passed_s = 0.0
             self._read()
         if self._filtering:
@@ -131,6 +133,11 @@ class AxisHeat:
         else:
             self._forced[axis] = celsius
         self._filtering = True
+
+    @property
+    def derating(self) -> float:
+        """Least fraction of an axis's current limit that heat leaves."""
+        return float(self._control.derating.min())
 
     def numbers(self) -> tuple[float, ...]:
         """Return the temperatures, for `set_numbers`: windings, housings, output stages."""

@@ -127,3 +127,21 @@ def test_counts_are_needed_by_0_5_only(rig: Rig, path: Path, dialect: DialectNam
     else:
         driver.set_position((1.0, 1.0))
     driver.close()
+
+
+def test_temperatures_come_once_a_second_where_the_firmware_tells_them(
+    rig: Rig, driver: OdriveCan, dialect: DialectName
+) -> None:
+    found = []
+    deadline = time.monotonic() + 2.5
+    while time.monotonic() < deadline and not found:
+        reading = rig.cycle(driver)
+        if reading.fet_celsius is not None:
+            found.append(reading)
+    if dialect == "0.5":
+        assert not found
+        return
+    assert found[0].fet_celsius == pytest.approx(tuple(rig.bank.heat.fet[list(AXES)]), abs=0.1)
+    assert found[0].motor_celsius is None, "no thermistor is wired: 0 is no reading"
+    after = [rig.cycle(driver).fet_celsius for _ in range(20)]
+    assert after.count(None) >= 19

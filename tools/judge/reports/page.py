@@ -32,7 +32,7 @@ SCRIPTS: Final = tuple(
 
 PANELS: Final = (
     panels.body, panels.hand, panels.feet, panels.states, panels.network, times.ages,
-    panels.certificate, torques.joints, panels.harness, times.times,
+    panels.certificate, torques.joints, panels.heat, panels.harness, times.times,
 )  # fmt: skip
 """What makes the panels, in the order of the page."""
 BEFORE_FALL_S: Final = 3.0

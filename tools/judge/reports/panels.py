@@ -286,6 +286,31 @@ def harness(run: RunData) -> Iterator[Panel]:
         yield Plot(f"Harness {name}", unit, note, NO_HARNESS, lines=lines)
 
 
+def heat(run: RunData) -> Iterator[Panel]:
+    """Yield the estimated temperature of each module's warmer winding, and the seconds left."""
+    lines = []
+    for number, module in enumerate(MODULES):
+        celsius = run.wide(topics.JOINT_STATE, "celsius", 2, module)
+        if celsius.any():
+            t = run.times(topics.JOINT_STATE, module)
+            lines.append(Line(module, t, celsius.max(axis=1), number))
+    limits = []
+    if run.robot is not None and run.robot.heat.estimate:
+        limits = [LevelLine(run.robot.heat.winding_max, "limit", shown=False)]
+    yield Plot(
+        "Warmest winding", "C", "Estimated from torque and time; the warmer of a module's motors.",
+        "no estimate in this log", lines=lines, limits=limits,
+    )  # fmt: skip
+    t = run.times(topics.PLANNER_STATUS)
+    (left,) = run.columns(topics.PLANNER_STATUS, "", "heat_left_s")
+    left[left < 0.0] = np.nan
+    known = bool(np.isfinite(left).any())
+    yield Plot(
+        "Left at this load", "s", "Until a winding or an output stage is too warm; 3600: or more.",
+        "no estimate in this log", lines=[Line("least of all", t, left, 0)] if known else [],
+    )  # fmt: skip
+
+
 def certificate(run: RunData) -> Iterator[Panel]:
     """Yield the stability margins of the active gains and the least allowed margins."""
     t = run.times(topics.PLANNER_STATUS)

@@ -11,6 +11,7 @@ from shared.bus import topics
 from shared.bus.messages import (
     Cause,
     DriveStatus,
+    HeatAction,
     JointEvent,
     JointState,
     Mode,
@@ -243,6 +244,10 @@ def _planner(run: RunData, successive: Successive) -> Iterator[TimelineEvent]:
         trip = f", {name_of(Trip, after.trip)}" if after.mode == PlannerMode.TRIPPED else ""
         bad = after.mode not in _NORMAL_MODES
         yield TimelineEvent(t, "bad" if bad else "note", text + trip + fresh)
+    for index in _changes([row.heat for _, row in rows]):
+        t, row = rows[index]
+        said = f", {row.heat_left_s:.0f} s left at this load" if row.heat else ""
+        yield TimelineEvent(t, "note", f"heat: {name_of(HeatAction, row.heat)}{said}")
     for index in _changes([row.wait_s > 0.0 for _, row in rows]):
         t, row = rows[index]
         if row.wait_s >= BACKOFF_MIN_S:

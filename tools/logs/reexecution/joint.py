@@ -144,10 +144,13 @@ class JointExecution:
             self._outcome.starts += 1
             return
         if self._outcome.exact:
-            computed = msgspec.structs.replace(
-                trace, snapshot=_encode(self._loop.module.snapshot()).decode()
+            snapshot = _encode(self._loop.module.snapshot()).decode()
+            # what an older log lacks has its default
+            known = _encode(memory_of(trace.snapshot, DriveManagerState)).decode()
+            recorded, computed = (
+                msgspec.structs.replace(trace, snapshot=text) for text in (known, snapshot)
             )
-            self._compare("trace", self._loop.module.controller.cycle, trace, computed)
+            self._compare("trace", self._loop.module.controller.cycle, recorded, computed)
 
     def _loop_of(self, module: DriveManager) -> JointLoop:
         self._cycle = cycle = _Cycle()
@@ -219,4 +222,6 @@ def _reading(c: CycleTrace) -> DriveReading | None:
         c.error,
         c.carried if c.carries else None,
         c.encoder_zero if c.encoder_zero[0] >= 0.0 else None,
+        c.fet_celsius if any(c.fet_celsius) else None,
+        c.motor_celsius if any(c.motor_celsius) else None,
     )

@@ -1,0 +1,148 @@
+"""What the planner does before a motor is too warm (docs/law.md#heat). Pure.
+
+Each joint service says how many seconds are left at its present load. By the least of them:
+
+    below heat.ease_s     the person is told, and the assist goes, as far as nobody rests on it
+    below heat.stand_s    height and pitch are the planner's: it stands up slowly, to nearly
+                          straight knees, where a held pose costs least
+    straight              it stays so for `REST_S`, and until `RELEASE` times ease_s are left
+
+Without a planner the modules hold, and only say it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import msgspec
+
+from shared.bus.messages import HeatAction, JointState
+from shared.clamp import clamp
+from shared.clock import NS_PER_S
+from shared.config.sections import HeatConfig
+from shared.joints import MODULES, kind_of
+
+EASE_S: Final = 10.0
+"""Time in which all of the assist goes if nobody rests on it: 20 N/s of the full one."""
+SHED_RATE: Final = 5.0
+"""N/s with which it goes from under a person who takes weight off."""
+RESTED_ON: Final = 5.0
+"""N; the assist stays above what the person rests on it, less this; dry friction hides 6 N."""
+STRAIGHT: Final = -0.4
+"""rad, knees' theta: their soft stop is at -0.2, and a straight knee is singular."""
+SLACK: Final = 0.15
+"""rad by which a knee bends again before the robot goes on standing up."""
+REST_S: Final = 20.0
+"""Shortest time for which it stays straight."""
+RELEASE: Final = 2.0
+"""Times heat.ease_s that must be left before the height is the person's again."""
+ASSIST_AGAIN: Final = 10.0
+"""Times heat.ease_s that must be left before the assist comes back: with less it would come and
+go, for the load is light while it is gone."""
+_KNEES: Final = tuple(i for i, name in enumerate(MODULES) if kind_of(name) == "knee")
+
+
+class HeatDecision(NamedTuple):
+    """What a tick does against the heat."""
+
+    assist: float
+    """Assist that is requested of the law, N."""
+    direction: float | None
+    """1: stand up, 0: stay; None: the height is the person's."""
+
+
+class HeatWatchState(msgspec.Struct):
+    """State of `HeatWatch`."""
+
+    action: HeatAction = HeatAction.NONE
+    since_ns: int = 0
+    """Since when the action is so."""
+    scale: float = 1.0
+    """Fraction of the requested assist that is left."""
+    rests: float = 0.0
+    """What the person rests on the robot, N; it falls by `SHED_RATE` at the most."""
+    left_s: float = -1.0
+    """Least of all modules; -1: none says."""
+    hottest: int = 0
+    """Its module; the one for which it stands up while it does."""
+
+
+class HeatWatch:
+    """Decides what is done against the heat."""
+
+    def __init__(self, config: HeatConfig) -> None:
+        """Take the limits."""
+        self._ease_s, self._stand_s = config.ease_s, config.stand_s
+        self.state = HeatWatchState()
+
+    @property
+    def moves(self) -> bool:
+        """True while height and pitch are the planner's."""
+        return self.state.action >= HeatAction.STANDS_UP
+
+    def advance(
+        self,
+        now_ns: int,
+        states: Sequence[JointState],
+        requested: float,
+        lifted: float | None,
+        dt: float,
+    ) -> HeatDecision:
+        """Advance by one tick.
+
+        Args:
+            now_ns: the planner's clock.
+            states: newest of each module.
+            requested: assist that the operator requests, N.
+            lifted: upward force of the person on the robot, N; None if it is not known.
+            dt: time since the last tick, s.
+        """
+        s = self.state
+        lefts = [state.heat_left_s for state in states]
+        known = [left for left in lefts if left >= 0.0]
+        s.left_s = min(known, default=-1.0)
+        if known and not self.moves:
+            s.hottest = lefts.index(s.left_s)
+        action = self._next(now_ns, states) if known else HeatAction.NONE
+        if action is not s.action:
+            s.action, s.since_ns = action, now_ns
+        step = dt / EASE_S
+        s.scale = clamp(s.scale + (step if action is HeatAction.NONE else -step), 0.0, 1.0)
+        rests = 0.0 if lifted is None else -lifted
+        s.rests = max(0.0, rests, s.rests - SHED_RATE * dt)
+        assist = requested
+        if s.scale < 1.0:
+            assist = min(requested, max(s.scale * requested, s.rests - RESTED_ON))
+        direction = None
+        if self.moves:
+            direction = 1.0 if action is HeatAction.STANDS_UP else 0.0
+        return HeatDecision(assist, direction)
+
+    def describe(self) -> str:
+        """Return what is done against the heat, in words; "" if nothing."""
+        s = self.state
+        if s.action is HeatAction.NONE:
+            return ""
+        name = MODULES[s.hottest]
+        if s.action is HeatAction.RESTS:
+            return f"{name} was hot: it stays straight until it has cooled"
+        words = "stand up, or take weight off; the assist goes"
+        if s.action is HeatAction.STANDS_UP:
+            words = "it stands up by itself; let it"
+        return f"{name} is hot, {s.left_s:.0f} s left at this load: {words}"
+
+    def _next(self, now_ns: int, states: Sequence[JointState]) -> HeatAction:
+        s = self.state
+        knee = min(states[i].q[1] for i in _KNEES)
+        if s.action is HeatAction.RESTS:
+            rested = now_ns - s.since_ns >= REST_S * NS_PER_S
+            if rested and s.left_s >= RELEASE * self._ease_s:
+                return HeatAction.NONE
+            return HeatAction.STANDS_UP if knee < STRAIGHT - SLACK else HeatAction.RESTS
+        if s.action is HeatAction.STANDS_UP:
+            return HeatAction.RESTS if knee >= STRAIGHT else HeatAction.STANDS_UP
+        if s.left_s < self._stand_s:
+            return HeatAction.STANDS_UP if knee < STRAIGHT else HeatAction.RESTS
+        limit = self._ease_s * (ASSIST_AGAIN if s.action is HeatAction.EASES else 1.0)
+        return HeatAction.EASES if s.left_s < limit else HeatAction.NONE

@@ -1,0 +1,76 @@
+"""A squat held until a motor is nearly too warm: the robot stands up by itself."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import msgspec
+import pytest
+
+from shared.bus.messages import HeatAction, PlannerMode, SimTruth
+from shared.config.robot_config import RobotConfig
+from tests.lockstep.runs import led_to, status_of
+from tools.sim.lockstep import Lockstep
+from tools.sim.standing_start import begin_standing
+
+HELD_S = 8.0
+SQUAT = 0.948
+
+
+class Held(NamedTuple):
+    """What was seen of a held squat."""
+
+    fleet: Lockstep
+    rows: list[SimTruth]
+    actions: list[int]
+    derating: float
+
+
+def hold(
+    robot: RobotConfig, *, hand: bool = True, until_s: float = 20.0, skip: bool = True,
+    kill: bool = False,
+) -> Held:  # fmt: skip
+    """Squat, let the time pass for the temperatures until 33 s are left, and run on."""
+    fleet = Lockstep(robot, led_to((2.0, SQUAT), duration=until_s))
+    assert begin_standing(fleet)
+    rows, actions, derating, skips = [], [], 1.0, skip
+    for row in fleet.run():
+        rows.append(row)
+        if not hand and row.scenario_s > 0.5 * HELD_S:
+            fleet.world.let_go()
+        if skips and row.scenario_s > HELD_S:
+            skips = False
+            if kill:
+                fleet.planner = None
+            while min(law.heat.state.left_s for law in fleet.controllers) > 33.0:
+                fleet.skip_heat(1.0)
+        if fleet.planner is not None:
+            actions.append(status_of(fleet).heat)
+        derating = min(derating, fleet.bank.heat.derating)
+    return Held(fleet, rows, actions, derating)
+
+
+@pytest.mark.parametrize("hand", [True, False], ids=["a hand that clings", "nobody's hand"])
+def test_a_robot_too_hot_for_its_squat_stands_up_by_itself_and_derates_nowhere(
+    robot: RobotConfig, hand: bool
+) -> None:
+    held = hold(robot, hand=hand)
+    assert list(dict.fromkeys(held.actions)) == [
+        HeatAction.NONE, HeatAction.EASES, HeatAction.STANDS_UP, HeatAction.RESTS,
+    ]  # fmt: skip
+    last = held.rows[-1]
+    assert not last.fallen
+    assert last.torso[2] > 1.2
+    assert held.derating == 1.0
+    status = status_of(held.fleet)
+    assert status.mode == PlannerMode.LEADING
+    assert status.heat_left_s > 60.0
+    assert max(abs(1e3 * row.com[0]) for row in held.rows) < 15.0
+    assert max(law.heat.state.winding[0] for law in held.fleet.controllers) < 100.0
+
+
+def test_without_an_estimate_nothing_is_said_and_nothing_done(robot: RobotConfig) -> None:
+    heat = msgspec.structs.replace(robot.heat, estimate=False)
+    held = hold(msgspec.structs.replace(robot, heat=heat), skip=False, until_s=4.0)
+    assert set(held.actions) == {HeatAction.NONE}
+    assert status_of(held.fleet).heat_left_s == -1.0

@@ -1,0 +1,138 @@
+"""What the planner does before a motor is too warm."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from services.planner.law.lift import FADE_RATE, FORCE_MAX, LEAD_ANGLE, LEAD_MAX, RATE, Lift
+from services.planner.watch.heat import (
+    EASE_S,
+    REST_S,
+    RESTED_ON,
+    SHED_RATE,
+    HeatDecision,
+    HeatWatch,
+)
+from shared.bus.messages import HeatAction
+from shared.clock import NS_PER_S
+from shared.config.robot_config import RobotConfig
+from shared.joints import MODULES, N_MODULES
+from tests.planner.states import state
+
+NONE, EASES, STANDS_UP, RESTS = HeatAction
+SQUATTED, STRAIGHT = -1.2, -0.3
+
+
+class Watched:
+    """A watch over six modules, in ticks of 0.1 s."""
+
+    def __init__(self, robot: RobotConfig) -> None:
+        self.watch = HeatWatch(robot.heat)
+        self.now_s = 100.0
+
+    def run(
+        self, left_s: float, knee: float = SQUATTED, *, seconds: float = 0.1,
+        requested: float = 0.0, lifted: float | None = 0.0, module: int = 1,
+    ) -> HeatDecision:  # fmt: skip
+        q = np.tile((0.0, knee), N_MODULES)
+        states = [
+            state(i, q, heat_left_s=left_s if i == module else 3600.0) for i in range(N_MODULES)
+        ]
+        for _ in range(max(1, round(10.0 * seconds))):
+            now_ns = round(self.now_s * NS_PER_S)
+            decision = self.watch.advance(now_ns, states, requested, lifted, 0.1)
+            self.now_s += 0.1
+        return decision
+
+    @property
+    def action(self) -> HeatAction:
+        return self.watch.state.action
+
+
+@pytest.mark.parametrize("module", range(N_MODULES))
+def test_each_module_is_watched_and_named(robot: RobotConfig, module: int) -> None:
+    watched = Watched(robot)
+    watched.run(robot.heat.stand_s - 1.0, module=module)
+    assert watched.action is STANDS_UP
+    assert watched.watch.describe().startswith(MODULES[module])
+
+
+def test_every_action_follows_at_its_limit_and_no_sooner(robot: RobotConfig) -> None:
+    watched, heat = Watched(robot), robot.heat
+    for left_s, knee, action in (
+        (-1.0, SQUATTED, NONE),  # not estimated
+        (3600.0, SQUATTED, NONE),
+        (heat.ease_s, SQUATTED, NONE),
+        (heat.ease_s - 0.1, SQUATTED, EASES),
+        (10.0 * heat.ease_s - 0.1, SQUATTED, EASES),
+        (10.0 * heat.ease_s, SQUATTED, NONE),
+        (heat.stand_s, SQUATTED, EASES),
+        (heat.stand_s - 0.1, SQUATTED, STANDS_UP),
+        (3600.0, SQUATTED, STANDS_UP),  # nothing ends it half way
+        (3600.0, STRAIGHT, RESTS),
+        (3600.0, STRAIGHT - 0.2, RESTS),
+        (3600.0, SQUATTED, STANDS_UP),  # pressed down again
+    ):
+        watched.run(left_s, knee)
+        assert watched.action is action, (left_s, knee)
+
+
+def test_it_rests_for_a_while_and_until_enough_is_left(robot: RobotConfig) -> None:
+    watched = Watched(robot)
+    watched.run(1.0)
+    watched.run(3600.0, STRAIGHT, seconds=REST_S - 1.0)
+    assert watched.action is RESTS
+    assert watched.run(1.5 * robot.heat.ease_s, STRAIGHT, seconds=2.0).direction == 0.0
+    assert watched.run(3600.0, STRAIGHT, seconds=1.0).direction is None
+    assert watched.action is NONE
+
+
+def test_the_assist_goes_but_never_from_under_the_person(robot: RobotConfig) -> None:
+    free, resting = Watched(robot), Watched(robot)
+    left_s = robot.heat.ease_s - 5.0
+    assert free.run(left_s, requested=200.0).assist == pytest.approx(200.0 - 20.0 * 0.1)
+    free.run(left_s, requested=200.0, seconds=EASE_S)
+    assert free.run(left_s, requested=200.0).assist == pytest.approx(0.0)
+    resting.run(left_s, requested=200.0, lifted=-150.0, seconds=EASE_S)
+    decision = resting.run(left_s, requested=200.0, lifted=-150.0)
+    assert decision.assist == pytest.approx(150.0 - RESTED_ON)
+    assert resting.run(left_s, requested=100.0, lifted=-150.0).assist <= 100.0
+    decision = resting.run(left_s, requested=200.0, lifted=0.0, seconds=10.0)
+    assert decision.assist == pytest.approx(150.0 - RESTED_ON - 10.0 * SHED_RATE)
+
+
+def test_the_lift_rises_at_its_rate_and_hardly_leads_what_does_not_follow() -> None:
+    lift, p, T_z = Lift(), np.zeros(6), np.full(12, 4.0)
+    p[2] = 0.74
+    for _ in range(500):  # 2 s, and the robot follows
+        lift.advance(1.0, p, T_z, 0.004)
+        p[2] = lift.state.z
+    assert lift.state.rate == pytest.approx(RATE)
+    assert lift.state.force < 1.0
+    start = p[2]  # and now it is held back, for 8 s
+    forces = [lift.advance(1.0, p, T_z, 0.004) for _ in range(2000)]
+    assert lift.state.z - start == pytest.approx(min(LEAD_MAX, LEAD_ANGLE / 4.0))
+    assert max(forces) == FORCE_MAX
+    assert max(np.diff(forces)) <= 61.0 * 0.004
+    for _ in range(round(FORCE_MAX / FADE_RATE / 0.004) + 10):
+        lift.advance(None, p, T_z, 0.004)
+    assert lift.state.force == 0.0
+    assert not lift.is_holding
+
+
+def test_a_lift_begins_and_ends_without_a_step_of_the_reference() -> None:
+    lift, T_z = Lift(), np.full(12, 4.0)
+    p, pdot = np.zeros(6), np.zeros(6)
+    p[2], p[4], pdot[2] = 0.74, 0.3, -0.1
+    seen = []
+    for k in range(1000):
+        lift.advance(1.0 if k < 500 else None, p, T_z, 0.004)
+        p_ref, pdot_ref = p.copy(), pdot.copy()
+        lift.apply(p_ref, pdot_ref, p, pdot)
+        seen.append((p_ref[2], p_ref[4], pdot_ref[2]))
+        p[2] += 0.004 * pdot_ref[2]
+    steps = np.abs(np.diff(np.array(seen), axis=0)).max(axis=0)
+    assert steps[0] < 1e-3, "it moves at 0.1 m/s as it begins"
+    assert steps[1] < 1e-9
+    assert steps[2] < 2e-3
