@@ -128,6 +128,7 @@ VERBS: Final = (
         Verb(f"study {name}", about, f"tools.lab.studies.sweeps.{name}")
         for name, about in (
             ("kill", "kill the planner in random poses, under random pushes"),
+            ("heat", "hold a squat until the motors get warm: who falls, who derates under load"),
             ("robust", "draw every error of the plant at once: who falls, and why"),
             ("latency", "compare three controls over bad networks: who falls, who leads"),
             ("push", "find the hardest push by direction, duration, pose and mode"),
