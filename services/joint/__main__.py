@@ -9,6 +9,7 @@ from services.joint.drive_manager import DriveManager
 from services.joint.drivers.base import Drive
 from services.joint.drivers.odrive_can import OdriveCan
 from services.joint.drivers.wired_drive import MotorFrame, WiredDrive
+from services.joint.heat import HeatFile
 from services.joint.loop import JointLoop, JointPorts
 from services.joint.neighbours import Neighbours
 from services.joint.rearm_guard import LastState, RearmGuard
@@ -62,8 +63,9 @@ def main() -> int:
         last_state = LastState.NOTHING if rearm_guard is None else rearm_guard.read()
         neighbours = None if arguments.readonly else Neighbours(arguments.run_dir, module)
         loop = JointLoop(
-            robot, DriveManager(robot, module, last_state), drive, ports, rearm_guard, neighbours
-        )
+            robot, DriveManager(robot, module, last_state), drive, ports, rearm_guard, neighbours,
+            heat_file=HeatFile(arguments.run_dir, module),
+        )  # fmt: skip
         logger.info("up, %s%s", granted, ", read-only" if arguments.readonly else "")
         freeze_garbage()
         loop.run(stop)

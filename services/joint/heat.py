@@ -14,10 +14,13 @@ output stage is at its limit, if the mean load of the last `LOAD_S` goes on.
 from __future__ import annotations
 
 import math
+import struct
+from pathlib import Path
 from typing import Final, NamedTuple
 
 import msgspec
 
+from services.joint.rearm_guard import mapped
 from shared.bus.messages import LEFT_MAX_S, Pair
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
@@ -30,8 +33,13 @@ LOAD_S: Final = 4.0
 """Time constant of the mean load: a squat takes 5 s."""
 UNKNOWN_S: Final = -1.0
 """Seconds left where nothing is estimated."""
-FOLLOW_S: Final = 30.0
-"""Time constant with which the housing follows what a motor's own thermistor corrects."""
+FOLLOW: Final = 0.5
+"""Share of a thermistor's surprise that is believed, once a second, of winding and housing alike. A
+housing that is off pulls its winding off by 2 % of that in a second: it is found in a minute."""
+HOLDS_S: Final = 60.0
+"""Time for which a drive is taken to have held on after its service ended; one is back in 5 s."""
+COOLS_S: Final = 4.0 * 3600.0
+"""A module is cold after so long."""
 COPPER: Final = 0.00393
 """1/K, resistance of copper at 25 C."""
 REFERENCE: Final = 25.0
@@ -116,10 +124,7 @@ class HeatEstimate:
         a, b = motor_torque
         s.square = (s.square[0] + a * a, s.square[1] + b * b)
         s.cycles += 1
-        if fet is not None:
-            s.stage = fet
-        if motor is not None:
-            self._follow(motor)
+        self.report(fet, motor)
         if not s.stepped_ns:
             s.stepped_ns = now_ns
         elif now_ns - s.stepped_ns >= STEP_S * NS_PER_S:
@@ -135,6 +140,29 @@ class HeatEstimate:
             self._step(mean, dt_s)
             self._show()
 
+    def keep(self) -> tuple[float, ...]:
+        """Return what a service that starts after this one needs, for `resume`; C and (N m)^2."""
+        s = self.state
+        return (*s.winding, *s.housing, *s.stage, *s.load)
+
+    def resume(self, kept: tuple[float, ...], passed_s: float) -> None:
+        """Start as warm as an earlier service left the module, cooled since.
+
+        A drive may have held the robot meanwhile, by its own loop: the load goes on for `HOLDS_S`.
+
+        Args:
+            kept: what `keep` returned.
+            passed_s: time since then, s.
+        """
+        a, b, c, d, e, f, g, h = kept
+        s = self.state
+        s.winding, s.housing, s.stage, s.load = (a, b), (c, d), (e, f), (g, h)
+        held_s = min(passed_s, HOLDS_S)
+        self.skip(held_s)
+        s.load = (0.0, 0.0)
+        self.skip(min(passed_s - held_s, COOLS_S))
+        s.load = (g, h)
+
     def skip(self, seconds: float) -> None:
         """Let time pass for the temperatures alone, under the present mean load (lockstep)."""
         while seconds > 0.0:
@@ -147,15 +175,15 @@ class HeatEstimate:
         s.left_s = round(min(self._left_s(0), self._left_s(1)), 1)
         s.shown = (round(s.winding[0], 1), round(s.winding[1], 1))
 
-    def _follow(self, motor: Pair) -> None:
-        """Take the windings from their thermistors; called once a second.
-
-        What the estimate was off says how far the housing, which nobody measures, is off.
-        """
-        s, share = self.state, 1.0 - math.exp(-1.0 / FOLLOW_S)
-        (a, b), (c, d) = s.housing, s.winding
-        s.housing = (a + share * (motor[0] - c), b + share * (motor[1] - d))
-        s.winding = motor
+    def report(self, fet: Pair | None, motor: Pair | None) -> None:
+        """Correct the estimate by what the drive reports, C; None: nothing new."""
+        s = self.state
+        if fet is not None:
+            s.stage = fet
+        if motor is not None:
+            (a, b), (c, d) = s.winding, s.housing
+            first, second = FOLLOW * (motor[0] - a), FOLLOW * (motor[1] - b)
+            s.winding, s.housing = (a + first, b + second), (c + first, d + second)
 
     def _step(self, square: Pair, dt_s: float) -> None:
         """Advance the temperatures under a mean squared torque, (N m)^2."""
@@ -217,3 +245,40 @@ class HeatEstimate:
                 return before_s + (t - before_s) * (most - before) / (now - before)
             before_s, before = t, now
         return LEFT_MAX_S
+
+
+_KEPT: Final = struct.Struct("<q8d")
+_POSSIBLE: Final = (-60.0, 400.0)
+"""C; a file with anything else is none."""
+
+
+class HeatFile:
+    """A module's temperatures in its run directory: a service that restarts finds it warm.
+
+    The file is mapped: writing it is a store, which the control path may do. Times are of the
+    monotonic clock; after a restart of the host nothing counts as cooled.
+    """
+
+    def __init__(self, run_dir: Path, module: str) -> None:
+        """Open it, or make it; the directory is there.
+
+        Raises:
+            FleetError: it cannot be made.
+        """
+        self._memory = mapped(run_dir / f"{module}.heat", _KEPT.size)
+        self._written_ns = 0
+
+    def restore(self, estimate: HeatEstimate, now_ns: int) -> None:
+        """Make an estimate go on from what the file holds, if it holds anything."""
+        then_ns, *kept = _KEPT.unpack(self._memory[:])
+        low, high = _POSSIBLE
+        possible = all(low < one < high for one in kept) and min(kept[6:]) >= 0.0
+        if then_ns > 0 and possible and estimate.enabled:
+            estimate.resume(tuple(kept), max(0, now_ns - then_ns) / NS_PER_S)
+
+    def write(self, estimate: HeatEstimate) -> None:
+        """Write what has changed since the last step of the estimate."""
+        stepped_ns = estimate.state.stepped_ns
+        if stepped_ns != self._written_ns:
+            self._written_ns = stepped_ns
+            self._memory[:] = _KEPT.pack(stepped_ns, *estimate.keep())

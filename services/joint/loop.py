@@ -20,6 +20,7 @@ from services.joint.drive_manager import (
     DriveManager,
 )
 from services.joint.drivers.base import Drive, DriveStatus
+from services.joint.heat import HeatFile
 from services.joint.neighbours import UNKNOWN, NeighbourRow, NeighbourView
 from services.joint.pendant import PendantWatch
 from services.joint.rearm_guard import PENDANT, LastState, RearmGuard
@@ -89,6 +90,7 @@ class JointLoop:
         rearm_guard: RearmGuard | None = None,
         neighbours: OtherModules | None = None,
         clock: Callable[[], int] | None = None,
+        heat_file: HeatFile | None = None,
     ) -> None:
         """Take the parts of the service.
 
@@ -100,11 +102,15 @@ class JointLoop:
             rearm_guard: shared memory for the next service of this module, and for a local stop.
             neighbours: the six services on this host.
             clock: in place of this host's monotonic one, ns.
+            heat_file: how warm an earlier service left the module, and for the next.
         """
         self.module = module
         self._rearm_guard, self._neighbours = rearm_guard, neighbours
         self._pendant = PendantWatch(config.joint_service.pendant_ms)
         self._drive, self._ports, self._clock = drive, ports, clock or now_ns
+        self._heat_file = heat_file
+        if heat_file is not None:
+            heat_file.restore(module.controller.heat, self._clock())
         self._tracer = None if ports.traces is None else Tracer(module)
         self._reported = ArmingInhibit.NONE
         self._report_at_ns = 0
@@ -154,6 +160,8 @@ class JointLoop:
             ports.states.put(controller.state(now))
         if self._rearm_guard is not None:
             self._rearm_guard.write(module.last_state)
+        if self._heat_file is not None:
+            self._heat_file.write(controller.heat)
         if tracer is not None and ports.traces is not None:
             trace = tracer.after(now, reading, command, estop, step, near, malformed)
             if trace is not None:

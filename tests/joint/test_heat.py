@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import msgspec
 import pytest
 
-from services.joint.heat import LEFT_MAX_S, HeatEstimate
-from shared.bus.messages import Pair
+from services.joint.heat import HeatEstimate, HeatFile
+from shared.bus.messages import LEFT_MAX_S, Pair
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 
@@ -95,6 +96,25 @@ def test_what_the_drive_reports_counts_more_than_the_estimate(robot: RobotConfig
     assert max(silent.heat.state.winding) < 40.0
 
 
+def test_a_thermistor_shows_how_warm_the_housing_is_and_with_it_how_much_time_is_left(
+    robot: RobotConfig,
+) -> None:
+    truth, told, deaf = (Loaded(robot, ambient=air) for air in (45.0, 25.0, 25.0))
+    for _ in range(240):
+        truth.run(SQUAT, 1.0)
+        told.run(SQUAT, 1.0, motor=truth.heat.state.winding)
+        deaf.run(SQUAT, 1.0)
+    left_s = truth.heat.state.left_s
+    assert told.heat.state.left_s == pytest.approx(left_s, rel=0.4), (
+        "the air is taken 20 K too cool"
+    )
+    assert deaf.heat.state.left_s > 2.0 * left_s
+    for _ in range(180):
+        truth.run(SQUAT, 1.0)
+        told.run(SQUAT, 1.0, motor=truth.heat.state.winding)
+    assert told.heat.state.left_s == pytest.approx(truth.heat.state.left_s, abs=20.0)
+
+
 def test_a_process_that_stood_still_takes_its_last_load_for_a_while_only(
     robot: RobotConfig,
 ) -> None:
@@ -110,3 +130,41 @@ def test_a_robot_file_without_heat_estimates_nothing(robot: RobotConfig) -> None
     heat = HeatEstimate(with_heat(robot, estimate=False))
     assert not heat.enabled
     assert heat.state.left_s == -1.0
+
+
+def restarted(robot: RobotConfig, run_dir: Path, now_s: float) -> HeatEstimate:
+    """Return the estimate of a service that starts now."""
+    heat = HeatEstimate(robot)
+    HeatFile(run_dir, "knee_left").restore(heat, round(now_s * NS_PER_S))
+    return heat
+
+
+def test_a_service_that_restarts_finds_the_module_as_warm_as_it_was_left(
+    robot: RobotConfig, tmp_path: Path
+) -> None:
+    loaded, file = Loaded(robot), HeatFile(tmp_path, "knee_left")
+    assert restarted(robot, tmp_path, 1.0).state.winding == (40.0, 40.0), "nothing is kept yet"
+    loaded.run(SQUAT, 200.0)
+    file.write(loaded.heat)
+    warm = max(loaded.heat.state.winding)
+    soon = restarted(robot, tmp_path, loaded.now_s + 5.0).state
+    assert max(soon.winding) >= warm, "its drive may have held on"
+    assert soon.load == loaded.heat.state.load
+    late = restarted(robot, tmp_path, loaded.now_s + 600.0).state
+    assert 40.0 < max(late.winding) < warm - 10.0
+    next_day = restarted(robot, tmp_path, loaded.now_s + 86_400.0).state
+    assert max(next_day.winding) == pytest.approx(40.0, abs=0.1)
+    rebooted = restarted(robot, tmp_path, 1.0).state
+    assert max(rebooted.winding) == pytest.approx(warm)
+
+
+@pytest.mark.parametrize(
+    "content", [b"\xff" * 72, bytes(72), b"\x01" + bytes(63) + b"\xf0\x7f" * 4]
+)
+def test_a_file_that_holds_nonsense_holds_nothing(
+    robot: RobotConfig, tmp_path: Path, content: bytes
+) -> None:
+    (tmp_path / "knee_left.heat").write_bytes(content)
+    state = restarted(robot, tmp_path, 100.0).state
+    assert max(state.winding) <= 40.0
+    assert all(map(math.isfinite, (*state.winding, *state.housing, *state.load)))

@@ -340,9 +340,14 @@ class Lockstep:
 
         For a pose that is held: thermal time constants are minutes.
         """
-        self.bank.heat.skip(self.bank.heat.load, seconds)
-        for joint in self.joints:
-            joint.manager.controller.heat.skip(seconds)
+        heat = self.bank.heat
+        while seconds > 0.0:
+            step_s = min(1.0, seconds)
+            heat.skip(heat.load, step_s)
+            for joint in self.joints:
+                joint.manager.controller.heat.skip(step_s)
+                joint.manager.controller.heat.report(*joint.drive.thermistors())
+            seconds -= step_s
 
     def act(self, row: Happening) -> None:
         """Carry out a row of the scenario, or of somebody who looks on, and record it."""

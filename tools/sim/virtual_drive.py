@@ -94,9 +94,7 @@ class VirtualDrive:
         fet = motor = None
         if self._heat_at_ns is not None and is_responding and now_ns >= self._heat_at_ns:
             self._heat_at_ns = now_ns + HEAT_EVERY_NS
-            heat = bank.heat
-            fet = (float(heat.fet[a]), float(heat.fet[b]))
-            motor = real_readings(float(heat.motor[a]), float(heat.motor[b]))
+            fet, motor = self.thermistors()
         return DriveReading(
             self._sampled_ns,
             (float(pos[a]), float(pos[b])),
@@ -122,6 +120,14 @@ class VirtualDrive:
             for axis in self._axes
         )
         return (a, b)
+
+    def thermistors(self) -> tuple[Pair | None, Pair | None]:
+        """Return what the drive reports of output stages and motors, C; None: nothing."""
+        if self._heat_at_ns is None:
+            return None, None
+        heat, (a, b) = self._bank.heat, self._axes
+        fet = real_readings(float(heat.fet[a]), float(heat.fet[b]))
+        return fet, real_readings(float(heat.motor[a]), float(heat.motor[b]))
 
     def write_torque(self, torque: Pair) -> None:
         """See `Drive.write_torque`."""
