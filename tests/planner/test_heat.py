@@ -8,6 +8,7 @@ import pytest
 from services.planner.law.lift import FADE_RATE, FORCE_MAX, LEAD_ANGLE, LEAD_MAX, RATE, Lift
 from services.planner.watch.heat import (
     EASE_S,
+    HAND_MAX,
     REST_S,
     RESTED_ON,
     SHED_RATE,
@@ -84,6 +85,8 @@ def test_it_rests_for_a_while_and_until_enough_is_left(robot: RobotConfig) -> No
     watched.run(3600.0, STRAIGHT, seconds=REST_S - 1.0)
     assert watched.action is RESTS
     assert watched.run(1.5 * robot.heat.ease_s, STRAIGHT, seconds=2.0).direction == 0.0
+    for lifted in (-HAND_MAX - 1.0, HAND_MAX + 1.0, None):
+        assert watched.run(3600.0, STRAIGHT, seconds=1.0, lifted=lifted).direction == 0.0
     assert watched.run(3600.0, STRAIGHT, seconds=1.0).direction is None
     assert watched.action is NONE
 

@@ -5,7 +5,8 @@ Each joint service says how many seconds are left at its present load. By the le
     below heat.ease_s     the person is told, and the assist goes, as far as nobody rests on it
     below heat.stand_s    height and pitch are the planner's: it stands up slowly, to nearly
                           straight knees, where a held pose costs least
-    straight              it stays so for `REST_S`, and until `RELEASE` times ease_s are left
+    straight              it stays so for `REST_S`, until `RELEASE` times ease_s are left, and while
+                          a hand presses or pulls it: given back, it would follow that at once
 
 Without a planner the modules hold, and only say it.
 """
@@ -37,6 +38,9 @@ REST_S: Final = 20.0
 """Shortest time for which it stays straight."""
 RELEASE: Final = 2.0
 """Times heat.ease_s that must be left before the height is the person's again."""
+HAND_MAX: Final = 30.0
+"""N beyond the assist, either way; with more on it the height is not given back. With 150 N on it a
+robot fell from 1.29 to 0.95 m within a second."""
 ASSIST_AGAIN: Final = 10.0
 """Times heat.ease_s that must be left before the assist comes back: with less it would come and
 go, for the load is light while it is gone."""
@@ -104,20 +108,25 @@ class HeatWatch:
         s.left_s = min(known, default=-1.0)
         if known and not self.moves:
             s.hottest = lefts.index(s.left_s)
-        action = self._next(now_ns, states) if known else HeatAction.NONE
+        quiet = lifted is not None and abs(lifted + self._assist(requested)) <= HAND_MAX
+        action = self._next(now_ns, states, quiet=quiet) if known else HeatAction.NONE
         if action is not s.action:
             s.action, s.since_ns = action, now_ns
         step = dt / EASE_S
         s.scale = clamp(s.scale + (step if action is HeatAction.NONE else -step), 0.0, 1.0)
         rests = 0.0 if lifted is None else -lifted
         s.rests = max(0.0, rests, s.rests - SHED_RATE * dt)
-        assist = requested
-        if s.scale < 1.0:
-            assist = min(requested, max(s.scale * requested, s.rests - RESTED_ON))
         direction = None
         if self.moves:
             direction = 1.0 if action is HeatAction.STANDS_UP else 0.0
-        return HeatDecision(assist, direction)
+        return HeatDecision(self._assist(requested), direction)
+
+    def _assist(self, requested: float) -> float:
+        """Return what is left of the requested assist, N."""
+        s = self.state
+        if s.scale >= 1.0:
+            return requested
+        return min(requested, max(s.scale * requested, s.rests - RESTED_ON))
 
     def describe(self) -> str:
         """Return what is done against the heat, in words; "" if nothing."""
@@ -126,18 +135,18 @@ class HeatWatch:
             return ""
         name = MODULES[s.hottest]
         if s.action is HeatAction.RESTS:
-            return f"{name} was hot: it stays straight until it has cooled"
+            return f"{name} was hot: it stays straight until it has cooled, and no hand presses it"
         words = "stand up, or take weight off; the assist goes"
         if s.action is HeatAction.STANDS_UP:
             words = "it stands up by itself; let it"
         return f"{name} is hot, {s.left_s:.0f} s left at this load: {words}"
 
-    def _next(self, now_ns: int, states: Sequence[JointState]) -> HeatAction:
+    def _next(self, now_ns: int, states: Sequence[JointState], *, quiet: bool) -> HeatAction:
         s = self.state
         knee = min(states[i].q[1] for i in _KNEES)
         if s.action is HeatAction.RESTS:
             rested = now_ns - s.since_ns >= REST_S * NS_PER_S
-            if rested and s.left_s >= RELEASE * self._ease_s:
+            if rested and quiet and s.left_s >= RELEASE * self._ease_s:
                 return HeatAction.NONE
             return HeatAction.STANDS_UP if knee < STRAIGHT - SLACK else HeatAction.RESTS
         if s.action is HeatAction.STANDS_UP:

@@ -18,7 +18,7 @@ from shared.exceptions import FAULT_EXIT_CODE, RunError
 from shared.joints import MODULES, kind_of
 from shared.robot.robot_model import stand_pose
 from tools.flags import Count
-from tools.lab.studies.sweeps import heat_trial, plants, study
+from tools.lab.studies.sweeps import heat_picture, heat_trial, plants, study
 from tools.lab.studies.sweeps.figures import Ending, exit_code, with_payload
 from tools.lab.studies.sweeps.heat_trial import INSULATION, HeatResult, HeatTrial
 from tools.lab.studies.sweeps.report import parted, show_falls, show_share
@@ -29,6 +29,7 @@ from tools.terminal import Console
 
 EXAMPLES: Final = """
 xrl study heat --poses
+xrl study heat --poses --out out/held
 xrl study heat --n 30
 xrl study heat --only 4 --out out/heat4
 """
@@ -40,6 +41,7 @@ POSES: Final = (
     ("crawl, 200 N", 0.79, 1.2, 200.0),
 )  # fmt: skip
 """Name, torso's height, m, pitch, rad, and assist, N."""
+PICTURE: Final = "held.png"
 DAYS: Final = (("20 C", 20.0, 1.0), ("45 C", 45.0, 1.0), ("45 C, payload +20 %", 45.0, 1.2))
 """Heading, air, C, and the payload's scale."""
 
@@ -50,7 +52,8 @@ class HeatStudyFlags(AloneFlags):
     n: Count = 30
     """trials"""
     poses: bool = False
-    """print only how long each pose can be held, by the robot file; no trial runs"""
+    """print only how long each pose can be held, by the robot file; with --out draw a squat that is
+    held until the robot stands up by itself"""
 
     def check(self) -> None:
         """Refuse two things at once."""
@@ -180,7 +183,8 @@ def report(finished: Finished) -> None:
             printed.add_row(words, *(f"{value:.3g}" for value in cells), unit)
     console.print(printed)
     lasting = sum(row["held_s"] is None for row in standing)
-    console.print(f"{lasting} of {len(rows)} poses last for two hours and more")
+    why = "light enough, or relieved in time"
+    console.print(f"{lasting} of {len(rows)} stood up for no heat: {why}")
     unled = len(others) - len(fallen)
     if unled:
         console.print(f"{unled} plants were not led: loaded otherwise than the law carries")
@@ -216,6 +220,11 @@ STUDY: Final = Study[HeatTrial](
 def run(flags: HeatStudyFlags) -> int:
     """Print the table of the poses, or run the study, or one case of it."""
     if flags.poses:
-        show_poses(load(flags), Console())
+        robot, console = load(flags), Console()
+        show_poses(robot, console)
+        if flags.out is not None:
+            flags.out.mkdir(parents=True, exist_ok=True)
+            heat_picture.draw(robot, flags.out / PICTURE)
+            console.print(f"{flags.out}/{PICTURE}", style="dim", soft_wrap=True)
         return 0
     return study.run(STUDY, flags)

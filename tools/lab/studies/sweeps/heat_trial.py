@@ -33,7 +33,7 @@ from tools.sim.lockstep import Lockstep
 PersonKind = Literal["follows", "clings", "leaves"]
 PEOPLE: Final[tuple[PersonKind, ...]] = ("follows", "clings", "leaves")
 """Takes weight off when told, and stands up with it; keeps weight and hand where they are; takes
-both off once the pose is held."""
+the weight and then the hand off, once the pose is held."""
 LEAD_S: Final = 3.0
 HELD_S: Final = 8.0
 """Time for which the pose is held before time is skipped: the mean load has settled."""
@@ -83,7 +83,8 @@ class HeatResult(Ended, frozen=True, kw_only=True):
     """The figures of a trial; None where there is nothing to measure."""
 
     held_s: float | None = None
-    """How long the pose was held before the robot stood up by itself; None: 2 h and more."""
+    """How long the pose was held before the robot stood up by itself; None: it did not, in two
+    hours, or as the person took the weight off in time."""
     told_s: float | None = None
     """How long the person was told before."""
     rose_s: float | None = None
@@ -159,9 +160,10 @@ class _Person:
     def act(self, row: SimTruth, action: HeatAction) -> None:
         world, now_s = self._fleet.world, row.scenario_s
         self._told_s.setdefault(action, now_s)
-        if self._kind == "leaves" and now_s > LEAD_S + 0.5 * HELD_S and world.outside.holds:
+        if self._kind == "leaves" and now_s > LEAD_S + 0.3 * HELD_S:
             world.outside.asked = (0.0, STRAIGHT)
-            world.let_go()
+            if now_s > LEAD_S + 0.8 * HELD_S:
+                world.let_go()
         if self._kind != "follows" or now_s < self._told_s.get(HeatAction.EASES, now_s) + REACTS_S:
             return
         world.outside.asked = (0.0, STRAIGHT)
