@@ -85,8 +85,9 @@ DRIVE_FAULTS: Final[dict[FaultKind, DriveFault]] = {
         recovery=f"{_HANG}; repair the encoder's cable or supply, then `xrl drive zero`",
     ),
     "encoder_gap": DriveFault(
-        "it holds the last position, armed and blind, and goes on without an error; if a turn may "
-        "be missing then, it is idled and forgets its zero", limp=False, cause=None,
+        "it holds the last position, armed and blind, and goes on without an error; where the "
+        "count jumps by a tenth of a turn: OVERSPEED; if a turn may be missing, it is idled and "
+        "forgets its zero", limp=False, cause=None,
         zero_lost=False,
         recovery="repair the encoder's cable",
     ),

@@ -273,7 +273,7 @@ def test_the_current_that_an_emf_drives_is_that_of_the_loop_at_its_own_rate() ->
     """Winding and PI loop of the firmware at 8 kHz, against the bank's step of a millisecond."""
     bank = make_bank()
     bank.settings.fill("motor.config.current_lim_margin", math.inf)
-    loops = bank._control._loops.reshape(4, 12)
+    loops = bank._control._loops.reshape(5, 12)
     rng = np.random.default_rng(5)
     kt, resistance, inductance, w = 0.0827, 0.1, PHASE_INDUCTANCE, 1000.0
     fine = 64

@@ -137,7 +137,7 @@ class AxisBank:
             for axis in range(N_JOINTS):
                 self._watchdogs.feed(axis, now_s)
             self._encoders.start(pos_turns, vel_turns)
-            control.turn(vel_turns)
+            control.start(vel_turns)
         else:
             dt_s = now_s - self.now_s
             self.now_s = now_s

@@ -62,8 +62,10 @@ _SETTINGS: Final = (
 """The axis settings that the law reads."""
 
 
-_ROWS: Final = 4
+_ROWS: Final = 5
 """Of the state of the current loops: see `LawResults.loops`."""
+_POWER: Final = 4 * N_JOINTS
+"""Where its last row begins."""
 
 
 class LawResults(NamedTuple):
@@ -80,8 +82,9 @@ class LawResults(NamedTuple):
     over_current: Vector
     """1 beyond the limit of the current and its margin."""
     loops: Vector
-    """(48,), four rows: current, the EMF's rate behind the winding, the current that it drives, and
-    the filtered power of the torque that the controller asks for, armed or not; A, A/s, A, W."""
+    """(60,), five rows: current, the EMF's rate behind the winding, the current that it drives, the
+    motor's true speed, and the filtered power of the torque that the controller asks for, armed or
+    not; A, A/s, A, turn/s, W."""
     broken: Vector
     """1 where the torque is no number, or the limit of the current none or negative."""
     extremes: Vector
@@ -109,7 +112,7 @@ class AxisControl:
         self.armed, self.connected, self.integrator = np.zeros((3, N_JOINTS))
         self.derating, self.warmth = np.ones((2, N_JOINTS))
         self._loops = np.zeros(_ROWS * N_JOINTS)
-        self._speeds = np.zeros((2, N_JOINTS))  # of the motors, before and now, turn/s
+        self._speed = np.zeros(N_JOINTS)  # of the motors, turn/s
         self.resistance = np.full(N_JOINTS, PHASE_RESISTANCE)
         self._dt_s = 0.0
         self._graph = graph = CompiledGraph(law_graph())
@@ -119,7 +122,7 @@ class AxisControl:
         live = (
             encoders.pos_estimate, encoders.vel_estimate, self.input_pos, self.input_vel,
             self.input_torque, self.armed, self.connected, self.derating, self.integrator,
-            self.warmth, self._loops, *self._speeds,
+            self.warmth, self._loops, self._speed,
         )  # fmt: skip
         for index, array in enumerate((*columns, *live)):
             graph.bind(index, array)
@@ -141,13 +144,16 @@ class AxisControl:
     def arm(self, axis: int) -> None:
         """Let an axis's torque through, from where it is; `input_torque` stays as it stands."""
         self.hold_here(axis)
-        self.integrator[axis] = self._loops[3 * N_JOINTS + axis] = 0.0
+        self.integrator[axis] = self._loops[_POWER + axis] = 0.0
         self.armed[axis] = self.connected[axis] = 1.0
+
+    def start(self, vel_turns: Vector) -> None:
+        """Take the motors' true speeds for those of before: nothing has changed yet."""
+        self._loops[3 * N_JOINTS : _POWER] = vel_turns
 
     def turn(self, vel_turns: Vector) -> None:
         """Take the motors' true speeds after a step."""
-        self._speeds[0] = self._speeds[1]
-        self._speeds[1] = vel_turns
+        self._speed[:] = vel_turns
 
     def control(self) -> tuple[float, float, float]:
         """Compute torques, powers and who is beyond a limit; the integrators stay as they are.
@@ -165,7 +171,7 @@ class AxisControl:
         return beyond, least, most
 
     def integrate(self) -> None:
-        """Take over the integrators and currents that the last `control` arrived at."""
+        """Take over the integrators and current loops that the last `control` arrived at."""
         self.integrator[:] = self.results.integrator
         self._loops[:] = self.results.loops
 
@@ -179,7 +185,7 @@ class AxisControl:
 
     def asked_power(self, axis: int) -> float:
         """Return the filtered power of the torque that an axis's controller asks for, W."""
-        return float(self._loops[3 * N_JOINTS + axis])
+        return float(self._loops[_POWER + axis])
 
     def over_current(self) -> list[int]:
         """Return the armed axes whose current is beyond its limit and margin."""
@@ -195,10 +201,7 @@ def law_graph() -> ca.Function:
         "integrator", "warmth",
     )  # fmt: skip
     of = {name: ca.SX.sym(name, N_JOINTS) for name in (*names, *inputs)}
-    loops, *speeds = (
-        ca.SX.sym("loops", _ROWS * N_JOINTS),
-        *(ca.SX.sym(name, N_JOINTS) for name in ("speed_before", "speed")),
-    )
+    loops, speed = ca.SX.sym("loops", _ROWS * N_JOINTS), ca.SX.sym("speed", N_JOINTS)
     step = ca.SX.sym("step", 2)
     dt_s, decay = step[0], step[1]
     vel, vel_limit = of["vel"], of["vel_limit"]
@@ -231,8 +234,8 @@ def law_graph() -> ca.Function:
     mechanical = 2.0 * math.pi * vel * torque
     copper = 1.5 * of["phase_resistance"] * of["warmth"] / of["torque_constant"] ** 2
     power = copper * torque * torque + mechanical
-    loops_next, over_current = _currents(of, torque, loops, speeds, dt_s)
-    asked_power = loops[3 * N_JOINTS :]
+    loops_next, over_current = _currents(of, torque, loops, speed, dt_s)
+    asked_power = loops[_POWER:]
     gain = (2.0 * math.pi * vel * asked - asked_power) * (1.0 - ca.exp(-BANDWIDTH * dt_s))
     gain = ca.if_else(of["connected"] > 0.0, gain, 0.0)
     loops_next = ca.vertcat(loops_next, asked_power + gain)
@@ -240,7 +243,7 @@ def law_graph() -> ca.Function:
     extremes = ca.vertcat(beyond, ca.mmin(power), ca.mmax(power))
     return ca.Function(
         "axes",
-        [*of.values(), loops, *speeds, step],
+        [*of.values(), loops, speed, step],
         [
             ca.densify(one)
             for one in (
@@ -253,22 +256,21 @@ def law_graph() -> ca.Function:
 
 
 def _currents(
-    of: dict[str, ca.SX], torque: ca.SX, loops: ca.SX, speeds: list[ca.SX], dt_s: ca.SX
+    of: dict[str, ca.SX], torque: ca.SX, loops: ca.SX, speed: ca.SX, dt_s: ca.SX
 ) -> tuple[ca.SX, ca.SX]:
     """Return the current loops after the step, and who is beyond the limit and its margin.
 
     The EMF's rate x1 and what it drives x2 follow x1' = z - R / L x1, x2' = x1 - w x2 for a speed
     that ramps over the step, z = e' / L. A limit that was lowered is checked a cycle later.
     """
-    current, x1, x2 = ca.vertsplit(loops[: 3 * N_JOINTS], N_JOINTS)
+    current, x1, x2, speed_before, _ = ca.vertsplit(loops, N_JOINTS)
     w, kt, resistance = (
         of[name] for name in ("current_control_bandwidth", "torque_constant", "phase_resistance")
     )
     wanted = torque / kt
     first = wanted + (current - wanted) * ca.exp(-w / FIRMWARE_RATE_HZ)
     current = wanted + (current - wanted) * ca.exp(-w * dt_s)
-    before, now = speeds
-    rate = ca.if_else(dt_s > 0.0, (now - before) / dt_s, 0.0)
+    rate = ca.if_else(dt_s > 0.0, (speed - speed_before) / dt_s, 0.0)
     z = -2.0 / 3.0 * kt * 2.0 * math.pi * rate / PHASE_INDUCTANCE
     # a pole of the winding beside that of the loop; they are kept apart for the formula's sake
     pole = resistance / PHASE_INDUCTANCE
@@ -283,7 +285,7 @@ def _currents(
     most = ca.fmax(ca.fabs(first), ca.fabs(current + x2_next))
     over = ca.logic_and(of["armed"] > 0.0, most > limit)
     kept = ca.if_else(of["armed"] > 0.0, 1.0, 0.0)
-    return ca.vertcat(current * kept, x1_next * kept, x2_next * kept), over
+    return ca.vertcat(current * kept, x1_next * kept, x2_next * kept, speed), over
 
 
 def _clamp(value: ca.SX, low: ca.SX, high: ca.SX) -> ca.SX:

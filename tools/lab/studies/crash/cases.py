@@ -154,6 +154,7 @@ LEFT_ONLY: Final[tuple[tuple[FaultKind, str], ...]] = (
     ("overspeed", "hip_left"),
     ("encoder_zero", "knee_left"),
     ("encoder_gap", "knee_left"),
+    ("encoder_gap", "hip_left"),
 )
 """Faults that leave a module limp as `disarmed` does: left and right are mirrored, and one
 module is enough where only the error's name differs."""
@@ -161,8 +162,6 @@ module is enough where only the error's name differs."""
 DEAD_BUS: Final[tuple[FaultKind, ...]] = ("no_ack", "bus_full", "bus_flap")
 """Faults of a module's CAN bus; its drive holds its last target meanwhile."""
 _LASTING: Final = ("encoder", "encoder_zero", "link_lost", "over_temperature", *DEAD_BUS)
-_THROUGH: Final = ("encoder_gap", "bus_full")
-"""Faults through which the robot is led on."""
 _FREE: Final = "each drive holds by its own loop, and needs neither its service nor the others'"
 _NEITHER: Final = "HOLD needs neither"
 
@@ -200,13 +199,18 @@ def _lost(service: str, signal: str) -> CrashCase:
     )
 
 
+def _is_overspeed_after_a_gap(module: str) -> bool:
+    """Return True for a knee: it moves on the way down, and its count jumps at the gap's end."""
+    return kind_of(module) == "knee"
+
+
 def _faulted(module: str, kind: FaultKind, *, quick: bool, sort: str = "") -> CrashCase:
     """Return the case of one drive's fault; `sort` of crash, if it is not its own."""
     name: str = kind
     expected = CrashVerdict.STOOD
-    if kind == "encoder_gap":
-        why = f"{FAULT_KINDS[kind].about}: the drive holds through it"
-    elif not DRIVE_FAULTS[kind].limp:
+    if kind == "encoder_gap" and not _is_overspeed_after_a_gap(module):
+        why = "the joint hardly moves meanwhile: the drive holds through it"
+    elif not DRIVE_FAULTS[kind].limp and kind != "encoder_gap":
         name = "unplugged" if kind == "link_lost" else kind
         why = "the drive holds its last target; its service has lost contact"
     else:
@@ -218,7 +222,7 @@ def _faulted(module: str, kind: FaultKind, *, quick: bool, sort: str = "") -> Cr
         crash=(fault(module, kind),),
         expected=expected,
         why=why,
-        holds=kind not in _THROUGH,
+        holds=kind != "bus_full" and (kind != "encoder_gap" or _is_overspeed_after_a_gap(module)),
         leads_again=not DRIVE_FAULTS[kind].zero_lost,
         quick=quick,
     )
