@@ -39,6 +39,8 @@ Array = NDArray[np.float64]
 
 CLEAR: Final = 1.5
 """Times what is explained that the second best pose must take."""
+READS_ZERO: Final = 1e-4
+"""turns: nearer to 0 than two counts of 16384, an encoder may read nothing but 0."""
 UNMOVED: Final = 0.0015
 """turns; encoders that both read the same so closely have not moved: 0.3 mrad at the joint, more
 than an encoder's error changes with its temperature. A joint that was moved reads so by chance once
@@ -196,7 +198,7 @@ def _own(
     """Decide a module by itself; None: gravity may. Encoders so near to their rest are unmoved."""
     if not len(poses):
         return _refused(f"its angles fit no pose inside its limits; {PROTRACTOR}")
-    if 0.0 in evidence.angles:
+    if any(min(angle, 1.0 - angle) < READS_ZERO for angle in evidence.angles):
         return _refused(
             "an encoder reads exactly 0, as one without power or with a broken line does; "
             "move the joint a little, and again"
@@ -344,6 +346,8 @@ def _moved(evidence: ModuleEvidence, unmoved: float) -> str | None:
             f"axis{axis}'s encoder reads {apart[axis]:.3f} turns off and axis{1 - axis}'s has not "
             f"moved: axis{axis}'s was exchanged, or has slipped"
         )
+    if min(apart) <= STAYED * UNMOVED:
+        return ""
     crossed = [abs(_wrapped(a - b)) for a, b in zip(evidence.angles, rested[::-1], strict=True)]
     if max(crossed) <= UNMOVED:
         return "its two encoders read each other's angles: their cables are swapped"

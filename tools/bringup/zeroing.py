@@ -61,6 +61,15 @@ class DriveLook(NamedTuple):
     """Largest way from the first sample to another, rad."""
     error: int
     """`AxisError` bits of both axes."""
+    angles: Pair | None = None
+    """Its encoders' angles within the turn, turns; None: the drive does not tell."""
+    q_there: Pair = (0.0, 0.0)
+    """`q` when the encoders were at these angles: a joint that is still may creep."""
+
+    @property
+    def is_moving(self) -> bool:
+        """True if it moved while it was watched."""
+        return self.speed > STILL or self.moved > MOVED_MAX
 
 
 SILENT: Final = DriveLook(
@@ -81,20 +90,28 @@ def look(drive: Drive, mark_turns: float, gear_ratio: float) -> DriveLook:
         return SILENT
     first = newest = reading
     speed, moved, errors = 0.0, 0.0, reading.error
-    until = time.monotonic() + LOOK_S
-    while time.monotonic() < until:
+    there = None
+    begun = time.monotonic()
+    while time.monotonic() - begun < LOOK_S:
         reading = drive.read(_READ_S)
         if reading is None:
             continue
         newest = reading
+        if reading.encoder_zero is not None:
+            there = reading
         errors |= reading.error
         speed = max(speed, *map(abs, joint_from_motor(reading.vel_turns, gear_ratio)))
         (a1, a2), (b1, b2) = reading.pos_turns, first.pos_turns
         moved = max(moved, *map(abs, joint_from_motor((a1 - b1, a2 - b2), gear_ratio)))
-    counted = MotorFrame(mark_turns).from_drive(newest)
+    frame = MotorFrame(mark_turns)
+    counted = frame.from_drive(newest)
     q = joint_from_motor(counted.pos_turns, gear_ratio)
     zeroed = counted.status is not DriveStatus.UNZEROED
-    return DriveLook(newest.status, zeroed=zeroed, q=q, speed=speed, moved=moved, error=errors)
+    seen = DriveLook(newest.status, zeroed=zeroed, q=q, speed=speed, moved=moved, error=errors)
+    if there is None:
+        return seen
+    q_there = joint_from_motor(frame.from_drive(there).pos_turns, gear_ratio)
+    return seen._replace(angles=there.angles, q_there=q_there)
 
 
 def refusal(seen: DriveLook) -> str:
@@ -105,7 +122,7 @@ def refusal(seen: DriveLook) -> str:
         return "its drive is armed (closed loop); make it idle first"
     if seen.error & AxisError.ENCODER_FAILED:
         return "its drive reports an encoder error; repair that first (`xrl doctor`)"
-    if seen.speed > STILL or seen.moved > MOVED_MAX:
+    if seen.is_moving:
         return (
             f"it moves: {seen.speed:.2f} rad/s, {seen.moved:.3f} rad in {LOOK_S:g} s; "
             "hold it still, and try again"

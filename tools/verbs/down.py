@@ -8,6 +8,7 @@ from typing import Annotated, Final
 from shared.config.files import load
 from shared.exceptions import FleetError
 from shared.joints import MODULES
+from tools.bringup.resuming import rests_after_down
 from tools.flags import Arg, Duration, RunDirFlags
 from tools.fleet import procfs
 from tools.fleet.descent import WAYS
@@ -40,9 +41,13 @@ class DownFlags(RunDirFlags):
 
 
 def run(flags: DownFlags) -> int:
-    """Lower the robot, then stop every service, also without a supervisor; keep the logs."""
+    """Lower the robot, then stop every service, also without a supervisor; keep the logs.
+
+    Then store where the joints rest, which `xrl drive zero --resume` goes by.
+    """
     fleet = SupervisedFleet(flags.run_dir)
-    was_up = fleet.run.is_marked and fleet.run.read_manifest() is not None
+    manifest = fleet.run.read_manifest() if fleet.run.is_marked else None
+    was_up = manifest is not None
     was_up |= bool(procfs.fleet_pids(fleet.run.path))  # its directory may have been removed
     if not flags.limp:
         _lower(fleet, flags)
@@ -54,6 +59,9 @@ def run(flags: DownFlags) -> int:
         print(f"the fleet in {fleet.run.path} is down; its logs stay in {fleet.run.logs}")
     else:
         print(f"no fleet was up in {fleet.run.path}")
+    if manifest is not None:
+        rests = rests_after_down(Path(manifest.config), flags.run_dir, manifest.services)
+        print(rests, end="\n" if rests else "")
     return 0
 
 

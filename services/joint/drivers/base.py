@@ -50,6 +50,18 @@ class DriveReading(msgspec.Struct, gc=False, frozen=True):
     motor_celsius: Pair | None = None
     """What the motors' thermistors read, C; None: not with this sample, or there are none."""
 
+    @property
+    def angles(self) -> Pair | None:
+        """Angles of both encoders within their motors' turns, turns from 0 to 1.
+
+        None: not with this sample. Absolute encoders keep them without power. Of a motor that
+        turns they are as old as the estimate.
+        """
+        zero = self.encoder_zero
+        if zero is None:
+            return None
+        return (self.pos_turns[0] - zero[0]) % 1.0, (self.pos_turns[1] - zero[1]) % 1.0
+
 
 class MotorTarget(msgspec.Struct, gc=False, frozen=True):
     """Target of both motors' own loops, axis0 and axis1 (docs/drives.md).

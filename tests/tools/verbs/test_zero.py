@@ -44,7 +44,7 @@ class PlayedDrive:
         self.pos: Pair = (0.3, 0.6)
         self.vel: Pair = (0.0, 0.0)
         self.status = DriveStatus.IDLE
-        self.error = self.deaf = self.told = 0
+        self.error = self.deaf = self.told = self.asked = 0
         self.creep = 0.0
 
     def read(self, timeout_s: float) -> DriveReading | None:
@@ -72,6 +72,9 @@ class PlayedDrive:
 
     def idle(self) -> None:
         raise AssertionError("a zero changes no state")
+
+    def ask_angles(self) -> None:
+        self.asked += 1
 
     def close(self) -> None:
         pass

@@ -2,29 +2,31 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Final, NamedTuple
 
 import msgspec
 from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from services.joint.__main__ import open_drive
-from services.joint.drivers.base import Drive
+from services.joint.differential import motor_from_joint
+from services.joint.drivers.base import Drive, DriveStatus
 from shared.bus import topics
 from shared.bus.messages import JointState, Mode, Pair
 from shared.bus.session import open_session
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, DriveError, FleetError
-from shared.joints import MODULES
-from tools.bringup import drive_access
+from shared.joints import MODULES, kind_of, side_of
+from tools.bringup import drive_access, resuming, swing, zero_record
 from tools.bringup.motion import within_stops
+from tools.bringup.swing import Swing
+from tools.bringup.whole_turns import UNMOVED, Decision, decide
+from tools.bringup.zero_record import Identity, ZeroRecord
 from tools.bringup.zeroing import DriveLook, is_right, look, refusal, why_outside, zero
 from tools.flags import (
     Arg,
@@ -51,6 +53,9 @@ xrl drive zero knee_left --at 0,-0.5          # by a protractor: phi, theta in r
 xrl drive zero ankle_right --at -0.02,0.14
 xrl drive zero --all --standing 1.188         # in the jig: soles flat, hips 1.188 m above ankles
 xrl drive zero knee_left --by 0,-0.009        # corrects a zero, as `xrl drive identify body` prints
+xrl drive zero --all --resume                 # after a loss of power, hanging: what has not moved
+xrl drive zero --all --resume --untouched --swing --level     # knees and hips that have moved
+xrl drive zero ankle_left --resume --untouched --at 0.1,0.3   # roughly, to 0.08 rad
 """
 
 
@@ -64,14 +69,28 @@ class ZeroFlags(FleetRobotFlags):
     """one module"""
     all: Annotated[bool, Arg(exclusive="which!")] = False
     """all six"""
-    at: Annotated[Pair | None, parsed(_PAIR, "PHI,THETA", exclusive="where!")] = None
+    at: Annotated[Pair | None, parsed(_PAIR, "PHI,THETA", exclusive="where")] = None
     """the joint is at these angles now, rad, as 0,-0.5"""
-    by: Annotated[Pair | None, parsed(_PAIR, "PHI,THETA", exclusive="where!")] = None
+    by: Annotated[Pair | None, parsed(_PAIR, "PHI,THETA", exclusive="where")] = None
     """the joint is this much farther, rad, than its present zero says"""
-    standing: Annotated[Number | None, Arg(metavar="HEIGHT", exclusive="where!")] = None
+    standing: Annotated[Number | None, Arg(metavar="HEIGHT", exclusive="where")] = None
     """the robot stands or hangs as if it stood: both soles flat and level, at their distance
     (geometry.w_base), torso upright, COM over the ankles, the hips' axis HEIGHT m above the
     ankles'; the angles then follow from the lengths in the robot file"""
+    resume: bool = False
+    """after a loss of power, the robot hanging: find the whole turns by what was stored with the
+    zero, and say how clear that is; what is not clear is refused. --at and --standing are then
+    rough, within 0.08 rad"""
+    untouched: bool = False
+    """with --resume: you say that no encoder, magnet, motor or encoder cable was touched since the
+    zero; needed for joints that have moved"""
+    swing: bool = False
+    """with --resume: watch the legs swing, which shows that they hang free; for knees and hips that
+    have moved"""
+    level: bool = False
+    """with --resume, where no IMU is fitted: the torso is level to 2 degrees by a spirit level"""
+    rest: bool = False
+    """change no zero; store where the joints rest now, for --resume (`xrl down` does it)"""
     yes: bool = False
     """do not ask"""
 
@@ -81,42 +100,195 @@ class ZeroFlags(FleetRobotFlags):
         return MODULES if self.module is None else (self.module,)
 
     def check(self) -> None:
-        """Refuse one module's angles for all."""
+        """Refuse one module's angles for all, and flags that do not fit each other."""
         super().check()
-        if self.all and self.standing is None:
+        where = [self.at, self.by, self.standing]
+        if self.rest and (self.resume or any(one is not None for one in where)):
+            raise DriveError("--rest changes no zero; give it alone")
+        if self.resume and self.by is not None:
+            raise DriveError("--by corrects a zero that is there; --resume finds one: first resume")
+        if not self.resume and (self.untouched or self.swing or self.level):
+            raise DriveError("--untouched, --swing and --level are for --resume")
+        if not (self.resume or self.rest or any(one is not None for one in where)):
+            raise DriveError("give --at, --standing or --by; after a loss of power --resume")
+        if self.all and (self.at is not None or self.by is not None):
             raise DriveError("--at and --by are for one module; for all give --standing HEIGHT")
 
 
 def run(flags: ZeroFlags) -> int:
-    """Look, ask, set, read back."""
+    """Look, ask, set, read back; keep the zero for a loss of power."""
     console = Console()
     path = drive_access.robot_file(flags)
     robot = config_file.load_without_schedule(path)
     wanted = angles_of(flags, robot, console)
-    by = flags.by
-    modules = tuple(wanted) or flags.modules
+    modules = flags.modules
     holders = {module: drive_access.service_on(robot, module, flags.run_dir) for module in modules}
     with drive_access.drives_to_ourselves(robot, path, flags.run_dir, console.print) as started:
+        if flags.rest:
+            kept = resuming.store_rests(robot, path, flags.run_dir, modules, console.print)
+            console.print(f"{kept} of {len(modules)} modules rest, and that is stored")
+            return 0 if kept == len(modules) else FAULT_EXIT_CODE
         refuse_services(robot, holders)
-        with contextlib.ExitStack() as stack:
-            drives = {module: _open(robot, module, flags.run_dir, stack) for module in modules}
-            before = _look_all(robot, drives)
-            if by is not None:
-                wanted = corrected(before, by, robot)
-            console.print(plan_table(wanted, before))
-            _warn(wanted, holders, console)
-            question = "Are the joints at these angles now?" if by is None else "Correct the zero?"
-            if not drive_access.confirm(question, yes=flags.yes):
-                console.print("nothing was changed")
-                return DECLINED_EXIT_CODE
-            refuse_services(robot, holders)  # a person may take minutes to answer
-            now = _look_all(robot, drives)
-            if by is not None:  # from where it hangs now: it may have been touched meanwhile
-                wanted = corrected(now, by, robot)
-            code = _set_all(robot, drives, wanted, console)
+        known = resuming.identities(robot, flags.run_dir, modules, console.print)
+        record = zero_record.read(zero_record.path_of(robot, path, flags.run_dir), robot)
+        if flags.resume:
+            work = _Work(robot, path, flags, holders, known, record, console)
+            code = _resume(work, wanted)
+        else:
+            with resuming.drives_of(robot, modules, flags.run_dir) as drives:
+                work = _Work(robot, path, flags, holders, known, record, console)
+                code = _zero(work, drives, wanted)
     if started:
         console.print(drive_access.GONE)
     return code
+
+
+class _Work(NamedTuple):
+    """What zeroing and resuming have in common."""
+
+    robot: RobotConfig
+    path: Path
+    flags: ZeroFlags
+    holders: Mapping[str, SupervisedFleet | None]
+    known: Mapping[str, Identity]
+    record: ZeroRecord
+    console: Console
+
+    def keep(self, record: ZeroRecord) -> None:
+        """Write the zeros; that fails with a warning, because the drives have them."""
+        try:
+            zero_record.write(
+                zero_record.path_of(self.robot, self.path, self.flags.run_dir), record
+            )
+        except DriveError as error:
+            self.console.print(marked("[yellow]{}[/]", error))
+
+
+def _zero(work: _Work, drives: Mapping[str, Drive], wanted: Mapping[str, Pair]) -> int:
+    """Zero by measured angles, or correct; return the exit code."""
+    robot, by, console = work.robot, work.flags.by, work.console
+    before = _look_all(robot, drives)
+    if by is not None:
+        wanted = corrected(before, by, robot)
+    console.print(plan_table(wanted, before))
+    _warn(wanted, work.holders, console)
+    question = "Are the joints at these angles now?" if by is None else "Correct the zero?"
+    if not drive_access.confirm(question, yes=work.flags.yes):
+        console.print("nothing was changed")
+        return DECLINED_EXIT_CODE
+    refuse_services(robot, work.holders)  # a person may take minutes to answer
+    now = _look_all(robot, drives)
+    if by is not None:  # from where it hangs now: it may have been touched meanwhile
+        wanted = corrected(now, by, robot)
+    done = _set_all(robot, drives, wanted, console)
+    modules = dict(work.record.modules)
+    mark, gear_ratio = robot.drive.zero_mark_turns, robot.joint.gear_ratio
+    for module in done:
+        seen = look(drives[module], mark, gear_ratio)
+        identity, angles = work.known.get(module), seen.angles
+        modules.pop(module, None)
+        why = resuming.why_not_kept(robot, seen, identity)
+        if why or angles is None:
+            console.print(marked("[yellow]{}: not kept over a loss of power: {}[/]", module, why))
+            continue
+        modules[module] = zero_record.zeroed(robot, module, seen.q_there, angles, identity)
+    if done:
+        work.keep(msgspec.structs.replace(work.record, modules=modules))
+    return 0 if len(done) == len(wanted) else FAULT_EXIT_CODE
+
+
+def _resume(work: _Work, about: Mapping[str, Pair]) -> int:
+    """Find the whole turns again, ask, set; return the exit code."""
+    robot, flags, console = work.robot, work.flags, work.console
+    mark, gear_ratio = robot.drive.zero_mark_turns, robot.joint.gear_ratio
+    unknown = [module for module in flags.modules if module not in work.record.modules]
+    if len(unknown) == len(flags.modules):
+        raise DriveError(
+            f"{', '.join(unknown)}: no zero is stored; zero by a protractor (--at, --standing), "
+            "as on the first day: from then on it can be resumed"
+        )
+    up = resuming.upright(robot, flags.run_dir, level=flags.level)
+    with resuming.drives_of(robot, _legs_of(flags.modules), flags.run_dir) as drives:
+        swings: dict[str, Swing] = {}
+        if flags.swing:
+            console.print(swing.HOW)
+            legs = {name: one for name, one in drives.items() if kind_of(name) != "ankle"}
+            swings = swing.watch(legs, gear_ratio, console.print)
+        looks, _ = resuming.looks_at_rest(drives, mark, gear_ratio)
+        faults = {module: refusal(seen) for module, seen in looks.items()}
+        fit = {module: seen for module, seen in looks.items() if not faults[module]}
+        found = decide(
+            robot,
+            resuming.evidence_of(
+                robot, work.record, fit, work.known,
+                untouched=flags.untouched, about=about, swings=swings,
+            ),
+            up,
+        )  # fmt: skip
+        taken, zeroed = {}, []
+        for module in flags.modules:
+            decision = found.get(module) or Decision(None, "", math.inf, math.inf, "")
+            if looks[module].zeroed and not faults[module]:
+                zeroed.append(module)
+            elif decision.q is not None:
+                taken[module] = decision.q
+            else:
+                why = decision.why or faults[module] or "no zero of it is stored: zero it by --at"
+                console.print(marked("[yellow]{}: refused:[/] {}", module, why))
+        if zeroed:
+            console.print(f"{', '.join(zeroed)}: zeroed already; left as they are")
+        if not taken:
+            console.print("nothing was changed")
+            return 0 if len(zeroed) == len(flags.modules) else FAULT_EXIT_CODE
+        console.print(resumed_table({module: found[module] for module in taken}))
+        _warn(taken, work.holders, console)
+        if not drive_access.confirm("Does the robot hang so?", yes=flags.yes):
+            console.print("nothing was changed")
+            return DECLINED_EXIT_CODE
+        refuse_services(robot, work.holders)
+        now = {module: look(drives[module], mark, gear_ratio) for module in taken}
+        for module, seen in now.items():
+            if refusal(seen) or not resuming.same_angles(seen, looks[module], UNMOVED):
+                raise DriveError(f"{module}: it has moved meanwhile; nothing was changed; again")
+        done = [
+            module
+            for module in _set_all(robot, drives, taken, console)
+            if _is_its_zero(work, module, drives[module])
+        ]
+        rests = {module: motor_from_joint(taken[module], gear_ratio) for module in done}
+        work.keep(zero_record.with_rests(work.record, rests))
+    return 0 if len(done) + len(zeroed) == len(flags.modules) else FAULT_EXIT_CODE
+
+
+def _is_its_zero(work: _Work, module: str, drive: Drive) -> bool:
+    """Return True if a drive has its stored zero again, or else forgets the one it was given.
+
+    A joint that creeps while it is written has another.
+    """
+    mark, gear_ratio = work.robot.drive.zero_mark_turns, work.robot.joint.gear_ratio
+    seen = look(drive, mark, gear_ratio)
+    why = resuming.not_its_zero(seen, work.record.modules[module].offsets, gear_ratio)
+    if why:
+        work.console.print(marked("[bold red]{}: it moved as it was written; again[/]", module))
+        if seen.status is not DriveStatus.ARMED:
+            drive.set_position((0.0, 0.0))
+    return not why
+
+
+def _legs_of(modules: tuple[str, ...]) -> tuple[str, ...]:
+    """Return all modules of these modules' legs."""
+    sides = {side_of(module) for module in modules}
+    return tuple(module for module in MODULES if side_of(module) in sides)
+
+
+def resumed_table(found: Mapping[str, Decision]) -> Table:
+    """Return what was found as a table for the terminal."""
+    table = _table("found, rad", "by", "second best, rad away", "it takes, of what is allowed")
+    for module, decision in found.items():
+        if decision.q is not None:
+            times = f"{decision.times:.1f} times" if decision.by != "unmoved" else "-"
+            table.add_row(module, _angles(decision.q), decision.by, f"{decision.second:.2f}", times)
+    return table
 
 
 def angles_of(flags: ZeroFlags, robot: RobotConfig, console: Console) -> dict[str, Pair]:
@@ -220,10 +392,10 @@ def plan_table(wanted: Mapping[str, Pair], before: Mapping[str, DriveLook]) -> T
 
 def _set_all(
     robot: RobotConfig, drives: Mapping[str, Drive], wanted: Mapping[str, Pair], console: Console
-) -> int:
-    """Set all, read all back, show it; return the exit code."""
+) -> list[str]:
+    """Set all, read all back, show it; return which read back right."""
     table = _table("written, rad", "read back, rad", "")
-    code = 0
+    done = []
     for module, q in wanted.items():
         try:
             back = zero(drives[module], q, robot)
@@ -231,16 +403,16 @@ def _set_all(
             console.print(marked("[bold red]{}[/]: {}", module, error))
             back = None
         good = is_right(back, q)
-        code = code if good else FAULT_EXIT_CODE
+        done += [module] * good
         read = "nothing" if back is None else _angles(back.q)
         outcome = Text("zeroed") if good else Text("NOT zeroed", "bold red")
         table.add_row(module, _angles(q), read, outcome)
     console.print(table)
-    if code:
+    if len(done) < len(wanted):
         console.print(
             marked("[bold red]do not arm an unzeroed drive[/]: check it, and zero it again")
         )
-    return code
+    return done
 
 
 def _look_all(robot: RobotConfig, drives: Mapping[str, Drive]) -> dict[str, DriveLook]:
@@ -255,14 +427,6 @@ def _look_all(robot: RobotConfig, drives: Mapping[str, Drive]) -> dict[str, Driv
     if faults:
         raise DriveError("; ".join(faults) + "; nothing was changed")
     return seen
-
-
-def _open(robot: RobotConfig, module: str, run_dir: Path, stack: contextlib.ExitStack) -> Drive:
-    """Return a module's drive as it counts itself; the stack releases it."""
-    unmarked = msgspec.structs.replace(robot.drive, zero_mark_turns=0.0)
-    drive = open_drive(msgspec.structs.replace(robot, drive=unmarked), module, run_dir)
-    stack.callback(drive.close)
-    return drive
 
 
 def _warn(
