@@ -55,7 +55,7 @@ class Leg(NamedTuple):
     """(4,): of knee and hip, phi and theta, N m."""
 
 
-def drawn_leg(rng: np.random.Generator, robot: RobotConfig) -> Leg:
+def drawn_leg(rng: np.random.Generator, robot: RobotConfig, friction: float) -> Leg:
     """Return a leg whose masses, centres, stop and friction are drawn."""
     geometry, weight = robot.geometry, robot.mass.module * GRAVITY
     stiff = rng.random() < 0.05  # a gear that binds
@@ -65,7 +65,7 @@ def drawn_leg(rng: np.random.Generator, robot: RobotConfig) -> Leg:
         thigh_off=rng.uniform(-0.02, 0.02, 2),
         shin_off=rng.uniform(-0.015, 0.015, 2),
         stop=robot.limits.knee.theta[1] + float(rng.uniform(0.0, 0.2)),
-        friction=rng.uniform(0.05, 4.0 if stiff else 0.9, 4),
+        friction=friction * rng.uniform(0.05, 4.0 if stiff else 0.9, 4),
     )
 
 
@@ -100,10 +100,10 @@ def tilted(rng: np.random.Generator, largest: float) -> Array:
     return np.asarray(up / np.linalg.norm(up), float)
 
 
-def power_cycle(rng: np.random.Generator, robot: RobotConfig) -> PowerCycle:
-    """Draw one."""
+def power_cycle(rng: np.random.Generator, robot: RobotConfig, friction: float = 1.0) -> PowerCycle:
+    """Draw one, with so many times the usual friction."""
     event = EVENTS[rng.integers(len(EVENTS))]
-    legs = {side: drawn_leg(rng, robot) for side in SIDES}
+    legs = {side: drawn_leg(rng, robot, friction) for side in SIDES}
     levelled = rng.random() < 0.3
     up = tilted(rng, 0.03 if levelled else 0.3)
     q: dict[str, Pair] = {}

@@ -55,11 +55,11 @@ def is_wrong(decision: Decision, truth: Pair) -> bool:
     return q is not None and max(abs(a - b) for a, b in zip(q, truth, strict=True)) > EXACT
 
 
-def judged(robot: RobotConfig, seed: int, cases: range) -> Counter[str]:
+def judged(robot: RobotConfig, seed: int, cases: range, friction: float = 1.0) -> Counter[str]:
     """Return how many modules of drawn power cycles were resumed, refused and resumed wrongly."""
     count: Counter[str] = Counter()
     for case in cases:
-        cycle = power_cycle(np.random.default_rng([seed, case]), robot)
+        cycle = power_cycle(np.random.default_rng([seed, case]), robot, friction)
         for module, decision in decide(robot, cycle.evidence, cycle.upright).items():
             wrong = is_wrong(decision, cycle.truth[module])
             count["WRONG" if wrong else decision.by or "refused"] += 1
@@ -75,6 +75,13 @@ def test_no_power_cycle_of_some_hundreds_is_resumed_wrongly(robot: RobotConfig) 
     assert count.total() >= 400 * len(MODULES)
     assert min(count[by] for by in ("unmoved", "gravity", "measured", "refused")) > 40
     assert count["refused at rest"] < 0.05 * 400 * len(MODULES) / len(EVENTS)
+
+
+def test_legs_with_four_times_the_friction_are_refused_and_not_resumed_wrongly(
+    robot: RobotConfig,
+) -> None:
+    usual, stiff = (judged(robot, 2, range(300), friction) for friction in (1.0, 4.0))
+    assert 0 < stiff["gravity"] < 0.5 * usual["gravity"]
 
 
 @pytest.mark.wide

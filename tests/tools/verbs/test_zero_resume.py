@@ -29,6 +29,9 @@ from tools.bringup.zero_record import Identity, ModuleZero, ZeroRecord, why_stra
 from tools.verbs.drive import zero as verb
 from tools.verbs.drive.zero import ZeroFlags
 
+EXACT = 3e-4
+"""rad; a count of the encoder is 0.01 mrad at the joint."""
+
 
 class Counting(HungDrive):
     """A drive in its own count, which may be told where it is."""
@@ -153,7 +156,7 @@ def test_a_night_without_power_is_resumed_to_a_milliradian(
     bench.cut_power()
     assert bench.errors() == [9.0] * 6
     assert bench.run(resume=True) == 0
-    assert max(bench.errors()) < 1e-3
+    assert max(bench.errors()) < EXACT
     said = capsys.readouterr().out
     assert said.count("unmoved") == 6
     assert bench.run(resume=True) == 0
@@ -180,7 +183,7 @@ def test_legs_that_were_cut_off_at_work_are_resumed_once_they_have_swung(
 
     monkeypatch.setattr(swing, "watch", pushed)
     bench.run(resume=True, untouched=True, level=True, swing=True)
-    assert max(bench.errors()[i] for i in (1, 2, 4, 5)) < 1e-3
+    assert max(bench.errors()[i] for i in (1, 2, 4, 5)) < EXACT
     said = capsys.readouterr().out
     assert said.count("gravity") >= 4
     assert "second best" in said
@@ -217,7 +220,7 @@ def test_where_the_joints_rest_is_stored_of_zeroed_drives_only(
     assert bench.run(rest=True) == 0
     bench.cut_power()
     assert bench.run(resume=True) == 0
-    assert max(bench.errors()) < 1e-3
+    assert max(bench.errors()) < EXACT
     bench.cut_power()
     assert bench.run(rest=True) == FAULT_EXIT_CODE
     assert "it is unzeroed" in capsys.readouterr().out
