@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from services.joint.differential import motor_from_joint
-from shared.can.cansimple import AxisState
+from services.simulator.physics.plant import plant_from
+from shared.can.cansimple import AxisState, EncoderError, Heartbeat
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import DECLINED_EXIT_CODE, DriveError
+from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, DriveError
 from shared.joints import MODULES
 from tests.tools.bringup.bank_board import FIRST, BankBoard
 from tests.tools.bringup.board_in_memory import BoardInMemory, as_wanted
+from tests.tools.bringup.hung_robot import HungRobot
 from tools.bringup import calibrate_robot, calibration
 from tools.bringup.boards import FoundBoards
-from tools.bringup.calibration import BoardResult, Procedure
+from tools.bringup.calibration import BoardResult, Found, Procedure
+from tools.bringup.can_monitor import BusTraffic, NodeTraffic
 from tools.bringup.motion_runner import Interrupts
 from tools.terminal import Console
 
@@ -191,6 +195,25 @@ def test_a_robot_one_of_whose_drives_is_armed_is_refused(
         refuse(robot, made, "hip_right", tmp_path)
 
 
+@pytest.mark.parametrize("state", [AxisState.CLOSED_LOOP_CONTROL, AxisState.IDLE, None])
+def test_a_drive_that_is_not_on_usb_is_listened_to_on_can(
+    robot: RobotConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, state: int | None
+) -> None:
+    made = boards()
+    del made[MODULE]
+    beat = None if state is None else Heartbeat(0, state, *[False] * 3, trajectory_done=True)
+
+    def listen(_: object, nodes: Sequence[int], **__: object) -> BusTraffic:
+        return BusTraffic(nodes={node: NodeTraffic(heartbeat=beat) for node in nodes})
+
+    monkeypatch.setattr(calibrate_robot.can_monitor, "listen", listen)
+    if state != AxisState.CLOSED_LOOP_CONTROL:
+        refuse(robot, made, "hip_right", tmp_path)
+        return
+    with pytest.raises(DriveError, match="knee_left is armed"):
+        refuse(robot, made, "hip_right", tmp_path)
+
+
 @pytest.mark.parametrize(("theta", "refused"), [(0.85, True), (-0.05, False), (None, False)])
 def test_a_limp_leg_that_rests_on_something_is_refused_where_it_knows_its_angles(
     robot: RobotConfig, tmp_path: Path, theta: float | None, refused: bool
@@ -223,3 +246,51 @@ def test_whoever_says_no_has_nothing_calibrated(
         yes=False, check=lambda: None,
     )  # fmt: skip
     assert (code, board.restarts) == (DECLINED_EXIT_CODE, 0)
+
+
+def test_a_board_that_is_unplugged_meanwhile_does_not_stop_the_others(
+    robot: RobotConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second = BankBoard(), BankBoard()
+    monkeypatch.setattr(calibration, "_await_still", lambda *_: "")
+
+    def calibrate(board: BankBoard, *_: object) -> BoardResult:
+        if board is first:
+            raise DriveError("ODrive 3A: read: no answer")
+        return BoardResult({"axis0": Found(0.1, 4e-5, -1)})
+
+    monkeypatch.setattr(calibration, "calibrate_board", calibrate)
+    code = calibrate_robot.calibrate(
+        Console(), robot, {MODULE: (first, AXES), "hip_left": (second, AXES)}, Interrupts(),
+        yes=True, check=lambda: None,
+    )  # fmt: skip
+    said = " ".join(capsys.readouterr().out.split())
+    assert code == FAULT_EXIT_CODE
+    assert "knee_left: ODrive 3A: read: no answer" in said
+    assert "switch its supply off and on after that" in said
+    assert "without a zero: hip_left; next `xrl drive zero`" in said
+    assert "direction is -1: swap two of the motor's phases" in said
+    assert said.endswith("not calibrated: knee_left")
+
+
+@pytest.mark.parametrize(
+    ("axis", "amperes", "error"),
+    [
+        (2, 10.0, EncoderError.CPR_POLEPAIRS_MISMATCH),
+        pytest.param(2, 15.0, EncoderError.NONE, marks=pytest.mark.wide),
+        pytest.param(4, 15.0, EncoderError.NONE, marks=pytest.mark.wide),
+        (0, 15.0, EncoderError.NONE),
+    ],
+    ids=["knee on its stop, 10 A", "knee, 15 A", "hip, 15 A", "light foot, 15 A"],
+)
+def test_a_hanging_leg_of_the_realistic_robot_wants_more_current_than_as_shipped(
+    robot: RobotConfig, axis: int, amperes: float, error: EncoderError
+) -> None:
+    hung = HungRobot(robot, plant_from(["realistic"]))
+    bank = hung.bank
+    bank.settings.fill("motor.config.calibration_current", amperes)
+    bank.request_state(axis, AxisState.FULL_CALIBRATION_SEQUENCE)
+    for _ in range(13_300):
+        hung.step()
+    assert (bank.state[axis], bank.faults[axis].encoder) == (AxisState.IDLE, error)
+    assert bank.settings.axis("encoder.config.direction")[axis] == 1.0
