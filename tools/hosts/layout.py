@@ -15,6 +15,7 @@ import msgspec
 
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import BusSecurityConfig
+from shared.joints import MODULES
 from tools.bringup.check_socketcan import setup_commands
 from tools.hosts.hosts_file import Host, Hosts, ports
 
@@ -58,6 +59,11 @@ def unit(hosts: Hosts, host: Host) -> str:
     """
     xrl = f"{hosts.checkout}/.venv/bin/xrl"
     processors = f"CPUAffinity={host.processors}\n" if host.processors else ""
+    # Joint services throw old frames away by a restart of the CAN interface (docs/drives.md).
+    granted = "CAP_NET_ADMIN" if set(host.services) & set(MODULES) else ""
+    capabilities = f"CapabilityBoundingSet={granted}"
+    if granted:
+        capabilities += f"\nAmbientCapabilities={granted}"
     of_unit = of_service = ""
     if host.private:
         # Wants, not Requires: whoever stops that unit is not to idle the drives.
@@ -93,7 +99,7 @@ LimitRTPRIO=40
 LimitMEMLOCK=infinity
 LimitCORE=0
 {processors}{of_service}NoNewPrivileges=yes
-CapabilityBoundingSet=
+{capabilities}
 ProtectSystem=strict
 ProtectHome=yes
 ProtectKernelTunables=yes

@@ -65,7 +65,7 @@ def test_an_interface_that_is_set_as_it_should_be_is_ok(real: RobotConfig, tmp_p
         (link(ctrlmode=["LISTEN-ONLY"]), "mode", WRONG),
         (link(restart_ms=0), "restart-ms", WARNING),
         (link(length=10), "send queue", WARNING),
-        (link(length=1000), "send queue", WARNING),
+        (link(length=101), "send queue", WARNING),
     ],
 )
 def test_what_stops_or_delays_frames_is_named(
@@ -74,6 +74,36 @@ def test_what_stops_or_delays_frames_is_named(
     rows = rows_of(real, tmp_path, said)
     assert bad(rows) == [f"can0: {what}: {verdict}"]
     assert all(row.fix for row in rows if row.verdict != OK)
+
+
+def process(root: Path, number: str, command: bytes, capabilities: int) -> None:
+    folder = root / "proc" / number
+    folder.mkdir(parents=True)
+    (folder / "cmdline").write_bytes(command)
+    (folder / "status").write_text(f"Name:\tx\nCapEff:\t{capabilities:016x}\nSeccomp:\t0\n")
+
+
+@pytest.mark.parametrize(
+    ("capabilities", "service", "modes", "found"),
+    [
+        (1 << 12, 1 << 12, [], ["allowed"]),
+        (0, 0, [], ["not allowed"]),
+        (1 << 12, 0, [], ["not allowed"]),
+        (0, 1 << 12, [], ["allowed"]),
+        (0, None, [], ["not allowed"]),
+        (0, 0, ["ONE-SHOT"], []),
+    ],
+)
+def test_services_that_cannot_throw_old_frames_away_are_named(
+    real: RobotConfig, tmp_path: Path, capabilities: int, service: int | None, modes: list[str],
+    found: list[str],
+) -> None:  # fmt: skip
+    """Of the services if they are up, of this process otherwise; one-shot leaves no old frame."""
+    process(tmp_path, "self", b"xrl\0doctor", capabilities)
+    if service is not None:
+        process(tmp_path, "77", b"python\0-m\0services.joint\0hip_left", service)
+    rows = rows_of(real, tmp_path, link(ctrlmode=modes))
+    assert [row.found for row in rows if row.what == "restart by the services"] == found
 
 
 def test_counted_errors_are_reported(real: RobotConfig, tmp_path: Path) -> None:

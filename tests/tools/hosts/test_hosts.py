@@ -18,6 +18,7 @@ import tomli_w
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
+from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
 from tests.tools.hosts.places import LEGS, SHARED, make_hosts
 from tools import cli
@@ -146,6 +147,8 @@ def test_systemd_takes_the_unit_and_it_arms_nothing(hosts: Hosts, tmp_path: Path
         assert "--disarmed" in text
         own = "" if "recorder" in host.services else ",host_recorder"
         assert f"--only {','.join(host.services)}{own}\n" in text
+        restarts_buses = "AmbientCapabilities=CAP_NET_ADMIN\n" in text
+        assert restarts_buses is bool({*MODULES} & {*host.services})
         # what systemd cannot look for on this machine: the user, and the program's file
         text = text.replace("User=xrl", "User=root")
         text = re.sub(r"^(Exec\w+=)\S+", r"\1/bin/true", text, flags=re.MULTILINE)
