@@ -303,9 +303,10 @@ class HeatConfig(Section, frozen=True):
     """False: nothing is known of them, nothing estimated, and the robot stands up for no heat."""
     ambient: Celsius = 40.0
     """Air at the robot on the hottest day."""
-    winding_max: Celsius = 100.0
+    winding_max: Celsius = 95.0
     """No winding is to be warmer: below the insulation's class by what the estimate may be off, and
-    no more than the `temp_limit_lower` of a motor's thermistor."""
+    5 C below the `temp_limit_lower` of a motor's thermistor: to stand up against a hand that clings
+    adds 2 C."""
     stage_max: Celsius = 90.0
     """No output stage is to be warmer: below the drives' `temp_limit_lower`."""
     resistance: Annotated[float, Range(0.001, 10.0, "ohm")] = 0.1

@@ -91,6 +91,16 @@ def test_it_rests_for_a_while_and_until_enough_is_left(robot: RobotConfig) -> No
     assert watched.action is NONE
 
 
+def test_straight_and_still_too_hot_it_says_what_a_person_must_do(robot: RobotConfig) -> None:
+    watched = Watched(robot)
+    watched.run(1.0)
+    watched.run(3600.0, STRAIGHT, module=4)
+    assert watched.watch.describe().startswith(f"{MODULES[1]} was hot")
+    watched.run(robot.heat.ease_s - 1.0, STRAIGHT, module=4)
+    assert "left even straight" in watched.watch.describe()
+    assert watched.watch.describe().startswith(MODULES[4])
+
+
 def test_the_assist_goes_but_never_from_under_the_person(robot: RobotConfig) -> None:
     free, resting = Watched(robot), Watched(robot)
     left_s = robot.heat.ease_s - 5.0

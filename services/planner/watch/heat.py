@@ -69,7 +69,7 @@ class HeatWatchState(msgspec.Struct):
     left_s: float = -1.0
     """Least of all modules; -1: none says."""
     hottest: int = 0
-    """Its module; the one for which it stands up while it does."""
+    """Its module; while it rests, the one for which it stood up."""
 
 
 class HeatWatch:
@@ -106,7 +106,7 @@ class HeatWatch:
         lefts = [state.heat_left_s for state in states]
         known = [left for left in lefts if left >= 0.0]
         s.left_s = min(known, default=-1.0)
-        if known and not self.moves:
+        if known and (not self.moves or s.left_s < self._ease_s):
             s.hottest = lefts.index(s.left_s)
         quiet = lifted is not None and abs(lifted + self._assist(requested)) <= HAND_MAX
         action = self._next(now_ns, states, quiet=quiet) if known else HeatAction.NONE
@@ -134,6 +134,8 @@ class HeatWatch:
         if s.action is HeatAction.NONE:
             return ""
         name = MODULES[s.hottest]
+        if s.action is HeatAction.RESTS and s.left_s < self._ease_s:
+            return f"{name} is hot, {s.left_s:.0f} s left even straight: take load off, or hang it"
         if s.action is HeatAction.RESTS:
             return f"{name} was hot: it stays straight until it has cooled, and no hand presses it"
         words = "stand up, or take weight off; the assist goes"

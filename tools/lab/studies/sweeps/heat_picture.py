@@ -92,17 +92,18 @@ def draw(robot: RobotConfig, path: Path) -> None:
     for column, (t, unit) in enumerate(((t_s / 60.0, "min"), (t_s - begin_s, "s"))):
         _draw_column(grid[:, column], t, rows, robot)
         grid[2, column].set_xlabel(unit)
-    grid[0, 1].set_xlim(left=0.0)
+    grid[0, 1].set_xlim(0.0, t_s[-1] - begin_s)
     labels = ("warmest winding, C", "left at this\nload, s", "torso, m")
     for axis, label in zip(grid[:, 0], labels, strict=True):
         axis.set_ylabel(label)
     grid[1, 0].set_ylim(1.0, 2000.0)
     grid[0, 0].legend(fontsize=8, loc="lower right")
-    for begin in _starts(rows):
+    for number, begin in enumerate(_starts(rows)):
         if rows[begin].action in WORDS:
-            y, words = robot.heat.winding_max + 2.0, WORDS[rows[begin].action]
+            y = robot.heat.winding_max + 2.0 + 4.0 * (number % 2)
+            words = WORDS[rows[begin].action]
             grid[0, 1].text(t_s[begin] - begin_s + 0.5, y, words, fontsize=8)
-    grid[0, 0].set_ylim(top=robot.heat.winding_max + 8.0)
+    grid[0, 0].set_ylim(top=robot.heat.winding_max + 11.0)
     title = f"A squat at {SQUAT:g} m held by a hand that clings to it, until the robot stands up"
     figure.suptitle(title, x=0.01, ha="left", fontsize=11)
     save_figure(figure, path)
