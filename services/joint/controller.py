@@ -254,6 +254,7 @@ class JointController:
             refused_session=refused_session,
             celsius=s.heat.shown,
             heat_left_s=s.heat.left_s,
+            supply_v=estimate.supply_v,
         )
 
     def snapshot(self) -> ControllerSnapshot:

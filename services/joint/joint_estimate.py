@@ -69,6 +69,8 @@ class JointEstimate(msgspec.Struct):
     """Samples rejected since then."""
     first: TurnWatch = msgspec.field(default_factory=TurnWatch)
     second: TurnWatch = msgspec.field(default_factory=TurnWatch)
+    supply_v: float = 0.0
+    """Voltage of the drive's supply, V; 0: not known."""
 
     @property
     def turns_lost(self) -> bool:
@@ -90,6 +92,7 @@ class JointEstimate(msgspec.Struct):
             flushing: samples may be old, and jump: nothing is judged.
         """
         self.status, self.error, self.t_ns = reading.status, reading.error, reading.t_ns
+        self.supply_v = reading.supply_v
         event = _EVENT[reading.status]
         if event is _DRIVE_LOST:
             return event  # with positions that are old

@@ -73,6 +73,7 @@ class Tracer:
                 (r and r.encoder_zero) or _UNTOLD,
                 _NOTHING if r is None else r.fet_celsius or _NOTHING,
                 _NOTHING if r is None else r.motor_celsius or _NOTHING,
+                0.0 if r is None else r.supply_v,
             )
         )
         return self.take() if len(self._cycles) == CYCLES else None

@@ -26,6 +26,7 @@ from services.planner.watch.heat import HeatWatch, HeatWatchState
 from services.planner.watch.limp_leg_watch import LimpLegWatch
 from services.planner.watch.plausible import Plausible
 from services.planner.watch.rival_watch import RivalWatch
+from services.planner.watch.supply import SupplyState, SupplyWatch
 from services.planner.watch.trips import PlannerTrips, TripsState, values_of
 from services.planner.watch.unattended import Unattended, UnattendedState
 from shared.bus.messages import (
@@ -87,6 +88,7 @@ class PlannerState(msgspec.Struct, kw_only=True):
     phases: PhasesState = msgspec.field(default_factory=PhasesState)
     rival: RivalWatch = msgspec.field(default_factory=RivalWatch)
     heat: HeatWatchState = msgspec.field(default_factory=HeatWatchState)
+    supply: SupplyState = msgspec.field(default_factory=SupplyState)
     guard: GuardState | None = None
     """None without a controller of somebody's own."""
     refused: int = 0
@@ -135,6 +137,7 @@ class Planner:
         self._trips = PlannerTrips(config)
         self._unattended = Unattended()
         self._heat = HeatWatch(config.heat)
+        self._supply = SupplyWatch(config.supply)
         service = config.joint_service
         self._phases = StatePhases(service.rate_hz, service.state_rate_hz)
         self._period_s = 1.0 / config.planner.rate_hz
@@ -145,6 +148,7 @@ class Planner:
             unattended=self._unattended.state,
             phases=self._phases.state,
             heat=self._heat.state,
+            supply=self._supply.state,
             guard=None if self._guard is None else self._guard.state,
         )
         self._q: Array = np.zeros(N_JOINTS)
@@ -233,6 +237,7 @@ class Planner:
         self._phases.advance(states, self._state.arrived_ns, last_ns)
         request = self._state.request
         heat = self._heat.advance(now_ns, states, request.assist_n, self._lifted(now_ns), dt)
+        self._supply.advance(states, dt)
         # until all engage, the law restarts from the measured pose each tick: there is no
         # step
         self._output = self._law.tick(
@@ -243,7 +248,7 @@ class Planner:
             shift_requested=request.shift,
             probe=(request.probe_row, request.probe),
             lift=heat.direction,
-            toward=DOWN if request.sit and heat.direction is None else STAY,
+            toward=DOWN if self._sits and heat.direction is None else STAY,
             align=engagement.hold,
             wrench=self._usable_wrench(now_ns),
             up_torso=self._usable_up(now_ns),
@@ -290,6 +295,7 @@ class Planner:
         self._overload.state, self._trips.state = own.overload, own.trips
         self._unattended.state, self._phases.state = own.unattended, own.phases
         self._heat.state = own.heat
+        self._supply.state = own.supply
         if self._guard is not None:
             if own.guard is not None:
                 self._guard.state = own.guard
@@ -389,12 +395,17 @@ class Planner:
     def _drift(self, now_ns: int, lifted: float | None) -> float:
         """Return how far the robot has drifted since a hand was last felt, m."""
         wrench, output = self._usable_wrench(now_ns), self._output
-        if wrench is None or lifted is None or output is None or self._state.request.sit:
+        if wrench is None or lifted is None or output is None or self._sits:
             force = moment = math.nan
         else:
             force, moment = lifted, wrench.moment[1]
         p = output.p.tolist() if output is not None else [0.0] * 6
         return self._unattended.drift(now_ns, (p[2], p[4]), force, moment)
+
+    @property
+    def _sits(self) -> bool:
+        """True while the robot is to go down by itself."""
+        return self._state.request.sit or self._supply.state.sits
 
     def _lifted(self, now_ns: int) -> float | None:
         """Return the person's upward force on the robot, N, world; None if it is not known now."""
@@ -432,6 +443,18 @@ class Planner:
         It uses this tick's results: without a certificate no gains go to modules in TRACK.
         """
         return self._state.engagement.hold or self._inhibit() is not None
+
+    def _why(self) -> str:
+        """Return what the person must know: of the supply, of heat, and why it does not lead."""
+        refusal = (
+            self._state.rival.describe()
+            or self._law.stance_refusal()
+            or self._law.load_refusal()
+            or self._trips.why
+            or self._heat.describe()
+            or (self._guard.why if self._guard is not None else "")
+        )
+        return "; ".join(filter(None, (self._supply.describe(), refusal)))
 
     def status(self, now_ns: int, tick_us: float) -> PlannerStatus:
         """Return the inputs and decisions of the last tick."""
@@ -476,17 +499,13 @@ class Planner:
             probe_row=s.request.probe_row,
             probe=s.request.probe,
             stance=stance,
-            why=s.rival.describe()
-            or self._law.stance_refusal()
-            or self._law.load_refusal()
-            or self._trips.why
-            or self._heat.describe()
-            or (self._guard.why if self._guard is not None else ""),
+            why=self._why(),
             trip=int(self._trips.tripped),
             refused=self._plausible.refused,
             sit=s.request.sit,
             heat=int(self._heat.state.action),
             heat_left_s=self._heat.state.left_s,
+            supply_v=s.supply.volts,
         )
 
 

@@ -316,6 +316,8 @@ class JointState(Message, frozen=True):
     heat_left_s: float = -1.0
     """Seconds left at this load until a winding or an output stage is too warm; 3600: an hour or
     more; -1: not estimated."""
+    supply_v: float = 0.0
+    """Voltage of the drive's supply, V; 0: not known."""
 
 
 class JointCommand(Message, frozen=True):
@@ -474,7 +476,8 @@ class PlannerStatus(Message, frozen=True):
     """Place of the right foot relative to the left, as deviation from the robot file: x, y, z, m,
     and a rotation vector, rad, world axes."""
     why: str = ""
-    """Reason for not leading, in words, where the mode does not say it all."""
+    """Reason for not leading, in words, where the mode does not say it all; before it what is wrong
+    with the supply."""
     trip: Int64 = 0
     """Trip for which it does not lead."""
     load: Vector3 = (0.0, 0.0, 0.0)
@@ -494,6 +497,8 @@ class PlannerStatus(Message, frozen=True):
     """What is done before a motor is too warm."""
     heat_left_s: float = -1.0
     """Least of the modules' seconds left at this load; 3600: an hour or more; -1: not estimated."""
+    supply_v: float = 0.0
+    """Lowest voltage of the drives' supplies, V, low-passed; 0: not known."""
 
 
 class OperatorIntent(Message, frozen=True):

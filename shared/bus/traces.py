@@ -57,6 +57,8 @@ class CycleTrace(msgspec.Struct, gc=False, frozen=True):
     """Reported temperatures of the output stages, C; 0: not with this sample."""
     motor_celsius: Pair = (0.0, 0.0)
     """Reported temperatures of the motors, C; 0: not with this sample."""
+    supply_v: float = 0.0
+    """Voltage of the drive's supply, V; 0: not known."""
 
 
 class JointTrace(Message, frozen=True):

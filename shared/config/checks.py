@@ -123,6 +123,9 @@ def _names(config: RobotConfig) -> Problems:
                     "a free node",
                 )
     yield from _serial_numbers(config)
+    supply = config.supply
+    if supply.sit_v > supply.low_v:
+        yield "supply.sit_v", f"{supply.sit_v:g} V", f"at most supply.low_v, {supply.low_v:g} V"
     if config.harness.bus not in config.can:
         yield "harness.bus", f"{config.harness.bus!r}", buses
     yield from _imu(config)

@@ -387,6 +387,19 @@ class Ros2Config(Section, frozen=True):
     """Rate of `/clock`, of a simulated robot only; 0: not published."""
 
 
+SupplyVoltage = Annotated[float, Range(0.0, 100.0, "V")]
+
+
+class SupplyConfig(Section, frozen=True):
+    """Levels of the drives' supply; 0: never (docs/drives.md)."""
+
+    low_v: SupplyVoltage = 0.0
+    """Below it the person is told."""
+    sit_v: SupplyVoltage = 0.0
+    """Below it the robot goes down by itself: well above `config.dc_bus_undervoltage_trip_level` of
+    the drives, and above what the battery's own electronics switch off at."""
+
+
 LOST_S: Final = 0.1
 """Silence after which a drive without a watchdog is lost, s. In DAMP a knee whose fellow has been
 silent for that time holds, whatever the watchdog (`services.joint.neighbours`)."""

@@ -7,6 +7,7 @@ from typing import Final
 
 from services.joint.drivers.base import (
     HEAT_EVERY_NS,
+    SUPPLY_EVERY_NS,
     DriveReading,
     DriveStatus,
     MotorTarget,
@@ -58,6 +59,7 @@ class VirtualDrive:
         self._sampled_ns = clock()
         self._ask_at_ns = 0
         self._heat_at_ns = clock() if tells_heat else None
+        self._supply_at_ns, self._supply_v = 0, 0.0
         self._written = True
         """False: the service is new, and reads the torques of a drive that it finds armed."""
 
@@ -105,6 +107,7 @@ class VirtualDrive:
             None if armed or not is_responding else self._encoder_zero(now_ns),
             fet,
             motor,
+            supply_v=self._supply(now_ns),
         )
 
     def _encoder_zero(self, now_ns: int) -> Pair | None:
@@ -128,6 +131,13 @@ class VirtualDrive:
         heat, (a, b) = self._bank.heat, self._axes
         fet = real_readings(float(heat.fet[a]), float(heat.fet[b]))
         return fet, real_readings(float(heat.motor[a]), float(heat.motor[b]))
+
+    def _supply(self, now_ns: int) -> float:
+        """Return the supply's voltage, V, as a driver asks for it now and then."""
+        if now_ns >= self._supply_at_ns:
+            self._supply_at_ns = now_ns + SUPPLY_EVERY_NS
+            self._supply_v = self._bank.bus.state(self._axes[0] // 2)[0]
+        return self._supply_v
 
     def write_torque(self, torque: Pair) -> None:
         """See `Drive.write_torque`."""

@@ -11,11 +11,14 @@ from shared.bus.messages import DriveStatus, Pair
 from shared.clock import NS_PER_S
 
 __all__ = [
-    "HEAT_EVERY_NS", "Drive", "DriveReading", "DriveStatus", "MotorTarget", "real_readings",
+    "HEAT_EVERY_NS", "SUPPLY_EVERY_NS", "Drive", "DriveReading", "DriveStatus", "MotorTarget",
+    "real_readings",
 ]  # fmt: skip
 
 HEAT_EVERY_NS: Final = NS_PER_S
 """How often a driver asks its drive for the temperatures, ns, where the firmware tells them."""
+SUPPLY_EVERY_NS: Final = NS_PER_S // 2
+"""Time between two questions for the supply's voltage, ns."""
 CELSIUS: Final = (-40.0, 200.0)
 """What a thermistor that is there reads; a pin without one reads 0 or nonsense."""
 
@@ -49,6 +52,8 @@ class DriveReading(msgspec.Struct, gc=False, frozen=True):
     """What the thermistors of the output stages read, C; None: not with this sample."""
     motor_celsius: Pair | None = None
     """What the motors' thermistors read, C; None: not with this sample, or there are none."""
+    supply_v: float = 0.0
+    """Voltage of the drive's supply as it was told last, V; 0: not known."""
 
     @property
     def angles(self) -> Pair | None:

@@ -12,7 +12,13 @@ from collections.abc import Callable
 from typing import Final
 
 from services.joint.drivers import odrive_frames
-from services.joint.drivers.base import HEAT_EVERY_NS, DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.base import (
+    HEAT_EVERY_NS,
+    SUPPLY_EVERY_NS,
+    DriveReading,
+    DriveStatus,
+    MotorTarget,
+)
 from services.joint.drivers.can_link import RETRY_MS, CanLink, message
 from services.joint.drivers.encoder_pair import EncoderPair
 from services.joint.drivers.firmware import (
@@ -94,6 +100,7 @@ class OdriveCan:
             Command.GET_IQ: self._answers.take_current,
             Command06.GET_VERSION: self._take_version,
             Command06.GET_TEMPERATURE: self._answers.take_heat,
+            Command.GET_VBUS: self._answers.take_supply,
         }
         self._takers = {
             cansimple.arbitration_id(node, command): (axis, taker)
@@ -106,6 +113,7 @@ class OdriveCan:
         self._first = 0  # the axis that is written first
         self._windows = OrderWindows()
         self._heat_at_ns = 0
+        self._supply_at_ns = now_ns() + SUPPLY_EVERY_NS
         self._encoders = EncoderPair()
         self._times = FrameTimes(round(drive.lost_after_s * NS_PER_S), now_ns())
         self._connect()
@@ -157,6 +165,9 @@ class OdriveCan:
                 if now >= self._heat_at_ns and self._report.dialect == "0.6":
                     self._heat_at_ns = now + HEAT_EVERY_NS
                     self._link.send(self._answers.ask_heat)
+                if now >= self._supply_at_ns:
+                    self._supply_at_ns = now + SUPPLY_EVERY_NS
+                    self._link.send(self._answers.ask_supply)
                 return self._reading(status)
             if now >= deadline or not self._link.is_open:
                 break
@@ -319,6 +330,7 @@ class OdriveCan:
         """Forget the drive's reports: it may have been switched off and on."""
         self._report.forget()
         self._answers.forget_counts()
+        self._answers.supply_v = 0.0
 
     def _reading(self, status: DriveStatus) -> DriveReading:
         """Return the newest estimates with a status."""
@@ -332,6 +344,7 @@ class OdriveCan:
             self._answers.torques if self._due.gains is None else None,
             self._answers.encoder_zero(),
             *self._answers.heat(),
+            supply_v=self._answers.supply_v,
         )
 
     def _connect(self) -> bool:

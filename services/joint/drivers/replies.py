@@ -30,6 +30,8 @@ class Replies:
         ask_currents: requests for the currents.
         ask_counts: requests for the encoders' counts.
         ask_heat: requests for the temperatures, which firmware 0.6 knows.
+        ask_supply: request for the voltage of the supply.
+        supply_v: the newest, V; 0: not known.
         counted: position in turns, without velocity, of an axis that sends no estimates; None: no
     answer, or estimates have arrived.
     """
@@ -50,6 +52,8 @@ class Replies:
         self.ask_heat = [request_of(n, Command06.GET_TEMPERATURE) for n in node_ids]
         self.counted: list[Pair | None] = [None, None]
         self._heat: list[Pair | None] = [None, None]
+        self.ask_supply = [request_of(node_ids[0], Command.GET_VBUS)]
+        self.supply_v = 0.0
         self._torques: list[float | None] = [None, None]
         self._zeros: list[float | None] = [None, None]
         self._torque_constant = torque_constant
@@ -97,6 +101,13 @@ class Replies:
             self.counted[axis] = (shadow_count / self._counts_per_turn, 0.0)
             per_turn = self._counts_per_turn
             self._zeros[axis] = (shadow_count - in_turn) % per_turn / per_turn
+
+    def take_supply(self, _axis: int, data: bytes) -> None:
+        """Take the supply's voltage; both axes have one."""
+        if len(data) == _BYTES:
+            volts, _ = cansimple.unpack_two_floats(data)
+            if isfinite(volts):
+                self.supply_v = max(0.0, volts)
 
     def take_current(self, axis: int, data: bytes) -> None:
         """Take the current setpoint of axis 0 or 1; one that is not finite is no answer.

@@ -11,6 +11,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import msgspec
+
 from services.joint.drivers.base import Drive, DriveReading, DriveStatus, MotorTarget
 from shared.bus.messages import LOST_DRIVE, Pair
 
@@ -46,6 +48,7 @@ class MotorFrame(NamedTuple):
             else ((zero[0] * sign_a - mark) % 1.0, (zero[1] * sign_b - mark) % 1.0),
             reading.fet_celsius,
             reading.motor_celsius,
+            supply_v=reading.supply_v,
         )
 
     def target(self, target: MotorTarget) -> MotorTarget:
@@ -95,9 +98,7 @@ class WiredDrive:
         reading = self._frame.from_drive(raw)
         if not self._read_only or reading.status is not DriveStatus.ARMED:
             return reading
-        return DriveReading(
-            reading.t_ns, reading.pos_turns, reading.vel_turns, DriveStatus.IDLE, reading.error
-        )
+        return msgspec.structs.replace(reading, status=DriveStatus.IDLE, torque=None)
 
     def write_torque(self, torque: Pair) -> None:
         """See `Drive.write_torque`."""

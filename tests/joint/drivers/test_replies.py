@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import math
 import random
+import time
 
 import pytest
 
-from services.joint.drivers.base import DriveReading
+from services.joint.drivers.base import SUPPLY_EVERY_NS, DriveReading
 from services.joint.drivers.encoder_pair import EncoderPair
 from services.joint.drivers.frame_times import REBOOT_MS
 from services.joint.drivers.odrive_can import RETRY_MS, OdriveCan
+from services.joint.drivers.replies import Replies
+from services.simulator.fronts.cansimple_dialects import DialectName
 from shared.bus.messages import Pair
 from shared.can.cansimple import AxisState, Command, pack_two_floats, pack_two_ints
+from shared.clock import NS_PER_S
 from shared.config.sections import CanConfig
 from tests.joint.drivers.can_bench import Bench, receiving_fails
-from tests.joint.drivers.rig import DRIVE, NODES, Rig, arm
+from tests.joint.drivers.rig import DRIVE, NODES, Rig, Shed, arm
 
 COUNTS_PER_TURN = 1000
 
@@ -202,3 +206,25 @@ def test_what_is_no_number_is_no_estimate(bad: tuple[float, float]) -> None:
     pair.take(1, bad, 10**9)
     assert not pair.complete()
     assert pair.estimates == [(1.0, 2.0), (0.0, 0.0)]
+
+
+@pytest.mark.parametrize("dialect", ["0.5", "0.6"])
+def test_the_voltage_of_the_supply_is_asked_for_now_and_then(
+    shed: Shed, dialect: DialectName
+) -> None:
+    rig = shed.rig(dialect=dialect)
+    driver = shed.connected(rig)
+    assert rig.cycle(driver).supply_v == 0.0, "not known yet"
+    rig.bank.bus.supply[2] = 43.5
+    rig.bank.bus.changed()
+    time.sleep(SUPPLY_EVERY_NS / NS_PER_S)
+    rig.cycle(driver)
+    assert rig.cycle(driver).supply_v == pytest.approx(43.5, abs=0.01)
+
+
+@pytest.mark.parametrize("volts", [math.nan, math.inf, -1.0])
+def test_a_voltage_that_is_none_is_not_believed(volts: float) -> None:
+    replies = Replies(NODES, 0.08, None)
+    replies.take_supply(0, pack_two_floats(volts, 0.0))
+    replies.take_supply(0, b"")
+    assert replies.supply_v == 0.0

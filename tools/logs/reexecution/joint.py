@@ -224,4 +224,5 @@ def _reading(c: CycleTrace) -> DriveReading | None:
         c.encoder_zero if c.encoder_zero[0] >= 0.0 else None,
         c.fet_celsius if any(c.fet_celsius) else None,
         c.motor_celsius if any(c.motor_celsius) else None,
+        supply_v=c.supply_v,
     )
