@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from services.planner.intents import OperatorRequest
-from services.simulator.physics.plant import PlantConfig
+from services.simulator.physics.plant import PlantConfig, changed
 from shared.bus.messages import JointState, Message, Mode, PlannerStatus, SimTruth
 from shared.bus.topics import Topic
 from shared.config.robot_config import RobotConfig
@@ -138,7 +138,7 @@ def hang(fleet: Descending, row: SimTruth) -> None:
 def test_it_goes_down_and_holds_until_a_hoist_bears_it(robot: RobotConfig, number: int) -> None:
     found = go_down(robot, alone(), plants.draw(f"down {number}"), hang)
     assert found.fleet.asks[-1] is Ask.IDLE
-    assert found.fleet.error == ""
+    assert found.rows[-1].hoist == 1.0, "not before"
     assert found.speed < 0.2
     lowest = min(row.torso[2] for row in found.rows)
     assert lowest < 0.85, "the lowest pose"
@@ -153,6 +153,14 @@ def test_with_nothing_to_bear_it_it_holds_and_says_what_helps(robot: RobotConfig
     assert Ask.IDLE not in found.fleet.asks
     assert found.height < 0.85
     assert {*modes_of(found.fleet)} == {Mode.DAMP}
+
+
+def test_a_robot_without_its_payload_is_not_taken_for_a_hanging_one(robot: RobotConfig) -> None:
+    law = msgspec.structs.replace(robot.law, load_correction=(0.0, 0.0))  # led whatever it carries
+    light = changed(PlantConfig(), {"body.payload_scale": 0.0})
+    found = go_down(msgspec.structs.replace(robot, law=law), alone(kill=kill(0.5)), light)
+    assert "still holds: the legs bear" in found.fleet.error
+    assert Ask.IDLE not in found.fleet.asks
 
 
 def test_without_a_planner_it_sinks_in_damp(robot: RobotConfig) -> None:

@@ -105,6 +105,7 @@ REFUSALS: list[tuple[Callable[[Table], object], str, str, str]] = [
     (lambda raw: raw["module"].pop(), "module", "hip_left", "six modules"),
     (lambda raw: raw["module"].append(RAW["module"][0]), "module[6].name", "twice", "once"),
     (setting("module.4.bus", "can9"), "module[4].bus", "'can9'", "one of ankle_right"),
+    (setting("supply.sit_v", 45.0), "supply.sit_v", "45 V", "at most supply.low_v, 44 V"),
     (setting("harness.bus", "can9"), "harness.bus", "'can9'", "one of ankle_right"),
     (lambda raw: raw["imu"].update(fitted=True, bus="can9"), "imu.bus", "'can9'", "one of ankle"),
     (
