@@ -68,9 +68,11 @@ def causes(outcome: Run) -> set[Cause]:
 @pytest.mark.parametrize("name", SHAKEN)
 def test_a_robot_that_shook_itself_down_stands_in_hold(robot: RobotConfig, name: str) -> None:
     shaky, plant = unfiltered(robot), PLANTS[name]
-    # with no trip it shakes, and falls after 2 to 4 s: when, the last bit decides
+    # with no trip it shakes until a drive disarms for its current (48 A, at the torque's limit), or
+    # falls after 2 to 4 s: when, the last bit decides
     falls = run(untripped(shaky), still(8.0, push=PUSHED), plant=plant, stands=False)
-    assert falls.rows[-1].fallen, "nothing is proved by a robot that would have stood"
+    limp = Mode.FAULT in falls.modes
+    assert limp or falls.rows[-1].fallen, "nothing is proved by a robot that would have stood"
     # where it is never led for a second the scenario, and its push, do not begin
     outcome, _ = trip_run(shaky, still(4.0, push=PUSHED), plant, stands=False, until_s=12.0)
     assert Cause.SHAKING in causes(outcome)
