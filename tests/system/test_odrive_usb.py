@@ -251,6 +251,10 @@ def test_the_drive_takes_a_position_that_is_written(usb: UsbRobot, control: Cont
         assert usb.pos[AXES].tolist() == [0.0, 0.0]
 
 
+def test_an_idle_drives_encoders_tell_where_they_read_0(drive: OdriveUsb) -> None:
+    assert eventually(lambda: (reading := drive.read(0.01)) and reading.encoder_zero is not None)
+
+
 def test_a_control_loop_that_hangs_lets_the_watchdog_fire(usb: UsbRobot, armed: Control) -> None:
     time.sleep(odrive_usb.FEED_MS * 1e-3)
     assert armed.status is DriveStatus.ARMED

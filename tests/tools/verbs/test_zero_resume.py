@@ -227,6 +227,29 @@ def test_where_the_joints_rest_is_stored_of_zeroed_drives_only(
     assert bench.run(resume=True) == FAULT_EXIT_CODE, "its rest was forgotten"
 
 
+def test_down_stores_where_real_drives_rest(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab = tmp_path / "lab.toml"
+    lab.write_bytes(DEFAULT_CONFIG.read_bytes())
+    services = ["planner", *MODULES]
+    assert resuming.rests_after_down(lab, tmp_path, services) == "", "emulated drives are gone"
+    for module in (resuming, zero_record):
+        monkeypatch.setattr(module, "is_simulated", lambda _: False)
+    assert resuming.rests_after_down(lab, tmp_path, services) == "", "no zero was stored"
+    bench.zero()
+    kept = bench.path.rename(tmp_path / "lab.zeros.json")
+    before = zero_record.read(kept, bench.robot)
+    nowhere = zero_record.with_rests(before, dict.fromkeys(MODULES))
+    zero_record.write(kept, nowhere)
+    assert "6 of 6 modules rest" in resuming.rests_after_down(lab, tmp_path, services)
+    after = zero_record.read(kept, bench.robot)
+    for module, zero in before.modules.items():
+        assert after.modules[module].rest == pytest.approx(zero.rest, abs=1e-3)
+    kept.write_text("{")
+    assert "is not kept: " in resuming.rests_after_down(lab, tmp_path, services)
+
+
 # ---- whose zero it is
 
 
