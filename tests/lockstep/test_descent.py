@@ -20,6 +20,7 @@ from tests.lockstep.runs import kill, led_to, modes_of, push, run, still
 from tools.fleet.descent import LIGHT_FRACTION, Ask, Descent, Phase
 from tools.lab.studies.sweeps import plants
 from tools.sim.lockstep import Lockstep
+from tools.sim.standing_start import begin_standing
 
 AT_S = 1.0
 HEARD_S = 0.1
@@ -232,3 +233,30 @@ def test_beside_a_limp_module_it_is_refused(robot: RobotConfig) -> None:
     found = go_down(robot, alone(), each=idle)
     assert found.fleet.error.startswith("hip_right FAULT: it may bear weight on the others")
     assert found.fleet.asks == [Ask.NOTHING]
+
+
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize(("idled_s", "height"), [(10.0, 0.85), (0.5, 1.2)])
+def test_idled_it_meets_the_floor_as_hard_from_its_lowest_pose_as_from_a_stand(
+    robot: RobotConfig, idled_s: float, height: float
+) -> None:
+    """Why going down does not end with idle drives: 2.8 m/s from 0.82 m, 2.9 m/s from 1.19 m."""
+    heights: list[float] = []
+
+    def idle(fleet: Lockstep, row: SimTruth) -> bool:
+        fleet.estop = fleet.estop or row.scenario_s > 0.6
+        if row.scenario_s > idled_s:
+            heights.append(row.torso[2])
+            for joint in fleet.joints:
+                joint.frozen = True
+                joint.drive.idle()
+        return row.torso[2] < 0.2
+
+    fleet = Lockstep(robot, alone(16.0))
+    assert begin_standing(fleet)
+    for row in fleet.run():  # on through the fall
+        if idle(fleet, row):
+            break
+    assert heights[0] < height
+    assert heights[-1] < 0.2
+    assert 2.3 < -np.gradient(heights, 0.01).min() < 3.5
