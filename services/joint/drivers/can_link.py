@@ -208,12 +208,9 @@ class CanLink:
         """
         if self._bus is None:
             return
-        now = now_ns()
         self._commands = [*messages, *self._probe] if proven and self.watch.echoes else messages
-        self._commands_until_ns = now + COMMANDS_MS * NS_PER_MS
+        self._commands_until_ns = now_ns() + COMMANDS_MS * NS_PER_MS
         self._commands_proven = proven
-        if proven and self.watch.may_send(now) and not self.watch.may_arm(now):
-            self._send_probe(now)
         self._send_commands()
 
     def close(self) -> None:
@@ -228,6 +225,8 @@ class CanLink:
             self._commands = ()
         elif not self._commands_proven or self.watch.may_arm(now):
             self._commands = self._commands[self._hand_over(self._commands, now) :]
+        elif self.watch.may_send(now) and not self.watch.waits:
+            self._send_probe(now)
         return not self._commands
 
     def _hand_over(self, messages: Sequence[can.Message], now: int) -> int:

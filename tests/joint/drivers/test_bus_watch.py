@@ -247,6 +247,9 @@ class Cut:
     def power(self, *, on: bool) -> None:
         self.rig.bank.conditions.link(AXES[0] >> 1, up=on)
 
+    def choke(self, *, full: bool) -> None:
+        self.rig.bank.conditions.choke(AXES[0] >> 1, full=full)
+
     def step(self) -> None:
         """Let a millisecond pass."""
         self.hub.now_ms = self.ms
@@ -383,17 +386,18 @@ def test_a_bus_that_is_full_in_bursts_is_written_to_between_them(cut: Cut) -> No
     armed(cut)
     for _ in range(20):
         for choked in (True, False):
-            cut.hub.choked = choked
+            cut.choke(full=choked)
             cut.run(40)
             assert cut.reading is not None
             assert cut.reading.status is DriveStatus.ARMED
     assert cut.oldest_ms() <= CYCLE_MS
     assert cut.restarts == 0
+    assert 300 < cut.driver.write_failures < 500, "two of five were refused"
 
 
 def test_a_bus_that_stays_full_counts_as_one_that_carries_nothing(cut: Cut) -> None:
     armed(cut)
-    cut.hub.choked = True
+    cut.choke(full=True)
     cut.run(BLOCKED_MS + 20)
     assert cut.reading is not None
     assert cut.reading.status is DriveStatus.UNACKNOWLEDGED
