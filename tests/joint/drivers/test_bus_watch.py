@@ -137,6 +137,10 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
     bench.driver.close()
 
 
+COUNTS = [Command.GET_ENCODER_COUNT] * 2
+"""Asked for with each heartbeat of an axis that is not armed."""
+
+
 def echo(bench: Bench) -> None:
     """Hand back what was sent."""
     bench.bus.waiting.extend(bench.bus.sent)
@@ -150,7 +154,7 @@ def test_an_arming_request_waits_for_a_frame_that_is_carried_and_is_followed_by_
     bench.receive()
     bench.driver.arm(onboard=True)
     echo(bench)
-    assert bench.commands() == [Command06.GET_VERSION], "the probe"
+    assert bench.commands() == [*COUNTS, Command06.GET_VERSION], "the probe comes last"
     bench.after(2)
     bench.after(2)
     commands = bench.commands()
@@ -166,7 +170,7 @@ def test_no_arming_request_is_left_on_a_bus_that_carries_nothing(bench: Bench) -
     for _ in range(200):
         bench.driver.arm(onboard=True)
         bench.after(CYCLE_MS)
-    assert set(bench.commands()) == {Command06.GET_VERSION}
+    assert set(bench.commands()) == {*COUNTS, Command06.GET_VERSION}
 
 
 def test_where_nothing_can_be_thrown_away_a_dead_bus_gets_a_few_targets_and_no_more(

@@ -8,7 +8,8 @@ import time
 
 import pytest
 
-from services.joint.drivers.base import SUPPLY_EVERY_NS, DriveReading
+from services.joint.drivers import odrive_can
+from services.joint.drivers.base import DriveReading
 from services.joint.drivers.encoder_pair import EncoderPair
 from services.joint.drivers.frame_times import REBOOT_MS
 from services.joint.drivers.odrive_can import RETRY_MS, OdriveCan
@@ -16,7 +17,7 @@ from services.joint.drivers.replies import Replies
 from services.simulator.fronts.cansimple_dialects import DialectName
 from shared.bus.messages import Pair
 from shared.can.cansimple import AxisState, Command, pack_two_floats, pack_two_ints
-from shared.clock import NS_PER_S
+from shared.clock import NS_PER_MS
 from shared.config.sections import CanConfig
 from tests.joint.drivers.can_bench import Bench, receiving_fails
 from tests.joint.drivers.rig import DRIVE, NODES, Rig, Shed, arm
@@ -210,15 +211,18 @@ def test_what_is_no_number_is_no_estimate(bad: tuple[float, float]) -> None:
 
 @pytest.mark.parametrize("dialect", ["0.5", "0.6"])
 def test_the_voltage_of_the_supply_is_asked_for_now_and_then(
-    shed: Shed, dialect: DialectName
+    shed: Shed, dialect: DialectName, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(odrive_can, "SUPPLY_EVERY_NS", 5 * NS_PER_MS)
     rig = shed.rig(dialect=dialect)
-    driver = shed.connected(rig)
-    assert rig.cycle(driver).supply_v == 0.0, "not known yet"
     rig.bank.bus.supply[2] = 43.5
     rig.bank.bus.changed()
-    time.sleep(SUPPLY_EVERY_NS / NS_PER_S)
-    rig.cycle(driver)
+    driver = shed.connected(rig)
+    assert rig.cycle(driver).supply_v == 0.0, "not known yet"
+    for _ in range(100):  # an answer may find the drive's mailboxes full
+        time.sleep(0.005)
+        if rig.cycle(driver).supply_v:
+            break
     assert rig.cycle(driver).supply_v == pytest.approx(43.5, abs=0.01)
 
 
