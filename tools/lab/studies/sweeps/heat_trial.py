@@ -191,6 +191,7 @@ def run_trial(trial: HeatTrial, robot: RobotConfig, observer: Observer = NOBODY)
     rows: list[SimTruth] = []
     since_s: dict[HeatAction, float] = {}
     skipped_s, unseen, error, derating = 0.0, False, None, 1.0
+    winding = stage = 0.0
     for row in observer.rows_that_count(fleet.run(), 0.0):
         rows.append(row)
         planner = fleet.planner
@@ -199,6 +200,8 @@ def run_trial(trial: HeatTrial, robot: RobotConfig, observer: Observer = NOBODY)
         action = HeatAction(planner.status(fleet.now_ns, 0.0).heat)
         since_s.setdefault(action, row.scenario_s)
         derating = min(derating, heat.derating)
+        winding = max(winding, float(heat.winding.max()))
+        stage = max(stage, float(heat.stage.max()))
         unseen |= heat.derating < 1.0 and action is HeatAction.NONE
         if action is HeatAction.STANDS_UP and error is None:
             shown = max(max(law.heat.state.winding) for law in fleet.controllers)
@@ -222,8 +225,8 @@ def run_trial(trial: HeatTrial, robot: RobotConfig, observer: Observer = NOBODY)
         held_s=None if stands is None else stands - LEAD_S + skipped_s,
         told_s=None if stands is None else stands - since_s.get(HeatAction.EASES, stands),
         rose_s=None if stands is None or rests is None else rests - stands,
-        winding_max=float(heat.winding.max()),
-        stage_max=float(heat.stage.max()),
+        winding_max=winding,
+        stage_max=stage,
         derating_min=derating,
         unseen=unseen,
         error=error,
