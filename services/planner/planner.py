@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from services.planner.controller import Controller, Observation
 from services.planner.intents import OperatorRequest
 from services.planner.law.assist import Overload, OverloadState, force_up
-from services.planner.law.height import DOWN, STAY
+from services.planner.law.height import Toward
 from services.planner.law.hocca import Hocca, LawOutput, LawState
 from services.planner.state_phases import PhasesState, StatePhases
 from services.planner.watch.controller_guard import ControllerGuard, GuardState
@@ -247,8 +247,7 @@ class Planner:
             dt,
             shift_requested=request.shift,
             probe=(request.probe_row, request.probe),
-            lift=heat.direction,
-            toward=DOWN if self._sits and heat.direction is None else STAY,
+            toward=self._toward(heat.toward),
             align=engagement.hold,
             wrench=self._usable_wrench(now_ns),
             up_torso=self._usable_up(now_ns),
@@ -401,6 +400,10 @@ class Planner:
             force, moment = lifted, wrench.moment[1]
         p = output.p.tolist() if output is not None else [0.0] * 6
         return self._unattended.drift(now_ns, (p[2], p[4]), force, moment)
+
+    def _toward(self, heat: Toward) -> Toward:
+        """Return where the robot goes by itself; what is too warm goes first."""
+        return Toward.DOWN if heat is Toward.PERSON and self._sits else heat
 
     @property
     def _sits(self) -> bool:

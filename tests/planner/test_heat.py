@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.planner.law.lift import FADE_RATE, FORCE_MAX, LEAD_ANGLE, LEAD_MAX, RATE, Lift
+from services.planner.law.height import Toward
 from services.planner.watch.heat import (
     EASE_S,
     HAND_MAX,
@@ -84,10 +84,10 @@ def test_it_rests_for_a_while_and_until_enough_is_left(robot: RobotConfig) -> No
     watched.run(1.0)
     watched.run(3600.0, STRAIGHT, seconds=REST_S - 1.0)
     assert watched.action is RESTS
-    assert watched.run(1.5 * robot.heat.ease_s, STRAIGHT, seconds=2.0).direction == 0.0
+    assert watched.run(1.5 * robot.heat.ease_s, STRAIGHT, seconds=2.0).toward is Toward.REST
     for lifted in (-HAND_MAX - 1.0, HAND_MAX + 1.0, None):
-        assert watched.run(3600.0, STRAIGHT, seconds=1.0, lifted=lifted).direction == 0.0
-    assert watched.run(3600.0, STRAIGHT, seconds=1.0).direction is None
+        assert watched.run(3600.0, STRAIGHT, seconds=1.0, lifted=lifted).toward is Toward.REST
+    assert watched.run(3600.0, STRAIGHT, seconds=1.0).toward is Toward.PERSON
     assert watched.action is NONE
 
 
@@ -113,39 +113,3 @@ def test_the_assist_goes_but_never_from_under_the_person(robot: RobotConfig) -> 
     assert resting.run(left_s, requested=100.0, lifted=-150.0).assist <= 100.0
     decision = resting.run(left_s, requested=200.0, lifted=0.0, seconds=10.0)
     assert decision.assist == pytest.approx(150.0 - RESTED_ON - 10.0 * SHED_RATE)
-
-
-def test_the_lift_rises_at_its_rate_and_hardly_leads_what_does_not_follow() -> None:
-    lift, p, T_z = Lift(), np.zeros(6), np.full(12, 4.0)
-    p[2] = 0.74
-    for _ in range(500):  # 2 s, and the robot follows
-        lift.advance(1.0, p, T_z, 0.004)
-        p[2] = lift.state.z
-    assert lift.state.rate == pytest.approx(RATE)
-    assert lift.state.force < 1.0
-    start = p[2]  # and now it is held back, for 8 s
-    forces = [lift.advance(1.0, p, T_z, 0.004) for _ in range(2000)]
-    assert lift.state.z - start == pytest.approx(min(LEAD_MAX, LEAD_ANGLE / 4.0))
-    assert max(forces) == FORCE_MAX
-    assert max(np.diff(forces)) <= 61.0 * 0.004
-    for _ in range(round(FORCE_MAX / FADE_RATE / 0.004) + 10):
-        lift.advance(None, p, T_z, 0.004)
-    assert lift.state.force == 0.0
-    assert not lift.is_holding
-
-
-def test_a_lift_begins_and_ends_without_a_step_of_the_reference() -> None:
-    lift, T_z = Lift(), np.full(12, 4.0)
-    p, pdot = np.zeros(6), np.zeros(6)
-    p[2], p[4], pdot[2] = 0.74, 0.3, -0.1
-    seen = []
-    for k in range(1000):
-        lift.advance(1.0 if k < 500 else None, p, T_z, 0.004)
-        p_ref, pdot_ref = p.copy(), pdot.copy()
-        lift.apply(p_ref, pdot_ref, p, pdot)
-        seen.append((p_ref[2], p_ref[4], pdot_ref[2]))
-        p[2] += 0.004 * pdot_ref[2]
-    steps = np.abs(np.diff(np.array(seen), axis=0)).max(axis=0)
-    assert steps[0] < 1e-3, "it moves at 0.1 m/s as it begins"
-    assert steps[1] < 1e-9
-    assert steps[2] < 2e-3

@@ -19,7 +19,7 @@ Pure: no clock, bus or thread.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -36,11 +36,10 @@ from services.planner.law.assist import (
 )
 from services.planner.law.coupling import CouplingFilter
 from services.planner.law.gains import GainLaw
-from services.planner.law.height import STAY, HeightReference, HeightState
+from services.planner.law.height import HeightReference, HeightState, Toward
 from services.planner.law.kinematics import Measured
 from services.planner.law.law_terms import LawAtReference
 from services.planner.law.levelling import Levelling
-from services.planner.law.lift import Lift, LiftState
 from services.planner.law.load import Load, LoadState
 from services.planner.law.probe import NO_ROW, ProbeState, ReferenceProbe
 from services.planner.law.reference import Reference
@@ -60,6 +59,7 @@ RECENTRED = np.array([True, True, False, True, False, True])
 ankles along gravity. Along the floor's normal the COM is off them by its height times the floor's
 slope."""
 
+_PERSON: Final = Toward.PERSON
 KNEES = tuple(2 * MODULE_INDEX[f"knee_{side}"] + 1 for side in SIDES)
 """Indices of the knees' theta among the joints."""
 
@@ -115,7 +115,6 @@ class LawState(msgspec.Struct):
     load: LoadState = msgspec.field(default_factory=LoadState)
     probe: ProbeState = msgspec.field(default_factory=ProbeState)
     height: HeightState = msgspec.field(default_factory=HeightState)
-    lift: LiftState = msgspec.field(default_factory=LiftState)
 
 
 class Hocca:
@@ -150,7 +149,6 @@ class Hocca:
             assist.force_max, assist.rate_max, assist.integral_max, assist.integral_s
         )
         self._easing = LeadEasing(config.law.lead_easing)
-        self._lift = Lift()
         self._recentre_s = config.law.recentre_s
         self._p_C0: Array = np.zeros(6)
         self._state = LawState(
@@ -160,7 +158,6 @@ class Hocca:
             load=self._load.state,
             probe=self._probe.state,
             height=self._height.state,
-            lift=self._lift.state,
         )
 
     @property
@@ -196,8 +193,7 @@ class Hocca:
         *,
         shift_requested: Vector4 = STRAIGHT,
         probe: tuple[int, float] = (NO_ROW, 0.0),
-        toward: int = STAY,
-        lift: float | None = None,
+        toward: Toward = Toward.PERSON,
         align: bool = False,
         wrench: Wrench | None = None,
         up_torso: Vector3 | None = None,
@@ -213,9 +209,7 @@ class Hocca:
             shift_requested: requested x, y (m), roll and yaw (rad) of the shift; limited here.
             probe: row of p whose reference is offset, and by how much, m or rad
                 (`services.planner.law.probe`).
-            toward: go down or up without a hand (`services.planner.law.height`).
-            lift: 1 to stand up by itself, 0 to stay; None: height and pitch are the person's
-                (`services.planner.law.lift`).
+            toward: where to go without a hand (`services.planner.law.height`).
             align: start from the measured pose, so that engaging makes no step. p_C starts at the
                 measured pose and returns to zero (COM over the ankles, no roll, no yaw; height and
                 pitch stay) during `law.recentre_s` of ticks without `align`. A planner that was
@@ -241,13 +235,10 @@ class Hocca:
             self._shift.rest()
             self._probe.reset()
             self._height.reset()
-            self._lift.reset()
         else:
             self._state.has_led = True
             self._probe.advance(*probe, measured.p, measured.pdot, dt)
             self._shift.advance(shift_requested, dt)
-            knees = float(q[KNEES[0]]), float(q[KNEES[1]])
-            self._height.advance(toward, measured.p, measured.pdot, knees, dt)
         pdot = measured.pdot
         p_C, pdot_C = self._closed_loop_reference(dt)
         self._shift.add_to(p_C, pdot_C)
@@ -257,21 +248,21 @@ class Hocca:
         p_ref = self._S_perp * p_C + self._S * measured.p
         pdot_ref = self._S_perp * pdot_C + self._S * pdot
         self._probe.apply(p_ref, pdot_ref, measured.p, pdot)
-        self._height.apply(p_ref, pdot_ref)
         force, moment_pitch = None, 0.0
         if wrench is not None:
             force = force_up(wrench.force, measured.p[3], measured.p[4])
             moment_pitch = wrench.moment[1]
         still = not align and is_still(pdot[2], pdot[4])
-        lifts = lift is not None or self._lift.is_holding
-        if lifts:
+        height = self._height
+        if toward is not _PERSON or height.state.hold > 0.0:
             force = None  # the hand leads nothing now, and what it does is no error of the assist
         measured_assist = None if force is None else -force
         assist_rate = self._assist.advance(assist_wanted, measured_assist, dt, still=still)
         assist, F_O = self._assist.assist, self._F_O
-        if lifts and not align:
-            lift_n = self._lift.advance(lift, measured.p, reference.T[:, 2], dt)
-            self._lift.apply(p_ref, pdot_ref, measured.p, pdot)
+        if not align and (toward is not _PERSON or height.is_active):
+            T_z, knees = reference.T[:, 2], (float(q[KNEES[0]]), float(q[KNEES[1]]))
+            lift_n = height.advance(toward, measured.p, pdot, T_z, knees, dt)
+            height.apply(p_ref, pdot_ref)
             F_O = F_O.copy()
             F_O[:3] += lift_n * up
         ease_z, ease_pitch = self._easing.ease(force, moment_pitch, assist, dt)
@@ -302,7 +293,7 @@ class Hocca:
             pdot=pdot.copy(),
             p_ref=p_ref,
             closure=measured.closure.copy(),
-            assist=assist + self._lift.state.force,
+            assist=assist + height.state.force,
             slope=self._levelling.slope,
             stance=self._stance.taken,
             ik_iterations=result.iterations,
@@ -398,7 +389,6 @@ class Hocca:
             own.shift,
         )
         self._load.state, self._probe.state, self._height.state = own.load, own.probe, own.height
-        self._lift.state = own.lift
         self._p_C0 = np.array(own.p_C0)
         self._reference.start[:] = own.q
         self._coupling.restore(own.coupling)

@@ -18,6 +18,7 @@ from typing import Final, NamedTuple
 
 import msgspec
 
+from services.planner.law.height import Toward
 from shared.bus.messages import HeatAction, JointState
 from shared.clamp import clamp
 from shared.clock import NS_PER_S
@@ -52,8 +53,8 @@ class HeatDecision(NamedTuple):
 
     assist: float
     """Assist that is requested of the law, N."""
-    direction: float | None
-    """1: stand up, 0: stay; None: the height is the person's."""
+    toward: Toward
+    """Where to it moves by itself."""
 
 
 class HeatWatchState(msgspec.Struct):
@@ -116,10 +117,10 @@ class HeatWatch:
         s.scale = clamp(s.scale + (step if action is HeatAction.NONE else -step), 0.0, 1.0)
         rests = 0.0 if lifted is None else -lifted
         s.rests = max(0.0, rests, s.rests - SHED_RATE * dt)
-        direction = None
+        toward = Toward.PERSON
         if self.moves:
-            direction = 1.0 if action is HeatAction.STANDS_UP else 0.0
-        return HeatDecision(self._assist(requested), direction)
+            toward = Toward.UP if action is HeatAction.STANDS_UP else Toward.REST
+        return HeatDecision(self._assist(requested), toward)
 
     def _assist(self, requested: float) -> float:
         """Return what is left of the requested assist, N."""
