@@ -27,6 +27,8 @@ STILL: Final = 2e-5
 """turns: a third of a count of 16384, to which the estimate settles after the last word."""
 STILL_NS: Final = 4 * NS_PER_MS
 """An estimate that has not changed for so long does not follow an encoder."""
+SAMPLE_NS: Final = 4 * NS_PER_MS
+"""A longer time without a sample is the link's: the drive counts on."""
 SETTLES_S: Final = 0.008
 """s: the estimate rests so long after the last word at most."""
 GAP_NS: Final = 53 * NS_PER_MS
@@ -72,8 +74,10 @@ class TurnWatch(msgspec.Struct):
                 self.slowest = self.fastest = 0.0
                 self.lost = self.lost or self.is_zero(pos)
         else:
-            if self.changed_ns and STILL_NS <= self.newest_ns - self.changed_ns <= GAP_NS:
-                possible = self._explain(jump, (t_ns - self.changed_ns) / NS_PER_S) or possible
+            rested_ns = self.newest_ns - self.changed_ns
+            if self.changed_ns and STILL_NS <= rested_ns <= GAP_NS:
+                rested_ns += min(t_ns - self.newest_ns, SAMPLE_NS)
+                possible = self._explain(jump, rested_ns / NS_PER_S) or possible
             self.pos, self.changed_ns = pos, t_ns
             gains, fades = ACCELERATION * dt_s, FADES * dt_s
             slowest, fastest = self.slowest, self.fastest

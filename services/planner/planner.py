@@ -236,7 +236,7 @@ class Planner:
         self._support = self._state.limp_legs.advance(now_ns, states)
         self._phases.advance(states, self._state.arrived_ns, last_ns)
         request = self._state.request
-        heat = self._heat.advance(now_ns, states, request.assist_n, self._lifted(now_ns), dt)
+        heat = self._heat.advance(now_ns, states, request.assist_n, dt)
         self._supply.advance(states, dt)
         # until all engage, the law restarts from the measured pose each tick: there is no
         # step
@@ -257,6 +257,7 @@ class Planner:
         self._state.source = self._output.local.source
         loads = self._law.leg_loads(self._tau)
         lifted, leads = self._lifted(now_ns), not engagement.hold
+        self._heat.state.lifted = lifted
         all_carry = all(state.mode in _CARRIES for state in states)
         is_fresh = engagement.mode is not _WAITING
         known = is_fresh and all_carry and not any(map(math.isnan, loads))

@@ -19,9 +19,9 @@ from services.simulator.physics.plant import plant_from
 from services.simulator.physics.world import World
 from shared import log, scheduling
 from shared.bus import topics
-from shared.bus.messages import HandLead, OperatorIntent, SimControl, SimTruth
+from shared.bus.messages import HandLead, OperatorIntent, SimControl
 from shared.bus.session import open_session
-from shared.bus.traces import SimState
+from shared.bus.traces import SimState, SimTruth
 from shared.config import files as config_file
 from shared.config import scenarios
 from shared.config.robot_config import RobotConfig, expand

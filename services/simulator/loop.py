@@ -14,10 +14,10 @@ from services.simulator.fronts.fibre_port import FibreHub
 from services.simulator.fronts.sensor_fronts import HarnessFront, ImuFront
 from services.simulator.physics.world import World
 from services.simulator.state import read_state
-from shared.bus.messages import HandLead, OperatorIntent, SimControl, SimTruth, Vector4
+from shared.bus.messages import HandLead, OperatorIntent, SimControl, Vector4
 from shared.bus.session import Latest, Publisher
 from shared.bus.topics import SIM_STATE
-from shared.bus.traces import SimState
+from shared.bus.traces import SimState, SimTruth
 from shared.can.cansimple import AxisState
 from shared.clamp import clamp
 from shared.clock import NS_PER_MS, NS_PER_S, now_ns, sleep_until

@@ -540,59 +540,6 @@ class Estop(Message, frozen=True):
     """Name of the sender."""
 
 
-class SimTruth(Message, frozen=True):
-    """True state of the simulated world; no controller reads it."""
-
-    scenario_s: float
-    """Scenario time; negative until the scenario starts."""
-    com: Vector3
-    """COM of the whole robot, m, world."""
-    torso: Vector3
-    """Torso origin, m, world."""
-    angles: Vector3
-    """Torso roll, pitch, yaw (3-1-2), rad."""
-    operator_force: Vector3
-    """Force of the operator's hand on the torso, N, world."""
-    operator_moment: Vector3
-    """Moment of the operator's hand on the torso, N m."""
-    load_n: float
-    """Weight that the operator rests on the harness, N."""
-    harness_force_z: float
-    """Upward force of the robot on the operator: the load minus the hand's lift, N."""
-    push: Vector3
-    """Push on the torso, N, world."""
-    foot_right_tilt: float
-    """Angle between the right sole and the floor, rad."""
-    foot_left_tilt: float
-    """Angle between the left sole and the floor, rad."""
-    feet_slip: float
-    """Largest distance of an ankle from where it stood at the start, m."""
-    hoist: float
-    """Fraction of the hoist's support: 1 hanging, 0 free."""
-    fallen: bool
-    """True once the robot has fallen."""
-    real_time_factor: float
-    """Simulated time over wall time since the scenario started."""
-    late_s: float
-    """World time lost so far because the machine was too slow, s."""
-    lean: Pair = (0.0, 0.0)
-    """Lean of up against the floor's normal along x and y, m/m; not zero on a slope."""
-    foot_right_force: Vector3 = (0.0, 0.0, 0.0)
-    """Force of the floor on the right sole, N, world."""
-    foot_left_force: Vector3 = (0.0, 0.0, 0.0)
-    """N"""
-    foot_right_cop: Pair = (0.0, 0.0)
-    """Centre of pressure on the right sole, x and y, m, world; (0, 0) if it bears nothing."""
-    foot_left_cop: Pair = (0.0, 0.0)
-    """m"""
-
-    @property
-    def over(self) -> Pair:
-        """Where the COM is over by gravity, at the ankles' height: x and y, m, world."""
-        x, y, z = self.com
-        return x - self.lean[0] * z, y - self.lean[1] * z
-
-
 class SimControl(Message, frozen=True):
     """Command of a tool to the simulated world."""
 

@@ -109,7 +109,7 @@ ESTOP: Final = Topic(
     "emergency stop: every module to DAMP",
 )  # fmt: skip
 SIM_TRUTH: Final = Topic(
-    "sim/truth", messages.SimTruth, 100.0, _BACKGROUND, ("simulator",), (),
+    "sim/truth", traces.SimTruth, 100.0, _BACKGROUND, ("simulator",), (),
     "true state of the world, for the verdict; no controller reads it",
 )  # fmt: skip
 SIM_STATE: Final = Topic(

@@ -111,6 +111,17 @@ def test_an_encoder_that_is_read_all_the_time_raises_no_doubt(
     assert set(events) == {Event.DRIVE_ARMED}
 
 
+@pytest.mark.parametrize("silent_ms", [10, 60, 95])
+def test_samples_that_do_not_come_after_a_short_rest_raise_no_doubt(silent_ms: int) -> None:
+    """The drive counts on while its link is silent."""
+    axis = Axis(0.0, 0.0)
+    axis.goes(0.0, 3)
+    axis.t_ns += silent_ms * NS_PER_MS
+    axis.true += 0.02
+    assert set(axis.goes(0.0, 20)) == {Event.DRIVE_ARMED}
+    assert not axis.samples.turns_lost
+
+
 @pytest.mark.parametrize("in_turn", [0.02, 0.3, 0.499, 0.501, 0.95])
 @pytest.mark.parametrize("armed", [True, False])
 def test_an_encoder_that_reads_0_is_noticed_from_any_angle(in_turn: float, armed: bool) -> None:

@@ -13,8 +13,9 @@ from typing import Final, Literal
 import msgspec
 
 from services.joint.differential import joint_torque
-from shared.bus.messages import Message, Mode, Pair, PlannerStatus, SimTruth
+from shared.bus.messages import Message, Mode, Pair, PlannerStatus
 from shared.bus.topics import Topic
+from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Keyframe, Kill, Push, Restart, Scenario

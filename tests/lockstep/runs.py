@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.simulator.physics.plant import PlantConfig
-from shared.bus.messages import Message, Mode, PlannerStatus, SimTruth, Vector4
+from shared.bus.messages import Message, Mode, PlannerStatus, Vector4
 from shared.bus.topics import Topic
+from shared.bus.traces import SimTruth
 from shared.config import scenarios
 from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig

@@ -11,16 +11,8 @@ import pytest
 from services.simulator.physics.body import body_of
 from services.simulator.physics.plant import IDEAL
 from services.simulator.physics.world import World
-from shared.bus.messages import (
-    Cause,
-    Message,
-    Mode,
-    PlannerStatus,
-    SimTruth,
-    Tare,
-    TareRequest,
-    Wrench,
-)
+from shared.bus.messages import Cause, Message, Mode, PlannerStatus, Tare, TareRequest, Wrench
+from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Scenario
 from tests.lockstep.runs import Heard, modes_of, run, still, variant

@@ -15,7 +15,8 @@ from services.joint.drive_manager import DriveAction, DriveCommand
 from services.joint.drivers.base import DriveStatus
 from services.planner.planner import Planner
 from services.simulator.physics.plant import IDEAL, PlantConfig
-from shared.bus.messages import JointState, Mode, Pair, PlannerMode, SimTruth
+from shared.bus.messages import JointState, Mode, Pair, PlannerMode
+from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from shared.bus.messages import SimTruth
+from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
 from tools.lab.studies.sweeps import certificate, figures

@@ -18,16 +18,9 @@ import pytest
 from services.planner.state_phases import COMPARED_TICKS
 from services.planner.watch.engagement_fsm import WAITS_NS
 from shared.bus import topics
-from shared.bus.messages import (
-    Cause,
-    JointCommand,
-    JointState,
-    Message,
-    Mode,
-    PlannerStatus,
-    SimTruth,
-)
+from shared.bus.messages import Cause, JointCommand, JointState, Message, Mode, PlannerStatus
 from shared.bus.topics import Topic
+from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES

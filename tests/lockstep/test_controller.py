@@ -15,8 +15,9 @@ from services.planner.controller_file import controller_maker
 from services.planner.law.hocca import LawOutput
 from services.simulator.physics.plant import PlantConfig, changed
 from shared.bus import topics
-from shared.bus.messages import Message, Mode, PlannerMode, SimTruth
+from shared.bus.messages import Message, Mode, PlannerMode
 from shared.bus.topics import Topic
+from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
 from tests.imu.robots import with_imu
 from tests.lockstep.runs import Run, kill, modes_of, push, run, still

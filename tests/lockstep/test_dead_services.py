@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from services.simulator.physics.plant import PlantConfig, changed
-from shared.bus.messages import Mode, SimTruth
+from shared.bus.messages import Mode
+from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Push
 from shared.exceptions import RunError

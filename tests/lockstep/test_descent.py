@@ -10,8 +10,9 @@ import pytest
 
 from services.planner.intents import OperatorRequest
 from services.simulator.physics.plant import PlantConfig, changed
-from shared.bus.messages import JointState, Message, Mode, PlannerStatus, SimTruth
+from shared.bus.messages import JointState, Message, Mode, PlannerStatus
 from shared.bus.topics import Topic
+from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Scenario
 from shared.exceptions import FleetError

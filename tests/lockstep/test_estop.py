@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from services.simulator.physics.plant import PlantConfig, changed
-from shared.bus.messages import Mode, SimTruth
+from shared.bus.messages import Mode
+from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Fault, Keyframe, Kill
 from shared.joints import MODULES

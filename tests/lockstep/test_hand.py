@@ -9,7 +9,8 @@ import pytest
 
 from services.simulator.physics.led_hand import HEIGHT_MAX_RATE
 from shared.bus import topics
-from shared.bus.messages import HandLead, Mode, SimTruth
+from shared.bus.messages import HandLead, Mode
+from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from tests.lockstep.runs import still

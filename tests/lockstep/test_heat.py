@@ -7,7 +7,8 @@ from typing import NamedTuple
 import msgspec
 import pytest
 
-from shared.bus.messages import HeatAction, PlannerMode, SimTruth
+from shared.bus.messages import HeatAction, PlannerMode
+from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
 from tests.lockstep.runs import led_to, status_of
 from tools.sim.lockstep import Lockstep

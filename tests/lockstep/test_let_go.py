@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 
 from services.simulator.physics.plant import PlantConfig, changed
-from shared.bus.messages import PlannerMode, SimTruth, Trip
+from shared.bus.messages import PlannerMode, Trip
+from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
 from tests.lockstep.runs import Run, led_to, run, status_of, variant
 from tools.sim.lockstep import Lockstep

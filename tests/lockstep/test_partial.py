@@ -17,7 +17,7 @@ import random
 import pytest
 
 from services.planner.watch.engagement_fsm import GRACE_NS, WAITS_NS
-from shared.bus.messages import SimTruth
+from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES, SIDES

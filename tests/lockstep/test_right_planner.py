@@ -13,7 +13,8 @@ from services.joint.envelope import Envelope
 from services.joint.failsafe import Failsafe
 from services.planner.watch.trips import PlannerTrips
 from services.simulator.physics.plant import PlantConfig, changed
-from shared.bus.messages import Cause, Outside, PlannerMode, SimTruth
+from shared.bus.messages import Cause, Outside, PlannerMode
+from shared.bus.traces import SimTruth
 from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Keyframe, Push, Scenario

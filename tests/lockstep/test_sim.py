@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 from shared.bus import topics
-from shared.bus.messages import PlannerStatus, SimTruth
+from shared.bus.messages import PlannerStatus
+from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_S
 from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig

@@ -5,7 +5,8 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from shared.bus.messages import Mode, SimTruth
+from shared.bus.messages import Mode
+from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
 from tests.lockstep.runs import modes_of, run, status_of, still
 from tools.lab.studies.sweeps import plants

@@ -13,7 +13,8 @@ from typing import Any
 import pytest
 
 from services.simulator.physics.plant import PlantConfig, changed
-from shared.bus.messages import Cause, Mode, PlannerMode, PlannerStatus, SimTruth, Trip
+from shared.bus.messages import Cause, Mode, PlannerMode, PlannerStatus, Trip
+from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Scenario

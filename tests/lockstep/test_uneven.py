@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from scipy.signal import find_peaks
 
-from shared.bus.messages import Cause, Mode, SimTruth
+from shared.bus.messages import Cause, Mode
+from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Keyframe, Push, Scenario
 from tests.lockstep.runs import Run, led_to, modes_of, push, run, still, variant

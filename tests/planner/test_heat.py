@@ -42,7 +42,8 @@ class Watched:
         ]
         for _ in range(max(1, round(10.0 * seconds))):
             now_ns = round(self.now_s * NS_PER_S)
-            decision = self.watch.advance(now_ns, states, requested, lifted, 0.1)
+            self.watch.state.lifted = lifted
+            decision = self.watch.advance(now_ns, states, requested, 0.1)
             self.now_s += 0.1
         return decision
 

@@ -212,7 +212,7 @@ def test_a_watchdog_that_is_not_fed_ends_a_calibration() -> None:
     rotor.run(1.0)
     rotor.bank.settings.set(1, "axis0.config.watchdog_timeout", 0.1)
     rotor.bank.settings.set(1, "axis0.config.enable_watchdog", value=True)
-    rotor.run(2 * DT)
+    rotor.run(0.12)
     assert rotor.bank.faults[2] == AxisErrors(AxisError.WATCHDOG_TIMER_EXPIRED)
     assert (rotor.bank.state[2], rotor.calibrated) == (AxisState.IDLE, (False, False))
 

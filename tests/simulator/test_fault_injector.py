@@ -38,7 +38,7 @@ class Outcome(NamedTuple):
     registers: Registers
     sibling: AxisState = AxisState.CLOSED_LOOP_CONTROL
     is_responding: bool = True
-    after_s: float = 0.06
+    after_s: float = 0.02
 
 
 OUTCOMES = {
@@ -58,13 +58,14 @@ OUTCOMES = {
             EncoderError.ABS_SPI_COM_FAIL,
             ControllerError.INVALID_ESTIMATE,
         ),
+        after_s=0.06,
     ),
     "watchdog": Outcome(AxisState.IDLE, Registers(AxisError.WATCHDOG_TIMER_EXPIRED)),
     "link_lost": Outcome(AxisState.CLOSED_LOOP_CONTROL, Registers(), is_responding=False),
     "disarmed": Outcome(AxisState.IDLE, Registers()),
     "overspeed": Outcome(AxisState.IDLE, OVERSPEED),
     "encoder_zero": Outcome(AxisState.IDLE, OVERSPEED),
-    "encoder_gap": Outcome(AxisState.CLOSED_LOOP_CONTROL, Registers()),
+    "encoder_gap": Outcome(AxisState.CLOSED_LOOP_CONTROL, Registers(), after_s=0.0),
     "no_ack": Outcome(AxisState.CLOSED_LOOP_CONTROL, Registers()),
     "bus_full": Outcome(AxisState.CLOSED_LOOP_CONTROL, Registers()),
     "bus_flap": Outcome(AxisState.CLOSED_LOOP_CONTROL, Registers(), is_responding=False),

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from services.simulator.physics.body import body_of
 from services.simulator.physics.plant import IDEAL, changed
 from services.simulator.physics.world import World
-from shared.bus.messages import SimTruth
+from shared.bus.traces import SimTruth
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.config.scenarios import Keyframe, Push, Scenario
 from shared.joints import JOINTS, SIDES

@@ -13,8 +13,9 @@ from typing import Any, Final
 import pytest
 
 from shared.bus import topics
-from shared.bus.messages import JointState, Mode, PlannerMode, PlannerStatus, SimTruth
+from shared.bus.messages import JointState, Mode, PlannerMode, PlannerStatus
 from shared.bus.session import Session, open_session
+from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
 from shared.places import CHECKOUT, DEFAULT_CONFIG

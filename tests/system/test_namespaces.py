@@ -29,8 +29,8 @@ from shared.bus.messages import (
     Mode,
     PlannerMode,
     PlannerStatus,
-    SimTruth,
 )
+from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES

@@ -120,11 +120,11 @@ def apply(board: Board, changes: Sequence[SettingChange]) -> list[ChangeResult]:
     ]
 
 
-def _watchdog_order(change: SettingChange) -> int:
+def _watchdog_order(change: SettingChange) -> float:
     """Return a change's rank: a watchdog is off before its timeout changes, and on after that."""
     if not change.name.endswith(".config.enable_watchdog"):
-        return 0
-    return 1 if change.after else -1
+        return 0.0
+    return 1.0 if change.after else -1.0
 
 
 def describe(value: Value) -> str:

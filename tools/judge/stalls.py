@@ -15,15 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.bus import topics
-from shared.bus.messages import (
-    Cause,
-    JointEvent,
-    Mode,
-    PlannerStatus,
-    RunEvent,
-    RunEventKind,
-    SimTruth,
-)
+from shared.bus.messages import Cause, JointEvent, Mode, PlannerStatus, RunEvent, RunEventKind
+from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.joints import MODULES
 from shared.mcap_log.sequence_stats import KeyCount

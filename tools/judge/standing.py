@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from services.joint.trips import AT_LIMIT, SHAKE_ABOVE_HZ, SHAKE_S
 from shared.bus import topics
-from shared.bus.messages import JointState, Mode, SimTruth
+from shared.bus.messages import JointState, Mode
+from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES

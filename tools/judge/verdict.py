@@ -16,15 +16,8 @@ from numpy.typing import NDArray
 
 from services.planner.law.shift import ROWS
 from shared.bus import topics
-from shared.bus.messages import (
-    JointEvent,
-    JointState,
-    Mode,
-    PlannerStatus,
-    RunEvent,
-    RunEventKind,
-    SimTruth,
-)
+from shared.bus.messages import JointEvent, JointState, Mode, PlannerStatus, RunEvent, RunEventKind
+from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE, ConfigError, RunError
 from shared.joints import MODULES

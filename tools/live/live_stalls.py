@@ -10,7 +10,8 @@ from typing import Final
 
 from services.joint.loop import READ_TIMEOUT_S
 from shared.bus import topics
-from shared.bus.messages import JointState, Mode, SimTruth
+from shared.bus.messages import JointState, Mode
+from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S, now_ns, pace
 from shared.joints import MODULES
 from tools.fleet.stall_watch import ANY_CORE, GAP_NS, UNSURE, Gap, StallWatch

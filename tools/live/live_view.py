@@ -8,7 +8,8 @@ from typing import Any, Protocol
 
 from rich.text import Text
 
-from shared.bus.messages import PlannerStatus, SimTruth
+from shared.bus.messages import PlannerStatus
+from shared.bus.traces import SimTruth
 from shared.config.scenarios import Inject
 from tools.live.scenario_runner import LiveSnapshot
 from tools.terminal import Console, renewed

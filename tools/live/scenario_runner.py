@@ -21,10 +21,10 @@ from shared.bus.messages import (
     RunEvent,
     RunEventKind,
     SimControl,
-    SimTruth,
     name_of,
 )
 from shared.bus.session import Latest, Session
+from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_S, machine_s, now_ns, pace
 from shared.config.scenarios import Fault, Inject, Kill, Push, Restart, Scenario
 from shared.exceptions import RunError

@@ -7,7 +7,8 @@ from typing import Final
 import msgspec
 
 from shared.bus import topics
-from shared.bus.messages import HandLead, SimTruth
+from shared.bus.messages import HandLead
+from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_S
 from tools.logs.run_log import NewestAt, RunLog
 

@@ -25,17 +25,9 @@ from services.simulator.physics.plant import PlantConfig
 from services.simulator.physics.world import World
 from services.simulator.state import read_state, write_state
 from shared.bus import topics
-from shared.bus.messages import (
-    HandLead,
-    JointEvent,
-    Message,
-    Mode,
-    RunEvent,
-    RunEventKind,
-    SimTruth,
-)
+from shared.bus.messages import HandLead, JointEvent, Message, Mode, RunEvent, RunEventKind
 from shared.bus.topics import Topic
-from shared.bus.traces import SimState
+from shared.bus.traces import SimState, SimTruth
 from shared.clock import NS_PER_S
 from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
@@ -161,8 +153,7 @@ class Lockstep:
         self.world = World(body_of(config, self.plant), scenario)
         self.events: list[tuple[str, JointEvent]] = []
         self.time = time = VirtualTime(NS_PER_S)
-        self._record = record
-        self._traces = traced = self.traced and record is not forget
+        self._record, traced = record, self.traced and record is not forget
         self._controller = controller
         self.network = network_ = VirtualNetwork(
             network or BASE,
@@ -219,6 +210,10 @@ class Lockstep:
             *hand,
         ]
         self._progress = _Progress(sorted(happens, key=lambda row: row.at))
+
+    @property
+    def _traces(self) -> bool:
+        return self.traced and self._record is not forget
 
     @property
     def now_ns(self) -> int:

@@ -14,8 +14,9 @@ from services.simulator.physics.plant import PlantConfig
 from shared import revision
 from shared.bus import topics
 from shared.bus.codec import encode
-from shared.bus.messages import Message, SimTruth
+from shared.bus.messages import Message
 from shared.bus.topics import Topic
+from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_S
 from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig

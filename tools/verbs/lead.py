@@ -14,8 +14,9 @@ from rich.text import Text
 
 from shared.bus import topics
 from shared.bus.credentials import require_operator
-from shared.bus.messages import STRAIGHT, HandLead, OperatorIntent, PlannerStatus, SimTruth
+from shared.bus.messages import STRAIGHT, HandLead, OperatorIntent, PlannerStatus
 from shared.bus.session import Session, open_session
+from shared.bus.traces import SimTruth
 from shared.clock import now_ns
 from shared.config.files import load
 from shared.config.robot_config import RobotConfig

@@ -11,7 +11,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from services.planner.controller_file import controller_maker
 from services.simulator.physics.plant import plant_from
 from shared.bus import topics
-from shared.bus.messages import SimTruth
+from shared.bus.traces import SimTruth
 from shared.config.impairment import Impairment
 from shared.exceptions import RunError
 from shared.extras import require

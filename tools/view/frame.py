@@ -22,12 +22,12 @@ from shared.bus.messages import (
     PlannerStatus,
     RunEvent,
     RunEventKind,
-    SimTruth,
     Vector3,
     Wrench,
     name_of,
 )
 from shared.bus.topics import Topic
+from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.joints import MODULES, N_LEG

@@ -69,6 +69,8 @@ class HeatWatchState(msgspec.Struct):
     """What the person rests on the robot, N; it falls by `SHED_RATE` at the most."""
     left_s: float = -1.0
     """Least of all modules; -1: none says."""
+    lifted: float | None = None
+    """Upward force of the person on the robot in the last tick, N; None: not known."""
     hottest: int = 0
     """Its module; while it rests, the one for which it stood up."""
 
@@ -91,7 +93,6 @@ class HeatWatch:
         now_ns: int,
         states: Sequence[JointState],
         requested: float,
-        lifted: float | None,
         dt: float,
     ) -> HeatDecision:
         """Advance by one tick.
@@ -100,10 +101,10 @@ class HeatWatch:
             now_ns: the planner's clock.
             states: newest of each module.
             requested: assist that the operator requests, N.
-            lifted: upward force of the person on the robot, N; None if it is not known.
             dt: time since the last tick, s.
         """
         s = self.state
+        lifted = s.lifted
         lefts = [state.heat_left_s for state in states]
         known = [left for left in lefts if left >= 0.0]
         s.left_s = min(known, default=-1.0)

@@ -17,8 +17,8 @@ from services.simulator.physics.body import Body, FootPlacement
 from services.simulator.physics.led_hand import LedHand
 from services.simulator.physics.outside import OutsideForces, Torso
 from services.simulator.physics.posture import as_vector, measure_posture, sole_loads
-from shared.bus.messages import HandLead, SimTruth
-from shared.bus.traces import SimState
+from shared.bus.messages import HandLead
+from shared.bus.traces import SimState, SimTruth
 from shared.config.scenarios import Lead, Scenario
 from shared.extras import late
 

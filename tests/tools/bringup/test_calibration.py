@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from services.joint.differential import motor_from_joint
+from services.simulator.drives.axis_settings import PHASE_INDUCTANCE, PHASE_RESISTANCE
 from services.simulator.physics.plant import plant_from
 from shared.can.cansimple import AxisState, EncoderError, Heartbeat
 from shared.config.robot_config import RobotConfig
@@ -57,7 +58,7 @@ def test_a_new_board_is_calibrated_marked_saved_and_ready_after_power_up() -> No
     result = run(board)
     assert result.why == ""
     for found in result.found.values():
-        assert found == pytest.approx((0.1, 4e-5, 1))
+        assert found == pytest.approx((PHASE_RESISTANCE, PHASE_INDUCTANCE, 1))
     board.restart()
     assert calibration.uncalibrated(board) == ()
     changed = {name.partition(".")[2] for name, v in board.table().items() if before[name] != v}

@@ -22,9 +22,9 @@ from shared.bus.messages import (
     PlannerStatus,
     RunEvent,
     RunEventKind,
-    SimTruth,
 )
 from shared.bus.topics import Topic
+from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S, now_ns
 from shared.joints import MODULES
 from tests.shared.mcap_log.runs import sample

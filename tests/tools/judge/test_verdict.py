@@ -11,7 +11,7 @@ import pytest
 from services.simulator.physics.body import body_of
 from services.simulator.physics.plant import IDEAL
 from services.simulator.physics.world import World
-from shared.bus.messages import SimTruth
+from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Push
 from tests.lockstep.runs import still

@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 
 from shared.bus import topics
-from shared.bus.messages import HandLead, SimTruth
+from shared.bus.messages import HandLead
+from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_S
 from tests.shared.mcap_log.runs import sample
 from tools.logs.hand_path import hand_path

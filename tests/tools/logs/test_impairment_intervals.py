@@ -7,8 +7,8 @@ import io
 import numpy as np
 import pytest
 
-from shared.bus.messages import PlannerMode, PlannerStatus, SimTruth
-from shared.bus.traces import LinkEvent
+from shared.bus.messages import PlannerMode, PlannerStatus
+from shared.bus.traces import LinkEvent, SimTruth
 from shared.clock import NS_PER_S
 from shared.config.impairment import Direction, Impairment
 from shared.config.scenarios import Inject

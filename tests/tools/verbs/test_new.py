@@ -51,7 +51,7 @@ def test_a_name_with_a_space_is_quoted_in_what_is_to_be_typed(
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("full", "not empty"), ("full/file", "no directory"), ("none/lab", "does not exist")],
+    [("full", "not empty"), ("full/file", "not a directory"), ("none/lab", "does not exist")],
 )
 def test_a_place_that_cannot_be_filled_is_told_and_left(
     name: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -8,7 +8,8 @@ import msgspec
 import pytest
 
 from shared.bus import topics
-from shared.bus.messages import JointState, SimTruth
+from shared.bus.messages import JointState
+from shared.bus.traces import SimTruth
 from shared.joints import MODULES
 from tests.tools.judge.reports.runs import rewritten
 from tests.tools.logs.split_runs import recorded_in_parts

@@ -7,7 +7,7 @@ import pytest
 
 from services.planner.law.kinematics import Kinematics
 from services.planner.law.model import leg_geometry
-from shared.bus.messages import SimTruth
+from shared.bus.traces import SimTruth
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.robot.robot_model import stand_pose
 from tests.lockstep.runs import still

@@ -17,7 +17,8 @@ import numpy as np
 
 from services.planner.law.kinematics import Kinematics
 from shared.bus import topics
-from shared.bus.messages import JointState, Mode, PlannerStatus, SimTruth, Vector3
+from shared.bus.messages import JointState, Mode, PlannerStatus, Vector3
+from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError

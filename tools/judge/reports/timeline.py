@@ -19,13 +19,13 @@ from shared.bus.messages import (
     PlannerStatus,
     RunEvent,
     RunEventKind,
-    SimTruth,
     Tare,
     Trip,
     Wrench,
     name_of,
 )
 from shared.bus.topics import Topic
+from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS
 from shared.joints import MODULES
 from tools.judge.reports.limit_violations import LimitViolations

@@ -19,7 +19,8 @@ from gymnasium import spaces
 
 from services.planner.controller import Action, Array, Observation
 from services.simulator.physics.plant import PlantConfig
-from shared.bus.messages import Mode, SimTruth
+from shared.bus.messages import Mode
+from shared.bus.traces import SimTruth
 from shared.config.files import load
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Scenario

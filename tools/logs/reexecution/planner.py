@@ -194,8 +194,6 @@ class PlannerExecution:
         snapshot = self._snapshots.get((status.session, status.t_ns))
         if snapshot is not None and outcome.exact:
             text = _encode(loop.planner.snapshot()).decode()
-            known = _encode(memory_of(snapshot.snapshot, PlannerState)).decode()
-            snapshot = msgspec.structs.replace(snapshot, snapshot=known)
             mine_then = msgspec.structs.replace(snapshot, snapshot=text)
             compare("planner/checkpoint", status.seq, snapshot, mine_then)
 

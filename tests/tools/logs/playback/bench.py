@@ -16,8 +16,9 @@ from typing import NamedTuple
 import pytest
 
 from shared.bus import codec, topics
-from shared.bus.messages import Estop, JointCommand, JointState, Message, SimTruth, Wrench
+from shared.bus.messages import Estop, JointCommand, JointState, Message, Wrench
 from shared.bus.session import Session, open_session
+from shared.bus.traces import SimTruth
 from shared.config import files as config_file
 from shared.places import DEFAULT_CONFIG
 from tests.shared.mcap_log import runs

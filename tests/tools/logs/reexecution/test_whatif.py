@@ -8,7 +8,7 @@ import pytest
 
 from services.simulator.physics.plant import PlantConfig
 from shared.bus import topics
-from shared.bus.messages import SimTruth
+from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Fault, Scenario
 from shared.exceptions import RunError

@@ -10,7 +10,8 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from shared.bus.messages import Cause, JointEvent, Mode, RunEvent, RunEventKind, SimTruth
+from shared.bus.messages import Cause, JointEvent, Mode, RunEvent, RunEventKind
+from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import lead

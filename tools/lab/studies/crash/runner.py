@@ -13,8 +13,9 @@ import msgspec
 from services.simulator.physics.plant import PlantConfig
 from shared.bus import topics
 from shared.bus.codec import Decoder
-from shared.bus.messages import JointEvent, RunEvent, RunEventKind, SimTruth
+from shared.bus.messages import JointEvent, RunEvent, RunEventKind
 from shared.bus.session import Session
+from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError, RunError
 from shared.joints import MODULES

@@ -29,7 +29,8 @@ from services.planner.law.kinematics import Kinematics
 from services.simulator.physics.body import body_of
 from services.simulator.physics.plant import IDEAL, PlantConfig, changed
 from services.simulator.physics.world import World
-from shared.bus.messages import Pair, SimTruth
+from shared.bus.messages import Pair
+from shared.bus.traces import SimTruth
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.config.scenarios import Keyframe, Push, Scenario
 from shared.exceptions import RunError

@@ -9,7 +9,8 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from shared.bus.messages import JointEvent, SimTruth
+from shared.bus.messages import JointEvent
+from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE
 from tools.judge.standing import is_tipping

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.simulator.physics.plant import PlantConfig, changed
-from shared.bus.messages import HeatAction, SimTruth
+from shared.bus.messages import HeatAction
+from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Scenario
 from tools.lab.studies.sweeps.heat_trial import AHEAD_S, HELD_S, LEAD_S

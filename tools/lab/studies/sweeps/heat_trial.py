@@ -13,7 +13,8 @@ from typing import Final, Literal
 import msgspec
 
 from services.simulator.physics.plant import PlantConfig, changed
-from shared.bus.messages import LEFT_MAX_S, STRAIGHT, HandLead, HeatAction, SimTruth
+from shared.bus.messages import LEFT_MAX_S, STRAIGHT, HandLead, HeatAction
+from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Scenario
 from tools.lab.studies.sweeps import plants

@@ -11,16 +11,9 @@ import numpy as np
 
 from services.simulator.physics.plant import PlantConfig
 from services.simulator.physics.world import World
-from shared.bus.messages import (
-    JointEvent,
-    Message,
-    Mode,
-    PlannerStatus,
-    RunEvent,
-    RunEventKind,
-    SimTruth,
-)
+from shared.bus.messages import JointEvent, Message, Mode, PlannerStatus, RunEvent, RunEventKind
 from shared.bus.topics import Topic
+from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS
 from shared.config import gain_schedule
 from shared.config.gain_table import GainSchedule

@@ -17,17 +17,9 @@ import msgspec
 import numpy as np
 
 from services.simulator.physics.plant import PlantConfig
-from shared.bus.messages import (
-    JointEvent,
-    JointState,
-    Message,
-    Mode,
-    Pair,
-    RunEvent,
-    RunEventKind,
-    SimTruth,
-)
+from shared.bus.messages import JointEvent, JointState, Message, Mode, Pair, RunEvent, RunEventKind
 from shared.bus.topics import Topic
+from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_S
 from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig

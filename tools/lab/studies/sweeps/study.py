@@ -18,7 +18,7 @@ import msgspec
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from services.simulator.physics.plant import PlantConfig
-from shared.bus.messages import SimTruth
+from shared.bus.traces import SimTruth
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Scenario

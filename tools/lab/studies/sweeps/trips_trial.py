@@ -12,8 +12,9 @@ from typing import Annotated, Any, Final, NamedTuple
 import msgspec
 
 from services.simulator.physics.plant import IDEAL, PlantConfig, changed
-from shared.bus.messages import STRAIGHT, Cause, Message, Mode, PlannerStatus, SimTruth, Trip
+from shared.bus.messages import STRAIGHT, Cause, Message, Mode, PlannerStatus, Trip
 from shared.bus.topics import Topic
+from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_S
 from shared.config import scenarios
 from shared.config.gain_schedule import believing

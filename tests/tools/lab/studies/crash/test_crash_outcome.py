@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 import msgspec
 import pytest
 
-from shared.bus.messages import Cause, JointEvent, Mode, RunEvent, RunEventKind, SimTruth
+from shared.bus.messages import Cause, JointEvent, Mode, RunEvent, RunEventKind
+from shared.bus.traces import SimTruth
 from shared.config import scenarios
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES

@@ -14,7 +14,7 @@ from services.planner.law.kinematics import Kinematics
 from services.simulator.physics.body import body_of
 from services.simulator.physics.plant import IDEAL
 from services.simulator.physics.world import World
-from shared.bus.messages import SimTruth
+from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_S
 from shared.config import gain_schedule, scenarios
 from shared.config.robot_config import GRAVITY, RobotConfig
