@@ -284,6 +284,24 @@ def test_an_idle_joint_that_jumps_is_armed_only_once_a_new_zero_explains_it(
     assert (DriveCommand.CLEAR_ZERO in found) is not zeroed
 
 
+def test_samples_that_jump_as_the_link_is_read_out_after_a_freeze_lack_no_turns(
+    robot: RobotConfig,
+) -> None:
+    bench = marked(robot)
+    bench.zero = (0.25, 0.75)
+    bench.to(Mode.HOLD)
+    bench.zero = None
+    bench.now_ns += 2 * GAP_NS
+    bench.cycle()  # an old one
+    bench.q = (bench.q[0] + 0.1, bench.q[1] + 0.1)
+    bench.cycle()
+    bench.zero = (0.25, 0.75)
+    bench.cycle()
+    bench.run(NS_PER_S // 10)
+    assert not bench.module.controller.samples.turns_lost
+    assert bench.mode is Mode.HOLD
+
+
 def test_what_the_neighbours_do_comes_through(bench: ModuleBench) -> None:
     bench.to(Mode.DAMP)
     assert bench.module.needs_neighbours

@@ -206,7 +206,7 @@ def test_services_outlive_their_supervisor_and_are_shown_signalled_and_ended(
     assert wait_for(lambda: bool(fleet.supervision_fault()))
     assert [row.state for row in fleet.info()] == ["unsupervised", "unsupervised"]
     code, said = order("status")
-    assert (code, "nothing restarts what ends" in " ".join(said.split())) == (0, True)
+    assert (code, "nothing restarts one that ends" in " ".join(said.split())) == (0, True)
     assert fleet.pids() == pids
     with pytest.raises(FleetError, match="processes of a fleet without a supervisor"):
         start()
@@ -214,7 +214,7 @@ def test_services_outlive_their_supervisor_and_are_shown_signalled_and_ended(
     code, said = order("start", "planner")
     assert (code, "runs already" in said) == (0, True)
     assert order("kill", "harness")[0] == 0
-    assert "nothing restarts what ends" in caplog.text
+    assert "nothing restarts one that ends" in caplog.text
     assert wait_for(lambda: [row.state for row in fleet.info()] == ["unsupervised", "gone"])
     assert order("start", "harness")[0] == 2
     assert order("down")[0] == 0
@@ -415,7 +415,7 @@ def test_status_shows_mode_tier_age_and_rate(start: Start, order: Order) -> None
     assert status["modules"]["ankle_right"] == {
         "mode": "HOLD", "tier": 2, "cause": "NONE", "drive": "ARMED", "q": [0.0, 0.0],
         "way_out": "", "stiffened": False, "outside": "", "session": 0, "refusals": [],
-        "stopped_by": "",
+        "stopped_by": "", "celsius": None, "heat_left_s": None,
     }  # fmt: skip
     assert status["services"]["planner"]["rate_hz"] is None
     assert "ankle_right" in order("status")[1]
