@@ -34,6 +34,8 @@ TAKEN_S: Final = 0.1
 """s; samples this soon after a write may be older than it."""
 SET_S: Final = 0.5
 """Time for one attempt to read back right; frames may get lost, so there are some."""
+SETTLED_S: Final = 0.1
+"""s of reading before a position is written."""
 ATTEMPTS: Final = 4
 _READ_S: Final = 0.05
 
@@ -149,6 +151,10 @@ def zero(drive: Drive, q: Pair, robot: RobotConfig) -> Back | None:
     m1, m2 = motor_from_joint(q, gear_ratio)
     back: Back | None = None
     for _ in range(ATTEMPTS):
+        # what came while others were looked at is read out: a bus whose own frames wait takes none
+        until = time.monotonic() + SETTLED_S
+        while time.monotonic() < until:
+            drive.read(_READ_S)
         drive.set_position((m1 + mark, m2 + mark))
         taken_ns = now_ns() + round(TAKEN_S * NS_PER_S)
         until = time.monotonic() + SET_S

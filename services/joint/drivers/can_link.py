@@ -239,7 +239,8 @@ class CanLink:
             for each in messages[:taken]:
                 if each.arbitration_id in self._own and not each.is_remote_frame:
                     watch.sent(now)
-            if taken < len(messages):
+            # a question that found no room shows nothing: later ones do, and none comes back
+            if not all(each.is_remote_frame for each in messages[taken:]):
                 watch.refused(now)
         return taken
 

@@ -114,7 +114,7 @@ def test_an_axis_that_is_not_calibrated_is_led_through_it_and_no_other(
     asked = ["--apply", "--calibrate", "--yes", "--module", MODULE]
     result = verb(run_dir, tmp_path, *asked, plant)
     assert result.returncode == 0, result.stdout + result.stderr
-    assert f"{MODULE}.axis1: 0.1 ohm, 40 uH, direction 1" in result.stdout
+    assert f"{MODULE}.axis1: 0.1 ohm, 50 uH, direction 1" in result.stdout
     assert f"{MODULE}.axis0" not in result.stdout
     assert f"without a zero: {MODULE}; next `xrl drive zero`" in result.stdout
 
