@@ -36,6 +36,8 @@ pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(240)]
 
 NAMES = ("body", "right", "left")
 
+STOPPED = {Mode.DAMP, Mode.FAULT}
+
 
 def with_drives_in(robot: RobotConfig, drives: Path) -> RobotConfig:
     """Return the robot with its drives in one place."""
@@ -151,12 +153,13 @@ def lead_through(place: Place, ear: FleetEar, capsys: Any) -> None:
     ear.wait_for(Mode.DAMP, 60.0)
     place.cut_power("left", ear)
     assert wait_for(lambda: len(ear.modes()) == len(MODULES), timeout_s=60.0)
-    assert {*ear.modes().values()} == {Mode.DAMP}, "the stop holds on"
+    # half a robot that sinks on frozen targets: the drives' own current limit may disarm it
+    assert {*ear.modes().values()} <= STOPPED, "the stop holds on"
     capsys.readouterr()
     assert place.xrl("up") == 3
     said = " ".join(capsys.readouterr().out.split())
     assert "an emergency stop by xrl estop by" in said
-    assert ear.modes() == dict.fromkeys(MODULES, Mode.DAMP)
+    assert {*ear.modes().values()} <= STOPPED
     assert place.xrl("down", "--limp") == 0
 
     out = place.base / "records"
@@ -165,5 +168,6 @@ def lead_through(place: Place, ear: FleetEar, capsys: Any) -> None:
     joined = read_run(out / "joined")
     for module in MODULES:
         modes = [event.mode_after for event in joined.messages(topics.JOINT_EVENT, module)]
-        assert modes[-1] == Mode.DAMP, "to the end"
+        assert modes[-1] in STOPPED, "to the end"
+        assert Mode.DAMP in modes
         assert Mode.TRACK in modes

@@ -24,7 +24,7 @@ def run(flags: StartFlags) -> int:
     """Start it."""
     runs = SupervisedFleet.attach(flags.run_dir).start_service(flags.service)
     if runs is not None:
-        print(f"{flags.service}: already runs, as process {runs}; nothing was done")
+        print(f"{flags.service}: runs already, as process {runs}; nothing was done")
     else:
         print(f"{flags.service}: started; `xrl status` shows its state")
     return 0
