@@ -34,8 +34,10 @@ HEARD: Final = (
     Command.GET_ENCODER_ESTIMATES,
     Command.GET_ENCODER_COUNT,
     Command.GET_IQ,
+    Command.GET_VBUS,
+    Command06.GET_TEMPERATURE,
 )
-"""Commands whose frames are the drive's own: it is there."""
+"""Commands whose frames are the drive's own: it is there, and the kernel lets them through."""
 IN_KERNEL: Final = ("socketcan",)
 """Interfaces whose frames all wait in the kernel, behind one file descriptor: it throws other
 modules' frames away before a process is woken for them, and is waited for by `select`."""

@@ -239,6 +239,7 @@ def test_the_kernel_filters_by_the_nodes_to_wake_for(monkeypatch: pytest.MonkeyP
     assert passing == {arbitration_id(node, command) for node in NODES for command in theirs} | {
         arbitration_id(NODES[0], command) for command in ECHOED
     }
+    assert {*bench.driver._takers} <= passing, "what the driver takes must wake it"
     assert bench.bus.options["receive_own_messages"] is True
     assert all(each["extended"] is False for each in found)
     bench.driver.close()
