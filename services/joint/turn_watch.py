@@ -36,7 +36,7 @@ GAP_NS: Final = 53 * NS_PER_MS
 AT_ZERO: Final = 2e-4
 """turns: three counts of 16384. Single precision at the mark of 64 turns resolves 8e-6."""
 UNKNOWN: Final = -1.0
-"""Of `encoder_zero`: the drive has not told it."""
+"""Value of `encoder_zero` before the drive has answered."""
 
 
 class TurnWatch(msgspec.Struct):

@@ -105,7 +105,7 @@ class Interface:
         self._memory[: self._FULL] = count.to_bytes(self._FULL, "little")
 
     def close(self) -> None:
-        """Let go of the memory."""
+        """Release the memory."""
         self._memory.close()
 
 

@@ -310,7 +310,7 @@ class HeatConfig(Section, frozen=True):
     stage_max: Celsius = 90.0
     """No output stage is to be warmer: below the drives' `temp_limit_lower`."""
     resistance: Annotated[float, Range(0.001, 10.0, "ohm")] = 0.1
-    """Of a phase at 25 C; the drive's calibration finds it (`phase_resistance`)."""
+    """Resistance of a phase at 25 C; the drive's calibration finds it (`phase_resistance`)."""
     winding_capacity: Annotated[float, Range(1.0, 1e4, "J/K")] = 100.0
     winding_to_housing: Annotated[float, Range(0.01, 20.0, "K/W")] = 0.5
     housing_capacity: Annotated[float, Range(1.0, 1e5, "J/K")] = 1500.0

@@ -54,7 +54,7 @@ class HeatDecision(NamedTuple):
     assist: float
     """Assist that is requested of the law, N."""
     toward: Toward
-    """Where to it moves by itself."""
+    """Where it goes by itself."""
 
 
 class HeatWatchState(msgspec.Struct):

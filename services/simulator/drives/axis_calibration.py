@@ -72,9 +72,9 @@ class _Task(msgspec.Struct):
     stage: int = 0
     """Motor: resistance, inductance. Encoder: lock, way out, way back."""
     current: float = 0.0
-    """Of the field, A."""
+    """Current of the field, A."""
     phase: float = 0.0
-    """Of the field, electrical rad."""
+    """Angle of the field, electrical rad."""
     count: int = 0
     """The encoder's."""
     locked_count: int = 0

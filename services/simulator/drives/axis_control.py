@@ -63,7 +63,7 @@ _SETTINGS: Final = (
 
 
 _ROWS: Final = 5
-"""Of the state of the current loops: see `LawResults.loops`."""
+"""Rows of the current loops' state: see `LawResults.loops`."""
 _POWER: Final = 4 * N_JOINTS
 """Where its last row begins."""
 

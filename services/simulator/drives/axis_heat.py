@@ -53,7 +53,7 @@ class Heat(Section, frozen=True):
     warm: Kelvins = 0.0
     """Motors and output stages begin this much warmer than the air."""
     resistance: Annotated[float, Range(0.001, 10.0, "ohm")] = PHASE_RESISTANCE
-    """Of a phase at 25 C. Assumed, of an outrunner with 100 rpm/V and some 80 mm."""
+    """Resistance of a phase at 25 C. Assumed: an outrunner of some 80 mm with 100 rpm/V."""
     winding_capacity: Annotated[float, Range(1.0, 1e4, "J/K")] = 100.0
     """0.2 kg of copper (385 J/(kg K)) and its share of the teeth. Assumed."""
     winding_to_housing: Annotated[float, Range(0.01, 20.0, "K/W")] = 0.5

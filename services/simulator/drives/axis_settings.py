@@ -109,7 +109,7 @@ PHASE_RESISTANCE: Final = 0.1
 PHASE_INDUCTANCE: Final = 5e-5
 """H; assumed, likewise."""
 POLE_PAIRS: Final = 7
-"""Of the motors themselves, whatever a drive's setting says; assumed."""
+"""Pole pairs of the motors themselves, whatever a drive's setting says; assumed."""
 ENCODER_MODE: Final = 257
 """Absolute over SPI, AMS; set by hand before anything is calibrated."""
 CALIBRATION_CURRENT: Final = 15.0
