@@ -20,7 +20,7 @@ from shared.places import refuse_shipped
 from tools.flags import Arg, ConfigFlags, option
 from tools.lab.design import damping_picture, split_program
 from tools.lab.design.body_stiffness import BodyStiffness, for_robot
-from tools.lab.design.dynamic_certificate import DynamicCertificate
+from tools.lab.design.dynamic_certificate import BLIND, BLIND_S, DynamicCertificate
 from tools.lab.design.push_limit import DIRECTIONS, equivalent_slope
 from tools.terminal import Console
 
@@ -184,6 +184,11 @@ def _show_damping(robot: RobotConfig, schedule: GainSchedule, console: Console) 
     console.print(table)
     fades = certificate.sway(design)
     console.print(f"slowest oscillation while led fades with {-fades:.2f}/s")
+    blind = certificate.worst(design, BLIND).growth.rate
+    console.print(
+        f"while an encoder is blind, {1e3 * BLIND_S:.0f} ms, a motion grows to at most "
+        f"{math.exp(BLIND_S * blind):.2f} times its size"
+    )
 
 
 def draw_damping(robot: RobotConfig, schedule: GainSchedule, path: Path) -> None:

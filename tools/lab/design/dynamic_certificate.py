@@ -7,11 +7,15 @@ every drivetrain (`robustness.stiffness`), hand and delay of the robot file:
 - with every feedback torque, and with tau_coupled alone, scaled by `gain_margin`;
 - with the delay scaled by `delay_margin`;
 - in HOLD with the services, and with the drives alone.
+
+While an encoder is blind, which its drive says only after `BLIND_S`, a motion may grow, by
+`BLIND_GROWTH_MAX` at most until then.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Final, NamedTuple
 
@@ -23,7 +27,7 @@ from services.planner.law.coupling import UncoupledGains
 from services.planner.law.model import BodyInertia
 from services.planner.law.split import CouplingGains
 from shared.config.robot_config import RobotConfig
-from shared.joints import MODULES
+from shared.joints import MODULES, N_JOINTS, N_LEG
 from tools.lab.design.poses import Poses
 from tools.lab.design.sampled_loop import (
     NO_HAND,
@@ -37,6 +41,7 @@ from tools.lab.design.sampled_loop import (
     SampledLoop,
     Stand,
     halves,
+    whole,
 )
 
 Array = NDArray[np.float64]
@@ -48,10 +53,26 @@ DRIVE_STEP_S: Final = 1e-3
 critical."""
 DRIFT_HZ: Final = 0.05
 """A slower motion is no oscillation but a drift: the leading operator is part of that loop."""
-HALF_NAMES: Final = ("fore and aft", "sideways")
+HALF_NAMES: Final = ("fore and aft", "sideways", "all directions")
 TRACK: Final = ("TRACK",)
 HELD: Final = ("HOLD", "drives alone")
 """Modes: with the services, and with the drives alone."""
+BLIND: Final = tuple(
+    f"HOLD, {MODULES[i // 3]} with {('no encoder', 'one encoder', 'the other encoder')[i % 3]}"
+    for i in range(3 * N_LEG // 2)
+)
+"""Modes: modules of one leg, each with both axes blind, and with either."""
+BLIND_S: Final = 0.051
+"""s; so long an axis stays armed and blind (docs/drives.md)."""
+BLIND_GROWTH_MAX: Final = 1.5
+"""Factor on a motion in `BLIND_S`."""
+SEEN: Final = (
+    np.zeros((2, 2)),
+    0.5 * np.array([[1.0, 1.0], [1.0, 1.0]]),
+    0.5 * np.array([[1.0, -1.0], [-1.0, 1.0]]),
+)
+"""What (phi, theta) a module measures, per (phi, theta): with both motors blind, and with either:
+docs/law.md (3)."""
 
 LADDER: Final = (1.0, 1.41, 2.0, 2.82, 4.0, 5.64, 8.0)
 """Factors tried on gains, in ascending order."""
@@ -81,7 +102,7 @@ class Condition(NamedTuple):
     """One case in which every motion of the loop must decay."""
 
     mode: str
-    """"TRACK", "HOLD" or "drives alone"."""
+    """One of `TRACK`, `HELD` or `BLIND`."""
     node: StiffnessNode
     half: int
     stiffness: float
@@ -185,7 +206,7 @@ class DynamicCertificate:
         self._K_p, self._B_p = (np.array(gain) * (1.0 - S) for gain in (law.K_p, law.B_p))
         self._S = S
         self._hands = [HandModel(*hand) for hand in wanted.hands]
-        self._halves = halves()
+        self._halves = (*halves(), whole())
         self._hold = _hold_gains(config)
 
     def feedback(self, node: StiffnessNode, design: Design) -> Feedback:
@@ -224,24 +245,28 @@ class DynamicCertificate:
         else:
             feedback = self.held(c.node, design, onboard=c.mode == "drives alone")
             stand = stand._replace(S=np.zeros(6))
+            if c.mode in BLIND:
+                feedback = feedback._replace(seen=_seen(BLIND.index(c.mode)))
         drivetrain, timing = self.drivetrain(c.stiffness), self.timing(c.delay_s)
         return SampledLoop(stand, half, feedback, drivetrain, timing, c.hand)
 
     def conditions(
-        self, modes: Sequence[str] = TRACK + HELD, *, margins: bool = True
+        self, modes: Sequence[str] = TRACK + HELD + BLIND, *, margins: bool = True
     ) -> Iterator[Condition]:
         """Yield every condition; without `margins`, nominal gains and delays only."""
         for cases_of, own in ((self._in_track, TRACK), (self._in_hold, HELD)):
             if not set(own) <= set(modes):
                 continue
-            halves_of = range(len(self._halves))
-            for case in itertools.product(self._nodes, self._wanted.stiffness, halves_of):
+            for case in itertools.product(self._nodes, self._wanted.stiffness, (0, 1)):
                 yield from cases_of(*case, margins=margins)
+        if set(BLIND) <= set(modes):
+            for node, k, mode in itertools.product(self._nodes, self._wanted.stiffness, BLIND):
+                yield Condition(mode, node, 2, k, DELAY_MIN_S, NO_HAND, NOMINAL)
 
     def worst(
         self,
         design: Design,
-        modes: Sequence[str] = TRACK + HELD,
+        modes: Sequence[str] = TRACK + HELD + BLIND,
         *,
         margins: bool = True,
         stop_above: float = np.inf,
@@ -286,7 +311,9 @@ class DynamicCertificate:
 
         rooms = []
         for stiffness in self._wanted.stiffness:
-            nominal = [c for c in self.conditions(margins=False) if c.stiffness == stiffness]
+            nominal = [
+                c for c in self.conditions(TRACK + HELD, margins=False) if c.stiffness == stiffness
+            ]
             led = [c for c in nominal if c.mode == "TRACK"]
             prompt = [c for c in led if c.delay_s == DELAY_MIN_S]
             rooms.append(
@@ -307,6 +334,8 @@ class DynamicCertificate:
         growth = self.loop(condition, design).growth(condition.gains)
         drifts = condition.half == 0 and growth.frequency_hz < DRIFT_HZ
         allowed = self._wanted.drift_max if drifts and condition.mode == "TRACK" else 0.0
+        if condition.mode in BLIND:
+            allowed = math.log(BLIND_GROWTH_MAX) / BLIND_S
         return DynamicVerdict(growth, condition, growth.rate - allowed)
 
     def _in_track(
@@ -351,6 +380,13 @@ class DynamicCertificate:
         return LoopTiming(
             1.0 / service.rate_hz, 1.0 / self._config.planner.rate_hz, delay_s, DRIVE_STEP_S
         )
+
+
+def _seen(mode: int) -> Array:
+    """Return what the joints (12,) measure per joint angle in a mode of `BLIND`, by its index."""
+    seen, first = np.eye(N_JOINTS), 2 * (mode // len(SEEN))
+    seen[first : first + 2, first : first + 2] = SEEN[mode % len(SEEN)]
+    return seen
 
 
 def _hold_gains(config: RobotConfig) -> tuple[Array, Array]:

@@ -81,19 +81,23 @@ class LoopTiming(NamedTuple):
 
 
 class Feedback(NamedTuple):
-    """Feedback gains at one pose; matrices (12, 12) or (12,)."""
+    """Feedback gains at one pose."""
 
     D: Array
+    """(12,) N m/rad"""
     D_B: Array
+    """(12,) N m s/rad"""
     C_q: Array
-    """Coupled stiffness: tau_coupled = C_q e_q + C_v e_v, N m/rad."""
+    """Coupled stiffness (12, 12): tau_coupled = C_q e_q + C_v e_v, N m/rad."""
     C_v: Array
-    """Coupled damping, N m s/rad."""
+    """Coupled damping (12, 12), N m s/rad."""
     bandwidth_hz: float
     """Bandwidth of the two poles of tau_coupled."""
     lead_easing: float = 0.0
     easing_bandwidth_hz: float = 40.0
     """Bandwidth of the pole on the hand's measured wrench."""
+    seen: Array = np.eye(N_JOINTS)
+    """(12, 12): the local loops see `seen` q; the identity, but while an encoder is blind."""
 
 
 class Gains(NamedTuple):
@@ -214,6 +218,7 @@ class SampledLoop:
     Attributes:
         A: of plant and estimator, x' = A x + B (u, f).
         n_z: (n_p,), rise of the harness point along p.
+        feedback: of services and planner, before the half.
     """
 
     def __init__(
@@ -226,7 +231,7 @@ class SampledLoop:
         hand: HandModel = NO_HAND,
     ) -> None:
         """Discretise the plant over one step of the drives."""
-        self._timing, self._feedback = timing, feedback
+        self._timing, self.feedback = timing, feedback
         P, V = half.P, half.V
         self._n_p, self._n_q = n_p, n = P.shape[1], V.shape[1]
         at = np.cumsum([0, n_p, n_p, n, n, n, n, n])
@@ -339,10 +344,10 @@ class SampledLoop:
         r, rate = laws.J_open @ q, laws.J_open @ v
         e_q, e_v = laws.T_open @ r - q, laws.T_open @ rate - v
         raw = laws.C_q @ e_q + laws.C_v @ e_v
-        gain = pole_gain(self._feedback.bandwidth_hz, period)
+        gain = pole_gain(self.feedback.bandwidth_hz, period)
         f_1 = f_1 + gain * (raw - f_1)
         f_2 = f_2 + gain * (f_1 - f_2)
-        gain = pole_gain(self._feedback.easing_bandwidth_hz, period)
+        gain = pole_gain(self.feedback.easing_bandwidth_hz, period)
         felt = laws.ease_p @ x[at.p] + laws.ease_v @ x[at.pd]
         eased = eased + gain * (felt - eased)
         return f_1, f_2, eased, np.vstack((r, rate, f_2 + eased))
@@ -365,7 +370,7 @@ def _laws(
     P, V = half.P, half.V
     opened = np.flatnonzero(P.T @ stand.S > 0.0)
     gains = [feedback.D, feedback.D_B, motor_mean(feedback.D), motor_mean(feedback.D_B)]
-    D, D_B, D_m, D_Bm = (V.T @ np.diag(gain) @ V for gain in gains)
+    D, D_B, D_m, D_Bm = (V.T @ (gain[:, np.newaxis] * feedback.seen) @ V for gain in gains)
     easing = np.outer(V.T @ stand.J_harness[2], n_z), np.outer(V.T @ stand.J[4], n_pitch)
     alpha = feedback.lead_easing
     return _Laws(

@@ -18,6 +18,7 @@ from shared.config.robot_config import RobotConfig
 from tests.lockstep.runs import still
 from tests.tools.lab.design import loop_oracle
 from tools.lab.design.dynamic_certificate import (
+    BLIND,
     Condition,
     Design,
     DynamicCertificate,
@@ -71,8 +72,9 @@ def whole_loop(
     feedback = certificate.feedback(condition.node, design)
     drive = certificate.drivetrain(condition.stiffness)
     timing = certificate.timing(condition.delay_s)
+    gains = {name: value for name, value in feedback._asdict().items() if name != "seen"}
     oracle = loop_oracle.Loop(
-        **stand._asdict(), **feedback._asdict(), **timing._asdict(), hand=tuple(hand),
+        **stand._asdict(), **gains, **timing._asdict(), hand=tuple(hand),
         k=drive.stiffness, b=drive.damping, I=drive.rotor_inertia, d_motor=drive.motor_damping,
         d_joint=drive.joint_damping, lag_s=drive.lag_s, encoder_bandwidth=drive.encoder_bandwidth,
     )  # fmt: skip
@@ -270,3 +272,26 @@ def test_what_is_in_hand_is_at_least_what_was_asked_for(
     assert room.torque >= wanted.gain_margin
     assert room.coupling >= wanted.gain_margin
     assert room.delay_s >= wanted.delay_margin * wanted.delay_ms / 1e3
+
+
+def test_a_blind_module_adds_its_stiffness_along_the_axis_that_still_sees(
+    certificate: DynamicCertificate, nodes: list[StiffnessNode], design: Design
+) -> None:
+    knee = [mode for mode in BLIND if "knee" in mode]
+    cases = {c.mode: c for c in certificate.conditions(BLIND) if c.node is nodes[0]}
+    seen = [certificate.loop(cases[mode], design).feedback.seen[2:4, 2:4] for mode in knee]
+    first, second = np.array([1.0, 1.0]), np.array([-1.0, 1.0])  # of phi, theta for one motor each
+    np.testing.assert_array_equal(seen[0], 0.0)
+    for one, moved, rests in ((seen[1], first, second), (seen[2], second, first)):
+        np.testing.assert_allclose(one @ moved, moved)
+        np.testing.assert_allclose(one @ rests, 0.0)
+
+
+def test_until_its_drive_says_so_a_blind_encoder_lets_motions_grow_by_half_at_most(
+    certificate: DynamicCertificate, nodes: list[StiffnessNode], design: Design, robot: RobotConfig
+) -> None:
+    assert certificate.worst(design, BLIND).stable
+    heavy = [n._replace(stand=n.stand._replace(K_geo=8.0 * n.stand.K_geo)) for n in nodes]
+    verdict = DynamicCertificate(robot, heavy).worst(design, BLIND)
+    assert not verdict.stable
+    assert verdict.condition.mode in BLIND
