@@ -17,7 +17,7 @@ from services.joint.envelope import Envelope
 from services.joint.failsafe import Event, Failsafe, timing_of
 from services.joint.heat import HeatEstimate, HeatState
 from services.joint.joint_estimate import JointEstimate
-from services.joint.neighbours import UNKNOWN, NeighbourRow, NeighbourView
+from services.joint.neighbours import SILENT_NS, UNKNOWN, NeighbourRow, NeighbourView
 from services.joint.pd_law import Setpoint
 from services.joint.sample_clock import SampleClock
 from services.joint.setpoint_law import SetpointLaw, SetpointState
@@ -374,9 +374,15 @@ class JointController:
         )
 
 
-def row_of(controller: JointController) -> NeighbourRow:
+def row_of(controller: JointController, now_ns: int) -> NeighbourRow:
     """Return the row that the module's neighbours read."""
     estimate, mode = controller.samples, controller.failsafe.mode
+    silent = mode is not _DISARMED and now_ns - estimate.t_ns > SILENT_NS
     return NeighbourRow(
-        estimate.accepted_ns, estimate.q[1], estimate.v[1], mode, int(controller.caught)
+        estimate.accepted_ns,
+        estimate.q[1],
+        estimate.v[1],
+        mode,
+        int(controller.caught),
+        int(silent),
     )

@@ -153,7 +153,7 @@ class JointLoop:
         self._write(step)
         controller = module.controller
         if self._neighbours is not None:
-            self._neighbours.write(row_of(controller))
+            self._neighbours.write(row_of(controller, now))
         if step.event is not None:
             ports.events.put(step.event)
         if controller.is_state_due:

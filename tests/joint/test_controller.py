@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from services.joint.controller import ControllerSnapshot, CycleResult, JointController, row_of
 from services.joint.drivers.base import DriveReading, DriveStatus
-from services.joint.neighbours import NeighbourRow, NeighbourView
+from services.joint.neighbours import SILENT_NS, NeighbourRow, NeighbourView
 from services.joint.sinking import SinkingState
 from services.joint.torque_limiter import limits_of
 from services.joint.trips import JointTrips
@@ -357,11 +357,18 @@ def test_neighbours_are_given_the_joints_position_and_state(bench: Bench) -> Non
     bench.v = (0.3, -0.2)
     bench.to_hold()
     at = (pytest.approx(bench.q[1]), pytest.approx(-0.2))
-    assert row_of(bench.controller) == NeighbourRow(bench.now_ns, *at, Mode.HOLD, 0)
+    assert row_of(bench.controller, bench.now_ns) == NeighbourRow(bench.now_ns, *at, Mode.HOLD, 0)
     bench.cycle(estop=True)
     for _ in range(200):
         bench.cycle(estop=True, near=NeighbourView(sinks=False))
-    assert row_of(bench.controller)[3:] == (Mode.DAMP, 1)
+    assert row_of(bench.controller, bench.now_ns)[3:] == (Mode.DAMP, 1, 0)
+
+
+def test_neighbours_are_told_of_a_drive_that_is_silent(bench: Bench) -> None:
+    assert not row_of(bench.controller, bench.now_ns + SILENT_NS + 1).silent, "it is disarmed"
+    bench.to_hold()
+    assert not row_of(bench.controller, bench.now_ns + SILENT_NS).silent
+    assert row_of(bench.controller, bench.now_ns + SILENT_NS + 1).silent
 
 
 def test_a_module_that_holds_with_all_it_has_reports_it_from_the_first_cycle(bench: Bench) -> None:

@@ -82,6 +82,19 @@ def test_which_module_holds_beside_which() -> None:
         assert found.stiffen is stiffens, (asks, other, mode, age_ns)
 
 
+@pytest.mark.parametrize("own_age_ns", [0, STALE_NS, STALE_NS + 1])
+def test_a_drive_that_is_silent_beside_one_that_is_heard_may_be_limp(own_age_ns: int) -> None:
+    """A machine that stood still silences them all, and is no reason to stiffen."""
+    for asks, other in product(MODULES, MODULES):
+        silent = {asks: NeighbourRow(T0 - own_age_ns, 0.0, 0.0, Mode.HOLD)}
+        silent[other] = NeighbourRow(T0 - own_age_ns, 0.0, 0.0, Mode.HOLD, silent=1)
+        found = view_of(asks, rows(**silent), T0)
+        if asks != other:
+            limp = rows(**{other: NeighbourRow(T0, 0.0, 0.0, Mode.FAULT)})
+            wanted = own_age_ns <= STALE_NS and view_of(asks, limp, T0).stiffen
+            assert found.stiffen is wanted, (asks, other)
+
+
 def test_a_drive_that_never_sent_a_state_is_not_limp() -> None:
     for asks, other in (("hip_right", "knee_left"), ("knee_right", "ankle_left")):
         assert not view_of(asks, rows(**{other: NeighbourRow(0, 0.0, 0.0, Mode.FAULT)}), T0).stiffen
@@ -161,7 +174,7 @@ def test_a_row_mixed_of_two_is_never_read(tmp_path: Path, six: dict[str, Neighbo
     """On Arm a reader may see a writer's stores in any order, but each word whole."""
     rows_written = (
         NeighbourRow(T0, -1.9999, 0.0, Mode.HOLD),
-        NeighbourRow(T0 + 1, -2.0, -0.1, Mode.DAMP, 1),
+        NeighbourRow(T0 + 1, -2.0, -0.1, Mode.DAMP, 1, 1),
     )
     words = []
     for row in rows_written:

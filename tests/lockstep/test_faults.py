@@ -254,6 +254,16 @@ def test_a_limp_knee_stands_on_five_that_brace_and_takes_a_push(
     assert not led or max(outcome.steps_nm(module, after=Mode.HOLD)) < 3.0, "none of the five jerks"
 
 
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize("at", [1.0, 0.5, 1.7, 2.4])
+def test_a_knee_that_falls_silent_without_power_stands(robot: RobotConfig, at: float) -> None:
+    """Braced for once it was lost, after 100 ms, 3 of 4 fell."""
+    silent = fault("brown_out", "knee_left", at)
+    outcome = run(robot, variant("squat", duration=at + LASTING, fault=silent, push=(), kill=()))
+    assert outcome.stood
+    assert stiffened(outcome) == [other for other in MODULES if other != "knee_left"]
+
+
 def test_for_a_limp_ankle_the_knees_alone_brace(robot: RobotConfig) -> None:
     """Stiff hips handed the hand's moment to the one ankle that is left: 4 of 4 fell."""
     limp = fault("disarmed", "ankle_left", 0.886)

@@ -160,7 +160,7 @@ class VirtualJoint:
             neighbours=self._place,
             clock=self._clock,
         )
-        self._place.write(row_of(manager.controller))
+        self._place.write(row_of(manager.controller, self._clock()))
 
     def cycle(self) -> DriveAction:
         """Run one cycle."""
@@ -169,7 +169,7 @@ class VirtualJoint:
     def kill(self, *, for_good: bool) -> None:
         """Freeze the service; `for_good`: it is dead, and a restart makes a new one."""
         self.frozen, self._is_dead = True, self._is_dead or for_good
-        self._place.write(row_of(self.manager.controller), is_dead=self._is_dead)
+        self._place.write(row_of(self.manager.controller, self._clock()), is_dead=self._is_dead)
 
     def restart(self) -> None:
         """Continue a frozen service; a dead one is replaced, and takes over its armed drive."""
@@ -185,7 +185,7 @@ class VirtualJoint:
             self.kill(for_good=True)
         else:
             self.manager.restore(state)
-            self._place.write(row_of(self.manager.controller))
+            self._place.write(row_of(self.manager.controller, self._clock()))
         self.drive.assume_heard()
 
 
