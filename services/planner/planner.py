@@ -26,6 +26,7 @@ from services.planner.watch.heat import HeatWatch, HeatWatchState
 from services.planner.watch.limp_leg_watch import LimpLegWatch
 from services.planner.watch.plausible import Plausible
 from services.planner.watch.rival_watch import RivalWatch
+from services.planner.watch.soles import Soles
 from services.planner.watch.supply import SupplyState, SupplyWatch
 from services.planner.watch.trips import PlannerTrips, TripsState, values_of
 from services.planner.watch.unattended import Unattended, UnattendedState
@@ -135,6 +136,7 @@ class Planner:
         self._plausible = Plausible(config)
         self._overload = Overload.of(config.harness)
         self._trips = PlannerTrips(config)
+        self._soles = Soles(config)
         self._unattended = Unattended()
         self._heat = HeatWatch(config.heat)
         self._supply = SupplyWatch(config.supply)
@@ -265,11 +267,13 @@ class Planner:
             self._law.weigh(self._tau, self._v, self._usable_wrench(now_ns), dt, led=leads)
         else:
             self._law.pause_load_estimate()
+        soles = self._soles.loads(loads)
+        edge = self._soles.edge(self._tau, soles)
         rate = self._law.harness_rate(self._v)
         drift = self._drift(now_ns, lifted)
         moves = self._heat.moves
         values = values_of(
-            self._output, self._q, loads, lifted, rate, drift, leads=leads, moves=moves
+            self._output, self._q, soles, edge, lifted, rate, drift, leads=leads, moves=moves
         )
         self._trips.advance(now_ns, values, leads=leads)
         self._state.seq += 1
@@ -292,7 +296,8 @@ class Planner:
                 self.receive_state(module, state, arrived_ns)
         self._plausible.refused = own.refused
         self._law.restore(own.law)
-        self._overload.state, self._trips.state = own.overload, own.trips
+        self._overload.state = own.overload
+        self._trips.restore(own.trips)
         self._unattended.state, self._phases.state = own.unattended, own.phases
         self._heat.state = own.heat
         self._supply.state = own.supply

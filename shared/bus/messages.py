@@ -96,6 +96,8 @@ class Trip(IntEnum):
     """The person sinks with weight on the harness."""
     UNATTENDED = 9
     """The robot drifts and nobody holds it."""
+    EDGE = 10
+    """A sole is loaded near its edge: the robot is leaned on from the side."""
 
 
 class Outside(IntEnum):

@@ -79,6 +79,10 @@ PLANNER_TRIPS: Final[dict[Trip, TripRow]] = {
         "unattended", "it drifts with nobody's hand on it", "m",
         "take hold of it: it leads again a second later",
     ),
+    Trip.EDGE: TripRow(
+        "edge", "a sole is loaded near its edge, sideways", "of its half width",
+        "do not lean on it from the side: it leads again a second later",
+    ),
 }  # fmt: skip
 """By the planner, while it leads. It leads again once all is within its limits for a second."""
 

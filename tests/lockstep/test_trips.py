@@ -17,7 +17,7 @@ from shared.bus.messages import Cause, Mode, PlannerMode, PlannerStatus, Trip
 from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
-from shared.config.scenarios import Keyframe, Scenario
+from shared.config.scenarios import Keyframe, Push, Scenario
 from shared.robot.trip_table import JOINT_TRIPS, untripped
 from tests.lockstep.runs import Heard, Run, push, run, still, variant
 from tools.lab.studies.sweeps.trips_trial import PLANTS, unfiltered
@@ -171,3 +171,36 @@ def test_a_fast_lead_and_one_beyond_what_legs_reach_are_followed(
     scenario = variant("stand", duration=4.0, keyframe=frames, kill=(), push=())
     outcome, _ = trip_run(robot, scenario)
     assert not outcome.lockstep.events, "all six track on"
+
+
+def lean(newtons: float, seconds: float = 3.0) -> Push:
+    return Push(at=4.0, duration=seconds, force=(0.0, newtons, 0.0))
+
+
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize("delay_ms", [1.0, 10.0])
+@pytest.mark.parametrize(
+    ("height", "pitch", "newtons"),
+    [(1.188, 0.0, 60.0), (0.79, 1.2, 85.0), (1.05, 0.0, 60.0), (0.95, 0.0, 65.0)],
+)
+def test_leaned_on_from_the_side_it_holds_and_is_led_again(
+    robot: RobotConfig, height: float, pitch: float, newtons: float, delay_ms: float
+) -> None:
+    """Led on, it fell from 50 N on (crawl 70)."""
+    pose = (Keyframe(at=0.0, height=1.188), Keyframe(at=2.5, height=height, pitch=pitch))
+    happens: dict[str, Any] = {"kill": (), "restart": (), "push": (lean(newtons),)}
+    said = Heard(PlannerStatus)
+    outcome = run(
+        robot, variant("stand", duration=10.5, keyframe=pose, **happens),
+        delay_ms=delay_ms, record=said,
+    )  # fmt: skip
+    assert outcome.stood
+    assert {Trip(status.trip) for status in said} == {Trip.NONE, Trip.EDGE}
+    assert outcome.status.mode == PlannerMode.LEADING
+
+
+def test_leaned_on_by_30_newtons_it_is_led_on(robot: RobotConfig) -> None:
+    happens: dict[str, Any] = {"kill": (), "restart": (), "push": (lean(30.0),)}
+    outcome = run(robot, variant("stand", duration=9.0, **happens))
+    assert outcome.stood
+    assert Cause.HOLD_ALL not in causes(outcome)

@@ -9,11 +9,12 @@ import pytest
 
 from services.planner.law.hocca import LawOutput
 from services.planner.law.kinematics import Kinematics, Measured
+from services.planner.watch.soles import Soles
 from services.planner.watch.trips import CALM_NS, PlannerTrips, values_of
 from services.planner.watch.unattended import ARM, HAND_LOST_NS, HAND_MIN, Unattended
 from shared.bus.messages import Pair, Trip
 from shared.clock import NS_PER_MS
-from shared.config.robot_config import RobotConfig
+from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.robot.trip_table import JOINT_TRIPS, PLANNER_TRIPS
 from tests.planner.conftest import Closed
 
@@ -23,7 +24,7 @@ T0 = 5_000_000_000
 TICK_NS = 4 * NS_PER_MS
 
 
-CALM = (0.0, 0.0, 0.0, 200.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+CALM = (0.0, 0.0, 0.0, 200.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 TRIPS = list(PLANNER_TRIPS)
@@ -178,7 +179,7 @@ def test_in_hold_only_a_load_beyond_what_was_asked_or_a_pull_upwards_counts(
 ) -> None:
     """A request of 200 N with nobody there tripped for ever."""
     values = values_of(
-        output_of(assist), np.zeros(12), (200.0, 200.0), lifted, 0.0, 0.0, leads=leads
+        output_of(assist), np.zeros(12), (200.0, 200.0), 0.0, lifted, 0.0, 0.0, leads=leads
     )
     assert values[HARNESS] == pytest.approx(found)
 
@@ -199,7 +200,7 @@ def test_sagging_is_the_power_of_a_load_beyond_assist_and_lead_as_it_sinks(
 ) -> None:
     """The assist is 100 N, a lead 40 N. In HOLD nothing sinks, and the load itself is judged."""
     values = values_of(
-        output_of(100.0), np.zeros(12), (200.0, 200.0), lifted, rate, 0.0, leads=leads
+        output_of(100.0), np.zeros(12), (200.0, 200.0), 0.0, lifted, rate, 0.0, leads=leads
     )
     assert values[SAGGING] == pytest.approx(watts)
 
@@ -215,7 +216,7 @@ def test_a_hand_that_was_held_up_may_catch_up(robot: RobotConfig) -> None:
 
 @pytest.mark.parametrize("loads", [(math.nan, 5.0), (5.0, math.nan)])
 def test_with_one_leg_unknown_none_is_unloaded(loads: tuple[float, float]) -> None:
-    values = values_of(output_of(0.0), np.zeros(12), loads, None, 0.0, 0.0, leads=True)
+    values = values_of(output_of(0.0), np.zeros(12), loads, 0.0, None, 0.0, 0.0, leads=True)
     assert math.isnan(values[UNLOADED])
 
 
@@ -257,13 +258,52 @@ def test_each_value_is_the_tables(joint: int, sign: float) -> None:
     output = output_of(0.0)._replace(
         closure=np.array((0.01, -0.02, 0.02, 9.0, 9.0, 9.0)), ik_residual=0.004, pdot=pdot
     )
-    values = values_of(output, q, (90.0, 80.0), None, 0.0, 0.07, leads=True)
+    values = values_of(output, q, (90.0, 80.0), 0.6, None, 0.0, 0.07, leads=True)
     expected = {
         Trip.LEGS: 0.03, Trip.REACH: 0.004, Trip.TRACKING: 0.2, Trip.UNLOADED: 80.0,
         Trip.SINKING: 0.3, Trip.TURNING: 0.5, Trip.HARNESS: math.nan, Trip.SAGGING: math.nan,
-        Trip.UNATTENDED: 0.07,
+        Trip.UNATTENDED: 0.07, Trip.EDGE: 0.6,
     }  # fmt: skip
     assert values == pytest.approx([expected[trip] for trip in TRIPS], nan_ok=True)
+
+
+def test_a_watch_restored_from_before_there_was_a_trip_counts_it_from_now_on(
+    robot: RobotConfig,
+) -> None:
+    trips, old = PlannerTrips(robot), led(robot).state
+    old.since_ns = old.since_ns[:-1]
+    trips.restore(old)
+    assert go_on(trips, beyond(robot, Trip.EDGE), range(1000)).tripped is Trip.EDGE
+
+
+# ---- how far out its soles bear it
+
+
+def test_a_sole_bears_its_legs_force_and_its_leg(robot: RobotConfig) -> None:
+    leg = 2.0 * robot.mass.module * GRAVITY
+    right, left = Soles(robot).loads((190.0, math.nan))
+    assert right == pytest.approx(190.0 + leg)
+    assert math.isnan(left)
+
+
+@pytest.mark.parametrize("ankle", [0, 6])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_sole_is_at_its_edge_when_its_load_there_balances_the_ankles_torque(
+    robot: RobotConfig, ankle: int, sign: float
+) -> None:
+    soles, tau = Soles(robot), np.full(12, 5.0)
+    tau[ankle] = sign * 300.0 * robot.geometry.w_foot / 2.0
+    assert soles.edge(tau, (300.0, 300.0)) == pytest.approx(1.0)
+
+
+def test_a_load_that_is_not_known_is_half_of_the_weight_and_none_makes_no_edge_infinite(
+    robot: RobotConfig,
+) -> None:
+    soles, tau = Soles(robot), np.zeros(12)
+    half = 0.5 * (robot.total_mass + 2.0 * robot.mass.module) * GRAVITY
+    tau[0] = half * robot.geometry.w_foot / 2.0
+    assert soles.edge(tau, (math.nan, math.nan)) == pytest.approx(1.0)
+    assert math.isfinite(soles.edge(tau, (0.0, -100.0)))
 
 
 # ---- how far it drifts once the hand has left it

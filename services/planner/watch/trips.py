@@ -6,13 +6,14 @@ robot file):
     legs       the two legs' estimates of the torso's position differ: a sole tips, or a zero is off
     reach      the inverse kinematics does not reach the reference pose
     tracking   a joint is far from its reference
-    unloaded   a leg hardly carries the torso: J_leg^T W = tau, W its wrench on the torso
+    unloaded   a sole bears hardly anything (`services.planner.watch.soles`)
     sinking    the COM moves faster than a person leads
     turning    the torso turns faster than a person leads
     harness    the force on the person differs from the request by too much
     sagging    the person presses the robot down harder than a lead does: power of the load beyond
                assist and lead, while it sinks
     unattended the robot drifts with nobody's hand on it (`services.planner.watch.unattended`)
+    edge       a sole's centre of pressure is near its edge (`services.planner.watch.soles`)
 
 The trips are checked while the planner is engaged. `unloaded` counts only once both legs have
 carried the torso, because on the hoist neither does. `sagging` counts only after the person has
@@ -93,6 +94,11 @@ class PlannerTrips:
         """Active trip as text: value and limit at the time of the trip."""
         return self.state.why
 
+    def restore(self, state: TripsState) -> None:
+        """Continue from a state, which is the watch's from now on; an old log knows fewer trips."""
+        state.since_ns += (0,) * (len(_TRIPS) - len(state.since_ns))
+        self.state = state
+
     def advance(self, now_ns: int, values: tuple[float, ...], *, leads: bool) -> None:
         """Advance by one tick.
 
@@ -135,7 +141,8 @@ class PlannerTrips:
 def values_of(
     output: LawOutput,
     q: Array,
-    leg_loads: tuple[float, float],
+    soles: tuple[float, float],
+    edge: float,
     lifted: float | None,
     harness_rate: float,
     drift: float,
@@ -148,7 +155,8 @@ def values_of(
     Args:
         output: of the law.
         q: measured joint angles (12,), rad.
-        leg_loads: of the right and the left leg, N (`Hocca.leg_loads`).
+        soles: what the right and the left one bear, N.
+        edge: how far out a sole's pressure is (`services.planner.watch.soles.Soles.edge`).
         lifted: upward force of the person on the robot, N, world; None if it is not known.
         harness_rate: vertical rate of the harness point, m/s, world.
         drift: with nobody's hand on the robot, m.
@@ -161,12 +169,13 @@ def values_of(
         math.sqrt(x * x + y * y + z * z),
         output.ik_residual,
         max(float(error.max()), -float(error.min())),
-        math.nan if any(map(math.isnan, leg_loads)) else min(leg_loads),
+        math.nan if any(map(math.isnan, soles)) else min(soles),
         abs(float(output.pdot[2])),
         abs(float(output.pdot[4])),
         _assist_error(lifted, output.assist, leads=leads),
         0.0 if moves else _pressing_power(lifted, output.assist, harness_rate, leads=leads),
         0.0 if moves else drift,
+        edge,
     )
 
 
