@@ -48,6 +48,7 @@ class SetpointLaw:
         self._aging_max_s = service.command_aging_max_ms / 1e3
         self._coupled_ramp_ns = service.coupled_ramp_ms * NS_PER_MS
         self._blend_ns = service.blend_ms * NS_PER_MS
+        self._stiffen_ns = service.stiffen_ms * NS_PER_MS
         self.sinking = Sinking(config, module)
         stand_here = pd_law.stand(pd_law.ZERO, self.stand_k_p, self.stand_k_d)
         self.state = SetpointState(
@@ -119,7 +120,7 @@ class SetpointLaw:
         else:
             s.current = self._held(since_ns)
             if s.stiffened_ns:
-                risen = min(1.0, (now_ns - s.stiffened_ns) / self._blend_ns)
+                risen = min(1.0, (now_ns - s.stiffened_ns) / self._stiffen_ns)
                 s.current = pd_law.raise_gains(
                     s.current, self._support_k_p, self._support_k_d, risen
                 )
@@ -158,6 +159,6 @@ class SetpointLaw:
         """Return HOLD's setpoint: frozen, and some gains rise to the stand gains."""
         s = self.state
         moving = max(0.0, 1.0 - since_ns / self._coupled_ramp_ns)
-        risen = min(1.0, since_ns / self._blend_ns)
+        risen = min(1.0, since_ns / self._stiffen_ns)
         frozen = pd_law.freeze(s.frozen, moving)
         return pd_law.raise_gains(frozen, self._hold_k_p, self._hold_k_d, risen)

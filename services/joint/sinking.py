@@ -84,6 +84,7 @@ class Sinking:
         self._limits = config.limits.ankle.theta
         self._fade_ns = service.damp_fade_s * NS_PER_S
         self._blend_ns = service.blend_ms * NS_PER_MS
+        self._stiffen_ns = service.stiffen_ms * NS_PER_MS
         self._coupled_ramp_ns = service.coupled_ramp_ms * NS_PER_MS
         self.state = SinkingState(stop=service.damp_knee_stop if kind == "knee" else None)
 
@@ -151,7 +152,7 @@ class Sinking:
         start = pd_law.freeze(held, max(0.0, 1.0 - after_ns / self._coupled_ramp_ns))
         stands = pd_law.stand(held.q_ref, *self._support)
         stands = msgspec.structs.replace(stands, tau_ff=held.tau_ff)
-        return pd_law.blend(start, stands, min(1.0, after_ns / self._blend_ns))
+        return pd_law.blend(start, stands, min(1.0, after_ns / self._stiffen_ns))
 
     def _is_to_hold(self, since_ns: int, near: NeighbourView) -> bool:
         s = self.state

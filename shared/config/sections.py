@@ -237,6 +237,9 @@ class JointServiceConfig(Section, frozen=True):
     """Silence of a pendant that is an emergency stop, once the pendant was there."""
     limp_leg_hip_theta: AxisGains = AxisGains(k_p=2700.0, k_d=42.0)
     """Gains of each hip's theta while a knee is limp: its leg stands as a strut on them."""
+    stiffen_ms: Milliseconds = 300.0
+    """In HOLD, and beside a limp module: the rise of the gains. Within 300 ms, leaned on from the side
+    while led, it fell from 60 N on (crawl 100); within 100 ms from 70 N on (crawl 110)."""
 
 
 class EnvelopeConfig(Section, frozen=True):

@@ -150,7 +150,7 @@ def test_for_a_limp_module_it_holds_its_load(robot: RobotConfig, place: str, whe
     module, theta, near = PLACES[place]
     sinking, frozen = begun(robot, module)
     now_ns = round(when * robot.joint_service.damp_fade_s * NS_PER_S)
-    blend_ns = round(robot.joint_service.blend_ms * 1e6)
+    rise_ns = round(robot.joint_service.stiffen_ms * 1e6)
     q = (0.02, theta)
     before = frozen
     for since_ns, at in ((0, Q), (DOUBT_NS, Q), (now_ns, q)):
@@ -161,9 +161,9 @@ def test_for_a_limp_module_it_holds_its_load(robot: RobotConfig, place: str, whe
     assert pd_law.torque(current, q, pd_law.ZERO) == pytest.approx(load)
     assert (current.k_p, current.k_d) == (before.k_p, before.k_d)
     k_p, k_d = robot.support_gains(module)
-    half_way = sinking.law(frozen, current, now_ns + blend_ns // 2, q, limp)
+    half_way = sinking.law(frozen, current, now_ns + rise_ns // 2, q, limp)
     assert half_way.k_p[1] == pytest.approx(0.5 * (before.k_p[1] + k_p[1]))
-    for later_ns in (blend_ns, LONG_NS):
+    for later_ns in (rise_ns, LONG_NS):
         found = sinking.law(frozen, half_way, now_ns + later_ns, Q, UNKNOWN)
         holds = module.startswith("ankle")
         assert found.q_ref == (before.q_ref[0], before.q_ref[1] if holds else theta)
@@ -178,11 +178,11 @@ def test_rates_and_coupling_fade_in_a_module_that_stiffens(robot: RobotConfig) -
     sinking, frozen = begun(robot, "knee_right")
     limp = NeighbourView(stiffen=True)
     ramp_ns = round(robot.joint_service.coupled_ramp_ms * 1e6)
-    blend_ns = round(robot.joint_service.blend_ms * 1e6)
+    rise_ns = round(robot.joint_service.stiffen_ms * 1e6)
     sinking.law(frozen, FULL, 0, Q, limp)
     for part in (0.0, 0.5, 1.0):
         found = sinking.law(frozen, FULL, round(part * ramp_ns), Q, limp)
-        left = (1.0 - part) * (1.0 - part * ramp_ns / blend_ns)
+        left = (1.0 - part) * (1.0 - part * ramp_ns / rise_ns)
         assert found.tau_coupled == pytest.approx((5.0 * left, -6.0 * left))
     assert found.v_ref == pd_law.ZERO
 

@@ -44,8 +44,8 @@ def holding(robot: RobotConfig, module: str, k_p: Pair = SOFT_P, k_d: Pair = SOF
 
 
 def blended(bench: Bench, robot: RobotConfig) -> int:
-    """Return how many cycles `blend_ms` takes."""
-    return round(robot.joint_service.blend_ms * NS_PER_MS / bench.cycle_ns)
+    """Return how many cycles `stiffen_ms` takes."""
+    return round(robot.joint_service.stiffen_ms * NS_PER_MS / bench.cycle_ns)
 
 
 def at_least(robot: RobotConfig, module: str, k_p: Pair, k_d: Pair) -> tuple[Pair, Pair]:
@@ -152,7 +152,7 @@ def test_it_stays_stiff_until_it_tracks_again(robot: RobotConfig, after: str) ->
         bench.run(1, fresh=True, **soft)
     assert bench.mode is Mode.TRACK
     assert not bench.is_stiffened
-    bench.run(2 * blended(bench, robot), fresh=True, **soft)
+    bench.run(400, fresh=True, **soft)
     assert bench.controller.setpoint.k_p == SOFT_P
     bench.run(1000)
     assert bench.mode is Mode.HOLD
