@@ -238,8 +238,8 @@ class JointServiceConfig(Section, frozen=True):
     limp_leg_hip_theta: AxisGains = AxisGains(k_p=2700.0, k_d=42.0)
     """Gains of each hip's theta while a knee is limp: its leg stands as a strut on them."""
     stiffen_ms: Milliseconds = 300.0
-    """In HOLD, and beside a limp module: the rise of the gains. Within 300 ms, leaned on from the side
-    while led, it fell from 60 N on (crawl 100); within 100 ms from 70 N on (crawl 110)."""
+    """In HOLD, and beside a limp module: the rise of the gains. Within 300 ms, leaned on from the
+    side while led, it fell from 10 N less on."""
 
 
 class EnvelopeConfig(Section, frozen=True):
@@ -294,7 +294,7 @@ class TripsConfig(Section, frozen=True):
     harness: TripLimit = TripLimit(limit=150.0, after_ms=200.0)
     sagging: TripLimit = TripLimit(limit=10.0, after_ms=10.0)
     unattended: TripLimit = TripLimit(limit=0.03, after_ms=20.0)
-    edge: TripLimit = TripLimit(limit=0.8, after_ms=50.0)
+    edge: TripLimit = TripLimit(limit=0.8, after_ms=200.0)
 
 
 Celsius = Annotated[float, Range(-40.0, 200.0, "C")]

@@ -1,4 +1,4 @@
-"""The shipped planner is believed, whatever happens, and nothing trips."""
+"""The shipped planner is believed, whatever happens, and nothing trips but on a hard shove."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from services.joint.envelope import Envelope
 from services.joint.failsafe import Failsafe
 from services.planner.watch.trips import PlannerTrips
 from services.simulator.physics.plant import PlantConfig, changed
-from shared.bus.messages import Cause, Outside, PlannerMode
+from shared.bus.messages import Cause, Outside, PlannerMode, Trip
 from shared.bus.traces import SimTruth
 from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
@@ -49,7 +49,7 @@ class Judged:
 
         def watching(own: PlannerTrips, *rest: Any, **more: Any) -> None:
             advance(own, *rest, **more)
-            if own.tripped:
+            if own.tripped and own.tripped is not Trip.EDGE:
                 self.tripped.append(own.why)
 
         def hearing(own: Failsafe, *rest: Any, **more: Any) -> Cause | None:
