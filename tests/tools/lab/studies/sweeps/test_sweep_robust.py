@@ -92,7 +92,7 @@ def test_a_picture_is_drawn_and_falls_are_in_it(pushes: PushRange, tmp_path: Pat
 def test_with_every_error_drawn_it_is_led_pushed_killed_and_stands(
     robot: RobotConfig, pushes: PushRange, number: int
 ) -> None:
-    """A lean and a crawl of those that `xrl study robust` runs, not pushed so hard that it holds."""
+    """A lean and a crawl among those that `xrl study robust` runs, not pushed into HOLD."""
     outcome = run_trial(draw(pushes, 1, number), robot)
     assert outcome.stood
     assert outcome.operator_peak_n is not None
