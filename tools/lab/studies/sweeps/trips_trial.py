@@ -166,8 +166,8 @@ TROUBLES: Final[Mapping[str, Trouble]] = {
         _led(6.0), {"body.payload_scale": 0.7}, let_go_s=BEGINS_S,
     ),
     "is leaned on": Trouble(
-        "60 N from the side for 3 s", Trip.EDGE,
-        _led(7.0, push=(Push(at=2.5, duration=3.0, force=(0.0, 60.0, 0.0)),)),
+        "50 N from the side for 3 s", Trip.EDGE,
+        _led(7.0, push=(Push(at=2.5, duration=3.0, force=(0.0, 50.0, 0.0)),)),
     ),
     "squats": Trouble("as shipped: pushed, planner killed", None, _shipped("squat")),
     "crawls": Trouble("as shipped", None, _shipped("crawl")),
