@@ -139,6 +139,11 @@ class RobotConfig(Section, frozen=True):
         """m_total of the paper in kg."""
         return self.torso_mass + 4 * self.mass.module
 
+    @property
+    def leg_weight(self) -> float:
+        """Weight of a leg's knee and ankle, N: its sole bears it, its joints do not lift it."""
+        return 2.0 * self.mass.module * GRAVITY
+
 
 def expand(text: str, run_dir: Path) -> str:
     """Return a path or endpoint with `{run}` replaced by the run directory.

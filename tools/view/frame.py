@@ -29,7 +29,7 @@ from shared.bus.messages import (
 from shared.bus.topics import Topic
 from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES, N_LEG
 from shared.robot.frames import ORIGIN, capture_point
 from tools.fleet.fleet_status import module_status
@@ -49,7 +49,7 @@ class SoleEstimate:
     def __init__(self, config: RobotConfig) -> None:
         self._legs = leg_geometry(config)
         self._foot_height = config.geometry.foot_height
-        self._leg_weight = 2.0 * config.mass.module * GRAVITY  # knee and ankle
+        self._leg_weight = config.leg_weight
 
     def of(self, q: Sequence[float], tau: Sequence[float]) -> tuple[SoleLoad, SoleLoad] | None:
         """Return the loads of the right and the left sole; None where a leg is too straight."""

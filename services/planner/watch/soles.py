@@ -30,8 +30,8 @@ class Soles:
     def __init__(self, config: RobotConfig) -> None:
         """Take sizes and weights."""
         self._half_width = 0.5 * config.geometry.w_foot
-        self._leg_weight = 2.0 * config.mass.module * GRAVITY
-        self._at_rest = 0.5 * (config.total_mass + 2.0 * config.mass.module) * GRAVITY
+        self._leg_weight = config.leg_weight
+        self._at_rest = 0.5 * (config.total_mass * GRAVITY + config.leg_weight)
 
     def loads(self, leg_loads: Pair) -> Pair:
         """Return what the soles bear, N: the legs' forces on the torso, and their own weight.

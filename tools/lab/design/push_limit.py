@@ -121,7 +121,7 @@ class LoadedStand:
         self._leg_weights = [
             # the knee's weight turns the ankle with the moment that the ankle's torques
             # show
-            np.array([0.0, 0.0, 2.0 * config.mass.module * GRAVITY, *self._tau_knees[leg][:2], 0.0])
+            np.array([0.0, 0.0, config.leg_weight, *self._tau_knees[leg][:2], 0.0])
             for leg in _LEGS
         ]
         self._limits = _limits(config)
