@@ -1,6 +1,7 @@
 """The script that runs all checks: what it says of failures, and that Ctrl-C ends all of it.
 
-In a copy of `deploy` with an environment of its own, whose tools only say that they were called.
+In a copy of `deploy` with an environment of its own, whose tools only say that they were called;
+what runs them is the real one.
 """
 
 from __future__ import annotations
@@ -10,11 +11,12 @@ import re
 import shutil
 import signal
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from shared.places import DEFAULT_CONFIG
+from shared.places import CHECKOUT
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(60)]
 
@@ -22,10 +24,9 @@ pytestmark = [pytest.mark.system, pytest.mark.timeout(60)]
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     """Return a project of which nothing is there but its scripts and what they make it from."""
-    real = DEFAULT_CONFIG.parents[1]
-    shutil.copytree(real / "deploy", tmp_path / "deploy")
+    shutil.copytree(CHECKOUT / "deploy", tmp_path / "deploy")
     for name in ("requirements.lock", "requirements.runtime.lock", "pyproject.toml"):
-        shutil.copy(real / name, tmp_path)
+        shutil.copy(CHECKOUT / name, tmp_path)
     (tmp_path / ".venv/bin").mkdir(parents=True)
     subprocess.run(
         ["bash", "-c", "source deploy/lib.sh; fingerprint requirements.lock >.venv/xrl.stamp"],
@@ -39,7 +40,10 @@ def root(tmp_path: Path) -> Path:
 
 def write_tool(root: Path, name: str, body: str) -> None:
     tool = root / ".venv/bin" / name
-    tool.write_text(f"#!/usr/bin/env bash\n{body}\n")
+    checks = (
+        f'[[ "$*" != "-m tools.dev.checks"* ]] || {{ cd {CHECKOUT}; exec {sys.executable} "$@"; }}'
+    )
+    tool.write_text(f"#!/usr/bin/env bash\n{checks}\n{body}\n")
     tool.chmod(0o755)
 
 
@@ -79,8 +83,19 @@ def test_all_parts_are_run_and_success_is_exit_code_0(root: Path) -> None:
     assert said.count("ruff called") == 2
     assert said.count("mypy called") == 1
     assert said.count("\npytest called") == 3
+    live, patient = said.index("-m live and not wide"), said.rindex("-m not system and not wide")
+    assert live < patient, "what runs beside the others is shown last"
     assert said.count("python called: -m tools.dev.mutants --sample") == 1
     assert said.count("python called: -m tools.graph_libraries") == 1
+
+
+def test_what_runs_beside_live_fleets_gives_way_to_them(root: Path) -> None:
+    write_tool(root, "pytest", "echo policy $(cut -d' ' -f41 /proc/$$/stat) of $*")
+    _, said = run(root)
+    normal, idle = str(os.SCHED_OTHER), str(os.SCHED_IDLE)
+    assert re.findall(r"^policy (\d)", said, re.M) == [normal, normal, idle], (
+        "that one is told last"
+    )
 
 
 @pytest.mark.parametrize("in_the_way", [False, True], ids=["it fails", "no place for libraries"])
@@ -109,7 +124,7 @@ def test_failures_are_listed_last_and_the_other_parts_are_run(root: Path, status
     write_tool(root, "pytest", f"echo ERROR tests/test_x.py; echo one of $*; exit {status}")
     code, said = run(root)
     assert code == 3
-    assert said.count("== pytest -m") == 3
+    assert len(re.findall("^== pytest -m", said, re.M)) == 3
     last = said[said.index("== failed:") :]
     assert "== failed: mypy" in last
     assert last.count("== failed: ERROR tests/test_x.py") == 3
@@ -121,8 +136,10 @@ def test_the_last_line_says_what_ran_and_what_was_skipped_and_why(root: Path) ->
     code, said = run(root)
     last = said.splitlines()[-1]
     assert code == 0
-    assert re.match(r"== passed in 0 min \d+ s: ruff check, \d s; ruff format --check, \d s;", last)
-    assert "; 9 passed, 8 skipped in 3.1s (pytest -m live and not wide tests/system); " in last
+    assert re.match(
+        r"== passed in 0 min \d+ s: ruff check, \d s; ruff format --check, \d s; mypy", last
+    )
+    assert "; 9 passed, 8 skipped in 3.1s (pytest -m 'live and not wide' tests/system); " in last
     assert last.endswith("; skipped: 24: needs a Chromium")
     write_tool(root, "pytest", "echo '=== 9 passed in 3.1s ==='")
     write_tool(root, "mypy", "exit 1")
@@ -135,7 +152,7 @@ def test_its_help_names_the_parts_and_runs_none(root: Path) -> None:
     script = subprocess.run(
         ["bash", "deploy/test", "--help"], cwd=root, capture_output=True, text=True, check=True
     )
-    assert "Parts: ruff check, ruff format, mypy; tests without processes" in script.stdout
+    assert "Parts: ruff check, ruff format, mypy; live fleets" in script.stdout
     assert "Exits with 0 if every part passed" in script.stdout
     assert "called" not in script.stdout
 
@@ -156,4 +173,4 @@ def test_ctrl_c_ends_all_of_it(root: Path, part: str, *, background: bool) -> No
     rest, _ = script.communicate(timeout=30)
     assert script.returncode == 130
     assert "begins" not in rest
-    assert not list(root.glob("tmp.*")), "its file is gone"
+    assert not list(root.glob("tmp*")), "its files are gone"
