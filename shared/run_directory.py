@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import grp
+import mmap
 import os
 import pwd
 import stat
@@ -107,6 +108,22 @@ def open_private(path: Path) -> BinaryIO:
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, PRIVATE)
     os.fchmod(descriptor, PRIVATE)
     return os.fdopen(descriptor, "r+b")
+
+
+def mapped(path: Path, size: int) -> mmap.mmap:
+    """Return a shared file as memory, made if it is not there, for this user alone.
+
+    Its space is allocated now: on a full disk the first store would end the process (SIGBUS).
+
+    Raises:
+        FleetError: it cannot be made.
+    """
+    try:
+        with open_private(path) as file:
+            os.posix_fallocate(file.fileno(), 0, size)
+            return mmap.mmap(file.fileno(), size)
+    except OSError as error:
+        raise FleetError(f"{path}: no shared memory: {error.strerror}") from None
 
 
 @contextlib.contextmanager

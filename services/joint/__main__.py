@@ -23,6 +23,7 @@ from shared.config.robot_config import RobotConfig, expand
 from shared.config.sections import CanConfig
 from shared.extras import require
 from shared.joints import MODULES
+from shared.planner_life import PlannerLife
 from shared.process import (
     StopFlag,
     freeze_garbage,
@@ -55,6 +56,7 @@ def main() -> int:
             states=session.publisher(topics.JOINT_STATE, JointState, module),
             events=session.publisher(topics.JOINT_EVENT, JointEvent, module),
             traces=session.publisher(topics.JOINT_TRACE, JointTrace, module),
+            planner=PlannerLife(arguments.run_dir),
         )
         drive = open_drive(robot, module, arguments.run_dir, read_only=arguments.readonly)
         rearm_guard = None if arguments.readonly else RearmGuard(arguments.run_dir, module)

@@ -298,6 +298,10 @@ class JointController:
         """Count what came as a command and was none, before the cycle in which it came."""
         self._state.failsafe.count_malformed(count, now_ns)
 
+    def end_session(self, session: int) -> None:
+        """Take a planner's process for ended, before the cycle in which that was seen."""
+        self._state.failsafe.end_session(session)
+
     def _offer(self, now_ns: int, command: JointCommand) -> None:
         """Let the age rule and the envelope decide about a command."""
         s = self._state

@@ -188,6 +188,11 @@ class Failsafe(msgspec.Struct):
         self.command = command
         return refusal
 
+    def end_session(self, session: int) -> None:
+        """Take the newest command for stale: the process of its planner has ended."""
+        if session == self.session:
+            self.fresh_since_ns = -1
+
     def count_malformed(self, count: int, now_ns: int) -> None:
         """Count what came as a command and was none."""
         self._count(Refusal.MALFORMED, 0, count, now_ns)
@@ -255,7 +260,7 @@ class Failsafe(msgspec.Struct):
         """
         mode, fresh = self.mode, self.is_fresh(now_ns, timing)
         tracks = mode is _TRACK
-        # a new session replaced a current one that went stale in this cycle
+        # its planner's process has ended, or a new session replaced one that went stale just now
         broken = tracks and self.fresh_since_ns < 0
         if not fresh or mode is _DISARMED:
             self.fresh_since_ns = -1  # commands from before arming do not count

@@ -20,10 +20,10 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from services.joint.rearm_guard import mapped
 from shared.bus.messages import LEFT_MAX_S, Pair
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
+from shared.run_directory import mapped
 
 STEP_S: Final = 0.5
 """Step of the estimate, and of the seconds left."""

@@ -67,6 +67,13 @@ class OtherModules(Protocol):
         """Write down where this module is."""
 
 
+class SessionEnds(Protocol):
+    """What is seen of the planner's process on this host."""
+
+    def ended(self) -> int:
+        """Return the session of a planner whose process has ended since the last call, else 0."""
+
+
 class JointPorts(msgspec.Struct, frozen=True):
     """What one joint service takes and sends."""
 
@@ -76,6 +83,8 @@ class JointPorts(msgspec.Struct, frozen=True):
     events: Outbox[JointEvent]
     traces: Outbox[JointTrace] | None
     """None: nothing is recorded for re-execution."""
+    planner: SessionEnds | None = None
+    """None: its end is not seen, and its commands grow old."""
 
 
 class JointLoop:
@@ -146,6 +155,9 @@ class JointLoop:
         if malformed:
             self._malformed += malformed
             module.controller.count_malformed(malformed, now)
+        ended = 0 if ports.planner is None else ports.planner.ended()
+        if ended:
+            module.controller.end_session(ended)
         near = UNKNOWN
         if self._neighbours is not None and module.needs_neighbours:
             near = self._neighbours.view(now)
@@ -163,7 +175,7 @@ class JointLoop:
         if self._heat_file is not None:
             self._heat_file.write(controller.heat)
         if tracer is not None and ports.traces is not None:
-            trace = tracer.after(now, reading, command, estop, step, near, malformed)
+            trace = tracer.after(now, reading, command, estop, step, near, malformed, ended)
             if trace is not None:
                 ports.traces.put(trace)
         return step

@@ -24,12 +24,12 @@ from pathlib import Path
 from typing import Final, NamedTuple
 from zlib import crc32
 
-from services.joint.rearm_guard import mapped
 from shared.bus.messages import Mode, Pair
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import LOST_S
 from shared.joints import MODULE_INDEX, MODULES, N_MODULES, kind_of
 from shared.robot.hold_rules import SUPPORT_FOR
+from shared.run_directory import mapped
 
 STALE_NS: Final = 20 * NS_PER_MS
 """An older angle says nothing of where the joint is now."""

@@ -28,8 +28,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
-from shared.exceptions import FleetError
-from shared.run_directory import open_private
+from shared.run_directory import mapped
 
 _LAST_STATE, _STOP = range(2)
 _BEATS: Final = struct.Struct("<Q")
@@ -51,22 +50,6 @@ class LastState(IntEnum):
     """It held the robot: a drive that is no longer armed lost torque."""
     DAMP = 2
     """It sank after an emergency stop: so does the next."""
-
-
-def mapped(path: Path, size: int) -> mmap.mmap:
-    """Return a shared file as memory, made if it is not there, for this user alone.
-
-    Its space is allocated now: on a full disk the first store would end the process (SIGBUS).
-
-    Raises:
-        FleetError: it cannot be made.
-    """
-    try:
-        with open_private(path) as file:
-            os.posix_fallocate(file.fileno(), 0, size)
-            return mmap.mmap(file.fileno(), size)
-    except OSError as error:
-        raise FleetError(f"{path}: no shared memory: {error.strerror}") from None
 
 
 def path_of(run_dir: Path, module: str) -> Path:

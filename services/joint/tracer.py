@@ -46,6 +46,7 @@ class Tracer:
         step: DriveAction,
         near: NeighbourView = UNKNOWN,
         malformed: int = 0,
+        ended: int = 0,
     ) -> JointTrace | None:
         """Take down a cycle; return a message when it is full."""
         r = reading
@@ -74,6 +75,7 @@ class Tracer:
                 _NOTHING if r is None else r.fet_celsius or _NOTHING,
                 _NOTHING if r is None else r.motor_celsius or _NOTHING,
                 0.0 if r is None else r.supply_v,
+                ended,
             )
         )
         return self.take() if len(self._cycles) == CYCLES else None

@@ -22,6 +22,7 @@ from shared.bus.traces import PlannerCheckpoint
 from shared.config import files as config_file
 from shared.config import gain_schedule
 from shared.joints import MODULES
+from shared.planner_life import OwnLife
 from shared.process import (
     StopFlag,
     add_injected,
@@ -60,6 +61,7 @@ def main() -> int:
             commands=[session.publisher(topics.JOINT_COMMAND, JointCommand, m) for m in MODULES],
             status=session.publisher(topics.PLANNER_STATUS, PlannerStatus),
             checkpoint=session.publisher(topics.PLANNER_CHECKPOINT, PlannerCheckpoint),
+            announce=OwnLife(arguments.run_dir).announce,
         )
         session_id = secrets.randbelow(1 << 53) + 1  # JSON readers keep 53 bits
         loop = PlannerLoop(robot, Planner(robot, session_id, controller), ports)

@@ -40,6 +40,8 @@ class PlannerPorts(msgspec.Struct, frozen=True):
     status: Outbox[PlannerStatus]
     checkpoint: Outbox[PlannerCheckpoint] | None
     """None: nothing is recorded for re-execution."""
+    announce: Callable[[int], None] | None = None
+    """Takes the planner's session, so that joint services on its host see its process end."""
 
 
 def requests_of(
@@ -82,6 +84,7 @@ class PlannerLoop:
         self._due_ns = 0
         self._checkpoints = Checkpoints(config.planner.rate_hz)
         self._yielded = False
+        self._announced = 0
 
     def run(self, stop: StopFlag) -> None:
         """Run until `stop` is set."""
@@ -123,6 +126,9 @@ class PlannerLoop:
     def tick(self, now: int) -> None:
         """Receive the other inputs, run one tick and publish its results."""
         planner, ports = self.planner, self._ports
+        if planner.session != self._announced and ports.announce is not None:
+            self._announced = planner.session
+            ports.announce(planner.session)
         wrench = ports.wrench.take()
         if wrench is not None:
             planner.receive_wrench(wrench, now)

@@ -59,6 +59,8 @@ class CycleTrace(msgspec.Struct, gc=False, frozen=True):
     """Reported temperatures of the motors, C; 0: not with this sample."""
     supply_v: float = 0.0
     """Voltage of the drive's supply, V; 0: not known."""
+    ended: Int64 = 0
+    """Session of the planner whose process on this host ended; 0: none in this cycle."""
 
 
 class JointTrace(Message, frozen=True):

@@ -13,10 +13,10 @@ from services.joint.drive_manager import ARM_EVERY_NS, IDLE_EVERY_NS, DriveManag
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.loop import JointLoop, JointPorts
 from services.joint.rearm_guard import LastState, RearmGuard
-from shared.bus.messages import Estop, JointEvent, JointState, Mode, Pair, Refusal
+from shared.bus.messages import Cause, Estop, JointEvent, JointState, Mode, Pair, Refusal
 from shared.bus.traces import JointTrace
 from shared.config.robot_config import RobotConfig
-from tests.joint.helpers import T0, command, with_service
+from tests.joint.helpers import SESSION, T0, command, with_service
 
 M = TypeVar("M")
 
@@ -116,8 +116,16 @@ class Rig:
             states=cast("Any", self.states),
             events=cast("Any", self.events),
             traces=cast("Any", self.traces),
+            planner=self,
         )
         self.loop = JointLoop(robot, module, self.drive, ports, file)
+
+    ended_session = 0
+
+    def ended(self) -> int:
+        """Return the session whose planner's process has ended, once."""
+        session, self.ended_session = self.ended_session, 0
+        return session
 
     def run(self, cycles: int) -> None:
         for _ in range(cycles):
@@ -305,3 +313,21 @@ def test_what_is_no_command_is_counted_and_traced_with_its_cycle(onboard: Rig) -
     assert (state.refused, state.refusal, state.refused_session) == (3, Refusal.MALFORMED, 0)
     cycles = [cycle for trace in onboard.traces.sent for cycle in trace.cycles]
     assert [cycle.malformed for cycle in cycles[:8]] == [0, 0, 0, 0, 0, 3, 0, 0]
+
+
+def test_the_end_of_the_planners_process_is_hold_in_that_cycle_and_traced(onboard: Rig) -> None:
+    onboard.run(5)
+    onboard.lead(200)
+    onboard.ended_session = SESSION + 1
+    onboard.lead(20)
+    assert onboard.mode is Mode.TRACK, "somebody else's"
+    cycle = onboard.controller.cycle
+    onboard.ended_session = SESSION
+    onboard.run(1)
+    event = onboard.events.sent[-1]
+    assert (onboard.mode, event.cause) == (Mode.HOLD, Cause.COMMAND_STALE)
+    assert event.age_ns < onboard.controller.timing.max_command_age_ns, "it was not the age rule"
+    onboard.run(20)
+    cycles = [each for trace in onboard.traces.sent for each in trace.cycles]
+    ended = {at: each.ended for at, each in enumerate(cycles, 1) if each.ended}
+    assert ended == {cycle - 39: SESSION + 1, cycle + 1: SESSION}

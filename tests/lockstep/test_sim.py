@@ -48,7 +48,7 @@ def test_a_run_is_recorded_judged_and_drawn(tmp_path: Path) -> None:
     summary = summary_of(tmp_path)
     assert summary["stood"] is True
     assert summary["reengage_s"] < 1.5
-    assert max(summary["handover_ms"].values()) <= 55.0
+    assert max(summary["handover_ms"].values()) <= 4.0, "its process is on the same host"
     assert (tmp_path / "run.png").stat().st_size > 20_000
     assert len({status.session for status in statuses_of(tmp_path)}) == 2
     log = read_run(tmp_path / "run.mcap")

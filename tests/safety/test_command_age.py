@@ -354,3 +354,27 @@ def test_at_the_first_instant_of_a_clock_commands_are_fresh_as_at_any_other(timi
     tracking = Failsafe(mode=Mode.TRACK, session=SESSION, fresh_since_ns=0)
     tracking.offer(command(echo_t_ns=1), 1, timing)
     assert tracking.advance(1, timing, Event.NONE, estop=False) is not Cause.COMMAND_STALE
+
+
+@pytest.mark.parametrize("mode", list(Mode))
+@pytest.mark.parametrize("session", [SESSION, OTHER])
+def test_a_planner_whose_process_ended_is_tracked_no_more_and_counts_anew(
+    mode: Mode, session: int, timing: Timing
+) -> None:
+    failsafe = taken(timing)
+    failsafe.mode, failsafe.fresh_since_ns = mode, T0 - 10 * timing.engage_after_max_ns
+    failsafe.end_session(session)
+    cause = failsafe.advance(T0, timing, Event.NONE, estop=False)
+    if session == OTHER:
+        assert cause == (Cause.COMMANDS_FRESH if mode is Mode.HOLD else None)
+    elif mode is Mode.TRACK:
+        assert (failsafe.mode, cause) == (Mode.HOLD, Cause.COMMAND_STALE)
+        assert failsafe.dropouts.count == 1
+    else:
+        assert (failsafe.mode, cause) == (mode, None)
+    if session == SESSION and mode in (Mode.HOLD, Mode.TRACK):  # by what was on its way to it
+        after_ns = failsafe.engage_after_ns(timing)
+        late = command(seq=2, echo_t_ns=T0 + after_ns)
+        assert failsafe.offer(late, T0 + after_ns, timing) is Refusal.NONE
+        failsafe.advance(T0 + 1, timing, Event.NONE, estop=False)
+        assert not failsafe.ready(T0 + after_ns - 1, timing)

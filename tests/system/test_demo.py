@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 from shared.bus import topics
-from shared.bus.messages import PlannerStatus, Wrench
+from shared.bus.messages import Cause, PlannerStatus, Wrench
+from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
 from shared.places import CHECKOUT
@@ -70,6 +71,11 @@ def test_a_killed_and_restarted_planner_is_survived_and_recorded(
     felt = max(abs(wrench.force[2]) for wrench in wrenches if wrench.valid)
     given = max(abs(row.operator_force[2]) for row in log.messages(topics.SIM_TRUTH))
     assert felt == pytest.approx(given, rel=0.25)
+    first = [log.messages(topics.JOINT_EVENT, module) for module in MODULES]
+    ages_ms = [
+        e.age_ns / NS_PER_MS for each in first for e in each if e.cause == Cause.COMMAND_STALE
+    ]
+    assert min(ages_ms) < robot.joint_service.max_command_age_ms, "its process was seen to end"
     assert {"robot.toml", "robot.gains.json", "scenario.toml", "model.xml"} <= set(log.attachments)
 
 

@@ -129,6 +129,7 @@ class Lockstep:
         plant: PlantConfig | None = None,
         hand: Sequence[HandRow] = (),
         controller: Callable[[], Controller] | None = None,
+        planner_beside: bool = False,
     ) -> None:
         """Put the robot on the hoist, drives idle.
 
@@ -143,6 +144,8 @@ class Lockstep:
             plant: how the true robot differs from `config`; None: the realistic default.
             hand: how somebody leads the hand in place of the scenario.
             controller: makes a controller of somebody's own for each planner.
+            planner_beside: the planner's process is on the joint services' host, where its end is
+                seen at once; otherwise its commands grow old, which is harder.
 
         Raises:
             RunError: the scenario kills a service that has no process here.
@@ -169,9 +172,11 @@ class Lockstep:
         self._imu = VirtualImu(
             config, self.plant.imu, network_, record, seed, time=time, clock=clock_of["imu"]
         )
+        self._memory = SharedMemory()
         self._planner = VirtualPlanner(
             config, self._new_planner, self._request, network_, record,
             time=time, clock=clock_of["planner"], traced=traced,
+            beside=self._memory if planner_beside else None,
         )  # fmt: skip
         self.bank = AxisBank(
             config.drive,
@@ -181,7 +186,6 @@ class Lockstep:
         )
         self._torque = self.bank.torque
         self._faults = FaultInjector(scenario.fault, self.bank)
-        self._memory = SharedMemory()
         self.buses = {
             name: VirtualBus(
                 self.bank,

@@ -29,7 +29,7 @@ from tools.judge.verdict import Summary
 from tools.live import experiment
 from tools.logs.hand_path import HandRow
 from tools.sim.centralised.fleet import CONTROLS, SHIPPED
-from tools.sim.lockstep import Lockstep, Watch
+from tools.sim.lockstep import Watch
 from tools.sim.virtual_time import Record
 
 Outcome = TypeVar("Outcome")
@@ -179,9 +179,10 @@ def simulate(
             "seed": seed, "record": record, "plant": true_plant, "hand": hand,
         }  # fmt: skip
         if make is not None:
-            fleet = Lockstep(robot, scenario, network, controller=make, **inputs)
-        else:
-            fleet = CONTROLS[control](robot, scenario, network, **inputs)
+            inputs["controller"] = make
+        if control == SHIPPED:  # as `xrl demo` runs it, all on one host
+            inputs["planner_beside"] = True
+        fleet = CONTROLS[control](robot, scenario, network, **inputs)
         end_s = math.inf
         for truth in fleet.run():
             drain(truth)

@@ -47,21 +47,40 @@ class SharedMemory:
     Attributes:
         estop: set it to stop every module.
         rows: as each service wrote its own last, in virtual time.
+        planner: session of the planner's process on this host; 0: there is none.
+        ended: session of the one that ended last.
     """
 
     def __init__(self) -> None:
         self.estop = False
         self.rows: list[NeighbourRow | None] = [None] * len(MODULES)
+        self.planner = self.ended = 0
+
+    def announce(self, session: int) -> None:
+        """Say which planner is on this host."""
+        self.planner = session
+
+    def end_planner(self) -> None:
+        """Let its process end."""
+        self.ended = self.planner
 
 
 class Neighbourhood:
-    """One module's place in the shared memory: `OtherModules`, and the inbox of its stops."""
+    """One module's place in the shared memory: other modules, stops, the planner's end."""
 
     def __init__(
         self, memory: SharedMemory, index: int, time: VirtualTime, clock: Callable[[], int]
     ) -> None:
         self._memory, self._index = memory, index
         self._time, self._clock = time, clock
+        self._ended = 0
+
+    def ended(self) -> int:
+        """Return the session of a planner that has ended since the last call, else 0."""
+        if self._ended == self._memory.ended:
+            return 0
+        self._ended = self._memory.ended
+        return self._ended
 
     def view(self, _host_ns: int) -> NeighbourView:
         """Return what this module knows of the others; all rows are in virtual time."""
@@ -139,6 +158,7 @@ class VirtualJoint:
             states=RecordOutbox(record, topics.JOINT_STATE, name, network.states()[index], time),
             events=RecordOutbox(record, topics.JOINT_EVENT, name),
             traces=RecordOutbox(record, topics.JOINT_TRACE, name) if traced else None,
+            planner=self._place,
         )
         self._start(make())
 
@@ -208,6 +228,7 @@ class VirtualPlanner:
         time: VirtualTime,
         clock: HostClock,
         traced: bool,
+        beside: SharedMemory | None,
     ) -> None:
         """Start the service.
 
@@ -220,9 +241,11 @@ class VirtualPlanner:
             time: virtual time.
             clock: of the service's host.
             traced: record what re-execution needs.
+            beside: memory of the joint services' host, if it is the planner's as well.
         """
         self.frozen = self._is_dead = False
         self._config, self._make, self._clock = config, make, time.on(clock)
+        self._memory = beside
         commands = zip(MODULES, network.commands(), strict=True)
         checkpoints = RecordOutbox[PlannerCheckpoint](record, topics.PLANNER_CHECKPOINT)
         self._ports = PlannerPorts(
@@ -236,6 +259,7 @@ class VirtualPlanner:
             ],
             status=RecordOutbox(record, topics.PLANNER_STATUS),
             checkpoint=checkpoints if traced else None,
+            announce=None if beside is None else beside.announce,
         )
         self._session = 1
         self.loop: PlannerLoop | None = self._loop_of(make(1))
@@ -263,6 +287,8 @@ class VirtualPlanner:
     def kill(self, *, for_good: bool) -> None:
         """Freeze the service; `for_good`: it is dead, and a restart makes a new one."""
         self.frozen, self._is_dead = True, self._is_dead or for_good
+        if self._is_dead and self._memory is not None:
+            self._memory.end_planner()
 
     def restart(self) -> None:
         """Continue a frozen planner; a dead one is replaced under the next session."""

@@ -54,6 +54,9 @@ class _Cycle:
     def take(self) -> JointCommand | None:
         return self.command
 
+    def ended(self) -> int:
+        return self.now().ended
+
     def view(self, now_ns: int) -> NeighbourView:  # noqa: ARG002
         c = self.now()
         return NeighbourView(c.below if c.knows_below else None, c.sinks, c.stiffen)
@@ -152,7 +155,12 @@ class JointExecution:
     def _loop_of(self, module: DriveManager) -> JointLoop:
         self._cycle = cycle = _Cycle()
         ports = JointPorts(
-            commands=cycle, estops=_Stops(cycle), states=cycle, events=cycle, traces=None
+            commands=cycle,
+            estops=_Stops(cycle),
+            states=cycle,
+            events=cycle,
+            traces=None,
+            planner=cycle,
         )
         return JointLoop(self._robot, module, cycle, ports, neighbours=cycle, clock=cycle.clock)
 
