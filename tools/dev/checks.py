@@ -16,7 +16,8 @@ from typing import IO, Final
 
 import msgspec
 
-from shared.exceptions import FAULT_EXIT_CODE
+from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, RunError
+from tools.dev.changed import changed_since, selection
 
 CHECKS: Final = (("ruff", "check"), ("ruff", "format", "--check"), ("mypy",))
 PYTEST: Final = ("pytest", "--durations=12", "--durations-min=2")
@@ -35,9 +36,12 @@ PATIENT: Final = (
     ("python", "-m", "tools.dev.mutants", "--sample"),
 )  # fmt: skip
 """Neither processes nor real time: they take what the others leave of the cores."""
+CHANGED: Final = "--changed"
 ENDS_IN_S: Final = 30.0
 """Time for a part to end after Ctrl-C: a fleet goes down."""
 LOOK_EVERY_S: Final = 0.2
+SHOWN: Final = 9
+"""Words of a command."""
 
 
 class Check(msgspec.Struct):
@@ -54,6 +58,8 @@ class Check(msgspec.Struct):
     def name(self) -> str:
         """The command as a person would write it."""
         words = [word for word in self.command if not word.startswith("--durations")]
+        if len(words) > SHOWN:
+            words = [*words[:SHOWN], "..."]
         return " ".join(f"'{word}'" if " " in word else word for word in words)
 
     @property
@@ -88,6 +94,12 @@ def main(argv: Sequence[str]) -> int:
         signal.signal(number, signal.default_int_handler)
     begun_s = time.monotonic()
     alone = [PYTEST + tuple(argv)] if argv else [LIVE, WAITING]
+    if CHANGED in argv[:1]:
+        try:
+            alone = _touched(*argv[1:])
+        except (RunError, TypeError) as error:
+            print(f"{CHANGED} takes a revision, or nothing for what is not committed: {error}")
+            return DECLINED_EXIT_CODE
     running: list[Check] = []
     with ExitStack() as stack:
         stack.callback(_stop, running)
@@ -103,6 +115,20 @@ def main(argv: Sequence[str]) -> int:
         except KeyboardInterrupt:
             return 128 + signal.SIGINT
     return _tell(done, time.monotonic() - begun_s)
+
+
+def _touched(revision: str = "HEAD") -> list[tuple[str, ...]]:
+    """Return the command for what a change can have touched, if that is anything."""
+    changed = changed_since(revision)
+    whole, first = selection(changed)
+    print(
+        f"== {len(changed)} files differ from {revision}: {len(whole)} test files name them and run"
+        f" whole, {len(first)} reach them and run one test; none with processes or real time"
+    )
+    if not whole + first:
+        return []
+    of = [f"--first-of={name}" for name in first]
+    return [(*PATIENT[0], "-p", changed_since.__module__, *of, *whole, *first)]
 
 
 def _start(command: tuple[str, ...], to: IO[bytes] | int, *, beside: bool = False) -> Check:
