@@ -35,6 +35,7 @@ REJECTED_MAX: Final = 3
 # Compared in each cycle: docs/contributing.md, The control path.
 _NONE, _DRIVE_ARMED = Event.NONE, Event.DRIVE_ARMED
 _DRIVE_LOST, _POSITION_LOST = Event.DRIVE_LOST, Event.POSITION_LOST
+_ENCODER_FAILED: Final = int(AxisError.ENCODER_FAILED)
 _EVENT: Final = {
     DriveStatus.LOST: Event.DRIVE_LOST,
     DriveStatus.IDLE: Event.DRIVE_DISARMED,
@@ -104,7 +105,7 @@ class JointEstimate(msgspec.Struct):
         if reading.encoder_zero is not None:
             first.compare(reading.encoder_zero[0])
             second.compare(reading.encoder_zero[1])
-        if reading.error & AxisError.ENCODER_FAILED:  # when it is back, turns may be missing
+        if reading.error & _ENCODER_FAILED:  # when it is back, turns may be missing
             first.lost = second.lost = True
         possible = flushing or not self.accepted_ns or self._is_plausible(reading, armed=armed)
         if armed and not possible:

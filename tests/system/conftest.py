@@ -25,6 +25,9 @@ LED: Final = {
 }  # fmt: skip
 """Files whose tests start services that hold or lead the simulated robot: one after the other."""
 
+CROWDED: Final = {"test_hosts_verb", "test_namespaces", "test_usb_fleet"}
+"""Of these, those with several hosts, or boards that take more of the cores than axes on CAN."""
+
 
 def carried_pace() -> str:
     """Return the pace at which this machine carries a fleet, as `xrl demo` finds it; "" if none.
@@ -58,6 +61,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if _is_led(item):
             item.add_marker(pytest.mark.live)
+            if item.path.stem in CROWDED:
+                item.add_marker(pytest.mark.crowded)
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:

@@ -274,8 +274,14 @@ def test_supervision_goes_on_without_a_place_for_its_logs(
 def test_status_says_why_a_service_does_not_come_up(start: Start, order: Order) -> None:
     fleet = start({"planner": FAILING, "harness": SLEEPER}, disarmed=True)
     assert wait_for(lambda: service(fleet, "planner").restarts > 0)
-    shown = " ".join(order("status")[1].split())
-    assert "planner: exit status 3" in shown
+    shown = ""
+
+    def is_told() -> bool:  # not while it is being started again
+        nonlocal shown
+        shown = " ".join(order("status")[1].split())
+        return "planner: exit status 3" in shown
+
+    assert wait_for(is_told), shown
     assert "no drive on can0" in shown
 
 

@@ -12,7 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
-from typing import IO, Final
+from typing import IO, Final, NamedTuple
 
 import msgspec
 
@@ -22,7 +22,8 @@ from tools.dev.changed import changed_since, selection
 CHECKS: Final = (("ruff", "check"), ("ruff", "format", "--check"), ("mypy",))
 PYTEST: Final = ("pytest", "--durations=12", "--durations-min=2")
 CORES: Final = os.cpu_count() or 1
-LIVE: Final = (*PYTEST, "-m", "live and not wide", "tests/system")
+CROWDED: Final = (*PYTEST, "-m", "crowded and not wide", "tests/system")
+LIVE: Final = (*PYTEST, "-m", "live and not crowded and not wide", "tests/system")
 """None is elsewhere: tests/test_architecture.py."""
 WAITING: Final = (
     *PYTEST, "-m", "system and not live", "--numprocesses", str(2 * CORES), "--dist", "loadfile",
@@ -36,6 +37,18 @@ PATIENT: Final = (
     ("python", "-m", "tools.dev.mutants", "--sample"),
 )  # fmt: skip
 """Neither processes nor real time: they take what the others leave of the cores."""
+
+
+class Plan(NamedTuple):
+    """Commands after lint and types."""
+
+    before: tuple[tuple[str, ...], ...] = ()
+    beside: tuple[tuple[str, ...], ...] = ()
+    """Begun after these, and followed after the others."""
+    after: tuple[tuple[str, ...], ...] = ()
+
+
+ALL: Final = Plan(before=(CROWDED,), beside=PATIENT, after=(LIVE, WAITING))
 CHANGED: Final = "--changed"
 ENDS_IN_S: Final = 30.0
 """Time for a part to end after Ctrl-C: a fleet goes down."""
@@ -93,10 +106,10 @@ def main(argv: Sequence[str]) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):  # SIGINT is ignored where a shell put us behind
         signal.signal(number, signal.default_int_handler)
     begun_s = time.monotonic()
-    alone = [PYTEST + tuple(argv)] if argv else [LIVE, WAITING]
+    plan = Plan(after=(PYTEST + tuple(argv),)) if argv else ALL
     if CHANGED in argv[:1]:
         try:
-            alone = _touched(*argv[1:])
+            plan = Plan(after=_touched(*argv[1:]))
         except (RunError, TypeError) as error:
             print(f"{CHANGED} takes a revision, or nothing for what is not committed: {error}")
             return DECLINED_EXIT_CODE
@@ -104,20 +117,21 @@ def main(argv: Sequence[str]) -> int:
     with ExitStack() as stack:
         stack.callback(_stop, running)
         beside = list[tuple[Check, IO[bytes]]]()
-        for command in () if argv else PATIENT:
-            to = stack.enter_context(tempfile.TemporaryFile())
-            beside.append((_start(command, to, beside=True), to))
-            running.append(beside[-1][0])
-            print(f"== beside the others, shown after them: {running[-1].name}", flush=True)
         try:
-            done = [_run(command, running) for command in (*CHECKS, *alone)]
+            done = [_run(command, running) for command in (*CHECKS, *plan.before)]
+            for command in plan.beside:
+                to = stack.enter_context(tempfile.TemporaryFile())
+                beside.append((_start(command, to, beside=True), to))
+                running.append(beside[-1][0])
+                print(f"== beside the others, shown after them: {running[-1].name}", flush=True)
+            done += [_run(command, running) for command in plan.after]
             done += [_follow(*each, running) for each in beside]
         except KeyboardInterrupt:
             return 128 + signal.SIGINT
     return _tell(done, time.monotonic() - begun_s)
 
 
-def _touched(revision: str = "HEAD") -> list[tuple[str, ...]]:
+def _touched(revision: str = "HEAD") -> tuple[tuple[str, ...], ...]:
     """Return the command for what a change can have touched, if that is anything."""
     changed = changed_since(revision)
     whole, first = selection(changed)
@@ -126,9 +140,9 @@ def _touched(revision: str = "HEAD") -> list[tuple[str, ...]]:
         f" whole, {len(first)} reach them and run one test; none with processes or real time"
     )
     if not whole + first:
-        return []
+        return ()
     of = [f"--first-of={name}" for name in first]
-    return [(*PATIENT[0], "-p", changed_since.__module__, *of, *whole, *first)]
+    return ((*PATIENT[0], "-p", changed_since.__module__, *of, *whole, *first),)
 
 
 def _start(command: tuple[str, ...], to: IO[bytes] | int, *, beside: bool = False) -> Check:
