@@ -129,8 +129,6 @@ class PartialFleet(Lockstep):
     drive's, not the last one that the service sent.
     """
 
-    traced = False
-
     def __init__(self, config: RobotConfig, scenario: Scenario, record: Record = forget) -> None:
         """Begin as `Lockstep` does."""
         super().__init__(config, scenario, record=record)

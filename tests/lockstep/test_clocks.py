@@ -39,12 +39,8 @@ HOSTS = ("planner", "harness", *MODULES)
 SQUAT = partial.scenario_of(PartialCase("links", ()))
 
 
-class Fleet(Lockstep):
-    traced = False
-
-
 class Run(NamedTuple):
-    fleet: Fleet
+    fleet: Lockstep
     rows: list[SimTruth]
     sent: dict[str, list[JointCommand]]
     """By module."""
@@ -79,7 +75,7 @@ def squat(
             statuses.append(message)
 
     scenario = msgspec.structs.replace(SQUAT, duration=seconds)
-    fleet = Fleet(robot, scenario, record=record, clocks=clocks)
+    fleet = Lockstep(robot, scenario, record=record, clocks=clocks)
     rows: list[SimTruth] = []
     for row in fleet.run():
         rows.append(row)
@@ -154,12 +150,12 @@ PLAYED = 147
 
 def gone_on(
     robot: RobotConfig, start: FleetMoment, *, led: bool, again: Run | None = None, by_ns: int = 0
-) -> Fleet:
+) -> Lockstep:
     """Go on for 0.6 s, with or without a planner, with a record's commands played on top.
 
     They are put past the network's own order, as if they came from the planner.
     """
-    fleet = Fleet(robot, SQUAT)
+    fleet = Lockstep(robot, SQUAT)
     fleet.resume(start if led else msgspec.structs.replace(start, planner=None))
     played = [] if again is None else [itertools.cycle(again.sent[name]) for name in MODULES]
     for ms in range(600):

@@ -75,7 +75,6 @@ def test_so_it_does_with_any_other_module_late(robot: RobotConfig, module: str) 
 class Steps(Lockstep):
     """Watches how far the joint torques go from one cycle to the next."""
 
-    traced = False
     largest_nm = 0.0
 
     def advance(self) -> None:

@@ -7,13 +7,14 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
 import pytest
 
 from tests.system.stalls import FILE_VARIABLE, start_watch
-from tools.fleet.pace import PACE_VARIABLE, SLOWER
+from tools.fleet.pace import PACE_VARIABLE, SLOWER, usual_pace
 
 FULL: Final = 0.75
 """Fraction of all cores: a fleet that takes more drops out now and then, and its tests with it."""
@@ -25,8 +26,9 @@ LED: Final = {
 }  # fmt: skip
 """Files whose tests start services that hold or lead the simulated robot: one after the other."""
 
-CROWDED: Final = {"test_hosts_verb", "test_namespaces", "test_usb_fleet"}
-"""Of these, those with several hosts, or boards that take more of the cores than axes on CAN."""
+CROWDED: Final = {"test_hosts_verb": 0.6, "test_namespaces": 0.6, "test_usb_fleet": 0.6}
+"""Factor on the pace of those with several hosts, or with boards that take more of the cores than
+axes on CAN: other tests run beside them."""
 
 
 def carried_pace() -> str:
@@ -50,6 +52,16 @@ def carried_pace() -> str:
         return f"{summary['pace'] * (SLOWER if full else 1.0):g}"
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _slowed(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Let a fleet that crowds the cores run in slow motion."""
+    factor = CROWDED.get(request.path.stem)
+    with pytest.MonkeyPatch.context() as patch:
+        if factor is not None:
+            patch.setenv(PACE_VARIABLE, f"{factor * usual_pace():g}")
+        yield
+
+
 def _is_led(item: pytest.Item) -> bool:
     """Return True for a test of this folder that leads a fleet; others may have files so named."""
     return item.path.parent == Path(__file__).parent and item.path.stem in LED
@@ -61,8 +73,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if _is_led(item):
             item.add_marker(pytest.mark.live)
-            if item.path.stem in CROWDED:
-                item.add_marker(pytest.mark.crowded)
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:

@@ -10,23 +10,13 @@ import pytest
 from shared.joints import MODULES
 from tests.system.fleets import leaving_nothing, xrl_led
 from tests.usb import robot_file
-from tools.fleet.pace import PACE_VARIABLE, usual_pace
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(240)]
-
-BESIDE_CAN = 0.7
-"""Factor on the pace of a fleet on CAN."""
 
 
 @pytest.fixture
 def robot_path(tmp_path: Path) -> Path:
     return robot_file.write(tmp_path)
-
-
-@pytest.fixture(autouse=True)
-def _boards_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Six emulated boards on USB take more of the cores than twelve axes on CAN."""
-    monkeypatch.setenv(PACE_VARIABLE, f"{BESIDE_CAN * usual_pace():g}")
 
 
 def led(verb: str, out: Path, *flags: str | Path) -> str:

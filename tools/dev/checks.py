@@ -22,8 +22,7 @@ from tools.dev.changed import changed_since, selection
 CHECKS: Final = (("ruff", "check"), ("ruff", "format", "--check"), ("mypy",))
 PYTEST: Final = ("pytest", "--durations=12", "--durations-min=2")
 CORES: Final = os.cpu_count() or 1
-CROWDED: Final = (*PYTEST, "-m", "crowded and not wide", "tests/system")
-LIVE: Final = (*PYTEST, "-m", "live and not crowded and not wide", "tests/system")
+LIVE: Final = (*PYTEST, "-m", "live and not wide", "tests/system")
 """None is elsewhere: tests/test_architecture.py."""
 WAITING: Final = (
     *PYTEST, "-m", "system and not live", "--numprocesses", str(2 * CORES), "--dist", "loadfile",
@@ -42,13 +41,12 @@ PATIENT: Final = (
 class Plan(NamedTuple):
     """Commands after lint and types."""
 
-    before: tuple[tuple[str, ...], ...] = ()
+    alone: tuple[tuple[str, ...], ...] = ()
     beside: tuple[tuple[str, ...], ...] = ()
-    """Begun after these, and followed after the others."""
-    after: tuple[tuple[str, ...], ...] = ()
+    """Begun before these, and followed after them."""
 
 
-ALL: Final = Plan(before=(CROWDED,), beside=PATIENT, after=(LIVE, WAITING))
+ALL: Final = Plan((LIVE, WAITING), beside=PATIENT)
 CHANGED: Final = "--changed"
 ENDS_IN_S: Final = 30.0
 """Time for a part to end after Ctrl-C: a fleet goes down."""
@@ -106,10 +104,10 @@ def main(argv: Sequence[str]) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):  # SIGINT is ignored where a shell put us behind
         signal.signal(number, signal.default_int_handler)
     begun_s = time.monotonic()
-    plan = Plan(after=(PYTEST + tuple(argv),)) if argv else ALL
+    plan = Plan((PYTEST + tuple(argv),)) if argv else ALL
     if CHANGED in argv[:1]:
         try:
-            plan = Plan(after=_touched(*argv[1:]))
+            plan = Plan(_touched(*argv[1:]))
         except (RunError, TypeError) as error:
             print(f"{CHANGED} takes a revision, or nothing for what is not committed: {error}")
             return DECLINED_EXIT_CODE
@@ -118,13 +116,12 @@ def main(argv: Sequence[str]) -> int:
         stack.callback(_stop, running)
         beside = list[tuple[Check, IO[bytes]]]()
         try:
-            done = [_run(command, running) for command in (*CHECKS, *plan.before)]
             for command in plan.beside:
                 to = stack.enter_context(tempfile.TemporaryFile())
                 beside.append((_start(command, to, beside=True), to))
                 running.append(beside[-1][0])
                 print(f"== beside the others, shown after them: {running[-1].name}", flush=True)
-            done += [_run(command, running) for command in plan.after]
+            done = [_run(command, running) for command in (*CHECKS, *plan.alone)]
             done += [_follow(*each, running) for each in beside]
         except KeyboardInterrupt:
             return 128 + signal.SIGINT

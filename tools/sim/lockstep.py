@@ -8,6 +8,7 @@ process, clock or bus: two runs with one seed are equal to the last bit.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import ClassVar, NamedTuple
 
@@ -79,14 +80,15 @@ class _Periods(NamedTuple):
     step: int
     truth: int
     sim_state: int
+    """0: it is not recorded."""
 
     @classmethod
-    def of(cls, config: RobotConfig) -> _Periods:
+    def of(cls, config: RobotConfig, *, traced: bool) -> _Periods:
         rates_hz = (
             config.joint_service.rate_hz,
             1.0 / config.simulation.timestep,
             config.simulation.truth_rate_hz,
-            topics.SIM_STATE.rate_hz,
+            topics.SIM_STATE.rate_hz if traced else math.inf,
         )
         return cls(*(round(NS_PER_S / rate_hz) for rate_hz in rates_hz))
 
@@ -114,8 +116,6 @@ class Lockstep:
 
     planner_type: ClassVar[type[Planner]] = Planner
     module_type: ClassVar[type[DriveManager]] = DriveManager
-    traced: ClassVar[bool] = True
-    """Record all that re-execution of the services needs."""
 
     def __init__(
         self,
@@ -130,6 +130,7 @@ class Lockstep:
         hand: Sequence[HandRow] = (),
         controller: Callable[[], Controller] | None = None,
         planner_beside: bool = False,
+        traced: bool = False,
     ) -> None:
         """Put the robot on the hoist, drives idle.
 
@@ -146,6 +147,7 @@ class Lockstep:
             controller: makes a controller of somebody's own for each planner.
             planner_beside: the planner's process is on the joint services' host, where its end is
                 seen at once; otherwise its commands grow old, which is harder.
+            traced: record also what re-execution of the services needs.
 
         Raises:
             RunError: the scenario kills a service that has no process here.
@@ -156,7 +158,7 @@ class Lockstep:
         self.world = World(body_of(config, self.plant), scenario)
         self.events: list[tuple[str, JointEvent]] = []
         self.time = time = VirtualTime(NS_PER_S)
-        self._record, traced = record, self.traced and record is not forget
+        self._record = record
         self._controller = controller
         self.network = network_ = VirtualNetwork(
             network or BASE,
@@ -206,7 +208,7 @@ class Lockstep:
             )
             for index, name in enumerate(MODULES)
         ]  # fmt: skip
-        self._periods = _Periods.of(config)
+        self._periods = _Periods.of(config, traced=traced)
         happens: list[Kill | Restart | Push | HandRow] = [
             *scenario.kill,
             *scenario.restart,
@@ -214,10 +216,6 @@ class Lockstep:
             *hand,
         ]
         self._progress = _Progress(sorted(happens, key=lambda row: row.at))
-
-    @property
-    def _traces(self) -> bool:
-        return self.traced and self._record is not forget
 
     @property
     def now_ns(self) -> int:
@@ -280,7 +278,7 @@ class Lockstep:
             while self._progress.todo and self.world.scenario_s >= self._progress.todo[0].at:
                 self.act(self._progress.todo.pop(0))
             self.advance()
-            if self._traces and self.now_ns % self._periods.sim_state == 0:
+            if self._periods.sim_state and self.now_ns % self._periods.sim_state == 0:
                 self._progress.sim_states += 1
                 state = read_state(self.world, self.bank, self.now_ns, self._progress.sim_states)
                 self._record(topics.SIM_STATE, "", state)

@@ -181,7 +181,7 @@ def simulate(
         if make is not None:
             inputs["controller"] = make
         if control == SHIPPED:  # as `xrl demo` runs it, all on one host
-            inputs["planner_beside"] = True
+            inputs |= {"planner_beside": True, "traced": True}
         fleet = CONTROLS[control](robot, scenario, network, **inputs)
         end_s = math.inf
         for truth in fleet.run():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from typing import ClassVar, Final
+from typing import Final
 
 import msgspec
 
@@ -23,12 +23,6 @@ from tools.view.source import CUT_S, CUTS, HandOrders, Order, Source
 _FOREVER_S: Final = 1e9
 _STEP_S: Final = 0.01
 """So much virtual time at once, then the orders."""
-
-
-class _Watched(Lockstep):
-    """A fleet that is looked at, and not recorded for re-execution."""
-
-    traced: ClassVar[bool] = False
 
 
 class LockstepSource(Source):
@@ -87,7 +81,7 @@ class LockstepSource(Source):
         scenario = Scenario(
             name="view", about="", duration=_FOREVER_S, keyframe=(Keyframe(at=0.0, height=height),)
         )
-        fleet = _Watched(robot, scenario, record=self._newest.add)
+        fleet = Lockstep(robot, scenario, record=self._newest.add)
         begin_standing(fleet)
         hand = HandOrders()
         due = time.monotonic()

@@ -52,7 +52,7 @@ def sent_by_all(robot: RobotConfig, seconds: float) -> list[Sent]:
 
     scenario = msgspec.structs.replace(NOTHING_HAPPENS, duration=seconds)
     clocks = {name: CLOCKS[host] for name, host in HOST_OF.items()}
-    fleet = Lockstep(robot, scenario, record=put, clocks=clocks)
+    fleet = Lockstep(robot, scenario, record=put, clocks=clocks, traced=True)
     for _ in fleet.run():
         pass
     return sent

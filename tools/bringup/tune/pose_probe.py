@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import ClassVar, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,7 +62,6 @@ def course_of(statuses: list[PlannerStatus], row: int, ended: str = "") -> Probe
 class ProbedLockstep(Lockstep):
     """A stand whose reference is probed."""
 
-    traced: ClassVar[bool] = False
     row: int = NO_ROW
     excitation: Excitation | None = None
 

@@ -245,7 +245,7 @@ class LockstepRun:
     def _begin(self) -> None:
         self._outbox = RecordedMessages(self._robot.name)
         record = self._outbox.put if self._recorded else forget
-        self._fleet = Lockstep(self._robot, self._scenario, record=record)
+        self._fleet = Lockstep(self._robot, self._scenario, record=record, traced=self._recorded)
         begin_standing(self._fleet)
         self._run = self._fleet.run()
         for truth in self._run:

@@ -33,7 +33,6 @@ class CentralisedLockstep(Lockstep):
 
     planner_type = CentralPlanner
     module_type = PassThrough
-    traced = False  # the services that could be executed again are the shipped ones
 
     def __init__(
         self,

@@ -25,10 +25,6 @@ from tools.sim.lockstep import Lockstep
 PLANTS = 10
 
 
-class Untraced(Lockstep):
-    traced = False
-
-
 def drawn(number: int) -> PlantConfig:
     """Return a plant with every error drawn, its floor level within some 2 mrad."""
     plant, dice = plants.draw(f"identify/{number}"), random.Random(f"slope{number}")
@@ -48,7 +44,7 @@ def led(robot: RobotConfig, plant: PlantConfig) -> Moments:
             messages.append(message)
 
     scenario = scenarios.load(ROBOT_FILE.parent / "scenarios" / "identify.toml")
-    fleet = Untraced(robot, scenario, record=record, plant=plant)
+    fleet = Lockstep(robot, scenario, record=record, plant=plant)
     assert not any(truth.fallen for truth in fleet.run())
     states = [TimedRows(*rows[topics.JOINT_STATE.name, name]) for name in MODULES]
     return moments_of(states, TimedRows(*rows[topics.WRENCH.name, ""]))

@@ -146,7 +146,6 @@ def test_no_random_policy_gets_an_uncertified_gain_to_a_drive_and_the_robot_stan
     fleet = Lockstep(
         robot, still(1.0), seed=1, record=record, controller=lambda: PolicyController(policy)
     )
-    fleet.traced = False  # type: ignore[misc]
     begin_standing(fleet)
     for number_of, truth in enumerate(fleet.run()):
         assert not truth.fallen
