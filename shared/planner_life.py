@@ -13,10 +13,15 @@ import ctypes
 import platform
 import struct
 import threading
+from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
+from shared import log
+from shared.exceptions import FleetError
 from shared.run_directory import mapped
+
+End = TypeVar("End")
 
 _LIFE: Final = struct.Struct("<QLLQ")
 """Address of the next entry of the list, the word, a gap, the session."""
@@ -77,8 +82,9 @@ def _set_robust_list(head: _Head) -> bool:
     number = _SET_ROBUST_LIST.get(platform.machine())
     if number is None:
         return False
-    status: int = ctypes.CDLL(None).syscall(number, ctypes.byref(head), ctypes.sizeof(head))
-    return status == 0
+    call = ctypes.CDLL(None).syscall
+    call.argtypes, call.restype = (ctypes.c_long, ctypes.c_void_p, ctypes.c_size_t), ctypes.c_long
+    return bool(call(number, ctypes.addressof(head), ctypes.sizeof(head)) == 0)
 
 
 class PlannerLife:
@@ -96,3 +102,12 @@ class PlannerLife:
             return 0
         self._told = int(session)
         return self._told
+
+
+def if_possible(end: Callable[[Path], End], run_dir: Path) -> End | None:
+    """Return one of the two ends, or None and a warning: no service fails for a second trigger."""
+    try:
+        return end(run_dir)
+    except FleetError as error:
+        log.get("xrl").warning("%s; a planner's end is seen by the age of its commands", error)
+        return None

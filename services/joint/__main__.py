@@ -13,7 +13,7 @@ from services.joint.heat import HeatFile
 from services.joint.loop import JointLoop, JointPorts
 from services.joint.neighbours import Neighbours
 from services.joint.rearm_guard import LastState, RearmGuard
-from shared import log, scheduling
+from shared import log, planner_life, scheduling
 from shared.bus import topics
 from shared.bus.messages import Estop, JointCommand, JointEvent, JointState
 from shared.bus.session import open_session
@@ -56,7 +56,7 @@ def main() -> int:
             states=session.publisher(topics.JOINT_STATE, JointState, module),
             events=session.publisher(topics.JOINT_EVENT, JointEvent, module),
             traces=session.publisher(topics.JOINT_TRACE, JointTrace, module),
-            planner=PlannerLife(arguments.run_dir),
+            planner=planner_life.if_possible(PlannerLife, arguments.run_dir),
         )
         drive = open_drive(robot, module, arguments.run_dir, read_only=arguments.readonly)
         rearm_guard = None if arguments.readonly else RearmGuard(arguments.run_dir, module)

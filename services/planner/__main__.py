@@ -7,7 +7,7 @@ import secrets
 from services.planner.controller_file import controller_maker
 from services.planner.loop import PlannerLoop, PlannerPorts, requests_of
 from services.planner.planner import Planner
-from shared import log, scheduling
+from shared import log, planner_life, scheduling
 from shared.bus import topics
 from shared.bus.messages import (
     Attitude,
@@ -52,6 +52,7 @@ def main() -> int:
         controller = controller_maker(arguments.controller, robot)()
     stop = StopFlag()
     granted = scheduling.apply("planner")
+    life = planner_life.if_possible(OwnLife, arguments.run_dir)
     with open_session(robot, "planner", arguments.run_dir, injected=arguments.injected) as session:
         ports = PlannerPorts(
             states=[session.latest(topics.JOINT_STATE, JointState, m) for m in MODULES],
@@ -61,7 +62,7 @@ def main() -> int:
             commands=[session.publisher(topics.JOINT_COMMAND, JointCommand, m) for m in MODULES],
             status=session.publisher(topics.PLANNER_STATUS, PlannerStatus),
             checkpoint=session.publisher(topics.PLANNER_CHECKPOINT, PlannerCheckpoint),
-            announce=OwnLife(arguments.run_dir).announce,
+            announce=None if life is None else life.announce,
         )
         session_id = secrets.randbelow(1 << 53) + 1  # JSON readers keep 53 bits
         loop = PlannerLoop(robot, Planner(robot, session_id, controller), ports)

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from shared.places import CHECKOUT
-from shared.planner_life import OwnLife, PlannerLife
+from shared.planner_life import OwnLife, PlannerLife, if_possible
 from tests.waiting import comes_true
 
 pytestmark = [pytest.mark.system]
@@ -96,3 +96,12 @@ def test_the_next_planner_and_another_session_take_its_place(short_dir: Path) ->
     assert life.ended() == 0
     own.announce(11)
     assert life.ended() == 0, "the process goes on in another session"
+
+
+def test_without_shared_memory_a_service_does_without(
+    short_dir: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for end in (OwnLife, PlannerLife):
+        assert if_possible(end, short_dir) is not None
+        assert if_possible(end, short_dir / "gone") is None
+    assert caplog.text.count("a planner's end is seen by the age of its commands") == 2
