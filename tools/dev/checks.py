@@ -31,11 +31,11 @@ WAITING: Final = (
 PATIENT: Final = (
     (
         *PYTEST, "-m", "not system and not wide", "--numprocesses", "auto", "--dist", "loadfile",
-        "--no-loadscope-reorder",
+        "--no-loadscope-reorder", "--timeout", "300",
     ),
     ("python", "-m", "tools.dev.mutants", "--sample"),
 )  # fmt: skip
-"""Neither processes nor real time: they take what the others leave of the cores."""
+"""Neither processes nor real time: they take what the others leave of the cores, and longer."""
 
 
 class Plan(NamedTuple):
