@@ -47,11 +47,12 @@ def write_tool(root: Path, name: str, body: str) -> None:
     tool.chmod(0o755)
 
 
-def start(root: Path, *, background: bool = False) -> subprocess.Popen[str]:
+def start(root: Path, *words: str, background: bool = False) -> subprocess.Popen[str]:
     """Start the script as a terminal does: in a process group of its own.
 
     Args:
         root: the project.
+        words: arguments.
         background: as a shell without job control starts it with `&`: Ctrl-C's signal is ignored.
     """
 
@@ -60,7 +61,7 @@ def start(root: Path, *, background: bool = False) -> subprocess.Popen[str]:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     return subprocess.Popen(
-        ["bash", "deploy/test"],
+        ["bash", "deploy/test", *words],
         cwd=root,
         env={**os.environ, "TMPDIR": str(root)},
         stdout=subprocess.PIPE,
@@ -71,8 +72,8 @@ def start(root: Path, *, background: bool = False) -> subprocess.Popen[str]:
     )
 
 
-def run(root: Path) -> tuple[int, str]:
-    script = start(root)
+def run(root: Path, *words: str) -> tuple[int, str]:
+    script = start(root, *words)
     said, _ = script.communicate(timeout=30)
     return script.returncode, said
 
@@ -148,6 +149,26 @@ def test_the_last_line_says_what_ran_and_what_was_skipped_and_why(root: Path) ->
     last = run(root)[1].splitlines()[-1]
     assert last.startswith("== FAILED in 0 min ")
     assert last.endswith("; skipped: nothing")
+
+
+@pytest.mark.parametrize("words", [("no-such-revision",), ("HEAD", "more")])
+def test_a_change_since_what_is_no_revision_is_refused_and_nothing_runs(
+    root: Path, words: tuple[str, ...]
+) -> None:
+    code, said = run(root, "--changed", *words)
+    assert code == 2
+    assert "deploy/test: --changed " in said
+    assert "ruff called" not in said
+
+
+def test_who_reads_no_further_ends_it(root: Path) -> None:
+    write_tool(root, "mypy", "sleep 0.5; yes | head -n 100000")
+    script = start(root)
+    assert script.stdout is not None
+    while "== mypy" not in script.stdout.readline():
+        assert script.poll() is None
+    script.stdout.close()
+    assert script.wait(timeout=30) == 128 + signal.SIGPIPE
 
 
 def test_its_help_names_the_parts_and_runs_none(root: Path) -> None:

@@ -26,7 +26,7 @@ class Selection(NamedTuple):
 
     whole: tuple[str, ...]
     first: tuple[str, ...]
-    """Of these only the first test."""
+    """Files of which only the first test runs."""
 
 
 def changed_since(revision: str) -> set[str]:
@@ -41,9 +41,12 @@ def changed_since(revision: str) -> set[str]:
     )
     found = set[str]()
     for words in lists:
-        done = subprocess.run(
-            ("git", *words), cwd=ROOT, capture_output=True, text=True, check=False
-        )
+        try:
+            done = subprocess.run(
+                ("git", *words), cwd=ROOT, capture_output=True, text=True, check=False
+            )
+        except FileNotFoundError:
+            raise RunError(f"--changed {revision}: there is no git here to say it") from None
         if done.returncode:
             raise RunError(f"--changed {revision}: {done.stderr.strip().partition(chr(10))[0]}")
         found.update(done.stdout.splitlines())

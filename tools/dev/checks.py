@@ -48,6 +48,7 @@ class Plan(NamedTuple):
 
 ALL: Final = Plan((LIVE, WAITING), beside=PATIENT)
 CHANGED: Final = "--changed"
+INTERRUPTED: Final = 128 + signal.SIGINT
 ENDS_IN_S: Final = 30.0
 """Time for a part to end after Ctrl-C: a fleet goes down."""
 LOOK_EVERY_S: Final = 0.2
@@ -101,15 +102,19 @@ class Check(msgspec.Struct):
 
 def main(argv: Sequence[str]) -> int:
     """Run all parts, or lint, types and the tests that pytest's arguments name; 0, 3 or 130."""
-    for number in (signal.SIGINT, signal.SIGTERM):  # SIGINT is ignored where a shell put us behind
+    for number in (
+        signal.SIGINT,
+        signal.SIGTERM,
+        signal.SIGHUP,
+    ):  # SIGINT is ignored where a shell put us behind
         signal.signal(number, signal.default_int_handler)
     begun_s = time.monotonic()
     plan = Plan((PYTEST + tuple(argv),)) if argv else ALL
     if CHANGED in argv[:1]:
         try:
             plan = Plan(_touched(*argv[1:]))
-        except (RunError, TypeError) as error:
-            print(f"{CHANGED} takes a revision, or nothing for what is not committed: {error}")
+        except RunError as error:
+            print(f"deploy/test: {error}", file=sys.stderr)
             return DECLINED_EXIT_CODE
     running: list[Check] = []
     with ExitStack() as stack:
@@ -124,12 +129,17 @@ def main(argv: Sequence[str]) -> int:
             done = [_run(command, running) for command in (*CHECKS, *plan.alone)]
             done += [_follow(*each, running) for each in beside]
         except KeyboardInterrupt:
-            return 128 + signal.SIGINT
+            return INTERRUPTED
+        except BrokenPipeError:  # nobody reads it any more: `| head`
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 128 + signal.SIGPIPE
     return _tell(done, time.monotonic() - begun_s)
 
 
-def _touched(revision: str = "HEAD") -> tuple[tuple[str, ...], ...]:
+def _touched(revision: str = "HEAD", *others: str) -> tuple[tuple[str, ...], ...]:
     """Return the command for what a change can have touched, if that is anything."""
+    if others:
+        raise RunError(f"{CHANGED} takes one revision, or none for what is not committed")
     changed = changed_since(revision)
     whole, first = selection(changed)
     print(

@@ -226,11 +226,9 @@ class VirtualDrive:
             return
         if bus.acknowledged:
             self._watch.carried(now_ns)
-            bus.at_once += 1
-            self._receive(apply)
         else:
             self._watch.sent(now_ns)
-            bus.put(now_ns, lambda: self._receive(apply))
+        bus.put(now_ns, lambda: self._receive(apply))
 
     def _receive(self, apply: Apply) -> None:
         bank, (a, _) = self._bank, self._axes

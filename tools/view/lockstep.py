@@ -81,7 +81,7 @@ class LockstepSource(Source):
         scenario = Scenario(
             name="view", about="", duration=_FOREVER_S, keyframe=(Keyframe(at=0.0, height=height),)
         )
-        fleet = Lockstep(robot, scenario, record=self._newest.add)
+        fleet = Lockstep(robot, scenario, record=self._newest.add, planner_beside=True)
         begin_standing(fleet)
         hand = HandOrders()
         due = time.monotonic()

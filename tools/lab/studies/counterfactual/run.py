@@ -80,7 +80,9 @@ def counterfactual_of(task: Task) -> Counterfactual:
     """Go on from the moment, and judge."""
     moment = task.moment
     scenario = scenario_from(task.scenario, moment.at_s, task.kill, task.for_s)
-    fleet = Lockstep(task.robot, scenario, BASE, plant=task.plant, hand=task.hand)
+    fleet = Lockstep(
+        task.robot, scenario, BASE, plant=task.plant, hand=task.hand, planner_beside=True
+    )
     fleet.resume(FleetMoment(moment.state, moment.modules, moment.planner))
     rows = list(NOBODY.rows_that_count(fleet.run(), -math.inf))
     fell = rows.pop() if rows and rows[-1].fallen else None
