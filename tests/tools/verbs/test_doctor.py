@@ -31,7 +31,7 @@ TRAPS = {
     "controller.config.vel_integrator_gain": ("0.333", "0"),
 }
 MEASURED = ("heartbeat", "encoder frames", "load cells", "processors")
-"""What depends on how busy the machine is."""
+"""What depends on how busy the machine is: a full one may find any of it wrong."""
 START_S = 60.0
 
 
@@ -52,19 +52,24 @@ def doctor(run_dir: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def rows_of(result: subprocess.CompletedProcess[str]) -> list[dict[str, Any]]:
+    """Return a report's rows; its exit code must follow from them."""
     report = json.loads(result.stdout)
     rows = [row for group in report["groups"].values() for row in group]
     assert report["wrong"] == sum(row["verdict"] == "wrong" for row in rows)
+    assert result.returncode == (3 if report["wrong"] else 0), result.stderr
     return rows
+
+
+def bad_rows_of(result: subprocess.CompletedProcess[str], *verdicts: str) -> list[dict[str, Any]]:
+    """Return the rows with one of some verdicts, of what does not depend on the machine."""
+    rows = [row for row in rows_of(result) if row["what"] not in MEASURED]
+    return [row for row in rows if row["verdict"] in verdicts]
 
 
 def test_nothing_is_wrong_with_the_emulated_robot_as_shipped(run_dir: Path) -> None:
     result = doctor(run_dir, "--json")
-    assert result.returncode == 0, result.stdout + result.stderr
-    rows = rows_of(result)
-    bad = [row for row in rows if row["verdict"] != "ok"]
-    assert [row for row in bad if row["what"] not in MEASURED] == []
-    whats = [row["what"] for row in rows]
+    assert bad_rows_of(result, "warning", "wrong") == []
+    whats = [row["what"] for row in rows_of(result)]
     assert whats.count("settings") == 6
     assert whats.count("calibrated") == 12
     assert whats.count("zero") == 6
@@ -126,7 +131,7 @@ def test_it_writes_no_endpoint_calls_no_function_and_sends_questions_only(run_di
         cwd=DEFAULT_CONFIG.parents[1],
         check=False,
     )
-    assert result.returncode == 0, result.stdout + result.stderr
+    assert bad_rows_of(result, "warning", "wrong") == []
     summary = json.loads(result.stderr.splitlines()[-1])
     assert summary["usb"] == []
     assert summary["reads"] > 6, "it did read, through what is recorded here"
@@ -140,17 +145,15 @@ def test_it_writes_no_endpoint_calls_no_function_and_sends_questions_only(run_di
 def test_a_board_that_is_not_set_up_as_the_others_is_named(run_dir: Path) -> None:
     plant = "--plant=knee_left.axis1.motor.config.pole_pairs=20"
     result = doctor(run_dir, "--json", plant)
-    assert result.returncode == 0, "a warning: nothing that is wanted is missing"
-    bad = [row for row in rows_of(result) if row["verdict"] != "ok" and row["what"] not in MEASURED]
-    assert [(row["subject"], row["what"], row["found"]) for row in bad] == [
-        ("knee_left.axis1", "motor.config.pole_pairs", "20")
-    ]
+    (row,) = bad_rows_of(result, "warning", "wrong")
+    named = (row["subject"], row["what"], row["found"])
+    assert named == ("knee_left.axis1", "motor.config.pole_pairs", "20")
+    assert row["verdict"] == "warning", "nothing that is wanted is missing"
 
 
 def test_a_current_that_counts_the_other_way_is_wrong_over_can(run_dir: Path) -> None:
     result = doctor(run_dir, "--json", f"--plant={AXIS}.encoder.config.direction=-1")
-    assert result.returncode == 3, result.stderr
-    (row,) = [row for row in rows_of(result) if row["verdict"] == "wrong"]
+    (row,) = bad_rows_of(result, "wrong")
     assert (row["subject"], row["what"], row["found"]) == (AXIS, "encoder.config.direction", "-1")
     assert "two of the motor's phases" in row["fix"]
 
@@ -158,22 +161,21 @@ def test_a_current_that_counts_the_other_way_is_wrong_over_can(run_dir: Path) ->
 def test_three_planted_traps_are_named_all_three(run_dir: Path) -> None:
     plants = [f"--plant={AXIS}.{name}={found}" for name, (found, _) in TRAPS.items()]
     result = doctor(run_dir, "--json", *plants)
-    assert result.returncode == 3, result.stderr
-    wrong = [row for row in rows_of(result) if row["verdict"] == "wrong"]
+    wrong = bad_rows_of(result, "wrong")
     assert {(row["subject"], row["what"]): (row["found"], row["wanted"]) for row in wrong} == {
         (AXIS, name): values for name, values in TRAPS.items()
     }
     assert {row["fix"] for row in wrong} == {"`xrl drive configure --apply --module knee_left`"}
     periods = [row for row in rows_of(result) if row["what"] == "encoder frames"]
-    assert next(row for row in periods if row["subject"] == AXIS)["verdict"] == "warning"
+    assert next(row for row in periods if row["subject"] == AXIS)["verdict"] != "ok"
 
 
 def test_the_terminal_ends_in_what_is_wrong(run_dir: Path) -> None:
     result = doctor(run_dir, f"--plant={AXIS}.motor.config.pre_calibrated=false")
     assert result.returncode == 3
     words = " ".join(result.stdout.split())
-    last = words[words.rindex("2 wrong:") :]
-    assert last.startswith(f"2 wrong: {AXIS} pre_calibrated, {AXIS} calibrated")
+    last = words[words.rindex(" wrong: ") :]
+    assert f"{AXIS} pre_calibrated, {AXIS} calibrated" in last
 
 
 def test_ctrl_c_stops_the_simulator_that_was_started(run_dir: Path) -> None:
