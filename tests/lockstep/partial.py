@@ -6,7 +6,7 @@ of one run, so that none has to stand up first.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from itertools import chain, combinations
 from typing import Final, Literal
 
@@ -19,9 +19,9 @@ from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Keyframe, Kill, Push, Restart, Scenario
-from shared.exceptions import RunError
 from shared.joints import MODULE_INDEX, MODULES
 from shared.links import Pair as Link
+from tests.lockstep.runs import moment_of
 from tools.lab.studies.sweeps.figures import Ending, com_max_mm, ending_of, operator_peak_n, step_nm
 from tools.sim.lockstep import FleetMoment, Lockstep, forget
 from tools.sim.virtual_time import Record
@@ -83,13 +83,6 @@ class PartialResult(msgspec.Struct, frozen=True, kw_only=True):
 
     While they HOLD it leads on against them and comes to its limit, whatever failed.
     """
-
-
-def cases() -> Iterator[PartialCase]:
-    """Yield every case: 64 subsets of each kind."""
-    for kind in KINDS:
-        for modules in SUBSETS:
-            yield PartialCase(kind, modules)
 
 
 def scenario_of(case: PartialCase) -> Scenario:
@@ -154,18 +147,8 @@ class PartialFleet(Lockstep):
 
 
 def start_of(robot: RobotConfig) -> FleetMoment:
-    """Run to the moment that all cases go on from.
-
-    Raises:
-        RunError: the robot did not come so far.
-    """
-    fleet = PartialFleet(robot, scenario_of(PartialCase("links", ())))
-    for truth in fleet.run():
-        if truth.scenario_s >= BEGIN_S:
-            break
-    if fleet.world.scenario_s < BEGIN_S or fleet.planner is None:
-        raise RunError(f"the robot did not stand and track until {BEGIN_S:g} s")
-    return fleet.moment()
+    """Return the moment that all cases go on from."""
+    return moment_of(robot, scenario_of(PartialCase("links", ())), BEGIN_S)
 
 
 def run_case(case: PartialCase, robot: RobotConfig, start: FleetMoment) -> PartialResult:

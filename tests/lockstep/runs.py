@@ -19,9 +19,9 @@ from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Kill, Push, Restart, Scenario
 from tools.lab.studies.sweeps.figures import event_steps_nm
-from tools.sim.lockstep import Lockstep
+from tools.sim.lockstep import FleetMoment, Lockstep
 from tools.sim.network import BASE
-from tools.sim.standing_start import begin_standing
+from tools.sim.standing_start import begin_standing, standing
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "deploy" / "scenarios"
 
@@ -153,18 +153,21 @@ def run(
     *,
     network: Impairment | None = None,
     stands: bool = True,
+    start: FleetMoment | None = None,
     fleet_type: type[Lockstep] = Lockstep,
     each: Callable[[Lockstep, SimTruth], bool | None] = lambda _fleet, _row: None,
     **how: Any,
 ) -> Run:
     """Run to the end, to a fall, or until `each`, which sees each row, returns True.
 
-    On the network of the stand-up it begins standing, unless that is not to be taken for granted.
-    What else a fleet takes, such as `seed`, `record` or `controller`, is handed on.
+    It goes on from `start`, or begins standing, stood up on the usual network, unless that is not
+    to be taken for granted. What else a fleet takes, such as `seed` or `record`, is handed on.
     """
     network = network or Impairment(delay_ms=delay_ms)
     lockstep = fleet_type(robot, scenario, network, plant=plant, **how)
-    if stands and network == BASE:
+    if start is not None:
+        lockstep.resume(start)
+    elif stands:
         assert begin_standing(lockstep), "it stands and tracks"
     rows = []
     for row in lockstep.run():
@@ -173,3 +176,15 @@ def run(
         if each(lockstep, row) or row.fallen:
             break
     return Run(lockstep, rows)
+
+
+def standing_as(robot: RobotConfig, plant: PlantConfig | None = None) -> FleetMoment:
+    """Return where runs of a robot begin, for one with other keys to begin there as well."""
+    start = standing(robot, plant or PlantConfig())
+    assert start is not None, "it stands and tracks"
+    return start
+
+
+def moment_of(robot: RobotConfig, scenario: Scenario, at: float, **how: Any) -> FleetMoment:
+    """Return the moment at which a run has come so far; it begins as `run` does."""
+    return run(robot, scenario, each=lambda _, row: row.scenario_s >= at, **how).lockstep.moment()

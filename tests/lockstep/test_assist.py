@@ -2,41 +2,41 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
 import pytest
 
-from services.simulator.physics.body import body_of
-from services.simulator.physics.plant import IDEAL
-from services.simulator.physics.world import World
+from services.simulator.physics.plant import IDEAL, changed
 from shared.bus.messages import Cause, Message, Mode, PlannerStatus, Tare, TareRequest, Wrench
 from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Scenario
-from tests.lockstep.runs import Heard, modes_of, run, still, variant
-from tools.sim.lockstep import Lockstep
+from tests.lockstep.runs import Heard, modes_of, run, standing_as, still, variant
+from tools.sim.lockstep import FleetMoment, Lockstep
+
+M = TypeVar("M", bound=Message)
+LIGHT = changed(IDEAL, {"body.payload_scale": 0.9})
+"""2 kg of payload less than the planner knows."""
 
 
 def with_keys(robot: RobotConfig, section: str, **changes: object) -> RobotConfig:
     """Return the robot with keys of a section changed."""
-    changed = msgspec.structs.replace(getattr(robot, section), **changes)
-    return msgspec.structs.replace(robot, **{section: changed})
+    keys = msgspec.structs.replace(getattr(robot, section), **changes)
+    return msgspec.structs.replace(robot, **{section: keys})
 
 
 @pytest.fixture(scope="module")
 def resting() -> Scenario:
-    frames = (Keyframe(at=0.0, height=1.1), Keyframe(at=4.0, height=1.0, assist=200.0))
-    return variant("stand", duration=19.0, keyframe=frames)
+    frames = (Keyframe(at=0.0, height=1.188), Keyframe(at=4.0, height=1.0, assist=200.0))
+    return variant("stand", duration=9.0, keyframe=frames)
 
 
-def assisted_n(robot: RobotConfig, scenario: Scenario) -> float:
-    """Return the assist that is given at last, 2 kg of payload less than the planner knows."""
-    fleet = Lockstep(robot, scenario)
-    light = with_keys(robot, "mass", payload=robot.mass.payload - 2.0)
-    fleet.world = World(body_of(light, IDEAL), scenario)
-    return float(np.mean([t.harness_force_z for t in fleet.run() if t.scenario_s > 17.0]))
+def assisted_n(robot: RobotConfig, scenario: Scenario, start: FleetMoment) -> float:
+    """Return the assist that is given at last."""
+    outcome = run(robot, scenario, plant=LIGHT, start=start)
+    return float(np.mean([row.harness_force_z for row in outcome.rows[-100:]]))
 
 
 @pytest.mark.parametrize(
@@ -47,20 +47,22 @@ def assisted_n(robot: RobotConfig, scenario: Scenario) -> float:
 def test_the_assist_comes_true_with_a_payload_the_planner_does_not_know(
     robot: RobotConfig, resting: Scenario, weighed: bool, integrates: bool, comes_true: bool
 ) -> None:
+    start = standing_as(robot, LIGHT)
     if not weighed:
         robot = with_keys(robot, "law", load_correction=(0.0, 0.0))
     if not integrates:
         robot = with_keys(robot, "assist", integral_max=0.0)
-    error = abs(assisted_n(robot, resting) - 200.0)
+    error = abs(assisted_n(robot, resting, start) - 200.0)
     assert error < 10.0 if comes_true else error > 12.0
 
 
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("delay_ms", [1.0, 20.0])
 def test_the_eased_lead_is_lighter_and_as_steady(robot: RobotConfig, delay_ms: float) -> None:
-    squat = variant("squat", duration=6.0, kill=(), push=())
+    squat = variant("squat", duration=3.0, kill=(), push=())
     plain, eased = (
-        run(with_keys(robot, "law", lead_easing=alpha), squat, delay_ms) for alpha in (0.0, 0.5)
+        run(with_keys(robot, "law", lead_easing=alpha), squat, delay_ms, start=standing_as(robot))
+        for alpha in (0.0, 0.5)
     )
     assert eased.stood
     assert np.abs(eased.operator_n).max() < 0.8 * np.abs(plain.operator_n).max()
@@ -69,7 +71,7 @@ def test_the_eased_lead_is_lighter_and_as_steady(robot: RobotConfig, delay_ms: f
 
 def test_an_overloaded_harness_makes_all_hold_and_lead_again(robot: RobotConfig) -> None:
     frames = tuple(
-        Keyframe(at=t, height=1.1, assist=a)
+        Keyframe(at=t, height=1.188, assist=a)
         for t, a in ((0.0, 0.0), (2.0, 190.0), (3.0, 190.0), (5.0, 0.0))
     )
     held = []
@@ -79,8 +81,8 @@ def test_an_overloaded_harness_makes_all_hold_and_lead_again(robot: RobotConfig)
             held.append(set(modes_of(fleet)))
 
     tight = with_keys(robot, "harness", overload_force=170.0)
-    overloading = variant("stand", duration=9.0, keyframe=frames)
-    outcome = run(tight, overloading, stands=False, each=look)
+    overloading = variant("stand", duration=8.0, keyframe=frames)
+    outcome = run(tight, overloading, start=standing_as(robot), each=look)
     assert outcome.stood
     assert held
     assert all(modes == {Mode.HOLD} for modes in held)
@@ -88,37 +90,50 @@ def test_an_overloaded_harness_makes_all_hold_and_lead_again(robot: RobotConfig)
     assert Cause.HOLD_ALL in {event.cause for _, event in outcome.lockstep.events}
 
 
-def leaning(assist: float) -> Scenario:
-    """Return a scenario in which the torso pitches while a load comes to rest on it."""
-    end = Keyframe(at=2.0, height=1.1, pitch=0.4, assist=assist)
-    return variant("stand", duration=3.5, keyframe=(Keyframe(at=0.0, height=1.188), end))
-
-
 def heard_in(robot: RobotConfig, scenario: Scenario, **how: Any) -> list[Message]:
-    """Return every wrench, status and truth of a run from the hoist on, in the log's order."""
+    """Return every wrench, status and truth of a run, in the log's order."""
     heard = Heard(Wrench, PlannerStatus, SimTruth)
-    run(robot, scenario, stands=False, record=heard, **how)
+    run(robot, scenario, record=heard, **how)
     return heard
 
 
 @pytest.fixture(scope="module")
 def from_hoist(robot: RobotConfig) -> list[Message]:
     """A stand-up with 8 ms on each link, each way."""
-    return heard_in(robot, still(0.5), delay_ms=8.0)
+    return heard_in(robot, still(0.5), delay_ms=8.0, stands=False)
 
 
-def of(kind: type[Message], heard: list[Message]) -> list[Message]:
+def of(kind: type[M], heard: list[Message]) -> list[M]:
     return [message for message in heard if isinstance(message, kind)]
 
 
-def test_the_wrench_is_what_acts_on_the_torso_and_comes_at_its_rate(robot: RobotConfig) -> None:
-    heard = heard_in(robot, leaning(150.0))
-    wrenches = {m.t_ns: m for m in heard if isinstance(m, Wrench)}
+TARED_S = 3.3
+
+
+@pytest.fixture(scope="module")
+def leaned(robot: RobotConfig) -> list[Message]:
+    """The torso pitches while a load comes to rest on it; at `TARED_S` a new zero is asked for."""
+    end = Keyframe(at=2.0, height=1.1, pitch=0.4, assist=150.0)
+    leaning = variant("stand", duration=4.1, keyframe=(Keyframe(at=0.0, height=1.188), end))
+    asked: list[int] = []
+
+    def tare(fleet: Lockstep, truth: SimTruth) -> None:
+        if not asked and truth.scenario_s >= TARED_S:
+            asked.append(fleet.now_ns)
+            fleet.harness.tare(TareRequest(t_ns=fleet.now_ns, seq=1, source="a test"))
+
+    return heard_in(unheeded(robot), leaning, start=standing_as(robot), each=tare)
+
+
+def test_the_wrench_is_what_acts_on_the_torso_and_comes_at_its_rate(
+    robot: RobotConfig, leaned: list[Message]
+) -> None:
+    wrenches = {m.t_ns: m for m in of(Wrench, leaned)}
     stamps = sorted(wrenches)
     assert set(np.diff(stamps)) == {round(1e9 / robot.harness.rate_hz)}
     errors = []
-    for truth in heard:
-        if isinstance(truth, SimTruth) and truth.scenario_s > 3.0:
+    for truth in of(SimTruth, leaned):
+        if 2.8 < truth.scenario_s < TARED_S:
             # truth is told after the step, the sensor sampled before it: nothing moves fast
             wrench = wrenches[max(t for t in stamps if t <= truth.t_ns)]
             roll, pitch, _ = truth.angles
@@ -130,6 +145,19 @@ def test_the_wrench_is_what_acts_on_the_torso_and_comes_at_its_rate(robot: Robot
             assert pitch > 0.3
     assert np.abs(np.mean(errors)) < 1.0
     assert np.abs(errors).max() < 4.0
+
+
+def test_a_tare_on_request_takes_what_rests_on_the_harness_for_its_zero(
+    leaned: list[Message],
+) -> None:
+    asked = next(i for i, m in enumerate(leaned) if getattr(m, "scenario_s", 0.0) >= TARED_S)
+    *_, before = of(Wrench, leaned[:asked])
+    assert before.valid
+    assert np.linalg.norm(before.force) > 100.0
+    after = of(Wrench, leaned[asked:])
+    assert {m.tare for m in after if not m.valid} == {Tare.RUNNING}
+    assert after[-1].valid
+    assert np.linalg.norm(after[-1].force) < 10.0
 
 
 def test_the_tare_is_done_on_the_hoist_before_anything_loads_it(
@@ -156,17 +184,6 @@ def test_the_planner_receives_the_wrench_after_the_links_delay(
     assert max(ages_ms) < 8.0 + 2e3 / robot.planner.rate_hz
 
 
-def test_the_wrench_is_bit_identical_with_the_same_seed_alone(
-    robot: RobotConfig, from_hoist: list[Message]
-) -> None:
-    first = of(Wrench, from_hoist)
-    same, other = (
-        of(Wrench, heard_in(robot, still(0.5), delay_ms=8.0, seed=seed)) for seed in (0, 5)
-    )
-    assert same == first
-    assert other != first
-
-
 def unheeded(robot: RobotConfig) -> RobotConfig:
     """Return the robot with nothing made of the wrench."""
     robot = with_keys(robot, "law", lead_easing=0.0, load_correction=(0.0, 0.0))
@@ -176,23 +193,8 @@ def unheeded(robot: RobotConfig) -> RobotConfig:
 def test_the_sensors_noise_reaches_the_robot_through_the_law_only(robot: RobotConfig) -> None:
     deaf = unheeded(robot)
     noiseless = with_keys(deaf, "simulation", harness_noise=0.0)
-    truths = [of(SimTruth, heard_in(config, still(0.5))) for config in (deaf, noiseless)]
+    truths = [
+        of(SimTruth, heard_in(config, still(0.5), start=standing_as(robot)))
+        for config in (deaf, noiseless)
+    ]
     assert truths[0] == truths[1]
-
-
-def test_a_tare_on_request_takes_what_rests_on_the_harness_for_its_zero(robot: RobotConfig) -> None:
-    received = Heard(Wrench)
-    loaded: list[Message] = []
-
-    def tare(fleet: Lockstep, truth: SimTruth) -> None:
-        if not loaded and truth.scenario_s >= 2.7:
-            loaded.append(received[-1])
-            fleet.harness.tare(TareRequest(t_ns=fleet.now_ns, seq=1, source="a test"))
-
-    run(unheeded(robot), leaning(150.0), record=received, each=tare)
-    assert loaded[0].valid
-    assert np.linalg.norm(loaded[0].force) > 100.0
-    after = received[received.index(loaded[0]) + 1 :]
-    assert {m.tare for m in after if not m.valid} == {Tare.RUNNING}
-    assert received[-1].valid
-    assert np.linalg.norm(received[-1].force) < 10.0

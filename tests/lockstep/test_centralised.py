@@ -18,7 +18,6 @@ from services.simulator.physics.plant import IDEAL, PlantConfig
 from shared.bus.messages import JointState, Mode, Pair, PlannerMode
 from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Scenario
 from shared.joints import N_MODULES
@@ -27,7 +26,7 @@ from tests.joint.helpers import ModuleBench, command
 from tests.lockstep import runs
 from tests.lockstep.runs import push, variant
 from tests.planner.states import state
-from tests.test_architecture import IMPORTS, Import, imports_in
+from tests.test_architecture import IMPORTS
 from tools import cli
 from tools.sim.centralised.control import CentralPlanner, PassThrough
 from tools.sim.centralised.fleet import CONTROLS, SHIPPED, torques_only
@@ -40,15 +39,11 @@ TAU: Pair = (3.0, -41.0)
 
 
 def run(
-    control: str,
-    robot: RobotConfig,
-    scenario: Scenario,
-    delay_ms: float,
-    plant: PlantConfig | None = None,
+    control: str, robot: RobotConfig, scenario: Scenario, plant: PlantConfig | None = None
 ) -> list[SimTruth]:
-    network, fleet_type = Impairment(delay_ms=delay_ms), CONTROLS[control]
-    how = {"network": network, "plant": plant, "stands": False, "fleet_type": fleet_type}
-    return runs.run(robot, scenario, **how).rows
+    """Run on a network without delay."""
+    fleet_type = CONTROLS[control]
+    return runs.run(robot, scenario, 0.0, plant, stands=False, fleet_type=fleet_type).rows
 
 
 @pytest.fixture(scope="module")
@@ -60,13 +55,13 @@ def beginning() -> Scenario:
 @pytest.fixture(scope="module")
 def distributed(robot: RobotConfig, beginning: Scenario) -> list[SimTruth]:
     """Torques only there as well, from joint services that have the law."""
-    return run("distributed", torques_only(robot), beginning, 0.0, IDEAL)
+    return run("distributed", torques_only(robot), beginning, IDEAL)
 
 
 def test_without_delay_it_does_what_the_distributed_control_does(
     robot: RobotConfig, beginning: Scenario, distributed: list[SimTruth]
 ) -> None:
-    centralised = run("centralised", robot, beginning, 0.0, IDEAL)
+    centralised = run("centralised", robot, beginning, IDEAL)
     assert len(centralised) == len(distributed)
     for name, unit, far in (("com", 1e3, 1.0), ("torso", 1e3, 1.0), ("angles", 1.0, 0.002)):
         a, b = (
@@ -87,7 +82,7 @@ def test_without_delay_it_does_what_the_distributed_control_does(
 def test_at_100_ms_only_the_shipped_stands(robot: RobotConfig, control: str, falls: bool) -> None:
     late = (Inject(link="all", at=0.05, delay_ms=100.0),)
     happens = {"kill": (), "inject": late, "push": (push(0.2, 40.0, 0.0, 0.0),)}
-    rows = run(control, robot, variant("squat", duration=2.5, **happens), 0.0)
+    rows = run(control, robot, variant("squat", duration=2.5, **happens))
     assert rows[-1].fallen is falls
 
 
@@ -192,27 +187,12 @@ def test_once_it_leads_the_planner_leads_whatever_it_receives(robot: RobotConfig
     assert modes == [PlannerMode.WAITING, PlannerMode.LEADING]
 
 
-def knows_it(imports: list[Import]) -> bool:
-    return any(f"{one.full}.".startswith("tools.sim.centralised.") for one in imports)
-
-
-@pytest.mark.parametrize(
-    "source",
-    [
-        "from tools.sim.centralised.control import PassThrough",
-        "from tools.sim.centralised import fleet",
-        "from tools.sim import centralised",
-        "import tools.sim.centralised",
-        "def f():\n    import tools.sim.centralised.control as c",
-    ],
-)
-def test_every_importer_is_seen_however_it_is_written(source: str) -> None:
-    assert knows_it(imports_in(source))
-    assert not knows_it(imports_in(source.replace("centralised", "centralised_else")))
-
-
 def test_nothing_but_two_tools_knows_it_and_no_file_names_it() -> None:
-    users = {file for file, imports in IMPORTS.items() if knows_it(imports)}
+    users = {
+        file
+        for file, imports in IMPORTS.items()
+        if any(f"{one.full}.".startswith("tools.sim.centralised.") for one in imports)
+    }
     assert users == {
         "tools/sim/recorded_lockstep.py",
         "tools/verbs/sim.py",

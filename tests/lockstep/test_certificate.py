@@ -22,7 +22,7 @@ CLEAR = 0.1
 """Fraction of K_required; nearer to zero the floor's own elasticity may decide."""
 
 
-TRIED = 8
+TRIED = 5
 """The nearest on either side."""
 
 

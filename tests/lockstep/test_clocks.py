@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 import random
-from collections.abc import Callable
 from typing import NamedTuple
 
 import msgspec
@@ -24,7 +23,7 @@ from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
-from tests.lockstep import partial
+from tests.lockstep import partial, runs
 from tests.lockstep.partial import PartialCase
 from tests.lockstep.runs import kill, modes_of, restart, variant
 from tools.sim.lockstep import FleetMoment, Lockstep
@@ -40,8 +39,7 @@ SQUAT = partial.scenario_of(PartialCase("links", ()))
 
 
 class Run(NamedTuple):
-    fleet: Lockstep
-    rows: list[SimTruth]
+    run: runs.Run
     sent: dict[str, list[JointCommand]]
     """By module."""
     statuses: list[PlannerStatus]
@@ -49,7 +47,7 @@ class Run(NamedTuple):
     @property
     def left_track(self) -> dict[str, int]:
         """Return the cause for each module that left TRACK."""
-        return {m: e.cause for m, e in self.fleet.events if e.mode_before == Mode.TRACK}
+        return {m: e.cause for m, e in self.run.lockstep.events if e.mode_before == Mode.TRACK}
 
     @property
     def commands(self) -> list[JointCommand]:
@@ -62,9 +60,9 @@ def squat(
     robot: RobotConfig,
     seconds: float,
     clocks: dict[str, HostClock] | None = None,
-    at_half_time: Callable[[], None] = lambda: None,
+    step_ns: int = 0,
 ) -> Run:
-    """Squat for a while; half-way through, something is done."""
+    """Squat for a while from the hoist on; half-way through, the planner's clock steps."""
     sent: dict[str, list[JointCommand]] = {name: [] for name in MODULES}
     statuses: list[PlannerStatus] = []
 
@@ -74,16 +72,16 @@ def squat(
         elif isinstance(message, PlannerStatus):
             statuses.append(message)
 
+    def step(_fleet: Lockstep, row: SimTruth) -> None:
+        nonlocal step_ns
+        if clocks and step_ns and row.scenario_s >= seconds / 2:
+            clocks["planner"].step(step_ns)
+            step_ns = 0
+
     scenario = msgspec.structs.replace(SQUAT, duration=seconds)
-    fleet = Lockstep(robot, scenario, record=record, clocks=clocks)
-    rows: list[SimTruth] = []
-    for row in fleet.run():
-        rows.append(row)
-        if rows[-1].scenario_s >= seconds / 2:
-            at_half_time()
-            at_half_time = lambda: None  # noqa: E731
-    assert not row.fallen
-    return Run(fleet, rows, sent, statuses)
+    outcome = runs.run(robot, scenario, stands=False, record=record, clocks=clocks, each=step)
+    assert outcome.stood
+    return Run(outcome, sent, statuses)
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +109,7 @@ def test_hosts_offset_by_months_change_not_one_bit(robot: RobotConfig, plain: Ru
     """Months apart, each joint service on a host of its own."""
     dice = random.Random(1)
     other = squat(robot, 1.2, {host: HostClock(dice.randrange(10**16)) for host in HOSTS})
-    assert without_stamp(other.rows) == without_stamp(plain.rows)
+    assert without_stamp(other.run.rows) == without_stamp(plain.run.rows)
     assert other.commands == plain.commands
     stamps = {commands[-1].echo_t_ns for commands in other.sent.values()}
     assert len(stamps) == len(MODULES), "there were six clocks"
@@ -121,18 +119,17 @@ def test_clocks_200_ppm_apart_change_nothing_much(robot: RobotConfig, plain: Run
     """Not bit for bit: ages and periods are read 0.04 % longer or shorter; play adds to it."""
     clocks = {host: HostClock(HOUR_NS, 200.0 * (-1) ** n) for n, host in enumerate(HOSTS)}
     other = squat(robot, 1.2, clocks)
-    mine, its = (np.array([row.com for row in rows]) for rows in (other.rows, plain.rows))
-    assert np.abs(mine - its).max() < 1e-3
+    assert np.abs(other.run.com_mm - plain.run.com_mm).max() < 1.0
     assert other.left_track == {}
-    assert all(not controller.failsafe.refused for controller in other.fleet.controllers)
+    assert all(not each.failsafe.refused for each in other.run.lockstep.controllers)
 
 
 def test_a_planner_an_hour_ahead_holds_and_leads_again(robot: RobotConfig) -> None:
     """It cannot be, on a monotonic clock: all states look an hour old to one tick."""
     clock = HostClock(2 * HOUR_NS)
-    other = squat(robot, 2.4, {"planner": clock}, lambda: clock.step(HOUR_NS))
+    other = squat(robot, 2.4, {"planner": clock}, HOUR_NS)
     assert other.left_track == dict.fromkeys(MODULES, Cause.HOLD_ALL)
-    assert set(modes_of(other.fleet)) == {Mode.TRACK}
+    assert set(other.run.modes) == {Mode.TRACK}
     held = [status.t_ns for status in other.statuses if status.hold and status.t_ns > 3 * HOUR_NS]
     assert held[-1] - held[0] <= WAITS_NS[1] + 100 * NS_PER_MS
 
@@ -140,7 +137,7 @@ def test_a_planner_an_hour_ahead_holds_and_leads_again(robot: RobotConfig) -> No
 def test_with_a_planner_put_back_by_an_hour_it_holds(robot: RobotConfig) -> None:
     """It waits for its next tick, an hour long; the age rule does not. A restart mends it."""
     clock = HostClock(2 * HOUR_NS)
-    other = squat(robot, 1.2, {"planner": clock}, lambda: clock.step(-HOUR_NS))
+    other = squat(robot, 1.2, {"planner": clock}, -HOUR_NS)
     assert other.left_track == dict.fromkeys(MODULES, Cause.COMMAND_STALE)
 
 
@@ -207,8 +204,8 @@ class Sent:
 def test_after_one_comparison_all_are_in_step(robot: RobotConfig, skewed: tuple[int, ...]) -> None:
     """Joint services that began to count at different times send in the same period."""
     sent = Sent()
-    restarted = {"kill": kill(1.0), "restart": restart(2.0), "push": ()}
-    fleet = Lockstep(robot, variant("stand", duration=4.0, **restarted), record=sent)
+    restarted = {"kill": kill(0.2), "restart": restart(0.5), "push": ()}
+    fleet = Lockstep(robot, variant("stand", duration=1.5, **restarted), record=sent)
     for index, joint in enumerate(fleet.joints):
         clock = joint.manager.controller._state.clock
         clock.count, clock.at_ns = 2 - (index in skewed), fleet.now_ns - 2_000_000

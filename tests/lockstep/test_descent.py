@@ -23,7 +23,7 @@ from tools.lab.studies.sweeps import plants
 from tools.sim.lockstep import Lockstep
 from tools.sim.standing_start import begin_standing
 
-AT_S = 1.0
+AT_S = 0.3
 HEARD_S = 0.1
 
 
@@ -36,8 +36,10 @@ class Descending(Lockstep):
         interrupt: Ctrl-C at a scenario's time.
     """
 
+    wait_s = 5.0
+
     def __init__(self, robot: RobotConfig, *args: Any, **how: Any) -> None:
-        self.descent = Descent(robot, wait_s=8.0)
+        self.descent = Descent(robot, wait_s=self.wait_s)
         self.states: list[JointState | None] = [None] * len(MODULES)
         self.status: PlannerStatus | None = None
         self.asks: list[Ask] = []
@@ -74,6 +76,12 @@ class Descending(Lockstep):
         return ask
 
 
+class Impatient(Descending):
+    """Nothing is going to bear its weight."""
+
+    wait_s = 1.0
+
+
 class Descended(NamedTuple):
     """What came of it."""
 
@@ -96,8 +104,9 @@ def go_down(
     plant: PlantConfig | None = None,
     each: Any = lambda _fleet, _row: None,
     interrupt_s: float = np.inf,
+    fleet_type: type[Descending] = Descending,
 ) -> Descended:
-    """Type `xrl down` at `AT_S`; go on for a second after its end."""
+    """Type `xrl down` at `AT_S`; go on for half a second after its end."""
     ended: list[float] = []
 
     def look(fleet: Descending, row: SimTruth) -> bool:
@@ -107,9 +116,9 @@ def go_down(
         each(fleet, row)
         if not ended and (fleet.error or fleet.look() is Ask.IDLE):
             ended.append(row.scenario_s)
-        return bool(ended) and row.scenario_s > ended[0] + 1.0
+        return bool(ended) and row.scenario_s > ended[0] + 0.5
 
-    outcome = run(robot, scenario, plant=plant, fleet_type=Descending, each=look)
+    outcome = run(robot, scenario, plant=plant, fleet_type=fleet_type, each=look)
     assert not outcome.rows[-1].fallen
     on_feet = [row for row in outcome.rows if row.hoist == 0.0]
     assert max(max(row.foot_left_tilt, row.foot_right_tilt) for row in on_feet) < 0.05
@@ -118,6 +127,20 @@ def go_down(
 
 def alone(duration: float = 40.0, **changes: Any) -> Scenario:
     return msgspec.structs.replace(still(duration, **changes), hand=False)
+
+
+def floor_speed(fleet: Lockstep) -> float:
+    """Idle the drives, and return how fast the torso comes to the floor, m/s."""
+    heights: list[float] = []
+    for row in fleet.run():
+        heights.append(row.torso[2])
+        for joint in fleet.joints:
+            joint.frozen = True
+            joint.drive.idle()
+        if heights[-1] < 0.2:
+            break
+    assert heights[-1] < 0.2
+    return float(-np.gradient(heights, 0.01).min())
 
 
 HOISTED_M = 1.45
@@ -147,38 +170,47 @@ def test_it_goes_down_and_holds_until_a_hoist_bears_it(robot: RobotConfig, numbe
 
 
 def test_with_nothing_to_bear_it_it_holds_and_says_what_helps(robot: RobotConfig) -> None:
-    """Idled there it would tip: the torso meets the floor at 2.8 m/s, as from a stand."""
-    found = go_down(robot, alone())
+    """Idled there it tips: the torso meets the floor at 2.8 m/s, as from a stand."""
+    found = go_down(robot, alone(), fleet_type=Impatient)
     assert found.speed < 0.2
     assert "still holds: the legs bear 9" in found.fleet.error
     assert "stand under its torso" in found.fleet.error
     assert Ask.IDLE not in found.fleet.asks
     assert found.height < 0.85
     assert {*modes_of(found.fleet)} == {Mode.DAMP}
+    assert 2.3 < floor_speed(found.fleet) < 3.5
+
+
+def test_idled_in_a_stand_it_meets_the_floor_as_hard(robot: RobotConfig) -> None:
+    """2.9 m/s from 1.19 m; from its lowest pose, 0.82 m, see above."""
+    fleet = Lockstep(robot, alone())
+    assert begin_standing(fleet)
+    assert 2.3 < floor_speed(fleet) < 3.5
 
 
 def test_a_robot_without_its_payload_is_not_taken_for_a_hanging_one(robot: RobotConfig) -> None:
     law = msgspec.structs.replace(robot.law, load_correction=(0.0, 0.0))  # led whatever it carries
     light = changed(PlantConfig(), {"body.payload_scale": 0.0})
-    found = go_down(msgspec.structs.replace(robot, law=law), alone(kill=kill(0.5)), light)
+    led = msgspec.structs.replace(robot, law=law)
+    found = go_down(led, alone(kill=kill(0.1)), light, fleet_type=Impatient)
     assert "still holds: the legs bear" in found.fleet.error
     assert Ask.IDLE not in found.fleet.asks
 
 
 def test_without_a_planner_it_sinks_in_damp(robot: RobotConfig) -> None:
-    found = go_down(robot, alone(kill=kill(0.5)), each=hang)
+    found = go_down(robot, alone(kill=kill(0.1)), each=hang)
     assert found.fleet.asks == [Ask.NOTHING, Ask.STOP, Ask.NOTHING, Ask.IDLE]
     assert found.speed < 0.2
 
 
 def test_a_planner_that_dies_on_the_way_does_not_keep_it_up(robot: RobotConfig) -> None:
-    found = go_down(robot, alone(kill=kill(3.5)), each=hang)
+    found = go_down(robot, alone(kill=kill(2.8)), each=hang)
     assert Ask.SIT in found.fleet.asks
     assert found.fleet.asks[-1] is Ask.IDLE
 
 
 @pytest.mark.sampled(2)
-@pytest.mark.parametrize("at", [2.5, 4.5])
+@pytest.mark.parametrize("at", [1.8, 3.8])
 def test_interrupted_it_stands_where_it_is(robot: RobotConfig, at: float) -> None:
     heights = []
 
@@ -201,7 +233,7 @@ def test_a_hand_that_holds_it_up_is_not_pressed_down(robot: RobotConfig) -> None
 
 
 def test_a_person_who_goes_along_takes_it_down(robot: RobotConfig) -> None:
-    scenario = led_to((AT_S, 1.188), (7.0, 0.83), duration=40.0)
+    scenario = led_to((AT_S, 1.188), (AT_S + 6.0, 0.83), duration=40.0)
     found = go_down(robot, scenario, each=hang)
     assert found.fleet.asks[-1] is Ask.IDLE
 
@@ -209,7 +241,7 @@ def test_a_person_who_goes_along_takes_it_down(robot: RobotConfig) -> None:
 @pytest.mark.sampled(8)
 @pytest.mark.parametrize("number", range(8))
 def test_pushed_on_its_way_it_does_not_tip(robot: RobotConfig, number: int) -> None:
-    pushes = (push(3.0, 30.0, 0.0, 0.0), push(4.0, 0.0, 30.0, 0.0), push(5.5, -30.0, 0.0, 0.0))
+    pushes = (push(2.3, 30.0, 0.0, 0.0), push(3.3, 0.0, 30.0, 0.0), push(4.8, -30.0, 0.0, 0.0))
     found = go_down(robot, alone(push=pushes), plants.draw(f"pushed {number}"), hang)
     assert found.fleet.asks[-1] is Ask.IDLE
 
@@ -234,30 +266,3 @@ def test_beside_a_limp_module_it_is_refused(robot: RobotConfig) -> None:
     found = go_down(robot, alone(), each=idle)
     assert found.fleet.error.startswith("hip_right FAULT: it may bear weight on the others")
     assert found.fleet.asks == [Ask.NOTHING]
-
-
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize(("idled_s", "height"), [(10.0, 0.85), (0.5, 1.2)])
-def test_idled_it_meets_the_floor_as_hard_from_its_lowest_pose_as_from_a_stand(
-    robot: RobotConfig, idled_s: float, height: float
-) -> None:
-    """Why going down does not end with idle drives: 2.8 m/s from 0.82 m, 2.9 m/s from 1.19 m."""
-    heights: list[float] = []
-
-    def idle(fleet: Lockstep, row: SimTruth) -> bool:
-        fleet.estop = fleet.estop or row.scenario_s > 0.6
-        if row.scenario_s > idled_s:
-            heights.append(row.torso[2])
-            for joint in fleet.joints:
-                joint.frozen = True
-                joint.drive.idle()
-        return row.torso[2] < 0.2
-
-    fleet = Lockstep(robot, alone(16.0))
-    assert begin_standing(fleet)
-    for row in fleet.run():  # on through the fall
-        if idle(fleet, row):
-            break
-    assert heights[0] < height
-    assert heights[-1] < 0.2
-    assert 2.3 < -np.gradient(heights, 0.01).min() < 3.5

@@ -10,11 +10,10 @@ import pytest
 from shared.bus.messages import HeatAction, PlannerMode
 from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
-from tests.lockstep.runs import led_to, status_of
-from tools.sim.lockstep import Lockstep
-from tools.sim.standing_start import begin_standing
+from tests.lockstep.runs import led_to, standing_as, status_of
+from tools.sim.lockstep import FleetMoment, Lockstep
 
-HELD_S = 8.0
+HELD_S = 5.5
 SQUAT = 0.948
 
 
@@ -28,12 +27,12 @@ class Held(NamedTuple):
 
 
 def hold(
-    robot: RobotConfig, *, hand: bool = True, until_s: float = 20.0, skip: bool = True,
-    kill: bool = False,
+    robot: RobotConfig, start: FleetMoment, *, hand: bool = True, until_s: float = 16.0,
+    skip: bool = True,
 ) -> Held:  # fmt: skip
     """Squat, let the time pass for the temperatures until 33 s are left, and run on."""
     fleet = Lockstep(robot, led_to((2.0, SQUAT), duration=until_s))
-    assert begin_standing(fleet)
+    fleet.resume(start)
     rows, actions, derating, skips = [], [], 1.0, skip
     for row in fleet.run():
         rows.append(row)
@@ -41,12 +40,9 @@ def hold(
             fleet.world.let_go()
         if skips and row.scenario_s > HELD_S:
             skips = False
-            if kill:
-                fleet.planner = None
             while min(law.heat.state.left_s for law in fleet.controllers) > 33.0:
                 fleet.skip_heat(1.0)
-        if fleet.planner is not None:
-            actions.append(status_of(fleet).heat)
+        actions.append(status_of(fleet).heat)
         derating = min(derating, fleet.bank.heat.derating)
     return Held(fleet, rows, actions, derating)
 
@@ -55,7 +51,7 @@ def hold(
 def test_a_robot_too_hot_for_its_squat_stands_up_by_itself_and_derates_nowhere(
     robot: RobotConfig, hand: bool
 ) -> None:
-    held = hold(robot, hand=hand)
+    held = hold(robot, standing_as(robot), hand=hand)
     assert list(dict.fromkeys(held.actions)) == [
         HeatAction.NONE, HeatAction.EASES, HeatAction.STANDS_UP, HeatAction.RESTS,
     ]  # fmt: skip
@@ -72,6 +68,7 @@ def test_a_robot_too_hot_for_its_squat_stands_up_by_itself_and_derates_nowhere(
 
 def test_without_an_estimate_nothing_is_said_and_nothing_done(robot: RobotConfig) -> None:
     heat = msgspec.structs.replace(robot.heat, estimate=False)
-    held = hold(msgspec.structs.replace(robot, heat=heat), skip=False, until_s=4.0)
+    deaf = msgspec.structs.replace(robot, heat=heat)
+    held = hold(deaf, standing_as(deaf), skip=False, until_s=1.0)
     assert set(held.actions) == {HeatAction.NONE}
     assert status_of(held.fleet).heat_left_s == -1.0

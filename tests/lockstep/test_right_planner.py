@@ -13,7 +13,7 @@ from services.joint.envelope import Envelope
 from services.joint.failsafe import Failsafe
 from services.planner.watch.trips import PlannerTrips
 from services.simulator.physics.plant import PlantConfig, changed
-from shared.bus.messages import Cause, Outside, PlannerMode, Trip
+from shared.bus.messages import Cause, Mode, Outside, PlannerMode, Trip
 from shared.bus.traces import SimTruth
 from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
@@ -70,14 +70,11 @@ def judged(monkeypatch: pytest.MonkeyPatch) -> Judged:
 
 def led(
     judged: Judged, robot: RobotConfig, scenario: Scenario, network: Impairment = BASE,
-    plant: PlantConfig | None = None,
+    plant: PlantConfig | None = None, **how: Any,
 ) -> Run:  # fmt: skip
     """Run; assert that it never falls and that everything is believed."""
-
-    def look(_fleet: Lockstep, row: SimTruth) -> None:
-        assert not row.fallen, f"{row.scenario_s:.2f} s"  # on a bad network it may never begin
-
-    outcome = run(robot, scenario, network=network, plant=plant, each=look)
+    outcome = run(robot, scenario, network=network, plant=plant, **how)
+    assert not outcome.rows[-1].fallen
     assert judged.leading > 500, "there was something to believe"
     assert judged.outside == {}
     assert judged.tripped == []
@@ -87,13 +84,18 @@ def led(
 @pytest.mark.parametrize("name", ["squat", "crawl"])
 def test_while_the_hand_leads(robot: RobotConfig, judged: Judged, name: str) -> None:
     pushes = (push(1.0, 0.0, 40.0, 0.0), push(2.0, 40.0, 0.0, 0.0))
-    led(judged, robot, variant(name, duration=5.0, kill=(), push=pushes))
+    led(judged, robot, variant(name, duration=3.5, kill=(), push=pushes))
 
 
-def test_through_a_killed_planner_and_its_successor(robot: RobotConfig, judged: Judged) -> None:
-    restarted = {"kill": kill(1.0), "restart": restart(1.6), "push": ()}
-    outcome = led(judged, robot, variant("squat", duration=5.0, **restarted))
+def test_a_killed_planners_successor_takes_over_without_a_step(
+    robot: RobotConfig, judged: Judged
+) -> None:
+    restarted = {"kill": kill(2.2), "restart": restart(2.8), "push": ()}
+    outcome = led(judged, robot, variant("squat", duration=6.0, **restarted))
     assert outcome.status.mode == PlannerMode.LEADING
+    assert set(outcome.modes) == {Mode.TRACK}
+    assert all(each.failsafe.dropouts.count == 1 for each in outcome.lockstep.controllers)
+    assert max(outcome.steps_nm()) <= 5.0
 
 
 @pytest.mark.sampled(2)
@@ -107,7 +109,12 @@ def test_through_a_killed_planner_and_its_successor(robot: RobotConfig, judged: 
     ids=lambda network: f"{network.delay_ms:g}-{network.jitter_ms:g}-{network.loss:g}",
 )
 def test_over_a_bad_network(robot: RobotConfig, judged: Judged, network: Impairment) -> None:
-    led(judged, robot, variant("stand", push=(push(1.0, 0.0, 40.0, 0.0),), **DOWN), network)
+    happens = {"duration": 40.0, "push": (push(1.0, 0.0, 40.0, 0.0),)}
+
+    def enough(_fleet: Lockstep, row: SimTruth) -> bool:
+        return row.scenario_s > 4.0 and judged.leading > 600
+
+    led(judged, robot, variant("stand", **(DOWN | happens)), network, each=enough)
 
 
 @pytest.mark.sampled(2)
@@ -146,7 +153,7 @@ def test_held_off_centre_it_is_believed_and_leads_again(
     x, y = (50.0 * part for part in direction)
     pushed = (Push(at=0.5, duration=0.4, force=(x, y, 0.0)),)
     cut = (Inject(link="planner->joints", at=0.8, partition=True, duration=1.0),)
-    outcome = led(judged, robot, variant("stand", duration=7.0, push=pushed, inject=cut))
+    outcome = led(judged, robot, variant("stand", duration=5.5, push=pushed, inject=cut))
     away_mm = np.hypot(outcome.com_mm[:, 0], outcome.com_mm[:, 1])
     held = (outcome.t > 0.85) & (outcome.t < 1.8)
     assert away_mm[held].max() > 20.0, "it was off centre"

@@ -8,8 +8,10 @@ import pytest
 
 from shared.bus.messages import Cause, Mode
 from shared.config.robot_config import RobotConfig
-from tests.lockstep.runs import Run, kill, push, restart, run, still, variant
+from tests.lockstep.runs import Run, kill, push, run, still, variant
 from tools.sim.lockstep import Lockstep
+
+DIES_S = 8.0
 
 
 @pytest.fixture(scope="module")
@@ -19,8 +21,16 @@ def squat(robot: RobotConfig) -> Run:
 
 
 @pytest.fixture(scope="module")
-def crawl(robot: RobotConfig) -> Run:
-    return run(robot, variant("crawl"))
+def way_down(robot: RobotConfig) -> Run:
+    """Into the crawl, until just before a planner dies there."""
+    return run(robot, variant("crawl"), each=lambda _, row: row.scenario_s >= DIES_S - 0.1)
+
+
+@pytest.fixture(scope="module")
+def crawl(robot: RobotConfig, way_down: Run) -> Run:
+    """The whole of it, with a planner that lives."""
+    back = run(robot, variant("crawl"), start=way_down.lockstep.moment())
+    return back._replace(rows=way_down.rows + back.rows)
 
 
 def test_the_robot_balances_while_the_operator_leads_two_squats(squat: Run) -> None:
@@ -57,9 +67,7 @@ def test_all_six_modules_hold_within_the_command_age_of_the_kill(squat: Run) -> 
 
 
 def test_handing_over_makes_no_torque_step(squat: Run) -> None:
-    for _, event in squat.lockstep.events:
-        if event.mode_before == Mode.TRACK:
-            assert np.abs(np.subtract(event.tau_after, event.tau_before)).max() <= 5.0
+    assert max(squat.steps_nm()) <= 5.0
 
 
 def test_the_feet_stay_flat_and_where_they_are_however_often_it_squats(squat: Run) -> None:
@@ -76,17 +84,6 @@ def test_the_robot_stands_whenever_the_planner_dies(robot: RobotConfig, at: floa
     assert run(robot, variant("squat", duration=at + 3.0, kill=kill(at), push=pushes)).stood
 
 
-def test_a_restarted_planner_takes_over_without_a_step(robot: RobotConfig) -> None:
-    restarted = {"kill": kill(2.2), "restart": restart(4.0), "push": ()}
-    outcome = run(robot, variant("squat", duration=8.0, **restarted))
-    assert outcome.stood
-    assert set(outcome.modes) == {Mode.TRACK}
-    assert all(c.failsafe.dropouts.count == 1 for c in outcome.lockstep.controllers)
-    for _, event in outcome.lockstep.events:
-        step = np.abs(np.subtract(event.tau_after, event.tau_before)).max()
-        assert step <= 5.0 or event.mode_before == Mode.DISARMED
-
-
 def test_a_plain_average_of_the_legs_tips_the_soles(robot: RobotConfig) -> None:
     law = msgspec.structs.replace(robot.law, jacobian="average", split="diagonal")
     world = Lockstep(msgspec.structs.replace(robot, law=law), still(5.0))
@@ -101,7 +98,7 @@ def test_a_plain_average_of_the_legs_tips_the_soles(robot: RobotConfig) -> None:
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("delay_ms", [0.0, 5.0, 10.0])
 def test_the_robot_stands_at_any_delay_of_the_bus(robot: RobotConfig, delay_ms: float) -> None:
-    scenario = variant("squat", duration=5.0, kill=(), push=(push(2.0, 40, 0, 0),))
+    scenario = variant("squat", duration=4.0, kill=(), push=(push(2.0, 40, 0, 0),))
     assert run(robot, scenario, delay_ms).stood
 
 
@@ -128,18 +125,22 @@ def test_the_assist_carries_the_operators_weight(crawl: Run) -> None:
     assert given == pytest.approx(200.0, abs=10.0)
 
 
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize("at", [3.5, 8.0])
-def test_the_robot_stands_if_the_planner_dies_in_the_crawl(robot: RobotConfig, at: float) -> None:
-    outcome = run(robot, variant("crawl", duration=at + 3.0, kill=kill(at)))
+def test_the_robot_stands_if_the_planner_dies_on_the_way_into_the_crawl(
+    robot: RobotConfig,
+) -> None:
+    outcome = run(robot, variant("crawl", duration=6.5, kill=kill(3.5)))
     assert outcome.stood
     assert set(outcome.modes) == {Mode.HOLD}
 
 
-def test_the_ankles_hold_against_an_operator_who_pulls_himself_up(robot: RobotConfig) -> None:
+def test_the_ankles_hold_against_an_operator_who_pulls_himself_up(
+    robot: RobotConfig, way_down: Run
+) -> None:
     """With the gains frozen as they were, the soles tipped at 13 s of this run."""
-    outcome = run(robot, variant("crawl", duration=15.5, kill=kill(8.0)))
+    dead = variant("crawl", duration=15.5, kill=kill(DIES_S))
+    outcome = run(robot, dead, start=way_down.lockstep.moment())
     assert outcome.stood
-    hold = outcome.t >= 8.0
+    assert set(outcome.modes) == {Mode.HOLD}
+    hold = outcome.t >= DIES_S
     assert np.abs(outcome.operator_n[hold]).max() == pytest.approx(150.0), "he must pull"
     assert np.abs(outcome.com_mm[hold, 0]).max() <= 40.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import msgspec
+import numpy as np
 import pytest
 
 from shared.bus.messages import Mode
@@ -14,7 +15,7 @@ from tools.sim.lockstep import Lockstep
 
 FALL_V_S = 0.4
 """How fast the supplies fall: far faster than a battery's end."""
-UNDERVOLTAGE_V = 38.0
+BEGINS_V, UNDERVOLTAGE_V = 45.0, 38.0
 
 
 @pytest.mark.sampled(8)
@@ -26,10 +27,9 @@ def test_it_is_told_and_the_robot_is_down_before_the_drives_disarm(
 
     def empties(fleet: Lockstep, row: SimTruth) -> bool:
         bus = fleet.bank.bus
-        if row.scenario_s > 0.5:
-            fleet.bank.settings.fill("config.dc_bus_undervoltage_trip_level", UNDERVOLTAGE_V)
-            bus.supply -= 0.01 * FALL_V_S
-            bus.changed()
+        fleet.bank.settings.fill("config.dc_bus_undervoltage_trip_level", UNDERVOLTAGE_V)
+        bus.supply = np.minimum(bus.supply, BEGINS_V) - 0.01 * FALL_V_S
+        bus.changed()
         why = status_of(fleet).why
         if "change the battery" in why:
             told.setdefault("low", row.scenario_s)

@@ -84,10 +84,10 @@ class TwoPlanners(Lockstep):
 @pytest.mark.parametrize("link", ["planner->knee_left", "planner->joints"])
 def test_60_ms_of_loss_give_the_second_planner_no_module(robot: RobotConfig, link: str) -> None:
     """It took one knee for good, while the others followed the first."""
-    fleet = TwoPlanners(robot, 5.0, 0.5, 4.0, **lost(link, 0.06))
+    fleet = TwoPlanners(robot, 3.5, 0.5, 3.0, **lost(link, 0.06))
     assert fleet.to_the_end() == []
     assert fleet.sent == 0
-    assert 0 < fleet.announced <= 6 * 5 * 3.6, "it makes itself known five times a second"
+    assert 0 < fleet.announced <= 6 * 5 * 2.6, "it makes itself known five times a second"
 
 
 def test_when_the_first_ends_the_second_leads(robot: RobotConfig) -> None:
@@ -117,12 +117,12 @@ def test_one_that_was_held_up_leads_again_when_the_other_has_ended(
 
 def test_a_second_one_that_starts_in_a_gap_waits(robot: RobotConfig) -> None:
     """It caught some modules in the gap, and neither led any more."""
-    fleet = TwoPlanners(robot, 4.0, 1.1, 9.0, **lost("planner->joints", 0.3))
+    fleet = TwoPlanners(robot, 3.5, 1.1, 9.0, **lost("planner->joints", 0.3))
     fleet.to_the_end()
     assert fleet.sent == 0
 
 
 def test_two_that_start_at_once_agree_on_one(robot: RobotConfig) -> None:
-    fleet = TwoPlanners(robot, 3.0, -100.0, 9.0)
+    fleet = TwoPlanners(robot, 1.5, -100.0, 9.0)
     assert fleet.to_the_end(stands=False) == []
     assert len(set(fleet.accepted[-1][1])) == 1

@@ -12,16 +12,15 @@ from __future__ import annotations
 import os
 from typing import Final, NamedTuple
 
-import numpy as np
 import pytest
 
 from shared.bus.messages import Mode, Outside
+from shared.bus.traces import SimTruth
 from shared.config.gain_schedule import believing
 from shared.config.robot_config import RobotConfig
-from tests.lockstep.runs import push, variant
+from tests.lockstep.runs import moment_of, push, run, variant
 from tests.lockstep.wrong_planners import faults, wrong
 from tools.sim.lockstep import FleetMoment, Lockstep
-from tools.sim.network import BASE
 
 NAMES: Final = tuple(faults())
 EVERY: Final = 1 if os.environ.get("XRL_ALL_WRONG") else 15
@@ -55,11 +54,8 @@ def begins(robot: RobotConfig) -> list[Begin]:
 
 
 def begin(robot: RobotConfig, name: str, at: float) -> Begin:
-    fleet = Lockstep(robot, variant(name, duration=20.0, kill=(), push=()), BASE)
-    for row in fleet.run():
-        if row.scenario_s >= at:
-            break
-    return Begin(name, at, fleet.moment())
+    scenario = variant(name, duration=20.0, kill=(), push=())
+    return Begin(name, at, moment_of(robot, scenario, at, stands=False))
 
 
 def end(robot: RobotConfig, begin: Begin, name: str) -> End:
@@ -70,18 +66,16 @@ def end(robot: RobotConfig, begin: Begin, name: str) -> End:
 
     at = begin.at
     pushed = (push(at + 0.8, 0.0, 30.0, 0.0),)
-    fleet = Fleet(robot, variant(begin.name, duration=at + WRONG_S, kill=(), push=pushed), BASE)
-    fleet.resume(begin.moment)
-    fell, outside = False, set()
-    for row in fleet.run():
-        fell = row.fallen
-        outside |= {Outside(c.failsafe.outside) for c in fleet.controllers}
-        if fell:
-            break
-    events = [event for _, event in fleet.events if event.t_ns > begin.moment.state.t_ns]
-    steps = [np.abs(np.subtract(e.tau_after, e.tau_before)).max() for e in events]
-    modes = {c.failsafe.mode for c in fleet.controllers}
-    return End(fell, float(max(steps, default=0.0)), outside - {Outside.NOTHING}, modes)
+    outside: set[Outside] = set()
+
+    def look(fleet: Lockstep, _row: SimTruth) -> None:
+        outside.update(Outside(each.failsafe.outside) for each in fleet.controllers)
+
+    scenario = variant(begin.name, duration=at + WRONG_S, kill=(), push=pushed)
+    ended = run(robot, scenario, start=begin.moment, fleet_type=Fleet, each=look)
+    step_nm = max(ended.steps_nm(), default=0.0)
+    fell = ended.rows[-1].fallen
+    return End(fell, step_nm, outside - {Outside.NOTHING}, set(ended.modes))
 
 
 def test_there_are_300_wrong_planners() -> None:

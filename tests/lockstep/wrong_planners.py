@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import random
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from typing import Final
 
 import msgspec
@@ -109,38 +109,35 @@ def wrong(fault: Fault) -> type[Planner]:
     return Wrong
 
 
-def _changed(command: JointCommand, name: str, values: Pair) -> JointCommand:
-    return msgspec.structs.replace(command, **{name: values})
+def _each(name: str, change: Callable[[int, Pair, int], Pair]) -> Fault:
+    """Change a field of each command, by its module's index, what it is, and the tick's number."""
+    return lambda commands, tick: [
+        msgspec.structs.replace(c, **{name: change(index, getattr(c, name), tick)})
+        for index, c in enumerate(commands)
+    ]
 
 
-def _scaled(name: str, factor: float, indices: object) -> Fault:
-    def fault(commands: Commands, _tick: int) -> Commands:
-        return [
-            _changed(c, name, tuple(factor * x for x in getattr(c, name)))  # type: ignore[arg-type]
-            if i in indices  # type: ignore[operator]
-            else c
-            for i, c in enumerate(commands)
-        ]
+def _scaled(name: str, factor: float, indices: Collection[int]) -> Fault:
+    def change(index: int, pair: Pair, _tick: int) -> Pair:
+        return (factor * pair[0], factor * pair[1]) if index in indices else pair
 
-    return fault
+    return _each(name, change)
 
 
 def _off(index: int, axis: int, offset: float) -> Fault:
     return _drifting(index, axis, math.inf, offset)
 
 
-def _drifting(index: int, axis: int, rate: float, most: float = 2.0) -> Fault:
+def _drifting(module: int, axis: int, rate: float, most: float = 2.0) -> Fault:
     """Move a reference away at a rate, rad/s, or at once."""
 
-    def fault(commands: Commands, tick: int) -> Commands:
+    def change(index: int, pair: Pair, tick: int) -> Pair:
         away = math.copysign(min(abs(most), rate * 0.004 * tick), most)
-        q_ref = list(commands[index].q_ref)
-        q_ref[axis] += away
-        changed = list(commands)
-        changed[index] = _changed(commands[index], "q_ref", (q_ref[0], q_ref[1]))
-        return changed
+        if index != module:
+            return pair
+        return (pair[0], pair[1] + away) if axis else (pair[0] + away, pair[1])
 
-    return fault
+    return _each("q_ref", change)
 
 
 def _swapped(a: int, b: int) -> Fault:
@@ -152,14 +149,14 @@ def _swapped(a: int, b: int) -> Fault:
     return fault
 
 
-def _rows_of(source: JointCommand, onto: JointCommand) -> JointCommand:
-    return msgspec.structs.replace(onto, **{name: getattr(source, name) for name in PAIRS})
+def _rows_of(
+    source: JointCommand, onto: JointCommand, names: Collection[str] = PAIRS
+) -> JointCommand:
+    return msgspec.structs.replace(onto, **{name: getattr(source, name) for name in names})
 
 
 def _axes_swapped(name: str) -> Fault:
-    return lambda commands, _tick: [
-        _changed(c, name, (getattr(c, name)[1], getattr(c, name)[0])) for c in commands
-    ]
+    return _each(name, lambda _index, pair, _tick: (pair[1], pair[0]))
 
 
 def _stuck(*names: str) -> Fault:
@@ -168,10 +165,7 @@ def _stuck(*names: str) -> Fault:
     def fault(commands: Commands, _tick: int) -> Commands:
         if not kept:
             kept.extend(commands)
-        return [
-            msgspec.structs.replace(now, **{name: getattr(first, name) for name in names})
-            for now, first in zip(commands, kept, strict=True)
-        ]
+        return [_rows_of(*both, names) for both in zip(kept, commands, strict=True)]
 
     return fault
 
@@ -188,30 +182,25 @@ def _late(ticks: int) -> Fault:
 
 
 def _flipped(name: str, bit: int) -> Fault:
-    def fault(commands: Commands, tick: int) -> Commands:
-        changed, index, axis = list(commands), tick // 5 % N_MODULES, tick // 30 % 2
-        values = list(getattr(changed[index], name))
+    def change(index: int, pair: Pair, tick: int) -> Pair:
+        if index != tick // 5 % N_MODULES:
+            return pair
+        values, axis = list(pair), tick // 30 % 2
         (whole,) = struct.unpack("<Q", struct.pack("<d", values[axis]))
         (values[axis],) = struct.unpack("<d", struct.pack("<Q", whole ^ (1 << bit)))
-        changed[index] = _changed(changed[index], name, (values[0], values[1]))
-        return changed
+        return values[0], values[1]
 
-    return fault
+    return _each(name, change)
 
 
 def _ramped(signs: tuple[int, ...], ramp_s: float, most: float = 57.0) -> Fault:
-    def fault(commands: Commands, tick: int) -> Commands:
+    def change(index: int, pair: Pair, tick: int) -> Pair:
         size = most * min(1.0, 0.004 * tick / ramp_s)
-        changed = []
-        for index, command in enumerate(commands):
-            at = 2 * (index % (N_MODULES // 2))
-            phi, theta = command.tau_coupled
-            pair = (phi + signs[at] * size, theta + signs[at + 1] * size)
-            within = (max(-most, min(most, pair[0])), max(-most, min(most, pair[1])))
-            changed.append(_changed(command, "tau_coupled", within))
-        return changed
+        at = 2 * (index % (N_MODULES // 2))
+        phi, theta = pair[0] + signs[at] * size, pair[1] + signs[at + 1] * size
+        return max(-most, min(most, phi)), max(-most, min(most, theta))
 
-    return fault
+    return _each("tau_coupled", change)
 
 
 def _both(first: Fault, second: Fault) -> Fault:
@@ -229,13 +218,10 @@ def _every_other(inner: Fault) -> Fault:
 def _noisy(name: str, size: float) -> Fault:
     dice = random.Random(name)
 
-    def fault(commands: Commands, _tick: int) -> Commands:
-        return [
-            _changed(c, name, tuple(x + dice.gauss(0.0, size) for x in getattr(c, name)))  # type: ignore[arg-type]
-            for c in commands
-        ]
+    def change(_index: int, pair: Pair, _tick: int) -> Pair:
+        return pair[0] + dice.gauss(0.0, size), pair[1] + dice.gauss(0.0, size)
 
-    return fault
+    return _each(name, change)
 
 
 def _told_margin(margin: float) -> Fault:

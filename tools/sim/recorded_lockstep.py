@@ -46,10 +46,6 @@ REAL_TIME_ONLY: Final = (
 """Keys of the summary that only a live run has."""
 
 
-def _look_away(_truth: SimTruth) -> None:
-    """Watch nothing."""
-
-
 class RecordedMessages:
     """Messages on their way into the log."""
 
@@ -143,7 +139,7 @@ def simulate(
     network: Impairment,
     seed: int,
     out: Path,
-    watch: Watch = _look_away,
+    watch: Watch = lambda _truth: None,
     control: str = SHIPPED,
     true_plant: PlantConfig | None = None,
     hand: Sequence[HandRow] = (),

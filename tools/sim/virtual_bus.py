@@ -17,7 +17,6 @@ class VirtualBus:
     Attributes:
         acknowledged: True while some node is there.
         choked: True while frames of others fill the send queue: it takes none of ours.
-        at_once: how many rows were carried at once.
         ages_ns: of each row that waited and reached its drive then.
         thrown_away: how many rows waited and were thrown away.
     """
@@ -25,7 +24,7 @@ class VirtualBus:
     def __init__(self, bank: AxisBank, axes: Sequence[int]) -> None:
         """Take the drives, and the axes (0 .. 11) on this bus."""
         self.acknowledged, self.choked = True, False
-        self.at_once = self.thrown_away = 0
+        self.thrown_away = 0
         self.ages_ns: list[int] = []
         self._conditions, self._axes = bank.conditions, frozenset(axes)
         self._waiting: list[tuple[int, Apply]] = []
@@ -45,7 +44,6 @@ class VirtualBus:
     def put(self, now_ns: int, apply: Apply) -> None:
         """Send a row; one that the socket has no room for is dropped."""
         if self.acknowledged:
-            self.at_once += 1
             apply()
         elif len(self._waiting) < QUEUED_MAX:
             self._waiting.append((now_ns, apply))

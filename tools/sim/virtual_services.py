@@ -122,21 +122,7 @@ class VirtualJoint:
         clock: HostClock,
         traced: bool,
     ) -> None:
-        """Start the service.
-
-        Args:
-            config: the robot.
-            index: of the module in `MODULES`.
-            make: makes the service's decisions, now and at each restart.
-            bank: the drives.
-            bus: the module's CAN bus.
-            memory: of the host.
-            network: its links.
-            record: takes every message.
-            time: virtual time.
-            clock: of the service's host.
-            traced: record what re-execution needs.
-        """
+        """Start the service of module `index`; `make` is called now and at each restart."""
         self.name = name = MODULES[index]
         self.frozen = self._is_dead = False
         self._config, self._make, self._clock = config, make, time.on(clock)
@@ -230,18 +216,9 @@ class VirtualPlanner:
         traced: bool,
         beside: SharedMemory | None,
     ) -> None:
-        """Start the service.
+        """Start the service; `make` makes a planner with a session, now and at each restart.
 
-        Args:
-            config: the robot.
-            make: makes a planner with a session, now and at each restart.
-            request: returns what the operator requests.
-            network: its links.
-            record: takes every message.
-            time: virtual time.
-            clock: of the service's host.
-            traced: record what re-execution needs.
-            beside: memory of the joint services' host, if it is the planner's as well.
+        `beside`: memory of the joint services' host, if it is the planner's as well.
         """
         self.frozen = self._is_dead = False
         self._config, self._make, self._clock = config, make, time.on(clock)

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Final
+from collections.abc import Mapping
+from typing import Any, Final
 
 import msgspec
 
-from services.simulator.physics.plant import PlantConfig
 from shared.config.gain_schedule import believing
-from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
-from shared.config.scenarios import Scenario
 from shared.robot.trip_table import untripped
-from tools.logs.hand_path import HandRow
 from tools.sim.centralised.control import CentralPlanner, PassThrough
-from tools.sim.lockstep import Lockstep, forget
-from tools.sim.virtual_time import Record
+from tools.sim.lockstep import Lockstep
 
 
 def torques_only(config: RobotConfig) -> RobotConfig:
@@ -34,22 +29,9 @@ class CentralisedLockstep(Lockstep):
     planner_type = CentralPlanner
     module_type = PassThrough
 
-    def __init__(
-        self,
-        config: RobotConfig,
-        scenario: Scenario,
-        network: Impairment | None = None,
-        *,
-        seed: int = 0,
-        record: Record = forget,
-        plant: PlantConfig | None = None,
-        hand: Sequence[HandRow] = (),
-    ) -> None:
+    def __init__(self, config: RobotConfig, *args: Any, **how: Any) -> None:
         """Put the robot on the hoist; arguments as for `Lockstep`."""
-        super().__init__(
-            torques_only(config), scenario, network,
-            seed=seed, record=record, plant=plant, hand=hand,
-        )  # fmt: skip
+        super().__init__(torques_only(config), *args, **how)
 
 
 SHIPPED: Final = "distributed"
