@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.simulator.physics.plant import PlantConfig
-from shared.bus.messages import Message, Mode, PlannerStatus, Vector4
+from shared.bus.messages import Cause, Message, Mode, PlannerStatus, Vector4
 from shared.bus.topics import Topic
 from shared.bus.traces import SimTruth
 from shared.config import scenarios
 from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Kill, Push, Restart, Scenario
+from shared.robot.trip_table import JOINT_TRIPS
 from tools.lab.studies.sweeps.figures import event_steps_nm
 from tools.sim.lockstep import FleetMoment, Lockstep
 from tools.sim.network import BASE
@@ -68,6 +69,13 @@ class Run(NamedTuple):
     @property
     def status(self) -> PlannerStatus:
         return status_of(self.lockstep)
+
+    @property
+    def believed(self) -> bool:
+        """True if no module refused a command, and neither module nor planner tripped."""
+        causes = {event.cause for _, event in self.lockstep.events}
+        refused = any(each.failsafe.refused for each in self.lockstep.controllers)
+        return not refused and causes.isdisjoint((Cause.HOLD_ALL, *JOINT_TRIPS))
 
     @property
     def stood(self) -> bool:

@@ -95,7 +95,7 @@ def test_a_dead_services_successor_leads_again(robot: RobotConfig, module: str) 
     """Taken over without a step: no module's torque jumps, and all six track in the end."""
     dies = {"kill": kill(2.2, module), "restart": restart(4.0, module)}
     pushes = (push(2.5, 30.0, 0.0, 0.0), push(3.3, 0.0, 30.0, 0.0))
-    result = run(robot, variant("squat", duration=6.5, push=pushes, **dies))
+    result = run(robot, variant("squat", duration=5.5, push=pushes, **dies))
     assert result.stood
     assert set(result.modes) == {Mode.TRACK}
     for _, event in result.lockstep.events:

@@ -76,7 +76,7 @@ def faulted(request: pytest.FixtureRequest, robot: RobotConfig) -> Faulted:
     lasts = None if FAULT_KINDS[kind].duration is None else OVER - AT
     lasts = None if kind == "encoder_gap" else lasts  # any longer and it is an error
     restarts = {"kill": kill(RESTARTED, MODULE), "restart": restart(RESTARTED + 0.02, MODULE)}
-    scenario = still(4.5, fault=fault(kind, MODULE, AT, lasts), **restarts)
+    scenario = still(3.3, fault=fault(kind, MODULE, AT, lasts), **restarts)
     return Faulted(kind, DRIVE_FAULTS[kind], run(robot, scenario, each=look), modes, armed)
 
 

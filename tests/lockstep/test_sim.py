@@ -75,7 +75,7 @@ def test_a_record_in_which_nobody_led_the_hand_is_refused_in_words(
 
 
 def test_a_frozen_planner_goes_on_in_its_session(tmp_path: Path) -> None:
-    flags = ("--duration", "3", "--kill", "planner@1:STOP", "--restart", "planner@1.6")
+    flags = ("--duration", "2.4", "--kill", "planner@0.5:STOP", "--restart", "planner@1.1")
     assert sim(tmp_path, *flags) == 0
     assert len({status.session for status in statuses_of(tmp_path)}) == 1
     assert summary_of(tmp_path)["reengage_s"] < 1.5

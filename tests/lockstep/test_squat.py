@@ -38,6 +38,7 @@ def test_the_robot_balances_while_the_operator_leads_two_squats(squat: Run) -> N
     assert np.abs(squat.com_mm[alive, 0]).max() <= 10.0
     assert np.abs(squat.com_mm[alive, 1]).max() <= 5.0
     assert np.abs(squat.angles[alive][:, [0, 2]]).max() <= 0.01
+    assert squat.believed
 
 
 def test_the_operator_leads_the_height_by_hand(squat: Run) -> None:
@@ -98,8 +99,10 @@ def test_a_plain_average_of_the_legs_tips_the_soles(robot: RobotConfig) -> None:
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("delay_ms", [0.0, 5.0, 10.0])
 def test_the_robot_stands_at_any_delay_of_the_bus(robot: RobotConfig, delay_ms: float) -> None:
-    scenario = variant("squat", duration=4.0, kill=(), push=(push(2.0, 40, 0, 0),))
-    assert run(robot, scenario, delay_ms).stood
+    pushes = (push(1.0, 0, 40, 0), push(2.0, 40, 0, 0))
+    outcome = run(robot, variant("squat", duration=4.0, kill=(), push=pushes), delay_ms)
+    assert outcome.stood
+    assert outcome.believed
 
 
 # ---- the crawl under assist
@@ -110,6 +113,7 @@ def test_the_robot_goes_down_to_crawling_and_back(crawl: Run) -> None:
     assert min(row.torso[2] for row in crawl.rows) < 0.82
     assert crawl.angles[:, 1].max() > 1.15
     assert crawl.rows[-1].torso[2] > 1.15
+    assert crawl.believed
 
 
 def test_balance_is_kept_under_full_assist(crawl: Run) -> None:

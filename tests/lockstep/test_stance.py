@@ -46,6 +46,7 @@ def test_every_error_drawn_it_squats_in_its_stance_and_stands_pushed_without_a_p
     assert outcome.stood
     assert outcome.com_mm[outcome.t < 3.7][-1, 2] < 800.0, "it was led down"
     assert outcome.tilt < 0.02
+    assert outcome.believed
 
 
 def test_a_planner_that_comes_back_leads_on_in_the_same_stance(robot: RobotConfig) -> None:
@@ -140,6 +141,7 @@ def test_it_stands_in_the_farthest_corner(robot: RobotConfig, signs: tuple[int, 
     assert np.abs(outcome.operator_n[outcome.t < 2.9]).max() < 30.0, "the hand leads on"
     assert outcome.stood
     assert outcome.tilt < 0.05
+    assert outcome.believed
 
 
 def test_a_planner_that_comes_back_leads_to_the_same_lean(robot: RobotConfig) -> None:
@@ -171,3 +173,4 @@ def test_it_stands_at_the_corner_on_plants_with_every_error_drawn(
     outcome = run(robot, leaned, plant=plants.draw(drawn))
     assert outcome.stood
     assert np.hypot(*outcome.com_mm[-1, :2]) > 20.0, "it leans to the end"
+    assert outcome.believed

@@ -110,7 +110,7 @@ def test_without_tau_coupled_sway_is_damped_as_well_as_in_hold(robot: RobotConfi
     cut = (Inject(link="all", at=0.5, partition=True),)
     swings = {}
     for mode, network in {Mode.TRACK: one_late("knee_right", 20.0), Mode.HOLD: cut}.items():
-        result = run(robot, still(6.5, push=(push(1.5, 0.0, 40.0, 0.0),), inject=network))
+        result = run(robot, still(4.5, push=(push(1.5, 0.0, 40.0, 0.0),), inject=network))
         assert result.stood
         assert set(result.modes) == {mode}
         sway = np.abs(result.com_mm[result.t > 1.6, 1])
