@@ -14,7 +14,7 @@ from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Scenario
 from tests.lockstep.runs import Heard, modes_of, run, standing_as, still, variant
-from tools.sim.lockstep import FleetMoment, Lockstep
+from tools.sim.lockstep import Lockstep
 
 M = TypeVar("M", bound=Message)
 LIGHT = changed(IDEAL, {"body.payload_scale": 0.9})
@@ -27,32 +27,23 @@ def with_keys(robot: RobotConfig, section: str, **changes: object) -> RobotConfi
     return msgspec.structs.replace(robot, **{section: keys})
 
 
-@pytest.fixture(scope="module")
-def resting() -> Scenario:
-    frames = (Keyframe(at=0.0, height=1.188), Keyframe(at=4.0, height=1.0, assist=200.0))
-    return variant("stand", duration=9.0, keyframe=frames)
-
-
-def assisted_n(robot: RobotConfig, scenario: Scenario, start: FleetMoment) -> float:
-    """Return the assist that is given at last."""
-    outcome = run(robot, scenario, plant=LIGHT, start=start)
-    return float(np.mean([row.harness_force_z for row in outcome.rows[-100:]]))
-
-
 @pytest.mark.parametrize(
-    ("weighed", "integrates", "comes_true"),
-    [(False, True, True), (True, False, True), (False, False, False)],
+    ("weighed", "integrates", "duration", "comes_true"),
+    [(False, True, 9.0, True), (True, False, 5.5, True), (False, False, 9.0, False)],
     ids=["by its integral", "by the load found", "by neither"],
 )
 def test_the_assist_comes_true_with_a_payload_the_planner_does_not_know(
-    robot: RobotConfig, resting: Scenario, weighed: bool, integrates: bool, comes_true: bool
+    robot: RobotConfig, weighed: bool, integrates: bool, duration: float, comes_true: bool
 ) -> None:
     start = standing_as(robot, LIGHT)
     if not weighed:
         robot = with_keys(robot, "law", load_correction=(0.0, 0.0))
     if not integrates:
         robot = with_keys(robot, "assist", integral_max=0.0)
-    error = abs(assisted_n(robot, resting, start) - 200.0)
+    frames = (Keyframe(at=0.0, height=1.188), Keyframe(at=4.0, height=1.0, assist=200.0))
+    resting = variant("stand", duration=duration, keyframe=frames)
+    outcome = run(robot, resting, plant=LIGHT, start=start)
+    error = abs(np.mean([row.harness_force_z for row in outcome.rows[-100:]]) - 200.0)
     assert error < 10.0 if comes_true else error > 12.0
 
 

@@ -41,9 +41,9 @@ TAU: Pair = (3.0, -41.0)
 def run(
     control: str, robot: RobotConfig, scenario: Scenario, plant: PlantConfig | None = None
 ) -> list[SimTruth]:
-    """Run on a network without delay."""
-    fleet_type = CONTROLS[control]
-    return runs.run(robot, scenario, 0.0, plant, stands=False, fleet_type=fleet_type).rows
+    """Run without delay; the shipped control begins standing on the realistic plant."""
+    stands, fleet_type = control == SHIPPED and plant is None, CONTROLS[control]
+    return runs.run(robot, scenario, 0.0, plant, stands=stands, fleet_type=fleet_type).rows
 
 
 @pytest.fixture(scope="module")

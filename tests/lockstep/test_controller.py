@@ -90,7 +90,7 @@ def fleet_of(
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", CHANGES)
 def test_whatever_it_does_the_robot_stands(robot: RobotConfig, name: str) -> None:
-    outcome = fleet_of(robot, 4.5, CHANGES[name])
+    outcome = fleet_of(robot, 3.5, CHANGES[name])
     assert outcome.stood
     assert abs(outcome.rows[-1].over[0]) < 0.08
 

@@ -159,7 +159,7 @@ def hang(fleet: Descending, row: SimTruth) -> None:
 
 
 @pytest.mark.sampled(20)
-@pytest.mark.parametrize("number", range(40))
+@pytest.mark.parametrize("number", range(20))
 def test_it_goes_down_and_holds_until_a_hoist_bears_it(robot: RobotConfig, number: int) -> None:
     found = go_down(robot, alone(), plants.draw(f"down {number}"), hang)
     assert found.fleet.asks[-1] is Ask.IDLE

@@ -17,7 +17,7 @@ from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Fault, Keyframe, Kill, Scenario
 from shared.joints import MODULES
-from tests.lockstep.runs import at_rest, kill, moment_of, restart, run, variant
+from tests.lockstep.runs import at_rest, kill, moment_of, restart, run, standing_as, variant
 from tools.lab.studies.sweeps import plants
 from tools.sim.lockstep import FleetMoment, Lockstep
 from tools.sim.standing_start import begin_standing
@@ -76,9 +76,10 @@ def heavy(robot: RobotConfig) -> RobotConfig:
 
 
 @pytest.fixture(scope="module")
-def led_to(heavy: RobotConfig) -> Callable[[float], FleetMoment]:
+def led_to(robot: RobotConfig, heavy: RobotConfig) -> Callable[[float], FleetMoment]:
     """What many stops begin with: the robot of the file, led to a height."""
-    return functools.cache(lambda height: moment_of(heavy, led(height, 0.0), LED_S))
+    start = standing_as(robot)
+    return functools.cache(lambda height: moment_of(heavy, led(height, 0.0), LED_S, start=start))
 
 
 def stop(
@@ -118,9 +119,11 @@ def stop(
 
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("height", [1.188, 0.9])
-def test_it_sinks_slowly_and_never_topples(heavy: RobotConfig, height: float) -> None:
+def test_it_sinks_slowly_and_never_topples(
+    heavy: RobotConfig, led_to: Callable[[float], FleetMoment], height: float
+) -> None:
     """A hand that holds on holds it up; without one it sinks, see below."""
-    found = stop(heavy, height, hand=True)
+    found = stop(heavy, height, start=led_to(height), hand=True)
     assert found.modes == {Mode.DAMP}
     assert found.speed < 0.25, "slowly"
 
@@ -162,10 +165,15 @@ STOPPED: list[tuple[float, float, dict[str, Any]]] = [
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize(("height", "pitch", "errors"), STOPPED)
 def test_without_a_holder_the_torso_stays_as_it_stood(
-    heavy: RobotConfig, height: float, pitch: float, errors: dict[str, Any]
+    heavy: RobotConfig,
+    led_to: Callable[[float], FleetMoment],
+    height: float,
+    pitch: float,
+    errors: dict[str, Any],
 ) -> None:
     """It turned back by 1.5 to 2.5 rad, and fell with the COM 5 cm back and 10 cm up."""
-    found = stop(heavy, height, pitch, plant=changed(PlantConfig(), errors))
+    start = None if pitch or errors else led_to(height)
+    found = stop(heavy, height, pitch, start=start, plant=changed(PlantConfig(), errors))
     assert found.modes == {Mode.DAMP}
     assert found.turned < 0.1
     assert found.speed < 0.25

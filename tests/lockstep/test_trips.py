@@ -19,7 +19,7 @@ from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Push, Scenario
 from shared.robot.trip_table import JOINT_TRIPS, untripped
-from tests.lockstep.runs import Heard, Run, modes_of, push, run, still, variant
+from tests.lockstep.runs import Heard, Run, modes_of, push, run, standing_as, still, variant
 from tools.lab.studies.sweeps.trips_trial import PLANTS, unfiltered
 from tools.sim.lockstep import Lockstep
 
@@ -123,8 +123,8 @@ def test_what_keeps_shaking_is_led_ever_more_rarely(robot: RobotConfig) -> None:
 def test_a_person_who_sags_is_caught(robot: RobotConfig, height: float, delay_ms: float) -> None:
     """200 N rest on the harness where none were asked for: it went to the knees' stop, 0.76 m."""
     statuses = Heard(PlannerStatus)
-    how = {"delay_ms": delay_ms, "let_go_s": 2.4, "record": statuses}
-    outcome, heights = trip_run(robot, _sags(height), RESTS_TWICE, **how)
+    how: dict[str, Any] = {"delay_ms": delay_ms, "let_go_s": 2.4, "record": statuses}
+    outcome, heights = trip_run(robot, _sags(height), RESTS_TWICE, start=standing_as(robot), **how)
     sagged = heights[round(1.4 * 100.0) :]
     assert min(sagged) > height - 0.06
     assert fastest(sagged) < 0.32
@@ -137,7 +137,7 @@ def test_a_person_who_sags_is_caught(robot: RobotConfig, height: float, delay_ms
 
 
 def test_a_person_who_sags_and_holds_on_is_let_down_slowly(robot: RobotConfig) -> None:
-    outcome, heights = trip_run(robot, _sags(1.1), RESTS_TWICE)
+    outcome, heights = trip_run(robot, _sags(1.1), RESTS_TWICE, start=standing_as(robot))
     assert fastest(heights) < 0.32
     assert min(heights) > 0.95
     assert Cause.HOLD_ALL not in causes(outcome)

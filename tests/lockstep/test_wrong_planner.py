@@ -58,8 +58,8 @@ def begin(robot: RobotConfig, name: str, at: float) -> Begin:
     return Begin(name, at, moment_of(robot, scenario, at, stands=False))
 
 
-def end(robot: RobotConfig, begin: Begin, name: str) -> End:
-    """Be wrong for two seconds, pushed from the side after the first."""
+def end(robot: RobotConfig, begin: Begin, name: str, lasts_s: float = WRONG_S) -> End:
+    """Be wrong for two seconds, or less, pushed from the side after 0.8 s."""
 
     class Fleet(Lockstep):
         planner_type = wrong(faults()[name])
@@ -71,7 +71,7 @@ def end(robot: RobotConfig, begin: Begin, name: str) -> End:
     def look(fleet: Lockstep, _row: SimTruth) -> None:
         outside.update(Outside(each.failsafe.outside) for each in fleet.controllers)
 
-    scenario = variant(begin.name, duration=at + WRONG_S, kill=(), push=pushed)
+    scenario = variant(begin.name, duration=at + lasts_s, kill=(), push=pushed)
     ended = run(robot, scenario, start=begin.moment, fleet_type=Fleet, each=look)
     step_nm = max(ended.steps_nm(), default=0.0)
     fell = ended.rows[-1].fallen
@@ -93,21 +93,21 @@ def test_it_stands_whatever_its_planner_sends(
 
 
 @pytest.mark.parametrize(
-    ("name", "outside"),
+    ("name", "outside", "lasts_s"),
     [
-        ("k_p of all zero", Outside.K_P),
-        ("k_d of all zero", Outside.K_D),
-        ("tau_ff of knee_left negative", Outside.TAU_FF),
-        ("q_ref of hip_right theta off by 0.5 rad", Outside.Q_REF),
-        ("tau_coupled noisy", Outside.TORQUE_STEP),
-        ("margin 0", Outside.MARGIN),
-        ("tau_coupled of all ramps up in 1 s, +0 +0 +0 +1 +0 +1", Outside.COUPLED_WORK),
+        ("k_p of all zero", Outside.K_P, 0.8),
+        ("k_d of all zero", Outside.K_D, 0.8),
+        ("tau_ff of knee_left negative", Outside.TAU_FF, 0.8),
+        ("q_ref of hip_right theta off by 0.5 rad", Outside.Q_REF, 0.8),
+        ("tau_coupled noisy", Outside.TORQUE_STEP, 0.8),
+        ("margin 0", Outside.MARGIN, 0.8),
+        ("tau_coupled of all ramps up in 1 s, +0 +0 +0 +1 +0 +1", Outside.COUPLED_WORK, 2.0),
     ],
 )
 def test_it_holds_and_reports_what_it_does_not_believe(
-    robot: RobotConfig, begins: list[Begin], name: str, outside: Outside
+    robot: RobotConfig, begins: list[Begin], name: str, outside: Outside, lasts_s: float
 ) -> None:
-    ended = end(robot, begins[0], name)
+    ended = end(robot, begins[0], name, lasts_s)
     assert not ended.fell
     assert outside in ended.outside
     assert ended.modes == {Mode.HOLD}

@@ -36,13 +36,7 @@ class VirtualLink(Generic[M]):
     """
 
     def __init__(self, base: Impairment, name: str, seed: int) -> None:
-        """Prepare.
-
-        Args:
-            base: the link's own impairment.
-            name: of `shared.links`.
-            seed: of all random draws.
-        """
+        """Start empty; `base` is the link's own impairment, the name one of `shared.links`."""
         self.direction = Direction(name, seed)
         self.overtaken = 0
         """Messages that came too late, or twice, and were dropped."""
@@ -122,13 +116,9 @@ class VirtualNetwork:
         seed: int,
         record: Callable[[LinkEvent], None],
     ) -> None:
-        """Start with every link's own impairment.
+        """Start with every link's own impairment; `injects` are further ones, with their times.
 
-        Args:
-            base: the link's own impairment.
-            injects: further impairments, with their times.
-            seed: of all random draws.
-            record: takes an event whenever an impairment starts or ends.
+        `record` takes an event whenever one of those starts or ends.
         """
         self._links: dict[str, VirtualLink[Any]] = {
             name: VirtualLink(base, name, seed) for name in DIRECTIONS
