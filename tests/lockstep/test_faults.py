@@ -145,7 +145,7 @@ def test_a_fault_without_a_cause_leaves_every_module_in_control(
     robot: RobotConfig, kind: FaultKind
 ) -> None:
     module = MODULE if kind == "encoder_gap" else "knee_left"  # a knee in the squat: OVERSPEED
-    scenario = variant("squat", duration=2.5, fault=fault(kind, module, 1.0), **NOTHING)
+    scenario = variant("squat", duration=2.0, fault=fault(kind, module, 1.0), **NOTHING)
     outcome = run(robot, scenario)
     assert outcome.stood
     assert into_fault(outcome) == []

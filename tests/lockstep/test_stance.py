@@ -13,7 +13,18 @@ from shared.bus.messages import PlannerMode
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Keyframe
 from tests.imu.robots import with_imu
-from tests.lockstep.runs import Run, corner, kill, led_to, push, restart, run, status_of, variant
+from tests.lockstep.runs import (
+    Run,
+    corner,
+    kill,
+    led_to,
+    push,
+    restart,
+    run,
+    standing_as,
+    status_of,
+    variant,
+)
 from tools.lab.studies.sweeps import plants
 from tools.sim.lockstep import Lockstep
 
@@ -117,7 +128,8 @@ def test_when_the_imu_falls_silent_the_last_slope_stands(robot: RobotConfig) -> 
 
 def test_on_a_level_floor_an_imu_changes_little_that_the_hand_feels(robot: RobotConfig) -> None:
     scenario = variant("squat", duration=3.0, kill=(), push=())
-    outcome = run(with_imu(robot), scenario, plant=sloping(0.0, 0.0))
+    start, plant = standing_as(robot), sloping(0.0, 0.0)
+    outcome = run(with_imu(robot), scenario, plant=plant, start=start)
     assert outcome.stood
     assert np.abs(outcome.operator_n).max() < 26.0, "23 N measured, 19 without an IMU"
     assert over_mm(outcome) < 20.0
