@@ -178,6 +178,11 @@ def test_soft_stop_is_a_spring_that_pushes_inwards(
     assert out[1 - axis] == 0.0
 
 
+@pytest.mark.parametrize("q", [(-0.6, -1.0), (0.6, -1.0), (0.0, -3.0), (0.0, -0.2), (0.6, -0.2)])
+def test_soft_stop_does_nothing_at_the_stop_itself(q: Pair) -> None:
+    assert limit_torque((0.0, 0.0), q, (0.0, 0.0), LIMITS) == (0.0, 0.0)
+
+
 @pytest.mark.parametrize(
     ("module", "theta"), [("ankle_left", (-0.6, 0.9)), ("knee_right", (-3.0, -0.2))]
 )

@@ -141,3 +141,38 @@ def test_every_change_has_a_cause_that_fits_it() -> None:
                 assert cause in (Cause.DRIVE_LOST, Cause.DRIVE_DISARMED, Cause.POSITION_LOST)
             else:
                 assert cause in CAUSES[before, after]
+
+
+@pytest.mark.parametrize("estop", FLAGS)
+@pytest.mark.parametrize("drive", DRIVE_EVENTS)
+def test_nothing_leaves_fault(drive: Event, estop: bool, timing: Timing) -> None:
+    for situation in (s for s in SITUATIONS if s.mode is Mode.FAULT):
+        failsafe = placed(situation, timing)
+        for _ in range(3):
+            failsafe.advance(T0, timing, drive, estop)
+        assert failsafe.mode is Mode.FAULT
+
+
+def test_only_a_lost_drive_leaves_damp(timing: Timing) -> None:
+    left = set()
+    for situation in (s for s in SITUATIONS if s.mode is Mode.DAMP):
+        failsafe = placed(situation, timing)
+        if failsafe.advance(T0, timing, situation.drive, situation.estop) is not None:
+            assert failsafe.mode is Mode.FAULT
+            left.add(situation.drive)
+    assert left == {Event.DRIVE_LOST, Event.DRIVE_DISARMED, Event.POSITION_LOST}
+
+
+def test_an_emergency_stop_that_is_released_again_stays_in_damp(timing: Timing) -> None:
+    failsafe = placed(Situation(Mode.TRACK, Event.NONE, True, True, False, True), timing)
+    failsafe.advance(T0, timing, Event.DRIVE_ARMED, estop=True)
+    failsafe.advance(T0, timing, Event.DRIVE_ARMED, estop=False)
+    assert failsafe.mode is Mode.DAMP
+
+
+def test_emergency_stop_and_lost_drive_in_one_cycle_end_in_fault(timing: Timing) -> None:
+    for mode in (Mode.HOLD, Mode.TRACK, Mode.DAMP):
+        failsafe = placed(Situation(mode, Event.NONE, True, True, False, True), timing)
+        failsafe.advance(T0, timing, Event.DRIVE_LOST, estop=True)
+        failsafe.advance(T0, timing, Event.DRIVE_LOST, estop=True)
+        assert failsafe.mode is Mode.FAULT
