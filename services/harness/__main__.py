@@ -8,12 +8,12 @@ from services.harness.filter import WrenchFilter
 from services.harness.loop import HarnessLoop
 from shared import process
 from shared.bus import topics
-from shared.bus.messages import TareRequest, Vector6, Wrench
+from shared.bus.messages import TareRequest, Wrench
 from shared.bus.session import Session
-from shared.can.can_sensor import CanSensor, pause_ns
+from shared.can.can_sensor import sensor_of
 from shared.can.loadcell_can import SampleAssembler
 from shared.can.sensor_service import SensorService, serve
-from shared.config.robot_config import RobotConfig, expand
+from shared.config.robot_config import RobotConfig
 
 
 def main() -> int:
@@ -23,21 +23,15 @@ def main() -> int:
 
 def made(config: RobotConfig, run_dir: Path) -> SensorService:
     """Return the service of the robot's sensor; ConfigError if its geometry is singular."""
-    sensor, law = make_sensor(config, run_dir), WrenchFilter(config.harness)
+    harness = config.harness
+    sensor = sensor_of(config, harness, SampleAssembler(), run_dir)
+    law = WrenchFilter(harness)
 
     def loop_on(session: Session) -> HarnessLoop:
         wrenches = session.publisher(topics.WRENCH, Wrench)
         return HarnessLoop(sensor, law, wrenches, session.latest(topics.HARNESS_TARE, TareRequest))
 
-    return SensorService(config.harness.rate_hz, sensor, loop_on, "finite")
-
-
-def make_sensor(config: RobotConfig, run_dir: Path) -> CanSensor[Vector6]:
-    """Return the load-cell amplifier on the bus that the robot file names."""
-    harness = config.harness
-    link = config.can[harness.bus]
-    channel, pause = expand(link.channel, run_dir), pause_ns(harness.stale_ms, harness.rate_hz)
-    return CanSensor(link.interface, channel, SampleAssembler(), pause_ns=pause)
+    return SensorService(harness.rate_hz, sensor, loop_on, "finite")
 
 
 if __name__ == "__main__":

@@ -10,10 +10,10 @@ from shared import process
 from shared.bus import topics
 from shared.bus.messages import Attitude
 from shared.bus.session import Session
-from shared.can.can_sensor import CanSensor, pause_ns
+from shared.can.can_sensor import sensor_of
 from shared.can.imu_can import ImuAssembler
 from shared.can.sensor_service import SensorService, serve
-from shared.config.robot_config import RobotConfig, expand
+from shared.config.robot_config import RobotConfig
 
 
 def main() -> int:
@@ -24,9 +24,7 @@ def main() -> int:
 def made(config: RobotConfig, run_dir: Path) -> SensorService:
     """Return the service of the sensor on the bus that the robot file names."""
     imu = config.imu
-    link = config.can[imu.bus]
-    channel, pause = expand(link.channel, run_dir), pause_ns(imu.stale_ms, imu.rate_hz)
-    sensor = CanSensor(link.interface, channel, ImuAssembler(), pause_ns=pause)
+    sensor = sensor_of(config, imu, ImuAssembler(), run_dir)
 
     def loop_on(session: Session) -> ImuLoop:
         return ImuLoop(sensor, AttitudeLaw(imu), session.publisher(topics.ATTITUDE, Attitude))

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+from pathlib import Path
 from typing import Final, Generic, TypeVar
 
 import can
 
 from shared.can.frame_group import FrameGroup
 from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config.robot_config import RobotConfig, expand
+from shared.config.sections import HarnessConfig, ImuConfig
 from shared.exceptions import ConfigError
 
 S = TypeVar("S")
@@ -18,14 +21,6 @@ RETRY_NS: Final = 200 * NS_PER_MS
 
 DRAIN_MAX: Final = 1024
 """Most frames taken in one read, so that a flooded bus cannot hold up the loop."""
-
-
-def pause_ns(stale_ms: float, rate_hz: float) -> int:
-    """Return the time between two reads that counts as a pause, ns.
-
-    At a low rate every read comes later than `stale_ms`: two periods are no pause.
-    """
-    return round(max(stale_ms * NS_PER_MS, 2.0 * NS_PER_S / rate_hz))
 
 
 class CanSensor(Generic[S]):
@@ -125,6 +120,19 @@ class CanSensor(Generic[S]):
             if is_data_frame(frame):
                 newest = self._assembler.add(frame.arbitration_id, frame.data) or newest
         return newest, False
+
+
+def sensor_of(
+    robot: RobotConfig,
+    section: HarnessConfig | ImuConfig,
+    assembler: FrameGroup[S],
+    run_dir: Path,
+) -> CanSensor[S]:
+    """Return a sensor on the bus that its section of the robot file names."""
+    link = robot.can[section.bus]
+    # at a low rate every read comes later than `stale_ms`: two periods are no pause
+    pause_ns = round(max(section.stale_ms * NS_PER_MS, 2.0 * NS_PER_S / section.rate_hz))
+    return CanSensor(link.interface, expand(link.channel, run_dir), assembler, pause_ns=pause_ns)
 
 
 def is_data_frame(message: can.Message) -> bool:

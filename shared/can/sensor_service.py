@@ -9,25 +9,10 @@ from typing import Any, NamedTuple, Protocol
 from shared import log, process, scheduling
 from shared.bus.session import Session, open_session
 from shared.can.can_sensor import CanSensor
+from shared.can.sensor_loop import SensorLoop
 from shared.clock import NS_PER_S, now_ns, sleep_until
 from shared.config.files import load
 from shared.config.robot_config import RobotConfig
-
-
-class SensorLoop(Protocol):
-    """What runs at a rate, and counts."""
-
-    cycles: int
-    skipped: int
-    """Deadlines that were missed and not made up for."""
-    unsent: int
-
-    @property
-    def refused(self) -> int:
-        """Samples that no sensor can have measured."""
-
-    def cycle(self, now_ns: int, /) -> object:
-        """Run once."""
 
 
 class Stop(Protocol):
@@ -42,7 +27,7 @@ class SensorService(NamedTuple):
 
     rate_hz: float
     sensor: CanSensor[Any]
-    loop_on: Callable[[Session], SensorLoop]
+    loop_on: Callable[[Session], SensorLoop[Any, Any]]
     refused_for: str
     """What samples that are refused are not."""
 
@@ -82,7 +67,7 @@ def next_deadline(deadline_ns: int, period_ns: int, now_ns: int) -> tuple[int, i
     return deadline_ns + (missed + 1) * period_ns, missed
 
 
-def run(loop: SensorLoop, rate_hz: float, stop: Stop) -> None:
+def run(loop: SensorLoop[Any, Any], rate_hz: float, stop: Stop) -> None:
     """Run cycles at `rate_hz` until stopped; missed cycles are skipped."""
     period_ns = round(NS_PER_S / rate_hz)
     deadline_ns = now_ns()

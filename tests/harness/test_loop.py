@@ -8,15 +8,16 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from services.harness.__main__ import make_sensor
 from services.harness.filter import WrenchFilter
 from services.harness.loop import HarnessLoop
 from services.simulator.fronts.sensor_fronts import BIAS_MAX, HarnessFront
 from services.simulator.fronts.unix_can_hub import UnixCanHub
 from shared.bus.codec import Decoder
-from shared.bus.messages import Tare, Wrench
+from shared.bus.messages import Tare, Vector6, Wrench
+from shared.can.can_sensor import CanSensor, sensor_of
 from shared.can.loadcell_can import SampleAssembler, pack
 from shared.clock import NS_PER_MS
+from shared.config.robot_config import RobotConfig
 from shared.config.sections import CanConfig
 from tests.harness.helpers import (
     HARNESS,
@@ -53,6 +54,10 @@ class FrameList:
         return np.array([forces for forces in found if forces is not None])
 
 
+def sensor_in(run_dir: Path, robot: RobotConfig = ROBOT) -> CanSensor[Vector6]:
+    return sensor_of(robot, robot.harness, SampleAssembler(), run_dir)
+
+
 def test_every_cycle_publishes_once_with_the_next_sequence_number() -> None:
     loop, _, sink = make_loop()
     cycles(loop, T0, 10)
@@ -60,23 +65,6 @@ def test_every_cycle_publishes_once_with_the_next_sequence_number() -> None:
     messages = [decoder.decode(payload) for payload in sink.payloads]
     stamps = [(m.seq, m.t_ns) for m in messages if m is not None]
     assert stamps == [(n, T0 + n * PERIOD_NS) for n in range(10)]
-
-
-def test_the_wrench_is_invalid_while_taring_and_while_stale_and_valid_between() -> None:
-    loop, sensor, _ = make_loop()
-    message, t_ns = cycles(loop, T0, TARE_CYCLES)
-    assert not message.valid
-    sensor.forces = legs((10.0, 0, 0, 0, 0, 0))
-    message, t_ns = cycles(loop, t_ns, 1)
-    assert message.valid
-    sensor.forces = None
-    message, t_ns = cycles(loop, t_ns, round(HARNESS.stale_ms * NS_PER_MS / PERIOD_NS))
-    assert message.valid
-    message, t_ns = cycles(loop, t_ns, 1)
-    assert not message.valid
-    sensor.forces = ZERO
-    message, t_ns = cycles(loop, t_ns, 1)
-    assert message.valid
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
@@ -191,7 +179,7 @@ def test_the_operators_wrench_arrives_through_the_simulated_sensor_within_its_no
         ROBOT, simulation=msgspec.structs.replace(ROBOT.simulation, harness_noise=0.5)
     )
     path = short_dir / "can_harness.sock"
-    sensor = make_sensor(robot, short_dir)
+    sensor = sensor_in(short_dir, robot)
     law, sink = WrenchFilter(robot.harness), Sink()
     loop = HarnessLoop(sensor, law, sink, Asked())
     wrench = np.array([30.0, -20.0, 150.0, 4.0, 60.0, -5.0])
@@ -222,7 +210,7 @@ def test_the_simulator_going_away_makes_the_wrench_invalid_until_it_is_back(
     short_dir: Path,
 ) -> None:
     path = short_dir / "can_harness.sock"
-    sensor = make_sensor(ROBOT, short_dir)
+    sensor = sensor_in(short_dir)
     loop = HarnessLoop(sensor, WrenchFilter(HARNESS), Sink(), Asked())
     seen: list[bool] = []
     t_ns = T0
@@ -250,7 +238,7 @@ def test_a_low_rate_is_no_pause_of_the_process(short_dir: Path) -> None:
         harness=msgspec.structs.replace(HARNESS, rate_hz=20.0),
         can={**ROBOT.can, HARNESS.bus: CanConfig(interface="virtual", channel="{run}")},
     )
-    sensor = make_sensor(slow, short_dir)
+    sensor = sensor_in(short_dir, slow)
     sensor.newest(T0)
     sensor.newest(T0 + 50 * NS_PER_MS)
     assert sensor.discarded == 0

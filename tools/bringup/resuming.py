@@ -16,11 +16,11 @@ from services.joint.__main__ import open_drive
 from services.joint.differential import motor_from_joint
 from services.joint.drivers.base import Drive
 from shared.bus.messages import Pair
-from shared.can.can_sensor import CanSensor, pause_ns
+from shared.can.can_sensor import sensor_of
 from shared.can.imu_can import ImuAssembler
 from shared.clock import now_ns
 from shared.config import files as config_file
-from shared.config.robot_config import RobotConfig, expand
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError, XrlError
 from shared.joints import MODULES
 from tools.bringup import zero_record
@@ -147,10 +147,8 @@ def upright(robot: RobotConfig, run_dir: Path, *, level: bool) -> Upright:
     imu = robot.imu
     if not imu.fitted:
         return Upright((0.0, 0.0, 1.0), LEVEL_WITHIN if level else math.inf)
-    link, law = robot.can[imu.bus], AttitudeLaw(imu)
-    pause = pause_ns(imu.stale_ms, imu.rate_hz)
-    channel = expand(link.channel, RunDir(run_dir).path)
-    sensor = CanSensor(link.interface, channel, ImuAssembler(), pause_ns=pause)
+    law = AttitudeLaw(imu)
+    sensor = sensor_of(robot, imu, ImuAssembler(), RunDir(run_dir).path)
     try:
         until = time.monotonic() + IMU_S
         while time.monotonic() < until:
