@@ -175,12 +175,13 @@ def test_a_request_without_an_answer(
     assert bank.input_vel[2 * MODULE] == written
 
 
-@given(packet=st.binary(max_size=80))
-def test_no_packet_makes_the_front_fail(packet: bytes) -> None:
-    front = FibreFront(EmulatedBoard(idle_bank(), MODULE, SERIAL))
-    front.answer(packet)
-    (trailer,) = struct.unpack("<H", struct.pack("<H", crc16(1, front.descriptor)))
-    front.answer(packet + struct.pack("<H", trailer))
+def test_no_packet_makes_the_front_fail(client: Client) -> None:
+    @given(packet=st.binary(max_size=80))
+    def answered(packet: bytes) -> None:
+        client.front.answer(packet)
+        client.front.answer(packet + struct.pack("<H", client.trailer))
+
+    answered()
 
 
 def test_native_writes_feed_no_watchdog_but_its_function_does(

@@ -362,7 +362,7 @@ def test_no_arming_request_from_before_a_power_cut_reaches_the_drive(
         cut.driver.read(0.0)
     before = cut.states
     cut.power(on=False)
-    cut.run(3000, write=False)
+    cut.run(500, write=False)
     assert STAMPS == [], "nothing is left to be delivered"
     cut.power(on=True)
     cut.run(300, write=False)
