@@ -9,9 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from services.joint.drivers import bus_watch
 from services.joint.drivers.odrive_can import OdriveCan
-from shared.clock import NS_PER_S
 from tests.joint.drivers.can_bench import Bench
 from tests.joint.drivers.rig import Rig, Shed
 
@@ -26,15 +24,8 @@ def path() -> Iterator[Path]:
 
 @pytest.fixture
 def shed(path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Shed]:
-    """Return what makes emulated drives and drivers.
-
-    They run in real time: a machine that stands still for 20 ms is not to count as a dead bus.
-    """
-    for name in ("_QUIET_NS", "_STUCK_NS"):
-        monkeypatch.setattr(bus_watch, name, NS_PER_S)
-    for name in ("RESTART_MS", "PROOF_MS"):
-        monkeypatch.setattr(bus_watch, name, 1000)
-    shed = Shed(path)
+    """Return what makes emulated drives and drivers."""
+    shed = Shed(path, monkeypatch)
     yield shed
     shed.close()
 

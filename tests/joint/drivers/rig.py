@@ -1,4 +1,4 @@
-"""An emulated ODrive on a CAN bus over sockets, with time made by the test on its side."""
+"""Emulated ODrives on a CAN bus over sockets, and their drivers, in the test's own time."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
+from services.joint.drivers import can_link, odrive_can
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.drivers.frame_times import ARM_GRACE_MS
 from services.joint.drivers.odrive_can import OdriveCan
@@ -16,6 +18,9 @@ from services.simulator.drives.axis_bank import AxisBank
 from services.simulator.fronts.cansimple_dialects import DialectName
 from services.simulator.fronts.cansimple_front import CanSimpleFront
 from services.simulator.fronts.unix_can_hub import UnixCanHub
+from shared.can.cansimple import AxisState
+from shared.can.unix_can import Frame, UnixCanBus
+from shared.clock import NS_PER_MS
 from shared.config.sections import CanConfig, DriveConfig
 
 DRIVE = DriveConfig(
@@ -41,7 +46,7 @@ class Rig:
 
     def __init__(
         self,
-        path: Path,
+        shed: Shed,
         *,
         watchdog: bool = False,
         dialect: DialectName = "0.5",
@@ -49,7 +54,8 @@ class Rig:
         nodes: Sequence[int] = NODES,
     ) -> None:
         """Put the drive's axes on nodes of the same numbers."""
-        self.hub = hub(path)
+        self.shed = shed
+        self.hub = hub(shed.path)
         self.bank = AxisBank(DRIVE, encoder_counts_per_turn=16384, watchdog=watchdog)
         axes = [{node: node for node in nodes}]
         self.front = CanSimpleFront(
@@ -57,14 +63,25 @@ class Rig:
         )
         self.pos = np.zeros(12)
         self.vel = np.zeros(12)
-        self.now_s = 0.0
+
+    def as_shipped(self) -> None:
+        """Give the drive the limits and gains that it is sold with."""
+        bank = self.bank
+        bank.vel_limit[:], bank.current_lim[:] = 2.0, 10.0
+        bank.pos_gain[:], bank.vel_gain[:], bank.vel_integrator_gain[:] = 20.0, 1 / 6, 1 / 3
+
+    @property
+    def states(self) -> list[AxisState]:
+        """States of both axes."""
+        return [self.bank.state[axis] for axis in AXES]
 
     def step(self) -> np.ndarray:
+        now_s = self.shed.now_s
         self.front.receive()
-        torque = self.bank.step(self.now_s, self.pos, self.vel)
+        torque = self.bank.step(now_s, self.pos, self.vel)
         self.front.send_encoders()
-        self.front.send_heartbeats(self.now_s)
-        self.now_s += MS
+        self.front.send_heartbeats(now_s)
+        self.shed.wait(MS)
         return torque
 
     def cycle(self, driver: OdriveCan) -> DriveReading:
@@ -82,27 +99,48 @@ def read(driver: OdriveCan, timeout_s: float = 0.5) -> DriveReading:
     return reading
 
 
-def make_driver(path: Path) -> OdriveCan:
-    """Return a driver of the bus at a socket, which need not be there."""
-    config = CanConfig(interface="xrl_unix", channel=str(path))
-    return OdriveCan(config, NODES, DRIVE, encoder_counts_per_turn=16384)
-
-
 class Shed:
-    """Makes emulated drives and drivers of one socket, and closes them in the end."""
+    """Makes emulated drives and drivers of one socket, and closes them in the end.
 
-    def __init__(self, path: Path) -> None:
+    Their time is the shed's: a rig's steps and every wait, a driver's for frames too, make it pass.
+    """
+
+    def __init__(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.path = path
+        self.now_s = 0.0
         self.rigs: list[Rig] = []
         self.drivers: list[OdriveCan] = []
+        receive = UnixCanBus.recv_many
+
+        def recv_many(bus: UnixCanBus, timeout: float) -> list[Frame]:
+            frames = receive(bus, 0.0)
+            if not frames:
+                self.wait(timeout)
+            return frames
+
+        monkeypatch.setattr(UnixCanBus, "recv_many", recv_many)
+        monkeypatch.setattr(time, "sleep", self.wait)
+        for module in (odrive_can, can_link):
+            monkeypatch.setattr(module, "now_ns", self.now_ns)
+
+    def now_ns(self) -> int:
+        return NS_PER_MS + round(self.now_s * 1e9)
+
+    def wait(self, seconds: float) -> None:
+        self.now_s += seconds
 
     def rig(self, **how: Any) -> Rig:
-        self.rigs.append(Rig(self.path, **how))
+        self.rigs.append(Rig(self, **how))
         return self.rigs[-1]
 
-    def driver(self) -> OdriveCan:
-        self.drivers.append(make_driver(self.path))
-        return self.drivers[-1]
+    def driver(
+        self, nodes: tuple[int, int] = NODES, counts_per_turn: int | None = 16384
+    ) -> OdriveCan:
+        """Return a driver of the bus, which need not be there."""
+        config = CanConfig(interface="xrl_unix", channel=str(self.path))
+        driver = OdriveCan(config, nodes, DRIVE, encoder_counts_per_turn=counts_per_turn)
+        self.drivers.append(driver)
+        return driver
 
     def connected(self, rig: Rig) -> OdriveCan:
         """Return a driver that has found the drive."""

@@ -10,7 +10,6 @@ from pathlib import Path
 import can
 import pytest
 
-from services.joint.drivers import can_link, odrive_can
 from services.joint.drivers.base import DriveReading, DriveStatus
 from services.joint.drivers.bus_watch import (
     BLOCKED_MS,
@@ -21,14 +20,13 @@ from services.joint.drivers.bus_watch import (
     STUCK_MS,
     BusWatch,
 )
-from services.joint.drivers.odrive_can import OdriveCan
 from services.simulator.fronts.unix_can_hub import UnixCanHub
 from shared.can.cansimple import AxisState, Command, split_id
 from shared.can.cansimple_06 import Command06
 from shared.can.unix_can import Frame, UnixCanBus
 from shared.clock import NS_PER_MS
 from tests.joint.drivers.can_bench import Bench
-from tests.joint.drivers.rig import AXES, TARGET, Rig, make_driver
+from tests.joint.drivers.rig import AXES, TARGET, Shed
 
 OLD_MS = 50
 """No frame that is older reaches a drive."""
@@ -217,13 +215,12 @@ STAMPS: list[tuple[Frame, float]] = []
 class Cut:
     """An emulated drive, its driver as a service uses it, and the power of their bus."""
 
-    def __init__(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, shed: Shed, monkeypatch: pytest.MonkeyPatch) -> None:
         STAMPS.clear()
-        self.rig = Rig(path, hub=StampingHub)
+        self.shed = shed
+        self.rig = shed.rig(hub=StampingHub)
         assert isinstance(self.rig.hub, StampingHub)
         self.hub = self.rig.hub
-        for module in (odrive_can, can_link):
-            monkeypatch.setattr(module, "now_ns", lambda: round(self.ms * NS_PER_MS) + NS_PER_MS)
         send_many, restart = UnixCanBus.send_many, UnixCanBus.restart
 
         def stamped(bus: UnixCanBus, messages: list[can.Message]) -> None:
@@ -240,13 +237,13 @@ class Cut:
 
         monkeypatch.setattr(UnixCanBus, "send_many", stamped)
         monkeypatch.setattr(UnixCanBus, "restart", restarted)
-        self.path, self.restarts = path, 0
-        self.driver: OdriveCan = make_driver(path)
+        self.restarts = 0
+        self.driver = shed.driver()
         self.reading: DriveReading | None = None
 
     @property
     def ms(self) -> float:
-        return self.rig.now_s * 1e3
+        return self.shed.now_s * 1e3
 
     def power(self, *, on: bool) -> None:
         self.rig.bank.conditions.link(AXES[0] >> 1, up=on)
@@ -279,24 +276,18 @@ class Cut:
         self.hub.ages_ms.clear()
         return oldest
 
-    @property
-    def states(self) -> list[AxisState]:
-        return [self.rig.bank.state[axis] for axis in AXES]
-
 
 @pytest.fixture
-def cut(path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cut]:
-    cut = Cut(path, monkeypatch)
+def cut(shed: Shed, monkeypatch: pytest.MonkeyPatch) -> Cut:
+    cut = Cut(shed, monkeypatch)
     cut.run(50, write=False)
-    yield cut
-    cut.driver.close()
-    cut.rig.hub.close()
+    return cut
 
 
 def armed(cut: Cut) -> None:
     cut.driver.arm(onboard=True)
     cut.run(40, write=False)
-    assert cut.states == [AxisState.CLOSED_LOOP_CONTROL] * 2
+    assert cut.rig.states == [AxisState.CLOSED_LOOP_CONTROL] * 2
     cut.run(40)
     assert cut.oldest_ms() <= CYCLE_MS
 
@@ -342,7 +333,7 @@ def test_nothing_is_sent_into_a_dead_bus_and_it_is_told_there_too(cut: Cut) -> N
     cut.power(on=True)
     cut.run(50, write=False)
     assert cut.oldest_ms() <= CYCLE_MS
-    assert cut.states == [AxisState.IDLE] * 2
+    assert cut.rig.states == [AxisState.IDLE] * 2
 
 
 @pytest.mark.parametrize("offset_ms", range(-3, 12))
@@ -360,26 +351,24 @@ def test_no_arming_request_from_before_a_power_cut_reaches_the_drive(
     for _ in range(max(0, offset_ms)):
         cut.step()
         cut.driver.read(0.0)
-    before = cut.states
+    before = cut.rig.states
     cut.power(on=False)
     cut.run(500, write=False)
     assert STAMPS == [], "nothing is left to be delivered"
     cut.power(on=True)
     cut.run(300, write=False)
-    assert cut.states == before
+    assert cut.rig.states == before
     assert cut.oldest_ms() < OLD_MS
 
 
-def test_frames_of_a_service_that_died_in_the_cut_are_thrown_away_by_the_next(
-    cut: Cut, path: Path
-) -> None:
+def test_frames_of_a_service_that_died_in_the_cut_are_thrown_away_by_the_next(cut: Cut) -> None:
     armed(cut)
     cut.power(on=False)
     cut.driver.write(TARGET)
     cut.driver.write(TARGET)
     cut.driver.close()
     assert STAMPS != []
-    cut.driver = make_driver(path)
+    cut.driver = cut.shed.driver()
     cut.run(200, write=False)
     assert STAMPS == []
     assert cut.reading is not None

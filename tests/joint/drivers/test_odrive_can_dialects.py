@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,11 +15,9 @@ from services.joint.drivers.odrive_can import RETRY_MS, OdriveCan
 from services.simulator.fronts.cansimple_dialects import DialectName
 from shared.can.cansimple import AxisError, AxisState
 from shared.clock import NS_PER_MS
-from shared.config.sections import CanConfig
 from shared.exceptions import DriveError
 from tests.joint.drivers.rig import (
     AXES,
-    DRIVE,
     MS,
     NODES,
     TARGET,
@@ -120,32 +117,28 @@ def test_a_position_that_is_not_sent_names_the_nodes(rig: Rig, driver: OdriveCan
         driver.set_position((0.0, 0.0))
 
 
-def test_counts_are_needed_by_0_5_only(rig: Rig, path: Path, dialect: DialectName) -> None:
-    driver = OdriveCan(CanConfig(interface="xrl_unix", channel=str(path)), NODES, DRIVE)
+def test_counts_are_needed_by_0_5_only(rig: Rig, shed: Shed, dialect: DialectName) -> None:
+    driver = shed.driver(counts_per_turn=None)
     rig.cycle(driver)
     if dialect == "0.5":
         with pytest.raises(DriveError, match="counts"):
             driver.set_position((1.0, 1.0))
     else:
         driver.set_position((1.0, 1.0))
-    driver.close()
 
 
 def test_temperatures_come_now_and_then_where_the_firmware_tells_them(
-    rig: Rig, driver: OdriveCan, dialect: DialectName, monkeypatch: pytest.MonkeyPatch
+    rig: Rig, shed: Shed, dialect: DialectName, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found = []
-    monkeypatch.setattr(odrive_can, "HEAT_EVERY_NS", 20 * NS_PER_MS)
-    deadline = time.monotonic() + 1.5  # an answer may find the drive's mailboxes full
-    while time.monotonic() < deadline and not found:
-        reading = rig.cycle(driver)
-        if reading.fet_celsius is not None:
-            found.append(reading)
+    with monkeypatch.context() as patch:
+        patch.setattr(odrive_can, "HEAT_EVERY_NS", 20 * NS_PER_MS)
+        driver = shed.connected(rig)
+        readings = [rig.cycle(driver) for _ in range(100)]  # an answer may find mailboxes full
+    found = [reading for reading in readings if reading.fet_celsius is not None]
     if dialect == "0.5":
         assert not found
         return
     assert found[0].fet_celsius == pytest.approx(tuple(rig.bank.heat.fet[list(AXES)]), abs=0.1)
     assert found[0].motor_celsius is None, "no thermistor is wired: 0 is no reading"
-    monkeypatch.undo()
     after = [rig.cycle(driver).fet_celsius for _ in range(20)]
     assert after.count(None) >= 19

@@ -15,15 +15,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.joint.drivers import can_link, odrive_can
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
-from services.joint.drivers.odrive_can import OdriveCan
 from services.simulator.fronts.cansimple_dialects import DialectName
 from services.simulator.fronts.unix_can_hub import UnixCanHub
 from shared.can.cansimple import AxisState, ControlMode
 from shared.can.unix_can import Frame
-from shared.clock import NS_PER_MS
-from tests.joint.drivers.rig import AXES, DRIVE, MS, TARGET, Rig, make_driver
+from tests.joint.drivers.rig import AXES, DRIVE, MS, TARGET, Shed
 
 LOSS = 0.3
 
@@ -61,21 +58,18 @@ class LossyHub(UnixCanHub):
 class Bench:
     """A drive on a lossy bus, in its own time, and what a joint service does about it."""
 
-    def __init__(
-        self, path: Path, monkeypatch: pytest.MonkeyPatch, seed: int, dialect: DialectName
-    ) -> None:
-        self.rig = Rig(path, dialect=dialect, hub=LossyHub)
+    def __init__(self, shed: Shed, seed: int, dialect: DialectName) -> None:
+        self.shed = shed
+        self.rig = shed.rig(dialect=dialect, hub=LossyHub)
         assert isinstance(self.rig.hub, LossyHub)
         self.hub = self.rig.hub
         self.hub.dice.seed(seed)
-        for module in (odrive_can, can_link):
-            monkeypatch.setattr(module, "now_ns", lambda: round(self.rig.now_s * 1e9) + NS_PER_MS)
-        self.driver: OdriveCan = make_driver(path)
+        self.driver = shed.driver()
         self.status = DriveStatus.LOST
 
     def cycle(self) -> DriveReading | None:
         self.rig.step()
-        self.rig.now_s += (STEP_MS - 1) * MS
+        self.shed.wait((STEP_MS - 1) * MS)
         reading = self.driver.read(0.0)
         if reading is not None:
             self.status = reading.status
@@ -106,17 +100,11 @@ def seed(request: pytest.FixtureRequest) -> int:
 
 
 @pytest.fixture(params=["0.5", "0.6"])
-def bench(
-    request: pytest.FixtureRequest, path: Path, monkeypatch: pytest.MonkeyPatch, seed: int
-) -> Iterator[Bench]:
-    bench = Bench(path, monkeypatch, seed, request.param)
-    bank = bench.rig.bank
-    bank.vel_limit[:], bank.current_lim[:] = 2.0, 10.0  # as shipped
-    bank.pos_gain[:], bank.vel_gain[:], bank.vel_integrator_gain[:] = 20.0, 1 / 6, 1 / 3
+def bench(request: pytest.FixtureRequest, shed: Shed, seed: int) -> Iterator[Bench]:
+    bench = Bench(shed, seed, request.param)
+    bench.rig.as_shipped()
     yield bench
-    bench.driver.close()
     assert bench.hub.lost > 10
-    bench.hub.close()
 
 
 @pytest.mark.parametrize("onboard", [True, False])
@@ -128,7 +116,7 @@ def test_modes_limits_gains_and_targets_arrive(bench: Bench, onboard: bool) -> N
     for _ in range(1200 // STEP_MS):
         bench.cycle()
         bench.driver.write(TARGET) if onboard else bench.driver.write_torque((0.25, -0.5))
-    assert [bank.state[axis] for axis in axes] == [AxisState.CLOSED_LOOP_CONTROL] * 2
+    assert bench.rig.states == [AxisState.CLOSED_LOOP_CONTROL] * 2
     mode = ControlMode.POSITION if onboard else ControlMode.TORQUE
     assert list(bank.control_mode[axes]) == [mode] * 2
     np.testing.assert_allclose(bank.vel_limit[axes], DRIVE.vel_limit)
@@ -149,11 +137,10 @@ def test_a_drive_that_is_idled_until_it_is_idle_ends_idle(bench: Bench) -> None:
     bench.run(100)
     bench.until_armed(onboard=True)
     bench.run(300, TARGET)
-    bank = bench.rig.bank
     for _ in range(12):
         bench.driver.idle()
         bench.run(100)
-    assert [bank.state[axis] for axis in AXES] == [AxisState.IDLE] * 2
+    assert bench.rig.states == [AxisState.IDLE] * 2
 
 
 def test_the_dialect_is_found_and_never_the_wrong_one(bench: Bench) -> None:
@@ -220,15 +207,6 @@ class DroppingHub(UnixCanHub):
         return kept
 
 
-class Clock:
-    """The time of the rig that runs."""
-
-    rig: Rig | None = None
-
-    def now_ns(self) -> int:
-        return NS_PER_MS + (round(self.rig.now_s * 1e9) if self.rig is not None else 0)
-
-
 class Run:
     """One run with some frames lost, in its own time.
 
@@ -238,19 +216,17 @@ class Run:
         held_ms: when HOLD was first written.
     """
 
-    def __init__(self, folder: Path, lost: Iterable[int], clock: Clock) -> None:
-        path = folder / "can.sock"
-        self.rig = clock.rig = Rig(path, hub=DroppingHub)
+    def __init__(self, shed: Shed, lost: Iterable[int]) -> None:
+        shed.now_s = 0.0
+        self.rig = shed.rig(hub=DroppingHub)
         hub = self.rig.hub
         assert isinstance(hub, DroppingHub)
-        bank = self.rig.bank
-        bank.vel_limit[:], bank.current_lim[:] = 2.0, 10.0  # as shipped
-        bank.pos_gain[:], bank.vel_gain[:], bank.vel_integrator_gain[:] = 20.0, 1 / 6, 1 / 3
+        self.rig.as_shipped()
         self.rig.pos[list(AXES)] = HERE
         self.torques: list[np.ndarray] = []
         self.status = DriveStatus.LOST
         self.held_ms = 0
-        self.driver = make_driver(path)
+        self.driver = shed.driver()
         self._cycle(None, LISTEN_MS)
         self.torques.clear()
         self.rig.front.receive()  # where it is, which was asked before: no frame of an order
@@ -285,12 +261,9 @@ Runner = Callable[[Iterable[int]], Run]
 
 
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, path: Path) -> Runner:
+def run(shed: Shed) -> Runner:
     """Return how to make a run in which frames are lost."""
-    clock = Clock()
-    for module in (odrive_can, can_link):
-        monkeypatch.setattr(module, "now_ns", clock.now_ns)
-    return lambda lost: Run(path.parent, lost, clock)
+    return lambda lost: Run(shed, lost)
 
 
 def excess(torques: list[np.ndarray]) -> np.ndarray:
@@ -324,7 +297,7 @@ def test_no_lost_frame_of_arming_gives_a_torque_before_a_target(run: Runner) -> 
         before = np.array(each.torques[: each.held_ms])
         assert np.abs(before).max() < 1e-3, f"frame {lost}"
         assert each.status is DriveStatus.ARMED, f"frame {lost}"
-        assert [each.rig.bank.state[axis] for axis in AXES] == [AxisState.CLOSED_LOOP_CONTROL] * 2
+        assert each.rig.states == [AxisState.CLOSED_LOOP_CONTROL] * 2
         np.testing.assert_allclose(each.torques[-1], np.array(HOLD.torque) + SPRING, atol=2e-3)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import random
-import time
 
 import pytest
 
@@ -219,10 +218,8 @@ def test_the_voltage_of_the_supply_is_asked_for_now_and_then(
     rig.bank.bus.changed()
     driver = shed.connected(rig)
     assert rig.cycle(driver).supply_v == 0.0, "not known yet"
-    for _ in range(100):  # an answer may find the drive's mailboxes full
-        time.sleep(0.005)
-        if rig.cycle(driver).supply_v:
-            break
+    for _ in range(20):  # an answer may find the drive's mailboxes full
+        rig.cycle(driver)
     assert rig.cycle(driver).supply_v == pytest.approx(43.5, abs=0.01)
 
 
