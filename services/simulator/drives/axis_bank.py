@@ -108,7 +108,8 @@ class AxisBank:
         self.current_lim = column("motor.config.current_lim")
         self.pos_estimate, self.vel_estimate = encoders.pos_estimate, encoders.vel_estimate
         self.encoder_turns, self.connected = encoders.turns, control.connected
-        self.encoder_mount, self.encoder_angle = encoders.mount, encoders.angle
+        self.encoder_mount = encoders.mount
+        self.encoder_count, self.encoder_angle = encoders.counted, encoders.angle
         self._shaft = np.zeros(n)
         self.now_s = -math.inf
         self.calibration = Calibration(self.settings, encoders, drive.torque_constant)

@@ -99,7 +99,6 @@ class AxisControl:
         connected: 1.0 once in closed loop since it started up: from then on the controller sees the
             encoder, in IDLE as well.
         derating: fraction of current_lim that heat leaves.
-        resistance: of each motor's phases in truth, ohm.
         warmth: resistance of each winding over that at 25 C.
     """
 
@@ -113,12 +112,12 @@ class AxisControl:
         self.derating, self.warmth = np.ones((2, N_JOINTS))
         self._loops = np.zeros(_ROWS * N_JOINTS)
         self._speed = np.zeros(N_JOINTS)  # of the motors, turn/s
-        self.resistance = np.full(N_JOINTS, PHASE_RESISTANCE)
         self._dt_s = 0.0
         self._graph = graph = CompiledGraph(law_graph())
         columns = [settings.axis(name) for name in _SETTINGS]
         # what heats is the winding, whatever a calibration has found
-        columns[_SETTINGS.index("motor.config.phase_resistance")] = self.resistance
+        true_resistance = np.full(N_JOINTS, PHASE_RESISTANCE)
+        columns[_SETTINGS.index("motor.config.phase_resistance")] = true_resistance
         live = (
             encoders.pos_estimate, encoders.vel_estimate, self.input_pos, self.input_vel,
             self.input_torque, self.armed, self.connected, self.derating, self.integrator,

@@ -73,7 +73,7 @@ class AxisEncoders:
             odd.set_count(round(count))
             self._rows[2:, axis] = odd.count / self._cpr[axis]
             return
-        self.counts_from[axis] += round(count) - self._counted(axis)
+        self.counts_from[axis] += round(count) - self.counted(axis)
         self._rows[2:, axis] = self._rows[0, axis] = round(count) / self._cpr[axis]
 
     def forget_turns(self, axis: int) -> None:
@@ -93,6 +93,12 @@ class AxisEncoders:
         odd = self.odd.get(axis)
         return odd.angle if odd is not None else self._raw(axis) % self._counts_per_turn
 
+    def counted(self, axis: int) -> int:
+        """Return an axis's `shadow_count`."""
+        if self._seen != self._settings.version:
+            self._derive()
+        return round(float(self._rows[3, axis] * self._cpr[axis]))
+
     def wrap_turns(self, axis: int) -> None:
         """Make an axis's count its angle within the turn, as its encoder's calibration does."""
         self.set_count(axis, self.angle(axis))
@@ -107,7 +113,7 @@ class AxisEncoders:
             pos, vel = (self._rows[:2, axis] * self._cpr[axis]).tolist()
             self.odd[axis] = odd = OddEncoder(
                 self._raw(axis),
-                self._counted(axis),
+                self.counted(axis),
                 pos,
                 vel,
                 per_turn=self._counts_per_turn,
@@ -173,13 +179,9 @@ class AxisEncoders:
                 self._error_rates[axis] = odd.error_rate, self._clock_s
                 del self.odd[axis]
 
-    def _counted(self, axis: int) -> int:
-        """Return an axis's encoder's count."""
-        return round(float(self._rows[3, axis] * self._cpr[axis]))
-
     def _raw(self, axis: int) -> int:
         """Return an encoder's own count, with turns; of an odd one only once `_count` has run."""
-        return self._counted(axis) - round(float(self.counts_from[axis] - self.mount[axis]))
+        return self.counted(axis) - round(float(self.counts_from[axis] - self.mount[axis]))
 
     def _count(self, pos_turns: Vector) -> None:
         """Write the encoder's whole counts, in turns as the setting `cpr` has them."""

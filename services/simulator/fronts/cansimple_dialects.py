@@ -158,9 +158,7 @@ def _estimates_of_one(estimates: Callable[[AxisBank], tuple[Vector, Vector]]) ->
 
 
 def _encoder_count(bank: AxisBank, axis: int) -> bytes:
-    per_turn = int(bank.settings.axis("encoder.config.cpr")[axis])
-    count = round(bank.encoder_turns[axis] * per_turn)
-    return cansimple.pack_two_ints(count, bank.encoder_angle(axis))
+    return cansimple.pack_two_ints(bank.encoder_count(axis), bank.encoder_angle(axis))
 
 
 def _adc_voltage(_bank: AxisBank, _axis: int, data: bytes) -> bytes | None:

@@ -141,9 +141,18 @@ def endpoints() -> list[Endpoint]:
 
 def _axis(i: int) -> list[Property | Function]:
     """Return the endpoints of one axis but for its settings."""
+
+    def shown(name: str, kind: str, value: Callable[[AxisBank, int], Value]) -> Property:
+        return Property(name, kind, lambda b: value(b.bank, b.axis(i)))
+
+    def fault(name: str, kind: str, register: str) -> Property:
+        read = lambda b: int(getattr(b.bank.faults[b.axis(i)], register))  # noqa: E731
+        write = lambda b, value: b.bank.set_error(b.axis(i), register, int(value))  # noqa: E731
+        return Property(name, kind, read, write)
+
     return [
-        _fault("error", "uint32", i, "axis"),
-        Property("current_state", "uint8", lambda b: int(b.bank.state[b.axis(i)])),
+        fault("error", "uint32", "axis"),
+        shown("current_state", "uint8", lambda bank, axis: int(bank.state[axis])),
         Property(
             "requested_state",
             "uint8",
@@ -151,42 +160,32 @@ def _axis(i: int) -> list[Property | Function]:
             lambda b, value: b.bank.request_state(b.axis(i), int(value)),
         ),
         Function("watchdog_feed", lambda b: b.bank.feed(b.axis(i))),
-        _fault("motor.error", "uint64", i, "motor"),
-        Property("motor.is_calibrated", "bool", lambda b: b.bank.calibration.motor[b.axis(i)]),
-        Property(
-            "motor.is_armed",
-            "bool",
-            lambda b: b.bank.state[b.axis(i)] not in (AxisState.IDLE, AxisState.UNDEFINED),
+        fault("motor.error", "uint64", "motor"),
+        shown("motor.is_calibrated", "bool", lambda bank, axis: bank.calibration.motor[axis]),
+        shown("motor.is_armed", "bool", _is_armed),
+        shown("motor.fet_thermistor.temperature", "float", lambda bank, axis: bank.heat.fet[axis]),
+        shown(
+            "motor.motor_thermistor.temperature", "float", lambda bank, axis: bank.heat.motor[axis]
         ),
-        Property(
-            "motor.fet_thermistor.temperature",
-            "float",
-            lambda b: float(b.bank.heat.fet[b.axis(i)]),
-        ),
-        Property(
-            "motor.motor_thermistor.temperature",
-            "float",
-            lambda b: float(b.bank.heat.motor[b.axis(i)]),
-        ),
-        Property("motor.current_control.Iq_setpoint", "float", lambda b: _current(b, i)),
-        Property("motor.current_control.Iq_measured", "float", lambda b: _current(b, i)),
-        _fault("encoder.error", "uint16", i, "encoder"),
-        Property("encoder.is_ready", "bool", lambda b: b.bank.calibration.encoder[b.axis(i)]),
-        Property("encoder.shadow_count", "int32", lambda b: _count(b, i)),
-        Property("encoder.count_in_cpr", "int32", lambda b: b.bank.encoder_angle(b.axis(i))),
-        Property(
+        shown("motor.current_control.Iq_setpoint", "float", _current),
+        shown("motor.current_control.Iq_measured", "float", _current),
+        fault("encoder.error", "uint16", "encoder"),
+        shown("encoder.is_ready", "bool", lambda bank, axis: bank.calibration.encoder[axis]),
+        shown("encoder.shadow_count", "int32", lambda bank, axis: bank.encoder_count(axis)),
+        shown("encoder.count_in_cpr", "int32", lambda bank, axis: bank.encoder_angle(axis)),
+        shown(
             "encoder.calib_scan_response",
             "float",
-            lambda b: b.bank.calibration.response[b.axis(i)],
+            lambda bank, axis: bank.calibration.response[axis],
         ),
-        Property("encoder.pos_estimate", "float", lambda b: float(b.bank.pos_estimate[b.axis(i)])),
-        Property("encoder.vel_estimate", "float", lambda b: float(b.bank.vel_estimate[b.axis(i)])),
+        shown("encoder.pos_estimate", "float", lambda bank, axis: bank.pos_estimate[axis]),
+        shown("encoder.vel_estimate", "float", lambda bank, axis: bank.vel_estimate[axis]),
         Function(
             "encoder.set_linear_count",
             lambda b, count: b.bank.set_count(b.axis(i), count),
             (Argument("count", "int32"),),
         ),
-        _fault("controller.error", "uint8", i, "controller"),
+        fault("controller.error", "uint8", "controller"),
         *(_input(name, i) for name in ("input_pos", "input_vel", "input_torque")),
     ]
 
@@ -198,30 +197,17 @@ def _version(prefix: str, parts: tuple[str, ...], numbers: tuple[int, ...]) -> l
     return [constant(part, number) for part, number in zip(parts, numbers, strict=True)]
 
 
-def _fault(name: str, kind: str, i: int, register: str) -> Property:
-    """Return an error register's endpoint, which may be written as well."""
-
-    def write(board: EmulatedBoard, value: Value) -> None:
-        board.bank.set_error(board.axis(i), register, int(value))
-
-    read = lambda b: int(getattr(b.bank.faults[b.axis(i)], register))  # noqa: E731
-    return Property(name, kind, read, write)
-
-
 def _set_odrive_error(board: EmulatedBoard, value: Value) -> None:
     for i in AXES:
         board.bank.set_error(board.axis(i), "odrive", int(value))
 
 
-def _current(board: EmulatedBoard, i: int) -> float:
-    axis = board.axis(i)
-    return board.bank.settings.current(axis, board.bank.torque[axis])
+def _is_armed(bank: AxisBank, axis: int) -> bool:
+    return bank.state[axis] not in (AxisState.IDLE, AxisState.UNDEFINED)
 
 
-def _count(board: EmulatedBoard, i: int) -> int:
-    axis = board.axis(i)
-    per_turn = float(board.bank.settings.axis("encoder.config.cpr")[axis])
-    return round(float(board.bank.encoder_turns[axis]) * per_turn)
+def _current(bank: AxisBank, axis: int) -> float:
+    return bank.settings.current(axis, bank.torque[axis])
 
 
 def _input(name: str, i: int) -> Property:

@@ -95,10 +95,8 @@ class LedHand(msgspec.Struct):
     @classmethod
     def of_numbers(cls, numbers: Sequence[float]) -> LedHand:
         """Return the hand that `numbers` were of."""
-        hand = cls()
-        for name, value in zip(cls.__struct_fields__, numbers, strict=True):
-            setattr(hand, name, value)
-        return hand
+        leads, *rest = numbers
+        return cls(leads > 0.0, *rest)
 
     @property
     def push(self) -> Vector3 | None:
