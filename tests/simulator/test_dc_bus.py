@@ -40,19 +40,6 @@ def test_the_bus_current_is_that_of_mechanical_power_and_copper_losses(torque: f
     assert bank.bus.state(3) == (SUPPLY_VOLTAGE, 0.0)
 
 
-def test_with_the_limit_as_shipped_a_braking_leg_disarms_both_axes() -> None:
-    bank = make_bank()
-    bank.settings.set(2, "config.dc_max_negative_current", -0.01)
-    bank.input_torque[4:6] = -1.0, 0.5
-    step_for(bank, 0.03, vel=FAST)
-    for axis in (4, 5):
-        assert bank.state[axis] == AxisState.IDLE
-        assert bank.faults[axis].motor & MotorError.SYSTEM_LEVEL
-        assert bank.faults[axis].odrive == OdriveError.DC_BUS_OVER_REGEN_CURRENT
-        assert bank.heartbeat(axis).axis_error == AxisError.MOTOR_FAILED
-    assert bank.state[6] == AxisState.CLOSED_LOOP_CONTROL
-
-
 @pytest.mark.parametrize("resistor", [False, True], ids=["as configured", "with a brake resistor"])
 def test_a_leg_may_brake(resistor: bool) -> None:
     bank = make_bank()
@@ -66,24 +53,33 @@ def test_a_leg_may_brake(resistor: bool) -> None:
 
 
 @pytest.mark.parametrize(
-    ("resistance", "most", "torque", "error"),
+    ("resistance", "setting", "limit", "torque", "error"),
     [
-        (10.0, math.inf, -1.0, OdriveError.DC_BUS_OVER_VOLTAGE),
-        (SUPPLY_RESISTANCE, 5.0, 3.0, OdriveError.DC_BUS_OVER_CURRENT),
+        (10.0, "positive", math.inf, -1.0, OdriveError.DC_BUS_OVER_VOLTAGE),
+        (SUPPLY_RESISTANCE, "positive", 5.0, 3.0, OdriveError.DC_BUS_OVER_CURRENT),
+        (SUPPLY_RESISTANCE, "negative", -0.01, -1.0, OdriveError.DC_BUS_OVER_REGEN_CURRENT),
     ],
-    ids=["a supply that takes no current back", "a limit on the current drawn"],
+    ids=[
+        "a supply that takes no current back",
+        "a limit on the current drawn",
+        "a leg that brakes, and the limit as shipped",
+    ],
 )
 def test_beyond_the_bus_s_limits_both_axes_are_disarmed(
-    resistance: float, most: float, torque: float, error: OdriveError
+    resistance: float, setting: str, limit: float, torque: float, error: OdriveError
 ) -> None:
     bank = make_bank()
     bank.bus.resistance[2] = resistance
     bank.bus.changed()
-    bank.settings.set(2, "config.dc_max_positive_current", most)
-    bank.input_torque[4] = torque
+    bank.settings.set(2, f"config.dc_max_{setting}_current", limit)
+    bank.input_torque[4:6] = torque, 0.5
     step_for(bank, 0.03, vel=FAST)
-    assert bank.state[4] == bank.state[5] == AxisState.IDLE
-    assert bank.faults[4].odrive == bank.faults[5].odrive == error
+    for axis in (4, 5):
+        assert bank.state[axis] == AxisState.IDLE
+        assert bank.faults[axis].motor & MotorError.SYSTEM_LEVEL
+        assert bank.faults[axis].odrive == error
+        assert bank.heartbeat(axis).axis_error == AxisError.MOTOR_FAILED
+    assert bank.state[6] == AxisState.CLOSED_LOOP_CONTROL
 
 
 def test_a_sagging_supply_disarms_and_arms_again_only_when_it_is_back() -> None:

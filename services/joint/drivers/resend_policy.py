@@ -60,8 +60,8 @@ class ResendPolicy:
     def armed(self, now_ns: int) -> None:
         """Begin with a drive that was asked to arm, without gains."""
         self.gains = _NONE
-        self._gains_at_ns = 0
-        self._settle(now_ns)
+        self._gains_at_ns = self._settle_at_ns = 0
+        self._settle_until_ns = now_ns + SETTLE_MS * NS_PER_MS
 
     def idle(self) -> None:
         """Stop telling limits and modes."""
@@ -93,7 +93,3 @@ class ResendPolicy:
             self._gains_at_ns = 0
         if row is GainRow.ALL:
             self._settle_at_ns = 0
-
-    def _settle(self, now_ns: int) -> None:
-        self._settle_at_ns = 0
-        self._settle_until_ns = now_ns + SETTLE_MS * NS_PER_MS
