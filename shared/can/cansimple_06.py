@@ -131,12 +131,6 @@ def pack_error(active_errors: int, disarm_reason: int) -> bytes:
     return _TWO_U32.pack(active_errors, disarm_reason)
 
 
-def unpack_error(data: bytes) -> tuple[int, int]:
-    """Unpack 0x003 into active errors and the reason of the last disarm."""
-    active_errors, disarm_reason = _TWO_U32.unpack_from(data)
-    return active_errors, disarm_reason
-
-
 def pack_sdo(opcode: int, endpoint: int, value: bytes = b"") -> bytes:
     """Pack 0x004, or 0x005 with opcode 0; the value as the endpoint's type has it, <= 4 bytes."""
     return _SDO.pack(opcode, endpoint) + value

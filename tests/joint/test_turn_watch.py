@@ -12,12 +12,12 @@ from services.joint.drivers.base import DriveReading, DriveStatus
 from services.joint.failsafe import Event
 from services.joint.joint_estimate import REJECTED_MAX, JointEstimate
 from services.joint.turn_watch import ACCELERATION, FADES, GAP_NS
+from shared.bus.messages import Pair
 from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_MS, NS_PER_S
 
 PERIOD_NS = 2 * NS_PER_MS
 BANDWIDTH = 2000.0
-GAP_MAX_S = 0.051
 
 
 class Axis:
@@ -35,8 +35,16 @@ class Axis:
     def turns_missing(self) -> int:
         return round(self.true - self.count)
 
-    def sample(self, status: DriveStatus = DriveStatus.ARMED, *, armed: bool) -> Event:
-        reading = DriveReading(self.t_ns, (self.estimate, 0.0), (self.vel, 0.0), status, 0)
+    def sample(
+        self,
+        status: DriveStatus = DriveStatus.ARMED,
+        *,
+        armed: bool,
+        error: int = 0,
+        zero: Pair | None = None,
+    ) -> Event:
+        pos, vel = (self.estimate, 0.0), (self.vel, 0.0)
+        reading = DriveReading(self.t_ns, pos, vel, status, error, None, zero)
         return self.samples.take(reading, armed=armed)
 
     def move(self, acceleration: float, word: float | None, *, armed: bool = True) -> Event:
@@ -127,10 +135,7 @@ def test_samples_that_do_not_come_after_a_short_rest_raise_no_doubt(silent_ms: i
 def test_an_encoder_that_reads_0_is_noticed_from_any_angle(in_turn: float, armed: bool) -> None:
     axis = Axis(2.0 + in_turn, 0.0)
     axis.goes(0.0, 5)
-    zero = DriveReading(
-        axis.t_ns, (axis.count, 0.0), (0.0, 0.0), DriveStatus.IDLE, 0, None, (0, 0.5)
-    )
-    axis.samples.take(zero, armed=False)
+    axis.sample(DriveStatus.IDLE, armed=False, zero=(0.0, 0.5))
     for _ in range(2 * GAP_NS // PERIOD_NS):
         axis.move(0.0, 0.0, armed=armed)
     assert axis.samples.turns_lost
@@ -138,10 +143,7 @@ def test_an_encoder_that_reads_0_is_noticed_from_any_angle(in_turn: float, armed
 
 def test_an_encoder_that_rests_elsewhere_than_at_its_0_does_not_read_0() -> None:
     axis = Axis(2.1, 0.0)
-    zero = DriveReading(
-        axis.t_ns, (axis.count, 0.0), (0.0, 0.0), DriveStatus.IDLE, 0, None, (0, 0.5)
-    )
-    axis.samples.take(zero, armed=False)
+    axis.sample(DriveStatus.IDLE, armed=False, zero=(0.0, 0.5))
     axis.goes(0.0, 500)
     assert not axis.samples.turns_lost
 
@@ -149,10 +151,7 @@ def test_an_encoder_that_rests_elsewhere_than_at_its_0_does_not_read_0() -> None
 @pytest.mark.parametrize("armed", [True, False])
 def test_a_failed_encoder_lacks_turns_until_the_drive_has_no_zero(armed: bool) -> None:
     axis = Axis(0.0, 0.0)
-    failed = DriveReading(
-        axis.t_ns, (0.0, 0.0), (0.0, 0.0), DriveStatus.ERROR, int(AxisError.ENCODER_FAILED)
-    )
-    axis.samples.take(failed, armed=armed)
+    axis.sample(DriveStatus.ERROR, armed=armed, error=int(AxisError.ENCODER_FAILED))
     axis.sample(DriveStatus.IDLE, armed=armed)
     assert axis.samples.turns_lost
     axis.sample(DriveStatus.UNZEROED, armed=False)

@@ -113,7 +113,6 @@ def test_heartbeat_survives_the_round_trip(
 def test_what_is_packed_for_0_6_comes_back() -> None:
     assert cansimple_06.unpack_heartbeat(cansimple_06.pack_heartbeat(HEARTBEAT_06)) == HEARTBEAT_06
     assert cansimple_06.unpack_version(cansimple_06.pack_version(VERSION)) == VERSION
-    assert cansimple_06.unpack_error(cansimple_06.pack_error(1, 2)) == (1, 2)
     assert cansimple_06.unpack_sdo(cansimple_06.pack_sdo(0, 77, b"abcd")) == (0, 77, b"abcd")
 
 

@@ -20,14 +20,13 @@ from services.joint.drivers.base import (
     MotorTarget,
 )
 from services.joint.drivers.can_link import RETRY_MS, CanLink, message
-from services.joint.drivers.encoder_pair import EncoderPair
 from services.joint.drivers.firmware import (
     HEARTBEAT_BYTES,
     VERSION_BYTES,
     AxesReport,
     Dialect,
 )
-from services.joint.drivers.frame_times import FrameTimes, OrderWindows
+from services.joint.drivers.frame_times import EncoderPair, FrameTimes, OrderWindows
 from services.joint.drivers.odrive_frames import Frames
 from services.joint.drivers.replies import NOTHING, Replies
 from services.joint.drivers.resend_policy import GainRow, ResendPolicy

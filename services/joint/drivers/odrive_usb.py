@@ -25,9 +25,8 @@ import msgspec
 from odrive.device_manager import DeviceManager, get_device_manager
 from odrive.runtime_device import RuntimeDevice
 
-from services.joint.drivers.axes_status import AxesStatus
 from services.joint.drivers.base import HEAT_EVERY_NS, DriveReading, DriveStatus, MotorTarget
-from services.joint.drivers.odrive_v3 import OdriveV3
+from services.joint.drivers.odrive_v3 import AxesStatus, OdriveV3
 from shared import log
 from shared.bus.messages import Pair
 from shared.can.cansimple import AxisState

@@ -1,4 +1,4 @@
-"""What of an ODrive v3's tree the USB driver uses, by the names of firmware 0.5.x."""
+"""The part of an ODrive v3's tree that the USB driver uses, and what its registers say."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from math import isfinite
 from typing import Any, Final
 
-from services.joint.drivers.base import MotorTarget, real_readings
+from services.joint.drivers.base import DriveStatus, MotorTarget, real_readings
 from shared.bus.messages import Pair
-from shared.can.cansimple import AxisState, ControlMode, InputMode
+from shared.can.cansimple import AxisError, AxisState, ControlMode, Heartbeat, InputMode
 from shared.exceptions import DriveError
 
 ARM_SETTINGS: Final = (
@@ -29,6 +29,41 @@ _AXES = ("axis0", "axis1")
 _DIRECTION = "encoder.config.direction"
 _COUNTS = ("encoder.shadow_count", "encoder.count_in_cpr", "encoder.config.cpr")
 _THERMISTORS = ("motor.fet_thermistor.temperature", "motor.motor_thermistor.temperature")
+
+
+class AxesStatus:
+    """Judges both axes, and remembers which were armed: one that left closed loop is an error."""
+
+    def __init__(self) -> None:
+        """Begin after a request to arm or idle: neither axis has been armed since."""
+        self._was_armed = [False, False]
+
+    def judge(self, states: Sequence[int], errors: int) -> DriveStatus:
+        """Return the status by `current_state` of both axes and `errors`.
+
+        An axis that left closed loop is an error even without an error bit: OVERSPEED
+        leaves `axis.error` at 0.
+        """
+        closed = [state == AxisState.CLOSED_LOOP_CONTROL for state in states]
+        both = list(zip(self._was_armed, closed, strict=True))
+        self._was_armed = [was or now for was, now in both]
+        if errors or any(was and not now for was, now in both):
+            return DriveStatus.ERROR
+        return DriveStatus.ARMED if all(closed) else DriveStatus.IDLE
+
+    @staticmethod
+    def errors(registers: Sequence[int], *, wanted_armed: bool) -> int:
+        """Return `AxisError` bits of (axis, motor, encoder, controller) of axis0, then axis1.
+
+        A watchdog that ran out in IDLE only shows that nothing was written yet, and is no error.
+        """
+        errors = 0
+        for i in (0, 4):
+            axis, motor, encoder, controller = registers[i : i + 4]
+            errors |= Heartbeat(
+                axis, 0, motor != 0, encoder != 0, controller != 0, trajectory_done=True
+            ).errors
+        return int(errors if wanted_armed else errors & ~AxisError.WATCHDOG_TIMER_EXPIRED)
 
 
 class EndpointBatch:

@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 
 from services.simulator.drives.axis_encoders import AxisEncoders
-from services.simulator.drives.axis_faults import AxisErrors
+from services.simulator.drives.axis_faults import AxisErrors, encoder_fault, motor_fault
 from services.simulator.drives.axis_settings import (
     DIRECTION,
     PHASE_INDUCTANCE,
@@ -116,9 +116,7 @@ class Calibration:
     def take_mark(self, axis: int, name: str) -> None:
         """Act on a written `pre_calibrated`: a motor believes it, an encoder that is not ready not.
 
-        Args:
-            axis: 0 .. 11.
-            name: of the setting, below the axis.
+        `name` is the setting's, below the axis.
         """
         if name == "motor.config.pre_calibrated":
             self.motor[axis] = self.motor[axis] or self._setting(axis, name) > 0.0
@@ -138,11 +136,7 @@ class Calibration:
     ) -> AxisState | AxisErrors:
         """Begin the first of the states; return it, IDLE if there is none, or why not.
 
-        Args:
-            axis: 0 .. 11.
-            states: one after the other.
-            now_s: time of the bank.
-            latched: the axis has an error, which disarms it in the first cycle.
+        An error that is `latched` disarms the axis in the first cycle.
         """
         if not states:
             return AxisState.IDLE
@@ -155,7 +149,7 @@ class Calibration:
             if state == _MOTOR:
                 self._settings.find(axis, "motor.config.phase_resistance", 0.0)
             return AxisState.IDLE
-        count = self._count(axis)
+        count = self._encoders.counted(axis)
         self.running[axis] = _Task(state, tuple(rest), now_s, count=count, locked_count=count)
         return state
 
@@ -172,9 +166,7 @@ class Calibration:
     def stop(self, axis: int, *, requested: bool = False) -> AxisErrors:
         """Break off what an axis is at; return the error that the firmware makes of the half.
 
-        Args:
-            axis: 0 .. 11.
-            requested: by a request for another state, else it was disarmed.
+        It is `requested` by a request for another state; else the axis was disarmed.
         """
         task = self.running.pop(axis, None)
         if task is None:
@@ -200,11 +192,7 @@ class Calibration:
 
         The motor's calibration sets voltages, so its windings brake the rotor as if they were
         short-circuited. The encoder's sets currents, whose loop lets `BRAKING` of that remain.
-
-        Args:
-            axis: 0 .. 11.
-            pos_turns: where the rotor truly is, turns.
-            vel_turns: its rate, turn/s.
+        `pos_turns` and `vel_turns`, turn/s, are the rotor's in truth.
         """
         task, constant = self.running[axis], self._torque_constant
         ahead = pos_turns + LEAD_S * vel_turns
@@ -229,7 +217,7 @@ class Calibration:
                 axis, "motor.config.resistance_calib_max_voltage"
             ):
                 self._settings.find(axis, "motor.config.phase_resistance", math.nan)
-                return _motor(MotorError.PHASE_RESISTANCE_OUT_OF_RANGE)
+                return motor_fault(MotorError.PHASE_RESISTANCE_OUT_OF_RANGE)
             if elapsed_s >= RESISTANCE_S:
                 self._keep_resistance(axis, task)
                 task.stage, task.current = 1, 0.0  # the shaking has no torque
@@ -249,7 +237,7 @@ class Calibration:
         rate = self._setting(axis, "encoder.config.calib_scan_omega")
         scanned = max(0.0, rate * (elapsed_s - LOCK_S))
         task.phase = -0.5 * distance + distance - abs(distance - min(scanned, 2.0 * distance))
-        task.count = self._count(axis)
+        task.count = self._encoders.counted(axis)
         if task.stage == 0 and elapsed_s >= LOCK_S:
             task.stage, task.locked_count = 1, task.count
         elif task.stage == 1 and scanned >= distance:
@@ -268,7 +256,7 @@ class Calibration:
         """Judge the way out by the encoder's count, and find its direction."""
         response = task.count - task.locked_count
         if abs(response) <= RESPONSE_COUNTS:
-            return _encoder(EncoderError.NO_RESPONSE)
+            return encoder_fault(EncoderError.NO_RESPONSE)
         self._settings.find(axis, "encoder.config.direction", math.copysign(1.0, response))
         turns = self._setting(axis, "encoder.config.calib_scan_distance") / (
             2.0 * math.pi * self._setting(axis, "motor.config.pole_pairs")
@@ -277,14 +265,14 @@ class Calibration:
         self.response[axis] = float(abs(response))
         within = self._setting(axis, "encoder.config.calib_range")
         if abs(abs(response) - expected) > within * expected:
-            return _encoder(EncoderError.CPR_POLEPAIRS_MISMATCH)
+            return encoder_fault(EncoderError.CPR_POLEPAIRS_MISMATCH)
         return _NONE
 
     def _too_much(self, axis: int, current: float) -> AxisErrors | None:
         """Return an error if the field's current is beyond what the drive lets flow."""
         if current <= self._setting(axis, "motor.config.current_lim") + CURRENT_MARGIN:
             return None
-        return _motor(MotorError.CURRENT_LIMIT_VIOLATION)
+        return motor_fault(MotorError.CURRENT_LIMIT_VIOLATION)
 
     def _keep_resistance(self, axis: int, task: _Task) -> None:
         """Keep the voltage there is now over the current that was asked for, there or not."""
@@ -298,16 +286,5 @@ class Calibration:
         self._settings.find(axis, "encoder.config.phase_offset", float(mean))
         self.encoder[axis] = True
 
-    def _count(self, axis: int) -> int:
-        return round(float(self._encoders.turns[axis]) * self._setting(axis, "encoder.config.cpr"))
-
     def _setting(self, axis: int, name: str) -> float:
         return float(self._settings.axis(name)[axis])
-
-
-def _motor(error: MotorError) -> AxisErrors:
-    return AxisErrors(AxisError.MOTOR_FAILED, motor=error)
-
-
-def _encoder(error: EncoderError) -> AxisErrors:
-    return AxisErrors(AxisError.ENCODER_FAILED, encoder=error)

@@ -49,8 +49,14 @@ class AxisErrors(NamedTuple):
 _MOTOR: Final = AxisError.MOTOR_FAILED
 
 
-def _motor(error: MotorError) -> AxisErrors:
+def motor_fault(error: MotorError) -> AxisErrors:
+    """Return what a failed motor leaves."""
     return AxisErrors(_MOTOR, motor=error)
+
+
+def encoder_fault(error: EncoderError) -> AxisErrors:
+    """Return what a failed encoder leaves."""
+    return AxisErrors(AxisError.ENCODER_FAILED, encoder=error)
 
 
 def controller_fault(error: ControllerError) -> AxisErrors:
@@ -78,16 +84,16 @@ FAULTS: Final[Mapping[str, AxisErrors]] = {
     "DISARM": AxisErrors(),
     "OVERSPEED": controller_fault(ControllerError.OVERSPEED),
     "SPINOUT": controller_fault(ControllerError.SPINOUT_DETECTED),
-    "DRV_FAULT": _motor(MotorError.DRV_FAULT),
-    "CURRENT_LIMIT": _motor(MotorError.CURRENT_LIMIT_VIOLATION),
-    "MODULATION_IS_NAN": _motor(MotorError.MODULATION_IS_NAN),
-    "NO_PHASE": _motor(MotorError.UNKNOWN_PHASE_ESTIMATE),
-    "REGENERATION": _motor(MotorError.I_BUS_OUT_OF_RANGE),
+    "DRV_FAULT": motor_fault(MotorError.DRV_FAULT),
+    "CURRENT_LIMIT": motor_fault(MotorError.CURRENT_LIMIT_VIOLATION),
+    "MODULATION_IS_NAN": motor_fault(MotorError.MODULATION_IS_NAN),
+    "NO_PHASE": motor_fault(MotorError.UNKNOWN_PHASE_ESTIMATE),
+    "REGENERATION": motor_fault(MotorError.I_BUS_OUT_OF_RANGE),
     "ENCODER": controller_fault(ControllerError.INVALID_ESTIMATE).with_(
-        AxisErrors(AxisError.ENCODER_FAILED, encoder=EncoderError.ABS_SPI_COM_FAIL)
+        encoder_fault(EncoderError.ABS_SPI_COM_FAIL)
     ),
-    "OVER_TEMP": _motor(MotorError.FET_THERMISTOR_OVER_TEMP),
-    "MOTOR_OVER_TEMP": _motor(MotorError.MOTOR_THERMISTOR_OVER_TEMP),
+    "OVER_TEMP": motor_fault(MotorError.FET_THERMISTOR_OVER_TEMP),
+    "MOTOR_OVER_TEMP": motor_fault(MotorError.MOTOR_THERMISTOR_OVER_TEMP),
     "WATCHDOG": AxisErrors(AxisError.WATCHDOG_TIMER_EXPIRED),
     "ESTOP": AxisErrors(AxisError.ESTOP_REQUESTED),
 }
@@ -101,7 +107,7 @@ SHARED_FAULTS: Final = frozenset({"DRV_FAULT"})
 
 
 def _system(error: OdriveError) -> AxisErrors:
-    return _motor(MotorError.SYSTEM_LEVEL)._replace(odrive=error)
+    return motor_fault(MotorError.SYSTEM_LEVEL)._replace(odrive=error)
 
 
 BUS_FAULTS: Final[Mapping[str, AxisErrors]] = {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from services.joint.drivers.axes_status import AxesStatus
 from services.joint.drivers.base import DriveStatus
 from services.joint.drivers.firmware import (
     OTHER_ERROR,
@@ -15,6 +14,7 @@ from services.joint.drivers.firmware import (
     errors_from_06,
     judged,
 )
+from services.joint.drivers.odrive_v3 import AxesStatus
 from services.simulator.fronts.cansimple_dialects import VERSION_06
 from shared.can import cansimple, cansimple_06
 from shared.can.cansimple import AxisError, AxisState, Heartbeat
