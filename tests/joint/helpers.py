@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any, Literal
 
 import msgspec
@@ -148,11 +147,10 @@ class ModuleBench:
         status: DriveStatus = DriveStatus.IDLE,
         carries: Pair | None = None,
         obeys: bool = True,
-        make: Callable[[RobotConfig, str, LastState], DriveManager] = DriveManager,
     ) -> None:
         """Begin after a service that left `last_state`, with a drive that `carries` torques."""
         self.robot = with_service(robot, loop=loop)
-        self.module = make(self.robot, module, last_state)
+        self.module = DriveManager(self.robot, module, last_state)
         self.ratio = robot.joint.gear_ratio
         self.cycle_ns = round(NS_PER_S / robot.joint_service.rate_hz)
         self.now_ns = T0
@@ -233,7 +231,7 @@ class ModuleBench:
             self.lead(**coupled) if mode is Mode.TRACK else self.cycle()
         assert self.mode is mode
 
-    def freeze(self, lasting_ns: int, q: Pair, v: Pair = (0.0, 0.0)) -> None:
-        """Run no cycle for a while; the joint is then somewhere else."""
+    def freeze(self, lasting_ns: int, q: Pair) -> None:
+        """Run no cycle for a while; the joint then rests somewhere else."""
         self.now_ns += lasting_ns
-        self.q, self.v = q, v
+        self.q, self.v = q, (0.0, 0.0)

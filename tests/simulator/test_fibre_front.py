@@ -35,15 +35,13 @@ class Client:
         self.trailer = crc16(1, text)
         self.endpoints = dict(flat("", json.loads(text)))
 
-    def operate(
-        self, number: int, size: int, payload: bytes = b"", *, sequence: int = 0x81
-    ) -> bytes:
+    def operate(self, number: int, size: int, payload: bytes = b"") -> bytes:
         """Return the payload of an operation's answer."""
         trailer = self.trailer if number else 1
-        packet = struct.pack("<HHH", sequence, number | ANSWER, size) + payload
+        packet = struct.pack("<HHH", 0x81, number | ANSWER, size) + payload
         answer = self.front.answer(packet + struct.pack("<H", trailer))
         assert answer is not None
-        assert struct.unpack_from("<H", answer) == (sequence | ANSWER,)
+        assert struct.unpack_from("<H", answer) == (0x81 | ANSWER,)
         return answer[2:]
 
     def exchange(self, name: str, *value: float) -> Any:

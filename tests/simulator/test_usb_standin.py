@@ -13,13 +13,6 @@ from services.simulator.fronts import usb_standin
 from shared.exceptions import FleetError
 
 
-def compiler(folder: Path, script: str) -> None:
-    """Put a C compiler of our own into a folder."""
-    program = folder / "cc"
-    program.write_text(f"#!/bin/sh\n{script}\n")
-    program.chmod(0o755)
-
-
 def test_it_compiles_without_a_warning(tmp_path: Path) -> None:
     command = ["cc", "-std=gnu11", "-Wall", "-Wextra", "-Wno-unused-parameter", "-Werror", "-c"]
     subprocess.run([*command, "-o", tmp_path / "o", usb_standin.SOURCE], check=True)
@@ -46,7 +39,9 @@ def test_without_a_compiler_the_fix_is_named(
 def test_what_a_compiler_complains_of_is_shown_and_nothing_is_left(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    compiler(tmp_path, "echo no such header >&2; exit 1")
+    program = tmp_path / "cc"
+    program.write_text("#!/bin/sh\necho no such header >&2; exit 1\n")
+    program.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     with pytest.raises(FleetError, match="no such header"):
         usb_standin.build(tmp_path / "lib")

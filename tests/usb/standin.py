@@ -43,9 +43,9 @@ class UsbRobot:
     Hold `lock` to look into or change `bank` and `ports`.
     """
 
-    def __init__(self, robot: RobotConfig, folder: Path, *, watchdog: bool = True) -> None:
+    def __init__(self, robot: RobotConfig, folder: Path) -> None:
         counts = robot.joint.encoder_counts_per_turn
-        self.bank = AxisBank(robot.drive, encoder_counts_per_turn=counts, watchdog=watchdog)
+        self.bank = AxisBank(robot.drive, encoder_counts_per_turn=counts)
         self.ports = [
             FibrePort(
                 FibreFront(EmulatedBoard(self.bank, module, FIRST_SERIAL + module)),

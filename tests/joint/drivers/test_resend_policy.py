@@ -37,10 +37,10 @@ def settled(bench: Bench) -> None:
     bench.commands()
 
 
-def written(bench: Bench, target: MotorTarget, ms: float = 2.0) -> list[int]:
+def written(bench: Bench, target: MotorTarget) -> list[int]:
     """Write a target and return the commands to the second node."""
     bench.driver.write(target)
-    bench.wait(1e-3 * ms)
+    bench.wait(0.002)
     ids = [split_id(message.arbitration_id) for message in bench.bus.sent]
     bench.bus.sent.clear()
     return [command for node, command in ids if node == NODES[1]]
