@@ -8,16 +8,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from services.harness.filter import WrenchFilter
-from services.harness.loop import HarnessLoop
 from services.simulator.fronts.sensor_fronts import BIAS_MAX, HarnessFront
-from services.simulator.fronts.unix_can_hub import UnixCanHub
 from shared.bus.codec import Decoder
-from shared.bus.messages import Tare, Vector6, Wrench
-from shared.can.can_sensor import CanSensor, sensor_of
-from shared.can.loadcell_can import SampleAssembler, pack
+from shared.bus.messages import Tare, Wrench
+from shared.can.can_sensor import sensor_of
+from shared.can.loadcell_can import SampleAssembler
 from shared.clock import NS_PER_MS
-from shared.config.robot_config import RobotConfig
 from shared.config.sections import CanConfig
 from tests.harness.helpers import (
     HARNESS,
@@ -28,7 +24,6 @@ from tests.harness.helpers import (
     ZERO,
     Asked,
     G,
-    Sink,
     cycles,
     legs,
     make_loop,
@@ -52,10 +47,6 @@ class FrameList:
         assembler = SampleAssembler()
         found = [assembler.add(*frame) for packet in self.packets for frame in packet]
         return np.array([forces for forces in found if forces is not None])
-
-
-def sensor_in(run_dir: Path, robot: RobotConfig = ROBOT) -> CanSensor[Vector6]:
-    return sensor_of(robot, robot.harness, SampleAssembler(), run_dir)
 
 
 def test_every_cycle_publishes_once_with_the_next_sequence_number() -> None:
@@ -172,73 +163,13 @@ def test_the_simulated_cells_clip_and_the_service_calls_that_saturated() -> None
     assert not message.valid
 
 
-def test_the_operators_wrench_arrives_through_the_simulated_sensor_within_its_noise(
-    short_dir: Path,
-) -> None:
-    robot = msgspec.structs.replace(
-        ROBOT, simulation=msgspec.structs.replace(ROBOT.simulation, harness_noise=0.5)
-    )
-    path = short_dir / "can_harness.sock"
-    sensor = sensor_in(short_dir, robot)
-    law, sink = WrenchFilter(robot.harness), Sink()
-    loop = HarnessLoop(sensor, law, sink, Asked())
-    wrench = np.array([30.0, -20.0, 150.0, 4.0, 60.0, -5.0])
-    with UnixCanHub(path) as hub:
-        front = HarnessFront(robot, hub, seed=3)
-        t_ns = T0
-        message = loop.cycle(t_ns)
-        errors = []
-        for n in range(TARE_CYCLES + 500):
-            t_ns += PERIOD_NS
-            load = wrench if n > TARE_CYCLES else np.zeros(6)
-            front.send(load[:3], load[3:])
-            message = loop.cycle(t_ns)
-            assert message.valid is (n >= TARE_CYCLES)
-            assert message.age_ns == 0
-            if n > TARE_CYCLES + 50:
-                errors.append(np.subtract([*message.force, *message.moment], wrench))
-        sensor.close()
-    # The noise of six legs through G, before the low-pass makes it smaller.
-    sigma = 0.5 * np.sqrt((G**2).sum(axis=1))
-    assert len(errors) > 400
-    assert (np.std(errors, axis=0) < sigma).all()
-    assert (np.abs(np.mean(errors, axis=0)) < sigma / 2.0).all()
-    assert (np.abs(errors) < 4.0 * sigma).all()
-
-
-def test_the_simulator_going_away_makes_the_wrench_invalid_until_it_is_back(
-    short_dir: Path,
-) -> None:
-    path = short_dir / "can_harness.sock"
-    sensor = sensor_in(short_dir)
-    loop = HarnessLoop(sensor, WrenchFilter(HARNESS), Sink(), Asked())
-    seen: list[bool] = []
-    t_ns = T0
-    for present, count in ((True, 200), (False, 50), (True, 100)):
-        hub = UnixCanHub(path) if present else None
-        for _ in range(count):
-            if hub is not None:
-                hub.poll()
-                hub.broadcast(pack(ZERO))
-            seen.append(loop.cycle(t_ns).valid)
-            t_ns += PERIOD_NS
-        if hub is not None:
-            hub.close()
-    sensor.close()
-    # The last sample is still usable for `stale_ms`; the link is tried every 0.2 s.
-    assert seen[199]
-    assert not any(seen[206:250])
-    assert all(seen[310:])
-    assert sensor.opened == 2
-
-
 def test_a_low_rate_is_no_pause_of_the_process(short_dir: Path) -> None:
     slow = msgspec.structs.replace(
         ROBOT,
         harness=msgspec.structs.replace(HARNESS, rate_hz=20.0),
         can={**ROBOT.can, HARNESS.bus: CanConfig(interface="virtual", channel="{run}")},
     )
-    sensor = sensor_in(short_dir, slow)
+    sensor = sensor_of(slow, slow.harness, SampleAssembler(), short_dir)
     sensor.newest(T0)
     sensor.newest(T0 + 50 * NS_PER_MS)
     assert sensor.discarded == 0

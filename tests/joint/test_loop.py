@@ -55,15 +55,12 @@ class FakeDrive:
         """Where the motors were told that they are."""
         self.torques: list[Pair] = []
         self.targets: list[MotorTarget] = []
-        self.carries: Pair | None = None
-        """Motor torques that a drive which was found armed tells."""
 
     def read(self, _timeout_s: float) -> DriveReading | None:
         if self.silent:
             return None
         pos = motor_from_joint(self.q, self.rig.gear_ratio)
-        found = None if self.armed else self.carries
-        return DriveReading(self.rig.now_ns, pos, (0.0, 0.0), self.status, 0, found)
+        return DriveReading(self.rig.now_ns, pos, (0.0, 0.0), self.status, 0)
 
     def write_torque(self, torque: Pair) -> None:
         self.torques.append(torque)
@@ -231,19 +228,6 @@ def test_both_axes_go_idle_once_one_disarms(rig: Rig) -> None:
     assert rig.drive.armed == 1, "never again by itself"
 
 
-def test_a_drive_that_holds_the_robot_is_taken_over_without_a_step(onboard: Rig) -> None:
-    """Its service has died: the next one carries on with what the motors' loops carry."""
-    drive = onboard.drive
-    drive.status, drive.q, drive.carries = DriveStatus.ARMED, (0.02, -1.1), (0.4, 1.6)
-    onboard.run(10)
-    assert onboard.states.sent[-1].drive == DriveStatus.HOLDING
-    onboard.lead(1)
-    assert (onboard.mode, drive.armed) == (Mode.HOLD, 0)
-    assert drive.targets[0].torque == pytest.approx(drive.carries)
-    at = motor_from_joint(drive.q, onboard.gear_ratio)
-    assert drive.targets[0].pos_turns == pytest.approx(at)
-
-
 @pytest.mark.parametrize("sinks", [False, True], ids=["holds", "sinks"])
 def test_a_service_stopped_alone_leaves_its_drive_as_it_is(onboard: Rig, sinks: bool) -> None:
     onboard.run(20)
@@ -272,16 +256,6 @@ def test_states_carry_the_stamp_of_the_drives_sample(rig: Rig) -> None:
     sampled = rig.states.sent[-1].t_ns
     rig.lead(30)  # 120 ms: a planner that goes on with what it hears
     assert rig.states.sent[-1].t_ns - sampled <= 2 * rig.period_ns
-    assert rig.mode is Mode.HOLD
-
-
-def test_an_unzeroed_drive_is_never_armed_and_once_zeroed_it_is(rig: Rig) -> None:
-    rig.drive.status = DriveStatus.UNZEROED
-    rig.run_ns(3 * ARM_EVERY_NS)
-    assert (rig.mode, rig.drive.armed) == (Mode.DISARMED, 0)
-    assert rig.states.sent[-1].drive == DriveStatus.UNZEROED
-    rig.drive.status = DriveStatus.IDLE
-    rig.run_ns(ARM_EVERY_NS)
     assert rig.mode is Mode.HOLD
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from services.joint.differential import joint_torque
+from services.joint.differential import joint_torque, motor_from_joint
 from services.joint.drive_manager import ARM_EVERY_NS, ArmingInhibit, DriveCommand, DriveManager
 from services.joint.drivers.base import DriveStatus
 from services.joint.pendant import PendantWatch
@@ -130,6 +130,9 @@ def test_it_is_taken_over_with_the_commands_gains_and_the_torque_that_it_carries
     listens, takes_over = service.lead(2, **told)
     assert listens.target is None
     assert takes_over.target is not None
+    assert takes_over.target.torque == pytest.approx(CARRIED)
+    at = motor_from_joint(service.q, service.ratio)
+    assert takes_over.target.pos_turns == pytest.approx(at)
     setpoint = service.module.controller.setpoint
     assert (setpoint.k_p, setpoint.k_d) == (k_p, told["k_d"])
     assert setpoint.q_ref == pytest.approx(service.q)
@@ -199,9 +202,11 @@ def test_an_emergency_stop_waits_until_the_drive_is_known(robot: RobotConfig, un
     assert controller.tau == pytest.approx(joint_torque(CARRIED, service.ratio), abs=2.0)
 
 
-def test_zeroing_a_drive_needs_a_request(robot: RobotConfig) -> None:
-    service = successor(robot, LastState.HELD, DriveStatus.UNZEROED)
+@pytest.mark.parametrize("last_state", [LastState.NOTHING, LastState.HELD])
+def test_a_drive_is_armed_only_once_it_is_zeroed(robot: RobotConfig, last_state: LastState) -> None:
+    service = successor(robot, last_state, DriveStatus.UNZEROED)
     assert DriveCommand.ARM not in orders(service, NS_PER_S)
+    assert service.module.controller.state(service.now_ns).drive == DriveStatus.UNZEROED
     service.status = DriveStatus.IDLE
     assert DriveCommand.ARM in orders(service, ARM_EVERY_NS + 10 * NS_PER_MS)
 

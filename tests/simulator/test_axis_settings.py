@@ -111,21 +111,6 @@ def test_the_bank_acts_on_a_setting_from_the_next_step_on() -> None:
     assert bank.state[1] == AxisState.CLOSED_LOOP_CONTROL
 
 
-def test_without_its_velocity_limit_torque_mode_drives_beyond_it() -> None:
-    speed = np.full(12, 65.0)
-    torques = []
-    for enabled in (True, False):
-        bank = make_bank()
-        bank.settings.fill("config.dc_max_negative_current", -math.inf)
-        bank.settings.fill("motor.config.current_lim_margin", math.inf)  # it starts at speed
-        bank.settings.fill("controller.config.enable_torque_mode_vel_limit", enabled)
-        bank.vel_gain[:] = 0.1
-        bank.input_torque[:] = 1.0
-        torques.append(step_for(bank, 0.05, vel=speed)[0])
-    assert torques[0] == pytest.approx(-0.5, abs=0.05)
-    assert torques[1] == 1.0
-
-
 def test_a_wrong_cpr_scales_the_position() -> None:
     bank = make_bank()
     bank.settings.set(0, "axis0.encoder.config.cpr", CPR // 2)

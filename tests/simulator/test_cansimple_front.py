@@ -14,7 +14,6 @@ import pytest
 from services.simulator.drives.axis_faults import BUS_FAULTS, FAULTS
 from services.simulator.fronts.cansimple_dialects import (
     SDO_ENDPOINTS,
-    VERSION_06,
     DialectName,
     errors_06,
 )
@@ -154,14 +153,6 @@ def test_a_frame_of_another_node_changes_nothing(old: Bench) -> None:
 # ---- dialects
 
 
-def test_a_drive_of_0_6_replies_with_its_version_and_one_of_0_5_not_at_all(
-    old: Bench, new: Bench
-) -> None:
-    assert cansimple_06.unpack_version(new.ask(Command06.GET_VERSION)) == VERSION_06
-    old.send(Command06.GET_VERSION, remote=True)
-    assert old.heard() == []
-
-
 def test_a_fault_has_each_dialects_own_bits(old: Bench, new: Bench) -> None:
     for each in (old, new):
         each.bank.inject("knee_right.axis1", "WATCHDOG")
@@ -206,17 +197,6 @@ def test_a_heartbeat_of_0_6_says_how_a_calibration_went(
     heartbeat = cansimple_06.unpack_heartbeat(new.heartbeat())
     assert heartbeat.procedure_result == ProcedureResult[result]
     assert heartbeat.axis_error == DriveError06.CALIBRATION_ERROR
-
-
-def test_set_points_and_gains_are_taken_alike_in_both_dialects(old: Bench, new: Bench) -> None:
-    for each in (old, new):
-        each.send(Command.SET_INPUT_POS, struct.pack("<fhh", 1.5, 250, -500))
-        each.send(Command.SET_VEL_GAINS, struct.pack("<ff", 0.5, 0.0))
-        each.send(Command.SET_LIMITS, struct.pack("<ff", 30.0, 20.0))
-        bank = each.bank
-        got = (bank.input_pos[AXIS], bank.input_vel[AXIS], bank.input_torque[AXIS])
-        assert got == (1.5, 0.25, -0.5)
-        assert (bank.vel_gain[AXIS], bank.vel_limit[AXIS]) == (0.5, 30.0)
 
 
 # ---- endpoints
