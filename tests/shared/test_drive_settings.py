@@ -9,6 +9,7 @@ import pytest
 
 from services.simulator.drives.axis_settings import (
     AXIS_SETTINGS,
+    DRIVE_SETTINGS,
     NAMES,
     PHASE_RESISTANCE,
     Settings,
@@ -78,7 +79,7 @@ def test_a_drive_as_shipped_does_not_fit_at_any_trap(robot: RobotConfig, trap: s
 
 def test_a_drive_as_shipped_trips_at_the_first_braking_leg(robot: RobotConfig) -> None:
     row = next(r for r in of_module(robot, "hip_left") if r.name.endswith("negative_current"))
-    assert not row.fits(-0.01)
+    assert not row.fits(DRIVE_SETTINGS[row.name])
     assert row.fits(robot.drive.dc_max_negative_current)
 
 

@@ -12,30 +12,6 @@ from shared.can.cansimple import AxisState
 from shared.exceptions import DriveError
 from tests.simulator.banks import CPR, DRIVE, DT, make_bank, step_for
 
-TRAPS = {
-    "axis0.controller.config.vel_limit": (2.0, 60.0),
-    "axis0.controller.config.vel_integrator_gain": (1.0 / 3.0, 0.0),
-    "axis0.controller.config.enable_torque_mode_vel_limit": (True, None),
-    "axis0.controller.config.vel_limit_tolerance": (1.2, None),
-    "axis0.controller.config.spinout_electrical_power_threshold": (10.0, None),
-    "axis0.controller.config.spinout_mechanical_power_threshold": (-10.0, None),
-    "axis0.motor.config.current_lim": (10.0, 60.0),
-    "axis0.config.can.encoder_rate_ms": (10, 1),
-    "axis0.config.enable_watchdog": (False, True),
-    "axis0.config.watchdog_timeout": (0.0, 0.1),
-    "config.dc_max_negative_current": (-0.01, -30.0),
-}
-"""Values as shipped, and as the robot wants them; None: `tests/tools/bringup` has what it wants."""
-
-
-@pytest.mark.parametrize("name", TRAPS)
-def test_a_drive_as_shipped_has_every_trap_and_a_configured_one_none(name: str) -> None:
-    shipped, wanted = TRAPS[name]
-    assert Settings().get(3, name) == shipped
-    found = configured(DRIVE, encoder_counts_per_turn=CPR)
-    for each in (name, name.replace("axis0", "axis1")):
-        assert wanted is None or found.get(5, each) == wanted
-
 
 def test_a_value_set_by_name_is_that_drives_alone_and_of_its_own_type() -> None:
     settings = Settings()
