@@ -184,15 +184,6 @@ def test_a_watchdog_that_is_off_does_not_count_down() -> None:
     assert bank.state[0] == IDLE
 
 
-def test_rearming_brings_back_the_old_input_torque() -> None:
-    bank = make_bank()
-    bank.input_torque[5] = 1.25
-    bank.request_state(5, IDLE)
-    assert step_for(bank, DT)[5] == 0.0
-    bank.request_state(5, CLOSED_LOOP)
-    assert step_for(bank, DT)[5] == 1.25
-
-
 def test_state_that_is_not_emulated_is_invalid_and_leads_to_idle() -> None:
     bank = make_bank()
     bank.request_state(7, AxisState.HOMING)

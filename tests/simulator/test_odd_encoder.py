@@ -169,15 +169,6 @@ def test_an_encoder_that_reads_zero_freezes_at_its_nearest_turn_without_any_erro
     assert bank.state[AXIS] == CLOSED_LOOP, "armed, and blind for as long as it likes"
 
 
-def test_an_armed_axis_whose_encoder_reads_zero_is_overspeed_with_no_encoder_error() -> None:
-    bank = make_bank()
-    read(bank, Words.ZERO)
-    step_for(bank, DT)
-    assert bank.state[AXIS] == IDLE
-    assert bank.faults[AXIS].controller == ControllerError.OVERSPEED
-    assert bank.faults[AXIS].encoder == 0
-
-
 def test_a_lost_encoder_in_idle_says_so_and_its_controller_only_once_it_has_been_armed() -> None:
     bank = idle_bank(watchdog=False)
     bank.request_state(AXIS, CLOSED_LOOP)
