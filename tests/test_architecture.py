@@ -73,7 +73,8 @@ VENDORS = {
         "tools/output.py",
         "tools/judge/figure.py",
         "tools/lab/design/damping_picture.py",
-        "tools/lab/studies/*/*picture.py",
+        "tools/lab/studies/sweeps/kill.py",
+        "tools/lab/studies/sweeps/latency_report.py",
     ],
     "PIL": ["tools/judge/reports/moving_picture.py"],
     "casadi": [

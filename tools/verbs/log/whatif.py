@@ -18,8 +18,13 @@ from shared.joints import MODULES
 from shared.toml_file import Range, parse_toml
 from tools.flags import FINITE_MAX, RUN_HELP, Arg, Count, Duration, Folder, option, positional
 from tools.judge.run_parts import PartFlags, read_asked
-from tools.lab.studies.counterfactual.moments import moments_of
-from tools.lab.studies.counterfactual.run import Counterfactual, Task, counterfactual_of, draw
+from tools.lab.studies.counterfactual import (
+    Counterfactual,
+    Task,
+    counterfactual_of,
+    draw,
+    moments_of,
+)
 from tools.lab.studies.sweeps.pool import cores, results
 from tools.lab.studies.sweeps.study import bar
 from tools.live.experiment import PLANT_FILE

@@ -14,8 +14,13 @@ from shared.config.scenarios import Fault, Scenario
 from shared.exceptions import RunError
 from tests.lockstep.runs import kill, push, run, still
 from tools import cli
-from tools.lab.studies.counterfactual.moments import Moment, moments_of
-from tools.lab.studies.counterfactual.run import Task, counterfactual_of, scenario_from
+from tools.lab.studies.counterfactual import (
+    Moment,
+    Task,
+    counterfactual_of,
+    moments_of,
+    scenario_from,
+)
 from tools.logs.run_log import RunLog, read_run, robot_of
 from tools.sim.network import BASE
 from tools.sim.recorded_lockstep import simulate

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -56,10 +56,6 @@ class Confusion(NamedTuple):
     """The certificate said stand, and it fell: the dangerous mistake."""
     fall_stood: int
     fall_fell: int
-
-
-def _options(flags: CertificateStudyFlags) -> dict[str, Any]:
-    return {"rigid": flags.rigid, "plant": IDEAL if flags.friction else FRICTIONLESS}
 
 
 def report(finished: Finished) -> None:
@@ -120,7 +116,10 @@ STUDY: Final = Study[CertificateCase](
     words=lambda case: f"margin {case.weakest.margin:.3g}",
     figures=CertificateResult,
     trial=certificate_trial.run_case,
-    options=_options,
+    options=lambda flags: {
+        "rigid": flags.rigid,
+        "plant": IDEAL if flags.friction else FRICTIONLESS,
+    },
     fell=lambda row: not row["stood"],
     report=report,
     exit_code=lambda rows: (

@@ -14,7 +14,7 @@ import msgspec
 from shared.config.robot_config import RobotConfig
 from shared.toml_file import check_ranges
 from tools.flags import Arg, Count, Number, parsed
-from tools.lab.studies.sweeps import latency_picture, latency_report, latency_trial, plants, study
+from tools.lab.studies.sweeps import latency_report, latency_trial, plants, study
 from tools.lab.studies.sweeps.latency_trial import (
     CONTROLS,
     LatencyResult,
@@ -153,7 +153,7 @@ def _robots(
 def _report(finished: Finished) -> None:
     force_max = finished.robot.simulation.operator.force_max
     seed = f"seed {finished.flags.seed}"
-    latency_picture.draw(finished.rows, force_max, seed, finished.out)
+    latency_report.draw(finished.rows, force_max, seed, finished.out)
     latency_report.show(finished.rows, finished.command, finished.console)
 
 
@@ -161,7 +161,7 @@ STUDY: Final = Study[LatencyTrial](
     name="latency",
     case="trial",
     table="latency.csv",
-    pictures=(latency_picture.FALLS, latency_picture.EFFORT),
+    pictures=(latency_report.FALLS, latency_report.EFFORT),
     code=("tools.lab.studies.sweeps.latency_trial",),
     load=load,
     total=lambda flags: flags.trials * len(grid_of(flags)),

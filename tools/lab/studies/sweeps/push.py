@@ -72,10 +72,6 @@ def _inputs(flags: PushStudyFlags) -> dict[str, str]:
     return {"plant": plants.to_toml(plant_from(flags.plant)), "grid": grid}
 
 
-def _options(flags: PushStudyFlags) -> dict[str, Any]:
-    return {"plant": plant_from(flags.plant)}
-
-
 def _report(finished: Finished) -> None:
     """Draw the envelopes; print the weakest direction of each pose, duration and mode."""
     draw(finished.rows, finished.out / PICTURE)
@@ -142,7 +138,7 @@ STUDY: Final = Study[PushTrial](
     words=lambda point: point.words,
     figures=PushResult,
     trial=push_trial.run_trial,
-    options=_options,
+    options=lambda flags: {"plant": plant_from(flags.plant)},
     fell=lambda _row: False,
     report=_report,
     exit_code=lambda _rows: 0,

@@ -68,11 +68,6 @@ class RobustStudyFlags(AloneFlags, ImuFlags, PushFlags):
         plants.draw("check", beyond=self.beyond)
 
 
-def load(flags: RobustStudyFlags) -> RobotConfig:
-    """Check the flags and return the robot."""
-    return experiment.load_robot(flags.config, imu=flags.imu)
-
-
 def _cases(flags: RobustStudyFlags, robot: RobotConfig) -> Callable[[int], RobustTrial]:
     pushes = PushRange(robot, flags.push)
     return lambda number: robust_trial.draw(pushes, flags.seed, number, flags.beyond, flags.slope)
@@ -148,24 +143,24 @@ def draw(rows: Sequence[Row], title: str, path: Path) -> None:
     save_figure(figure, path)
 
 
-def _metadata(trial: RobustTrial, command: str) -> dict[str, str]:
-    return {"lockstep": f"{command}; delay {trial.delay_ms:g} ms"}
-
-
 STUDY: Final = Study[RobustTrial](
     name="robust",
     case="trial",
     table="trials.csv",
     pictures=(PICTURE,),
     code=("tools.lab.studies.sweeps.robust_trial",),
-    load=load,
+    load=lambda flags: experiment.load_robot(flags.config, imu=flags.imu),
     cases=_cases,
     decided_by=("seed", "beyond", "slope", "push"),
     inputs=lambda _flags: {"ranges": plants.digest()},
     row=robust_trial.row_of,
     figures=RobustResult,
     trial=robust_trial.run_trial,
-    log=CaseLog(robust_trial.scenario_of, robust_trial.plant_of, _metadata),
+    log=CaseLog(
+        robust_trial.scenario_of,
+        robust_trial.plant_of,
+        lambda trial, command: {"lockstep": f"{command}; delay {trial.delay_ms:g} ms"},
+    ),
     report=report,
 )
 

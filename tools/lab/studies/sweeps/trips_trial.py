@@ -175,8 +175,8 @@ TROUBLES: Final[Mapping[str, Trouble]] = {
 }  # fmt: skip
 
 
-class _Seen:
-    """Result of a run."""
+class TripRun:
+    """A run and what tripped in it."""
 
     def __init__(self, robot: RobotConfig, trouble: Trouble, plant: PlantConfig, seed: int) -> None:
         self.trips: dict[str, int] = {}
@@ -231,8 +231,8 @@ def run_trial(trial: TripTrial, robot: RobotConfig, seed: int) -> TripResult:
     """Run a trouble on a plant, with trips and without; `seed` is the noise's."""
     trouble, plant = TROUBLES[trial.trouble], PLANTS[trial.on]
     robot = unfiltered(robot) if trouble.unfiltered else robot
-    seen = _Seen(robot, trouble, plant, seed)
-    without = _Seen(untripped(robot), trouble, plant, seed)
+    seen = TripRun(robot, trouble, plant, seed)
+    without = TripRun(untripped(robot), trouble, plant, seed)
     return TripResult(
         led=seen.fleet.world.scenario_s > BEGINS_S,
         tripped=" ".join(sorted(seen.trips, key=lambda name: seen.trips[name])),

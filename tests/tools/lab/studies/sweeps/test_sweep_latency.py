@@ -15,8 +15,9 @@ from shared.bus.messages import JointEvent, Mode
 from shared.config import scenarios
 from shared.config.robot_config import RobotConfig
 from shared.links import DIRECTIONS
+from tests.messages import sample
 from tools.flags import add_flags, read_flags
-from tools.lab.studies.sweeps import latency, latency_picture, latency_report
+from tools.lab.studies.sweeps import latency, latency_report
 from tools.lab.studies.sweeps.figures import Ending
 from tools.lab.studies.sweeps.latency_trial import (
     CONTROLS,
@@ -72,14 +73,11 @@ def trial(**changes: Any) -> LatencyTrial:
         ("0:25:10", (0.0, 10.0, 20.0)),
         ("5:5:1", (5.0,)),
         (".5", (0.5,)),
+        ("0:0.5:0.1", (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)),
     ],
 )
 def test_values_are_written_as_a_range_or_a_list(text: str, values: tuple[float, ...]) -> None:
     assert latency.values_in(0.0, 1000.0)(text) == values
-
-
-def test_steps_of_a_tenth_end_at_their_end() -> None:
-    assert latency.values_in(0.0, 1.0)("0:0.5:0.1") == (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 
 
 @pytest.mark.parametrize("text", ["", "a", "-1", "0:10", "10:0:1", "0:10:0", "0:10000:0.001", "2"])
@@ -194,19 +192,6 @@ def test_a_control_differs_in_what_its_name_states(robot: RobotConfig) -> None:
     assert CONTROLS["distributed"].fleet is CONTROLS["diagonal"].fleet is Lockstep
 
 
-def event(t_ns: int, after: Mode) -> JointEvent:
-    return JointEvent(
-        t_ns=t_ns,
-        seq=0,
-        mode_before=0,
-        mode_after=int(after),
-        cause=0,
-        age_ns=0,
-        tau_before=(0.0, 0.0),
-        tau_after=(0.0, 0.0),
-    )
-
-
 @pytest.mark.parametrize(
     ("rows", "share"),
     [
@@ -225,7 +210,7 @@ def event(t_ns: int, after: Mode) -> JointEvent:
 def test_the_robot_holds_while_any_module_does_that_did_before_the_network_got_bad_included(
     rows: list[tuple[str, int, Mode]], share: float
 ) -> None:
-    events = [(name, event(t, after)) for name, t, after in rows]
+    events = [(name, sample(JointEvent, t_ns=t, mode_after=int(after))) for name, t, after in rows]
     assert hold_share(events, 0, 100) == pytest.approx(share)
 
 
@@ -281,8 +266,8 @@ def test_each_delay_has_bounds_of_its_own_and_names_their_mix(
 
 def test_a_study_with_trials_missing_reports_how_many_there_are() -> None:
     rows = made_up(lambda *_: False)
-    assert latency_picture._each(rows) == "4 trials a point"
-    assert latency_picture._each(rows[:-1]) == "3 to 4 trials a point"
+    assert latency_report._each(rows) == "4 trials a point"
+    assert latency_report._each(rows[:-1]) == "3 to 4 trials a point"
 
 
 def test_pictures_are_drawn_of_what_there_is(tmp_path: Path) -> None:
@@ -292,7 +277,7 @@ def test_pictures_are_drawn_of_what_there_is(tmp_path: Path) -> None:
     for name, some in (("all", rows), ("few", short)):
         folder = tmp_path / name
         folder.mkdir()
-        latency_picture.draw(some, 150.0, "made up", folder)
+        latency_report.draw(some, 150.0, "made up", folder)
         sizes = [path.stat().st_size for path in folder.iterdir()]
         assert len(sizes) == 2
         assert all(10_000 < size < 150_000 for size in sizes)

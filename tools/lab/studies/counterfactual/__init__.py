@@ -1,1 +1,0 @@
-"""What would have come of a recorded run, had something died in it."""
