@@ -13,6 +13,7 @@ from shared.config.files import load
 from shared.config.scenarios import Keyframe, Lead, Scenario
 from shared.places import DEFAULT_CONFIG
 from tools.sim.lockstep import Lockstep
+from tools.sim.standing_start import begin_standing
 
 LIMIT = 12.0  # N
 
@@ -35,6 +36,7 @@ def main() -> None:
     scenario = Scenario(name="gentle", about="down by 0.2 m", duration=3.5, keyframe=down)
     for name, hand in (("shipped", Operator), ("gentle", GentleHand)):
         fleet = Lockstep(robot, scenario, seed=1)
+        begin_standing(fleet)
         fleet.world.outside.operator = hand(robot.simulation.operator, robot.geometry.harness_point)
         rows = [row for row in fleet.run() if row.scenario_s >= 0.0]
         peak = max(abs(row.operator_force[2]) for row in rows)

@@ -8,6 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from shared.config.robot_config import RobotConfig
+from tests.lockstep.runs import still
+from tests.tools.exit_codes import exit_code
+from tools.sim.network import BASE
+from tools.sim.recorded_lockstep import simulate
+
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
 
@@ -48,25 +54,19 @@ def test_the_robot_in_virtual_time_holds_while_the_planner_is_dead_and_is_led_ag
 
 
 def test_the_lqr_leads_in_the_planners_place_and_the_robot_stands_when_it_is_killed(
-    tmp_path: Path,
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["sim", "--controller", str(EXAMPLES / "lqr_controller.py"), "--scenario", "squat"]
-    words += ["--duration", "3", "--kill", "planner@1.5", "--out", str(tmp_path / "run")]
-    done = subprocess.run(
-        [sys.executable, "-m", "tools.cli", *words],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "STOOD" in done.stdout
+    words = ["sim", "--controller", EXAMPLES / "lqr_controller.py", "--scenario", "squat"]
+    words += ["--duration", "3", "--kill", "planner@1.5", "--out", tmp_path / "run"]
+    assert exit_code(words) == 0
+    assert "STOOD" in capsys.readouterr().out
 
 
-def test_a_controller_that_is_not_there_leaves_nothing_behind(tmp_path: Path) -> None:
-    words = ["sim", "--controller", "nowhere.py", "--out", str(tmp_path / "run")]
-    done = subprocess.run(
-        [sys.executable, "-m", "tools.cli", *words], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 2
-    assert "nowhere.py: --controller: no such file" in done.stderr
+def test_a_controller_that_is_not_there_leaves_nothing_behind(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert exit_code(["sim", "--controller", "nowhere.py", "--out", tmp_path / "run"]) == 2
+    assert "nowhere.py: --controller: no such file" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
@@ -77,19 +77,9 @@ def test_a_gentler_hand_leads_the_same_squat_with_less_force() -> None:
     assert float(gentle[height]) == pytest.approx(float(shipped[height]), abs=0.005)
 
 
-def test_a_run_is_read_into_numpy(tmp_path: Path) -> None:
-    simulate = [
-        sys.executable,
-        "-m",
-        "tools.cli",
-        "sim",
-        "--duration",
-        "1",
-        "--out",
-        tmp_path / "run",
-    ]
-    subprocess.run(simulate, cwd=ROOT, capture_output=True, check=True)
-    lines = run("read_a_run.py", str(tmp_path / "run" / "run.mcap")).splitlines()
+def test_a_run_is_read_into_numpy(tmp_path: Path, robot: RobotConfig) -> None:
+    simulate(robot, still(1.0), BASE, 0, tmp_path)
+    lines = run("read_a_run.py", str(tmp_path / "run.mcap")).splitlines()
     assert lines[0].startswith("1.0 s, COM x ")
     assert "states, age 4." in lines[1]
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
-
 from tools.lab.bench.table import Row
 from tools.lab.bench.timing import Cost, Spread
 from tools.lab.bench.worker import Answer, PartRow, Request, row_of
@@ -35,13 +33,6 @@ def test_a_time_is_the_median_of_the_turns_with_its_ratio_to_the_yardstick() -> 
 
 def test_cold_calls_are_named_so() -> None:
     assert rows([timed(1.0)], [], request=Request("tick", cold=True, calls=9)).what == "tick, cold"
-
-
-def test_two_revisions_are_compared_turn_by_turn() -> None:
-    """The machine was half as fast in the second turn: the ratio does not see it."""
-    row = rows([timed(100.0), timed(200.0)], [timed(125.0), timed(250.0)])
-    assert row.other == 187.5
-    assert row.ratio == pytest.approx(0.8)
 
 
 def test_a_part_that_a_tree_does_not_have_has_no_row_and_no_ratio() -> None:

@@ -229,13 +229,6 @@ def test_a_hand_that_moves_it_feels_little_more_than_its_mass(
     assert abs(loop.impedance_z(w)) == pytest.approx(felt * w, rel=0.4)
 
 
-def test_the_shipped_design_is_stable_at_its_poses(
-    certificate: DynamicCertificate, design: Design
-) -> None:
-    verdict = certificate.worst(design, margins=False)
-    assert verdict.stable, verdict.words()
-
-
 @pytest.mark.parametrize("stiffness", [2000.0, 8000.0, 20000.0])
 def test_yesterday_s_coupling_is_called_unstable(
     nodes: list[StiffnessNode], certificate: DynamicCertificate, design: Design, stiffness: float
@@ -288,10 +281,11 @@ def test_a_blind_module_adds_its_stiffness_along_the_axis_that_still_sees(
 
 
 def test_until_its_drive_says_so_a_blind_encoder_lets_motions_grow_by_half_at_most(
-    certificate: DynamicCertificate, nodes: list[StiffnessNode], design: Design, robot: RobotConfig
+    nodes: list[StiffnessNode], design: Design, robot: RobotConfig
 ) -> None:
-    assert certificate.worst(design, BLIND).stable
-    heavy = [n._replace(stand=n.stand._replace(K_geo=8.0 * n.stand.K_geo)) for n in nodes]
+    """All poses of the schedule are in `test_split_program.py`, as shipped."""
+    assert DynamicCertificate(robot, nodes[:1]).worst(design, BLIND).stable
+    heavy = [n._replace(stand=n.stand._replace(K_geo=8.0 * n.stand.K_geo)) for n in nodes[:1]]
     verdict = DynamicCertificate(robot, heavy).worst(design, BLIND)
     assert not verdict.stable
     assert verdict.condition.mode in BLIND

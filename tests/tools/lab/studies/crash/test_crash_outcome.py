@@ -12,6 +12,7 @@ from shared.bus.traces import SimTruth
 from shared.config import scenarios
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
+from tests.messages import filled, sample
 from tools.lab.studies.crash.cases import (
     BACK_S,
     CASES,
@@ -30,40 +31,27 @@ KNEE = BY_NAME["kill-knee_left"]
 S = 1_000_000_000
 
 
+AT_REST: SimTruth = filled(SimTruth, {bool: False, int: 0, float: 0.0})
+
+
 def truth(t: float, **changes: object) -> SimTruth:
-    row = SimTruth(
-        t_ns=round((t + 7.0) * S),
-        seq=round(t * 100),
-        scenario_s=t,
-        com=(0.0, 0.0, 0.8),
-        torso=(0.0, 0.0, scenarios.lead(scenario_of(BY_NAME["kill-planner"]), t).height),
-        angles=(0.0, 0.0, 0.0),
-        operator_force=(0.0, 0.0, 0.0),
-        operator_moment=(0.0, 0.0, 0.0),
-        load_n=0.0,
-        harness_force_z=0.0,
-        push=(0.0, 0.0, 0.0),
-        foot_right_tilt=0.0,
-        foot_left_tilt=0.0,
-        feet_slip=0.0,
-        hoist=0.0,
-        fallen=False,
-        real_time_factor=1.0,
-        late_s=0.0,
-    )
-    return msgspec.structs.replace(row, **changes)
+    height = scenarios.lead(scenario_of(PLANNER), t).height
+    row = {
+        "t_ns": round((t + 7.0) * S), "scenario_s": t, "com": (0.0, 0.0, 0.8),
+        "torso": (0.0, 0.0, height), "real_time_factor": 1.0,
+    }  # fmt: skip
+    return msgspec.structs.replace(AT_REST, **(row | changes))
 
 
 def change(
     t: float, module: str, before: Mode, after: Mode, step: float = 0.0
 ) -> tuple[str, JointEvent]:
-    event = JointEvent(
+    event = sample(
+        JointEvent,
         t_ns=round((t + 7.0) * S),
-        seq=1,
         mode_before=int(before),
         mode_after=int(after),
         cause=4,
-        age_ns=0,
         tau_before=(1.0, 2.0),
         tau_after=(1.0, 2.0 - step),
     )

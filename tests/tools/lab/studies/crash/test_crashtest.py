@@ -15,7 +15,7 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Kill
 from shared.exceptions import RunError
 from shared.joints import MODULES
-from tests.tools.test_cli import assert_one_line_error, xrl
+from tests.tools.exit_codes import exit_code
 from tools.fleet.supervisor_client import ServiceInfo
 from tools.lab.studies.crash import report, runner
 from tools.lab.studies.crash.cases import CASES, CrashCase, CrashVerdict, scenario_of
@@ -192,24 +192,29 @@ def test_cases_are_chosen_by_name_pattern_and_length() -> None:
     assert crash.select(CASES, quick=False, only=()) == list(CASES)
 
 
-def test_a_name_that_fits_no_case_is_one_line_with_those_it_may_mean(tmp_path: Path) -> None:
-    done = xrl("study", "crash", "--only", "kill-kne_left", "--out", str(tmp_path / "out"))
-    assert_one_line_error(done)
-    assert "kill-knee_left" in done.stderr
-    assert "--list" in done.stderr
-    assert not (tmp_path / "out").exists()
+def test_a_name_that_fits_no_case_is_one_line_with_those_it_may_mean(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert exit_code(["study", "crash", "--only", "kill-kne_left", "--out", out]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "kill-knee_left" in line
+    assert "--list" in line
+    assert not out.exists()
 
 
-def test_list_runs_nothing_and_names_every_case(tmp_path: Path) -> None:
-    done = xrl("study", "crash", "--list", "--out", str(tmp_path / "out"))
-    assert done.returncode == 0, done.stderr
-    assert all(case.name in done.stdout for case in CASES)
+def test_list_runs_nothing_and_names_every_case(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert exit_code(["study", "crash", "--list", "--out", tmp_path / "out"]) == 0
+    printed = capsys.readouterr().out
+    assert all(case.name in printed for case in CASES)
     assert not (tmp_path / "out").exists()
 
 
 def test_results_that_are_there_are_left_alone(tmp_path: Path) -> None:
     (tmp_path / report.RESULTS).write_text("kept")
-    assert_one_line_error(xrl("study", "crash", "--quick", "--out", str(tmp_path)))
+    assert exit_code(["study", "crash", "--quick", "--out", tmp_path]) == 2
     assert (tmp_path / report.RESULTS).read_text() == "kept"
 
 

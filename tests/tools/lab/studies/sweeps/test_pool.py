@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import logging
 import multiprocessing
-import os
-import signal
 import sys
 import time
 from collections.abc import Callable
-from concurrent.futures import CancelledError, Future
+from concurrent.futures import Future
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
@@ -19,39 +17,20 @@ import pytest
 
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from tests.tools.lab.studies.sweeps.tables import sweep
+from tests.tools.lab.studies.sweeps.tables import die, give_up, sleep, square, stumble, sweep
 from tools.lab.studies.sweeps import pool
-from tools.lab.studies.sweeps.latency import STUDY
-from tools.lab.studies.sweeps.latency_trial import LatencyResult, LatencyTrial, Network, run_trial
+from tools.lab.studies.sweeps.certificate import STUDY
+from tools.lab.studies.sweeps.certificate_trial import (
+    CertificateCase,
+    CertificateCases,
+    CertificateResult,
+    run_case,
+)
 from tools.lab.studies.sweeps.pool import Cluster
 from tools.lab.studies.sweeps.table import code_digest, code_of
 
 CODE = ("tools/lab/studies/sweeps/pool.py",)
 HERE = Cluster("tcp://127.0.0.1:5", CODE)
-
-
-def square(number: int) -> int:
-    return number * number
-
-
-def stumble(number: int) -> int:
-    if number == 2:
-        raise ValueError("two\nlines")
-    return number
-
-
-def die(_number: int) -> int:
-    os.kill(os.getpid(), signal.SIGKILL)
-    return 0
-
-
-def sleep(seconds: float) -> float:
-    time.sleep(seconds)
-    return seconds
-
-
-def give_up(_number: int) -> int:
-    raise CancelledError("scheduler-connection-lost.\nClient lost the connection.")
 
 
 class Inline(ModuleType):
@@ -175,16 +154,14 @@ def test_dask_logs_nothing_into_a_study(dask: Inline, caplog: pytest.LogCaptureF
     assert logger.level == logging.WARNING
 
 
-def run_task(task: tuple[LatencyTrial, RobotConfig]) -> LatencyResult:
-    return run_trial(*task)
+def run_task(task: tuple[CertificateCase, RobotConfig]) -> CertificateResult:
+    return run_case(*task)
 
 
-def test_a_trial_on_a_real_cluster_is_the_trial_of_this_machine(robot: RobotConfig) -> None:
-    """In a process of its own, as a worker is; it falls early, and so takes no time."""
+def test_a_case_on_a_real_cluster_is_the_case_of_this_machine(robot: RobotConfig) -> None:
+    """In a process of its own, as a worker is."""
     distributed = pytest.importorskip("distributed")
-    network = Network(200.0, 0.0, 0.0)
-    trial = LatencyTrial(number=0, repeat=0, seed=1, control="centralised", network=network)
-    task = trial, robot
+    task = CertificateCases(robot).draw(1, 0), robot
     with distributed.LocalCluster(
         n_workers=1,
         threads_per_worker=1,
@@ -194,6 +171,5 @@ def test_a_trial_on_a_real_cluster_is_the_trial_of_this_machine(robot: RobotConf
         protocol="tcp://",
     ) as local:
         cluster = Cluster(local.scheduler_address, code_of(*STUDY.code))
-        found = list(pool.results(run_task, [task], cluster, lambda _task: "the trial"))
-    assert found == [(task, run_task(task))]
-    assert found[0][1].ending == "fell"
+        ((_, figures),) = pool.results(run_task, [task], cluster, lambda _task: "the case")
+    assert figures == run_task(task)

@@ -18,33 +18,32 @@ import pytest
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from tests.tools.exit_codes import exit_code
-from tests.tools.lab.studies.sweeps.tables import rows_of, sweep
+from tests.tools.lab.studies.sweeps.tables import rows_of, run_cases_here, sweep
 from tools import cli
-from tools.lab.studies.sweeps import kill, latency, study
+from tools.lab.studies.sweeps import kill, latency, push_trial, study
 from tools.lab.studies.sweeps.kill_trial import KillCases
 from tools.lab.studies.sweeps.report import wilson
 from tools.lab.studies.sweeps.table import code_of
 
 KILL = ("kill", "--split", "diagonal")
 """The paper's split needs no gain schedule."""
-SOON_DOWN = (
-    "latency", "--control", "centralised", "--delay", "200", "--loss", "0", "--trials", "1",
-)  # fmt: skip
-"""One trial, in which the baseline falls: no failure of the shipped control."""
+CERTIFICATE = ("certificate", "--rigid")
+"""The study whose cases take the least time."""
 
 
 def _certificate_was_right(row: Mapping[str, str]) -> bool:
     return (float(row["margin"]) > 0.0) == (row["stood"] == "True")
 
 
+@pytest.mark.usefixtures("on_its_feet")
 @pytest.mark.parametrize(
     ("flags", "numbers", "true", "words", "other"),
     [
         (
-            ("certificate", "--n", "2", "--rigid"), 2, _certificate_was_right,
+            (*CERTIFICATE, "--n", "1"), 1, _certificate_was_right,
             "said to fall", ("--seed", "2"),
         ),
-        (("dynamics", "--n", "2"), 2, lambda _row: True, "said to fade", ("--seed", "2")),
+        (("dynamics", "--n", "1"), 1, lambda _row: True, "said to fade", ("--seed", "2")),
         (
             ("push", "--pose", "squat", "--angle", "90", "--duration", "0.3"), 2,
             lambda row: row["mode"] == ("led", "dead")[int(row["number"])]
@@ -55,12 +54,6 @@ def _certificate_was_right(row: Mapping[str, str]) -> bool:
             ("trips", "--trouble", "drops", "--on", "rigid"), 1,
             lambda row: row["tripped"] == "SAGGING",
             "led down by 0.39 m in 0.3 s", ("--trouble", "sags"),
-        ),
-        (
-            SOON_DOWN, 1,
-            lambda row: row["ending"] == "fell" and 0.5 < float(row["fell_at_s"]) < 7.0
-            and float(row["hold_share"]) == 0.0,
-            "centralised: 1 of 1 fell", ("--delay", "100"),
         ),
     ],
     ids=lambda value: value[0] if isinstance(value, tuple) and len(value) > 2 else "",
@@ -73,8 +66,11 @@ def test_a_study_is_tabled_drawn_gone_on_with_and_another_is_refused_in_its_fold
     other: tuple[str, str],
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    assert sweep(*flags, "--workers", 2, "--out", tmp_path) == 0
+    run_cases_here(monkeypatch)
+    monkeypatch.setattr(push_trial, "STEP_N", 80.0)
+    assert sweep(*flags, "--out", tmp_path) == 0
     assert words in capsys.readouterr().out
     (path,) = tmp_path.glob("*.csv")
     table = path.read_bytes()
@@ -94,25 +90,30 @@ def test_the_same_seed_gives_the_same_table_gone_on_with_and_with_any_number_of_
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     a, b = (("--out", tmp_path / name) for name in "ab")
-    sweep(*KILL, "--n", 1, "--workers", 1, *a)
-    first = rows_of(tmp_path / "a" / "cases.csv")
+    sweep(*CERTIFICATE, "--n", 1, "--workers", 1, *a)
+    first = rows_of(tmp_path / "a" / "certificate.csv")
     capsys.readouterr()
-    sweep(*KILL, "--n", 2, "--workers", 1, *a)
+    sweep(*CERTIFICATE, "--n", 2, "--workers", 1, *a)
     assert "1 of 2 cases are done already" in capsys.readouterr().out
-    both = rows_of(tmp_path / "a" / "cases.csv")
+    both = rows_of(tmp_path / "a" / "certificate.csv")
     assert both[0] == first[0]
     assert [row["number"] for row in both] == ["0", "1"]
-    sweep(*KILL, "--n", 2, "--workers", 2, *b)
-    tables = [(tmp_path / name / "cases.csv").read_bytes() for name in "ab"]
+    sweep(*CERTIFICATE, "--n", 2, "--workers", 2, *b)
+    tables = [(tmp_path / name / "certificate.csv").read_bytes() for name in "ab"]
     assert tables[0] == tables[1]
-    assert all((tmp_path / name / "cases.png").stat().st_size > 20_000 for name in "ab")
 
 
-def test_a_single_case_equals_the_case_of_the_study_and_so_does_its_log(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("on_its_feet")
+def test_a_single_case_equals_the_case_of_the_study_and_so_does_its_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The log is judged by the code that judges live runs: another way to the same figures."""
-    sweep(*KILL, "--n", 1, "--out", tmp_path / "all")
-    assert sweep(*KILL, "--only", 0, "--out", tmp_path / "one") == 0
+    run_cases_here(monkeypatch)
+    short = (*KILL, "--seed", 42)
+    sweep(*short, "--n", 1, "--out", tmp_path / "all")
+    assert sweep(*short, "--only", 0, "--out", tmp_path / "one") == 0
     (row,) = rows_of(tmp_path / "all" / "cases.csv")
+    assert (tmp_path / "all" / "cases.png").stat().st_size > 20_000
     summary = json.loads((tmp_path / "one" / "summary.json").read_text())
     # such a push keeps motors at their limit: sound it is not, and the study asks for standing
     assert (summary["stood"] or summary["unsound"] != "") is (row["ending"] == "stood")
@@ -130,25 +131,37 @@ def test_a_single_case_equals_the_case_of_the_study_and_so_does_its_log(tmp_path
         assert float(figure) == pytest.approx(summary[key], rel=1e-4, abs=1e-9), key
 
 
-def test_a_case_alone_that_falls_is_exit_code_1_whatever_the_study_says(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_the_baseline_falls_and_alone_that_is_exit_code_1_whatever_the_study_says(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert sweep(*SOON_DOWN, "--out", tmp_path) == 0, "the shipped control did not fall"
-    capsys.readouterr()
-    assert sweep(*SOON_DOWN, "--only", 0) == 1
+    run_cases_here(monkeypatch)
+    soon_down = ("latency", "--control", "centralised", "--delay", "200", "--loss", "0")
+    of_one = (*soon_down, "--trials", "1", "--out", tmp_path)
+    assert sweep(*of_one) == 0, "the shipped control did not fall"
+    assert "centralised: 1 of 1 fell" in capsys.readouterr().out
+    assert all(path.stat().st_size > 10_000 for path in tmp_path.glob("*.png"))
+    (row,) = rows_of(tmp_path / "latency.csv")
+    assert 0.5 < float(row["fell_at_s"]) < 7.0
+    assert float(row["hold_share"]) == 0.0
+    assert sweep(*of_one, "--delay", "100") == 2
+    assert "holds a study of another" in capsys.readouterr().err
+    assert sweep(*soon_down, "--only", 0) == 1
     lines = (line.split() for line in capsys.readouterr().out.splitlines())
     alone = {words[0]: words[1] for words in lines if len(words) == 2}
-    (row,) = rows_of(tmp_path / "latency.csv")
-    for name in ("ending", "control"):
-        assert alone[name] == row[name]
+    assert alone["ending"] == row["ending"] == "fell"
+    assert alone["control"] == row["control"]
     for name in ("fell_at_s", "operator_peak_n", "com_max_mm", "torque_step_nm"):
         assert float(alone[name]) == pytest.approx(float(row[name]), rel=1e-3)
 
 
 def test_a_fall_is_exit_code_1_with_the_command_that_shows_it(
-    robot: RobotConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    robot: RobotConfig,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A plain average of the legs cannot carry the whole payload: it falls at the start."""
+    run_cases_here(monkeypatch)
     some = KillCases(robot)
     seed = next(s for s in range(100) if some.draw(s, 0).payload_kg == 20.4)
     average = ("--n", 1, "--seed", seed, "--jacobian", "average")
@@ -247,15 +260,15 @@ def test_a_study_that_is_stopped_keeps_its_rows_and_leaves_no_process(
     tmp_path: Path, number: signal.Signals, code: int
 ) -> None:
     """Ctrl-C goes to every process of the terminal; SIGKILL here to the first only."""
-    command = [sys.executable, "-m", "tools.cli", "study", *KILL]
+    command = [sys.executable, "-m", "tools.cli", "study", *CERTIFICATE, "--n", "200"]
     process = subprocess.Popen(
-        [*command, "--n", "200", "--workers", "2", "--out", str(tmp_path)],
+        [*command, "--workers", "2", "--out", str(tmp_path)],
         start_new_session=True,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
     )
-    table = tmp_path / "cases.csv"
+    table = tmp_path / "certificate.csv"
     try:
         wait_until(lambda: table.exists() and len(rows_of(table)) >= 2, "no case came")
         if number is signal.SIGINT:

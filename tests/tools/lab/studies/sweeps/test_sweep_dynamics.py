@@ -78,6 +78,7 @@ def test_drawn_gains_change_the_schedule_and_nothing_else(robot: RobotConfig) ->
     assert msgspec.structs.replace(other, gain_schedule=robot.gain_schedule) == robot
 
 
+@pytest.mark.usefixtures("on_its_feet")
 def test_the_shipped_gains_are_predicted_to_fade_and_fade_and_far_too_fast_a_coupling_grows(
     robot: RobotConfig,
 ) -> None:

@@ -31,12 +31,16 @@ def pushes(robot: RobotConfig) -> PushRange:
     return PushRange(robot)
 
 
-def rows_by(pushes: PushRange, cause: str, n: int = 60) -> list[dict[str, object]]:
+@pytest.fixture(scope="module")
+def drawn(pushes: PushRange) -> list[dict[str, object]]:
+    return [row_of(draw(pushes, 1, number)) for number in range(60)]
+
+
+def rows_by(drawn: list[dict[str, object]], cause: str) -> list[dict[str, object]]:
     """Return made-up rows in which one error alone moves the COM."""
     dice = random.Random(cause)
     rows = []
-    for number in range(n):
-        row = row_of(draw(pushes, 1, number))
+    for row in drawn:
         far = 100.0 * abs(float(row[cause])) + dice.uniform(0.0, 1e-3)
         rows.append(row | {"ending": Ending.STOOD, "com_led_max_mm": far})
     return rows
@@ -59,8 +63,10 @@ def test_every_trial_is_a_scenario_that_ends_after_its_kill(
 
 
 @pytest.mark.parametrize("cause", ["body.com_offset", "drive.lag_s", "floor.slope"])
-def test_the_ranking_finds_the_error_that_moves_the_com(pushes: PushRange, cause: str) -> None:
-    ranked = robust.ranking(rows_by(pushes, cause))
+def test_the_ranking_finds_the_error_that_moves_the_com(
+    drawn: list[dict[str, object]], cause: str
+) -> None:
+    ranked = robust.ranking(rows_by(drawn, cause))
     assert ranked[0][0] == cause
     assert ranked[0][1] > 0.9
     assert abs(ranked[1][1]) < 0.6
@@ -68,10 +74,10 @@ def test_the_ranking_finds_the_error_that_moves_the_com(pushes: PushRange, cause
 
 @pytest.mark.parametrize("few", [True, False])
 def test_of_a_few_trials_no_error_is_ranked(
-    robot: RobotConfig, pushes: PushRange, few: bool, tmp_path: Path
+    robot: RobotConfig, drawn: list[dict[str, object]], few: bool, tmp_path: Path
 ) -> None:
     figures = dict.fromkeys(key for key, _, _ in robust.FIGURES)
-    rows = [figures | row for row in rows_by(pushes, "drive.lag_s")[: robust.RANKED_LEAST - few]]
+    rows = [figures | row for row in rows_by(drawn, "drive.lag_s")[: robust.RANKED_LEAST - few]]
     printed = io.StringIO()
     args = robust.RobustStudyFlags()
     console = Console(width=200, file=printed)
@@ -80,8 +86,10 @@ def test_of_a_few_trials_no_error_is_ranked(
     assert ("drive.lag_s" in printed.getvalue()) is not few
 
 
-def test_a_picture_is_drawn_and_falls_are_in_it(pushes: PushRange, tmp_path: Path) -> None:
-    rows = rows_by(pushes, "drive.lag_s")
+def test_a_picture_is_drawn_and_falls_are_in_it(
+    drawn: list[dict[str, object]], tmp_path: Path
+) -> None:
+    rows = rows_by(drawn, "drive.lag_s")
     rows[3] |= {"ending": Ending.FELL, "com_led_max_mm": None}
     robust.draw(rows, "made up", tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 20_000

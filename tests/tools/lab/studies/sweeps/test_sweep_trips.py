@@ -14,9 +14,11 @@ from shared.robot.trip_table import JOINT_TRIPS, PLANNER_TRIPS
 from tools import cli
 from tools.lab.studies.sweeps.trips import exit_code, wrong_with
 from tools.lab.studies.sweeps.trips_trial import (
+    BEGINS_S,
     PLANTS,
     TROUBLES,
     TripResult,
+    TripRun,
     TripTrial,
     run_trial,
 )
@@ -30,17 +32,30 @@ def row(trouble: str, **changes: object) -> dict[str, object]:
     return begin | figures | {"led": True, "tripped": ""} | changes
 
 
-@pytest.mark.parametrize("trouble", [name for name in TROUBLES if not TROUBLES[name].unfiltered])
+TRIPS = [name for name, trouble in TROUBLES.items() if isinstance(trouble.trip, Trip)]
+"""Without the gains that shake: these are in `tests/lockstep/test_trips.py`, on every plant."""
+
+
+@pytest.mark.parametrize("trouble", TRIPS)
 def test_on_a_plant_of_many_errors_what_is_to_trip_trips_and_stands(
     trouble: str, robot: RobotConfig
 ) -> None:
-    """The gains that shake are in `tests/lockstep/test_trips.py`, on every plant."""
     outcome = run_trial(TripTrial(number=0, trouble=trouble, on=HARD_PLANT), robot, seed=1)
     assert wrong_with(row(trouble) | msgspec.structs.asdict(outcome)) == ""
-    if TROUBLES[trouble].trip is not None:
-        assert outcome.tripped_after_s is not None
-        assert outcome.tripped_after_s > 0.0
-        assert outcome.speed_max < outcome.untripped_speed_max
+    assert outcome.tripped_after_s is not None
+    assert outcome.tripped_after_s > 0.0
+    assert outcome.speed_max < outcome.untripped_speed_max
+
+
+@pytest.mark.parametrize(
+    "trouble", [name for name, trouble in TROUBLES.items() if trouble.trip is None]
+)
+def test_on_a_plant_of_many_errors_nothing_trips_for_nothing_and_it_stands(
+    trouble: str, robot: RobotConfig
+) -> None:
+    seen = TripRun(robot, TROUBLES[trouble], PLANTS[HARD_PLANT], seed=1)
+    assert seen.fleet.world.scenario_s > BEGINS_S
+    assert (seen.trips, seen.fell_at_s) == ({}, None)
 
 
 @pytest.mark.parametrize(

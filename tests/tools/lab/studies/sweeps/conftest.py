@@ -1,0 +1,22 @@
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from tools.lab.studies.sweeps import dynamics_trial, kill_trial
+from tools.sim.lockstep import Lockstep
+from tools.sim.standing_start import begin_standing
+
+
+@pytest.fixture
+def on_its_feet(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let trials begin on their feet: one robot on one plant is let down from its hoist once."""
+
+    def standing(*arguments: Any, **named: Any) -> Lockstep:
+        fleet = Lockstep(*arguments, **named)
+        begin_standing(fleet)
+        return fleet
+
+    for module in (dynamics_trial, kill_trial):
+        monkeypatch.setattr(module, "Lockstep", standing)
