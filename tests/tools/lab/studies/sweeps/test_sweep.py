@@ -87,10 +87,12 @@ def test_a_study_is_tabled_drawn_gone_on_with_and_another_is_refused_in_its_fold
 
 
 def test_the_same_seed_gives_the_same_table_gone_on_with_and_with_any_number_of_workers(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     a, b = (("--out", tmp_path / name) for name in "ab")
-    sweep(*CERTIFICATE, "--n", 1, "--workers", 1, *a)
+    with monkeypatch.context() as patch:
+        run_cases_here(patch)
+        sweep(*CERTIFICATE, "--n", 1, *a)
     first = rows_of(tmp_path / "a" / "certificate.csv")
     capsys.readouterr()
     sweep(*CERTIFICATE, "--n", 2, "--workers", 1, *a)
