@@ -31,7 +31,7 @@ def test_every_example_is_listed_and_tested() -> None:
     scripts = {path.name for path in EXAMPLES.glob("*.py")}
     listed = {name for name in scripts if f"`{name}`" in (EXAMPLES / "README.md").read_text()}
     here = Path(__file__)
-    tests = here.read_text() + (here.parent / "system/test_examples_live.py").read_text()
+    tests = here.read_text() + (here.parent / "system/test_led_live.py").read_text()
     assert listed == scripts == {name for name in scripts if f'"{name}"' in tests}
 
 

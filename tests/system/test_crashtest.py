@@ -14,7 +14,7 @@ import pytest
 from shared.places import CHECKOUT
 from tests.system.fleets import command, leaving_nothing, xrl_led
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(180)]
 
 
 def test_the_robot_stands_when_a_knees_service_is_killed_in_the_squat(tmp_path: Path) -> None:

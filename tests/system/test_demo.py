@@ -1,4 +1,7 @@
-"""The real fleet, live: ten processes, a kill and a verdict. Outcomes only, no milliseconds."""
+"""`xrl demo` on the real fleet: a fall, an end by Ctrl-C, a stall. Outcomes only, no milliseconds.
+
+How it survives its planner, and what it records of that: test_agreement.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +16,6 @@ from pathlib import Path
 import pytest
 
 from shared.bus import topics
-from shared.bus.messages import Cause, PlannerStatus, Wrench
-from shared.clock import NS_PER_MS
-from shared.config.robot_config import RobotConfig
-from shared.joints import MODULES
 from shared.places import CHECKOUT
 from tests.system.fleets import command, leaving_nothing, xrl_led
 from tests.system.stalls import stalled_before_it_began
@@ -24,63 +23,11 @@ from tools.fleet import procfs
 from tools.judge.stalls import stalls_of
 from tools.logs.run_log import read_run
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
-
-NOT_HERE = (topics.ESTOP, topics.HARNESS_TARE, topics.LINK_EVENT, topics.OPERATOR_HAND)
-SUMMARY_KEYS = {
-    "stood", "duration_s", "real_time_factor", "com_x_max_mm", "com_y_max_mm", "roll_max_rad",
-    "pitch_max_rad", "yaw_max_rad", "torso_height_min_m", "torso_height_max_m",
-    "operator_peak_n", "assist_error_n", "handover_ms", "handover_torque_step_nm", "reengage_s",
-    "pd_cycles_late_pct", "planner_tick_us", "messages_recorded", "sequence_gaps",
-    *(
-        f"{phase}_{key}"
-        for phase in ("alive", "hold")
-        for key in ("com_x_max_mm", "com_y_max_mm", "roll_max_rad", "pitch_max_rad", "yaw_max_rad")
-    ),
-}  # fmt: skip
-
-
-def test_a_killed_and_restarted_planner_is_survived_and_recorded(
-    tmp_path: Path, robot: RobotConfig
-) -> None:
-    flags = ("--duration", "8", "--kill", "planner@2.2", "--restart", "planner@4")
-    uphill = ("--imu", "--plant", "floor.slope=[0.05,0.0]")
-    with leaving_nothing():
-        result = xrl_led("demo", tmp_path, *flags, *uphill, "--push", "3:0.3:30,0,0")
-    assert result.returncode == 0, result.stdout + result.stderr
-    assert "STOOD" in result.stdout
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary.keys() >= SUMMARY_KEYS
-    assert summary["stood"] is True
-    assert set(summary["handover_ms"]) == set(MODULES)
-    assert all(value is not None for value in summary["handover_ms"].values())
-    assert summary["reengage_s"] is not None
-    assert (tmp_path / "run.png").stat().st_size > 20_000
-    log = read_run(tmp_path / "run.mcap")
-    assert log.complete
-    silent = [
-        key
-        for key, topic in topics.all_keys(robot.name).items()
-        if topic.recorded and topic not in NOT_HERE and not log.count(key)
-    ]
-    assert not silent
-    assert log.metadata["run"]["scenario"] == "squat"
-    statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
-    assert statuses[-1].slope == pytest.approx((0.05, 0.0), abs=0.02), "the IMU was heard"
-    wrenches: list[Wrench] = log.messages(topics.WRENCH)
-    felt = max(abs(wrench.force[2]) for wrench in wrenches if wrench.valid)
-    given = max(abs(row.operator_force[2]) for row in log.messages(topics.SIM_TRUTH))
-    assert felt == pytest.approx(given, rel=0.25)
-    first = [log.messages(topics.JOINT_EVENT, module) for module in MODULES]
-    ages_ms = [
-        e.age_ns / NS_PER_MS for each in first for e in each if e.cause == Cause.COMMAND_STALE
-    ]
-    assert min(ages_ms) < robot.joint_service.max_command_age_ms, "its process was seen to end"
-    assert {"robot.toml", "robot.gains.json", "scenario.toml", "model.xml"} <= set(log.attachments)
+pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(180)]
 
 
 def test_a_robot_that_cannot_stand_is_a_finding_and_not_an_error(tmp_path: Path) -> None:
-    result = xrl_led("demo", tmp_path, "--push", "1:3:0,250,0", "--duration", "6")
+    result = xrl_led("demo", tmp_path, "--push", "0.1:3:0,250,0", "--duration", "6")
     assert result.returncode == 1, result.stdout + result.stderr
     assert "FELL" in result.stdout
     assert json.loads((tmp_path / "summary.json").read_text())["stood"] is False
@@ -102,7 +49,7 @@ def test_an_interrupted_demo_leaves_nothing_behind(tmp_path: Path) -> None:
 
 
 def test_a_stall_of_all_services_is_told_in_line_record_and_verdict(tmp_path: Path) -> None:
-    words = command("demo", "--out", tmp_path, "--duration", "5", "--kill", "planner@4.5")
+    words = command("demo", "--out", tmp_path, "--duration", "3.5", "--kill", "planner@3")
     said, stopped = list[str](), False
     with (
         leaving_nothing() as mine,

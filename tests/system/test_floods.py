@@ -25,7 +25,7 @@ from tools.fleet.supervise import SupervisedFleet
 
 pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(180)]
 
-BEFORE_KILL_S = 2.0
+BEFORE_KILL_S = 1.0
 LEADS_AGAIN_S = 40.0
 RECORDER_MAX = 500 << 20
 

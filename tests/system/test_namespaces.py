@@ -43,7 +43,7 @@ from tools.logs.joined_records import host_record, join
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import RunLog, read_run
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(240)]
 
 ROOT = Path(__file__).resolve().parents[2]
 TRIES = 2

@@ -25,7 +25,7 @@ from shared.config.robot_config import RobotConfig
 from tests.joint.helpers import SESSION, command
 from tests.joint.test_loop import FakeDrive
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(60)]
+pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(60)]
 
 HOUR_NS = 3600 * NS_PER_S
 WILD = {"q_ref": (0.3, -2.5), "k_p": (3000.0, 3000.0), "tau_ff": (50.0, -50.0)}

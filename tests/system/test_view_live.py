@@ -21,7 +21,7 @@ from tests.system.fleets import command
 from tools.logs.hand_path import hand_path
 from tools.logs.run_log import read_run
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(240)]
 
 PATIENCE_S = 60.0
 

@@ -26,7 +26,7 @@ from tools.bringup import drive_access, zeroing
 from tools.bringup.zeroing import DriveLook, look
 from tools.fleet import procfs
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(180)]
 
 MODULE = "knee_left"
 LEG = (MODULE, "--torque-limit", "40", "--yes")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 
@@ -16,25 +18,33 @@ from tools.sim.standing_start import begin_standing
 from tools.view.frame import SoleEstimate, jacobian
 
 
-def standing(robot: RobotConfig, height: float) -> tuple[SimTruth, list[float], list[float]]:
-    """Return the world, the joints' angles and their torques, at rest at a height."""
-    fleet = Lockstep(robot, still(4.0, height))
+class AtRest(NamedTuple):
+    """A robot that stands still."""
+
+    weight: float
+    truth: SimTruth
+    q: list[float]
+    tau: list[float]
+
+
+@pytest.fixture(scope="module", params=[1.15, 0.95])
+def at_rest(robot: RobotConfig, request: pytest.FixtureRequest) -> AtRest:
+    fleet = Lockstep(robot, still(4.0, request.param))
     begin_standing(fleet)
     truth = list(fleet.run())[-1]
-    samples = [controller.samples for controller in fleet.controllers]
-    return (
+    return AtRest(
+        float(fleet.world.model.body_mass.sum()) * GRAVITY,
         truth,
-        [angle for sample in samples for angle in sample.q],
+        [angle for controller in fleet.controllers for angle in controller.samples.q],
         [torque for controller in fleet.controllers for torque in controller.tau],
     )
 
 
-@pytest.mark.parametrize("height", [1.15, 0.95])
 def test_at_rest_it_is_within_4_percent_and_5_millimetres(
-    robot: RobotConfig, height: float
+    robot: RobotConfig, at_rest: AtRest
 ) -> None:
-    truth, q, tau = standing(robot, height)
-    estimated = SoleEstimate(robot).of(q, tau)
+    truth = at_rest.truth
+    estimated = SoleEstimate(robot).of(at_rest.q, at_rest.tau)
     assert estimated is not None
     true = (
         (truth.foot_right_force, truth.foot_right_cop),
@@ -45,12 +55,11 @@ def test_at_rest_it_is_within_4_percent_and_5_millimetres(
         assert found.cop == pytest.approx(cop, abs=0.005)
 
 
-def test_the_two_soles_bear_the_whole_robot_and_who_holds_it(robot: RobotConfig) -> None:
-    truth, _, _ = standing(robot, 1.0)
-    fleet = Lockstep(robot, still(0.1))
-    weight = float(fleet.world.model.body_mass.sum()) * GRAVITY
+def test_the_two_soles_bear_the_whole_robot_and_who_holds_it(at_rest: AtRest) -> None:
+    truth = at_rest.truth
     borne = truth.foot_right_force[2] + truth.foot_left_force[2]
-    assert borne == pytest.approx(weight + truth.load_n - truth.operator_force[2], rel=0.01)
+    held = truth.load_n - truth.operator_force[2]
+    assert borne == pytest.approx(at_rest.weight + held, rel=0.01)
     middle = 0.5 * (np.array(truth.foot_right_cop) + truth.foot_left_cop)
     assert middle == pytest.approx(truth.com[:2], abs=0.01), "standing still"
 

@@ -45,8 +45,9 @@ def with_page(source: Source, work: Callable[[Page, str], Awaitable[None]]) -> N
     asyncio.run(main())
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def lockstep() -> Any:
+    """Return a robot for all of it; the test that stops it comes last."""
     made = LockstepSource(load_robot(DEFAULT_CONFIG))
     yield made
     made.close()
@@ -63,35 +64,6 @@ async def drag(
     await page.mouse("down", x, y, shift=shift)
     for part in range(1, 11):
         await page.mouse("move", x + dx * part / 10, y + dy * part / 10, shift=shift)
-
-
-def test_a_person_leads_pushes_kills_and_stops_it_with_the_mouse(
-    lockstep: LockstepSource, tmp_path: Path
-) -> None:
-    async def work(page: Page, address: str) -> None:
-        await page.open(address)
-        await page.until(MODES, lambda text: text.count("TRACK") == 6, 60.0)
-        begin = await page.value(HEIGHT)
-        await drag(page, 665.0, 185.0, 0.0, 90.0)  # where the hand's arrow is, too
-        low = await page.until(HEIGHT, lambda height: height < begin - 0.2)
-        await page.mouse("up", 665.0, 275.0)
-        await drag(page, 640.0, 260.0, 0.0, -60.0)
-        await page.until(HEIGHT, lambda height: height > low + 0.05)
-        await page.mouse("up", 640.0, 200.0)
-        pushed = "document.getElementById('plots').querySelectorAll('canvas').length"
-        assert await page.value(pushed) == 8
-        await page.value(button("kill"))
-        await page.until(MODES, lambda text: text.count("HOLD") == 6)
-        await page.until("document.getElementById('mode').textContent", lambda w: w == "silent")
-        await page.value(button("start"))
-        await page.until(MODES, lambda text: text.count("TRACK") == 6)
-        await page.key("ArrowDown")
-        await page.value("document.getElementById('estop').click()")
-        await page.until(MODES, lambda text: text.count("DAMP") == 6)
-        await page.picture(tmp_path / "stopped.png")
-        assert (tmp_path / "stopped.png").stat().st_size > 20_000
-
-    with_page(lockstep, work)
 
 
 def test_a_shove_shows_and_ends_with_the_hand(lockstep: LockstepSource) -> None:
@@ -184,5 +156,34 @@ def test_nothing_is_cut_off_on_a_wide_or_a_narrow_screen(
         await page.open(address, width, height)
         await page.until(MODES, lambda text: text.count("TRACK") == 6, 60.0)
         assert json.loads(await page.value(WIDE)) == []
+
+    with_page(lockstep, work)
+
+
+def test_a_person_leads_pushes_kills_and_stops_it_with_the_mouse(
+    lockstep: LockstepSource, tmp_path: Path
+) -> None:
+    async def work(page: Page, address: str) -> None:
+        await page.open(address)
+        await page.until(MODES, lambda text: text.count("TRACK") == 6, 60.0)
+        begin = await page.value(HEIGHT)
+        await drag(page, 665.0, 185.0, 0.0, 90.0)  # where the hand's arrow is, too
+        low = await page.until(HEIGHT, lambda height: height < begin - 0.2)
+        await page.mouse("up", 665.0, 275.0)
+        await drag(page, 640.0, 260.0, 0.0, -60.0)
+        await page.until(HEIGHT, lambda height: height > low + 0.05)
+        await page.mouse("up", 640.0, 200.0)
+        pushed = "document.getElementById('plots').querySelectorAll('canvas').length"
+        assert await page.value(pushed) == 8
+        await page.value(button("kill"))
+        await page.until(MODES, lambda text: text.count("HOLD") == 6)
+        await page.until("document.getElementById('mode').textContent", lambda w: w == "silent")
+        await page.value(button("start"))
+        await page.until(MODES, lambda text: text.count("TRACK") == 6)
+        await page.key("ArrowDown")
+        await page.value("document.getElementById('estop').click()")
+        await page.until(MODES, lambda text: text.count("DAMP") == 6)
+        await page.picture(tmp_path / "stopped.png")
+        assert (tmp_path / "stopped.png").stat().st_size > 20_000
 
     with_page(lockstep, work)
