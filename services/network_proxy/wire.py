@@ -50,7 +50,7 @@ def carries_messages(batch: bytes) -> bool:
     try:
         if batch[2] & _ID != _FRAME:
             return False
-        at = _after_number(batch, 3)
+        _, at = _number(batch, 3)
         if batch[2] & _EXTENDED:
             at = _after_extensions(batch, at)
         return batch[at] & _ID == _PUSH
@@ -58,11 +58,14 @@ def carries_messages(batch: bytes) -> bool:
         return False
 
 
-def _after_number(batch: bytes, at: int) -> int:
-    """Return where a number of seven bits a byte ends."""
-    while batch[at] & 0x80:
-        at += 1
-    return at + 1
+def _number(batch: bytes, at: int) -> tuple[int, int]:
+    """Return a number of seven bits a byte, least significant first, and where it ends."""
+    value, shift = 0, 0
+    while True:
+        byte = batch[at]
+        value, shift, at = value | (byte & 0x7F) << shift, shift + 7, at + 1
+        if not byte & 0x80:
+            return value, at
 
 
 def _after_extensions(batch: bytes, at: int) -> int:
@@ -71,15 +74,8 @@ def _after_extensions(batch: bytes, at: int) -> int:
         header = batch[at]
         at, more = at + 1, bool(header & _EXTENDED)
         if header & _ENCODING == _NUMBER:
-            at = _after_number(batch, at)
+            _, at = _number(batch, at)
         elif header & _ENCODING == _BYTES:
-            length, shift = 0, 0
-            while True:
-                byte = batch[at]
-                at += 1
-                length |= (byte & 0x7F) << shift
-                shift += 7
-                if not byte & 0x80:
-                    break
+            length, at = _number(batch, at)
             at += length
     return at

@@ -14,14 +14,12 @@ import pytest
 from services.network_proxy.sockets import (
     READ,
     WRITE,
-    Address,
-    ProxyEndpoint,
     SocketListener,
     SocketWatch,
     address_of,
 )  # fmt: skip
 from shared.exceptions import BusError
-from tests.network_proxy.rig import MESSAGE, PAIR, WAIT_S, Rig, batch, heard, listening
+from tests.network_proxy.rig import MESSAGE, WAIT_S, Rig, batch, heard, listening
 
 
 @pytest.mark.parametrize(
@@ -152,24 +150,6 @@ def test_with_a_descriptor_for_one_end_only_neither_is_kept(rig: Rig) -> None:
         rig.turn()
     assert rig.relay.refused == 1
     assert dialling.recv(1) == b""
-
-
-def test_a_place_dials_its_own_endpoint(tmp_path: Path) -> None:
-    where = str(tmp_path / "b")
-    with listening(socket.AF_UNIX, where) as beyond:
-        endpoint = ProxyEndpoint(
-            PAIR, SocketListener(tmp_path / "t"), Address(socket.AF_UNIX, where)
-        )
-        with socket.socket(socket.AF_UNIX) as dialling:
-            dialling.connect(str(tmp_path / "t"))
-            ends = endpoint.link()
-        assert ends is not None
-        beyond.settimeout(WAIT_S)
-        beyond.accept()[0].close()
-        for end in ends:
-            assert not end.getblocking()
-            end.close()
-        endpoint.listener.close()
 
 
 @pytest.fixture
