@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Callable, Collection
-from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -57,34 +56,36 @@ def run_live(
         controller: of somebody's own, `FILE.py[:NAME]`, in the place of the law.
         tell: takes a line of text each time the pace is lowered.
     """
-    at = partial(
-        _run_once, out.absolute(), robot, scenario, lead,
-        verb=verb, seed=seed, true_plant=true_plant, no_restart=no_restart, controller=controller,
-    )  # fmt: skip
+    out = out.absolute()
+    robot_path, overrides = _prepare(out, robot, scenario, seed, true_plant, controller)
+
+    def once(pace: float) -> T:
+        options = FleetOptions(
+            overrides=overrides,
+            no_restart=no_restart,
+            injected="network_proxy" in overrides,
+            pace=pace,
+            leashed=True,
+        )
+        return _run_once(out, robot, robot_path, options, verb, lead)
 
     def again(text: str) -> None:
         for record in out.glob("run*.mcap"):
             record.unlink()  # of a robot that stood and waited
         tell(text)
 
-    if pace is not None:
-        return at(pace=pace)
-    return run_at_fitting_pace(lambda fitting: at(pace=fitting), again)
+    return once(pace) if pace is not None else run_at_fitting_pace(once, again)
 
 
-def _run_once(
+def _prepare(
     out: Path,
     robot: RobotConfig,
     scenario: Scenario,
-    lead: Callable[[SupervisedFleet, Session], T],
-    *,
-    verb: str,
     seed: int,
     true_plant: PlantConfig,
-    no_restart: Collection[str],
-    pace: float,
     controller: str | None,
-) -> T:
+) -> tuple[Path, dict[str, list[str]]]:
+    """Write what the services read; return the robot file, and the words for each service."""
     robot_path, scenario_path, plant_path, *_ = experiment.write_inputs(
         out, robot, scenario, true_plant
     )
@@ -105,13 +106,17 @@ def _run_once(
         overrides["planner"] = ["--controller", absolute(controller)]
     if scenario.inject:
         overrides["network_proxy"] = seeded
-    options = FleetOptions(
-        overrides=overrides,
-        no_restart=no_restart,
-        injected=bool(scenario.inject),
-        pace=pace,
-        leashed=True,
-    )
+    return robot_path, overrides
+
+
+def _run_once(
+    out: Path,
+    robot: RobotConfig,
+    robot_path: Path,
+    options: FleetOptions,
+    verb: str,
+    lead: Callable[[SupervisedFleet, Session], T],
+) -> T:
     run_dir = Path(tempfile.mkdtemp(prefix=f"xrl-{verb}-", dir="/tmp"))
     try:
         fleet = SupervisedFleet.start(robot_path, run_dir, options)

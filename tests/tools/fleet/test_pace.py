@@ -12,6 +12,7 @@ from shared import clock
 from shared.exceptions import FleetError
 from tools.fleet import pace
 from tools.fleet.pace import CoresFullError, check_pace, usual_pace
+from tools.fleet.process_table import FleetOptions
 from tools.live import live
 
 
@@ -73,9 +74,12 @@ class Machine:
         self.carries = carries
         self.paces: list[float] = []
 
-    def run_once(self, *_: object, pace: float, **__: object) -> str:
-        self.paces.append(pace)
-        if pace > self.carries:
+    def run_once(
+        self, _out: Path, _robot: object, _path: object, options: FleetOptions, *_: object
+    ) -> str:
+        assert options.pace is not None
+        self.paces.append(options.pace)
+        if options.pace > self.carries:
             raise CoresFullError("full")
         return "led"
 
@@ -87,6 +91,7 @@ def run_live(
     asked: float | None,
     told: list[str],
 ) -> str:
+    monkeypatch.setattr(live, "_prepare", lambda *_: (None, {}))
     monkeypatch.setattr(live, "_run_once", machine.run_once)
     return live.run_live(
         out, None, None, None,  # type: ignore[arg-type]  # the machine takes them
