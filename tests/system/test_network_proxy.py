@@ -1,4 +1,7 @@
-"""The network proxy as a process, between two real sessions of the bus."""
+"""The network proxy as a process, between two real sessions of the bus.
+
+One is shared by all tests that leave it as they found it.
+"""
 
 from __future__ import annotations
 
@@ -12,17 +15,39 @@ from pathlib import Path
 import pytest
 
 from shared.config.scenarios import Inject
+from shared.links import ATTITUDES
 from tests.system.proxied import Heard, Proxied, proxied
 from tools import cli
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
 
+BESIDE = ATTITUDES
+"""A link that no test impairs: what is told of it comes after all that was told before."""
 SPARE = 12
 """Descriptors beyond those of the links that are up; each dial takes two."""
 
 
+@pytest.fixture(scope="module")
+def shared() -> Iterator[Proxied]:
+    with proxied("knee_left") as links:
+        yield links
+
+
 @pytest.fixture
-def rig() -> Iterator[Proxied]:
+def rig(shared: Proxied) -> Iterator[Proxied]:
+    """Return links to which nothing is done, neither before nor after."""
+    shared.wait(shared.linked)
+    yield shared
+    shared.client.clear("all")
+    shared.client.begin(Inject(link=BESIDE, at=0.0, delay_ms=1.0))
+    shared.client.clear("all")
+    shared.wait(lambda: any(not event.active and event.link == BESIDE for event in shared.told))
+    shared.told.clear()
+
+
+@pytest.fixture
+def own() -> Iterator[Proxied]:
+    """Return links that a test may harm."""
     with proxied("knee_left") as links:
         yield links
 
@@ -104,43 +129,43 @@ def test_what_a_partition_held_on_a_stream_that_is_given_up_counts_as_lost(rig: 
     assert ended.lost > 50
 
 
-def test_a_partition_may_last_though_all_dial_again_and_again(rig: Proxied) -> None:
+def test_a_partition_may_last_though_all_dial_again_and_again(own: Proxied) -> None:
     """Both ways, with few descriptors, for many dials: it neither ends early nor kills."""
-    full = descriptors(rig) + SPARE
-    resource.prlimit(rig.proxy.pid, resource.RLIMIT_NOFILE, (full, full))
+    full = descriptors(own) + SPARE
+    resource.prlimit(own.proxy.pid, resource.RLIMIT_NOFILE, (full, full))
     begun = time.monotonic()
-    rig.client.begin(Inject(link="all", at=0.0, duration=12.0, partition=True))
+    own.client.begin(Inject(link="all", at=0.0, duration=12.0, partition=True))
     most = 0
     while time.monotonic() < begun + 10.0:
-        arrived = list(rig.send(100))
+        arrived = list(own.send(100))
         assert not arrived or time.monotonic() > begun + 12.0
-        most = max(most, descriptors(rig))
+        most = max(most, descriptors(own))
     assert most < full, "none was turned away for want of one"
-    assert rig.proxy.poll() is None
-    rig.wait(rig.linked)
+    assert own.proxy.poll() is None
+    own.wait(own.linked)
     assert time.monotonic() > begun + 12.0
-    assert len(rig.send_to_the_last(100)) == 100
+    assert len(own.send_to_the_last(100)) == 100
 
 
 def test_an_injector_that_is_killed_and_started_again_links_anew_and_does_nothing(
-    rig: Proxied,
+    own: Proxied,
 ) -> None:
-    inject(rig, loss=1.0)
-    rig.kill()
-    assert rig.send(20) == []
-    rig.start()
-    rig.wait(rig.linked)
-    assert rig.client.list() == ()
-    assert len(rig.send_to_the_last(100)) == 100
+    inject(own, loss=1.0)
+    own.kill()
+    assert own.send(20) == []
+    own.start()
+    own.wait(own.linked)
+    assert own.client.list() == ()
+    assert len(own.send_to_the_last(100)) == 100
 
 
 def test_an_impairment_that_lasts_is_reported_with_its_counts_when_the_injector_stops(
-    rig: Proxied,
+    own: Proxied,
 ) -> None:
-    inject(rig, loss=0.5)
-    rig.send(100)
-    rig.stop()
-    ended = rig.ended()
+    inject(own, loss=0.5)
+    own.send(100)
+    own.stop()
+    ended = own.ended()
     assert ended.passed > 0
     assert ended.lost > 0
 
