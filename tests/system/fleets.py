@@ -30,7 +30,7 @@ OF_VERBS: Final = ("/tmp/xrl-demo-", "/tmp/xrl-crash-")
 """Run directories of the fleets that `xrl demo` and `xrl study crash` start."""
 
 
-def wait_for(truth: Callable[[], bool], timeout_s: float = 20.0) -> bool:
+def wait_for(truth: Callable[[], bool], timeout_s: float = 60.0) -> bool:
     """Return True as soon as it is so; False if it is not in time."""
     deadline = time.monotonic() + timeout_s
     while not truth():

@@ -142,9 +142,14 @@ def test_a_stopped_fleet_leaves_no_process_and_no_file(start: Start, run_dir: Pa
     assert not run_dir.exists()
 
 
-def test_a_killed_service_is_restarted_and_counted(start: Start) -> None:
+def test_a_service_is_suspended_resumed_killed_restarted_and_counted(start: Start) -> None:
     fleet = start()
-    before = fleet.kill("planner", signal.SIGKILL)
+    before = fleet.kill("planner", signal.SIGSTOP)
+    assert wait_for(lambda: service(fleet, "planner").state == "suspended")
+    assert fleet.kill("planner", signal.SIGCONT) == before
+    assert wait_for(lambda: service(fleet, "planner").state == "running")
+    assert service(fleet, "planner").restarts == 0
+    assert fleet.kill("planner", signal.SIGKILL) == before
     assert wait_for(lambda: fleet.pids().get("planner", before) != before)
     planner, harness = service(fleet, "planner"), service(fleet, "harness")
     assert (planner.restarts, harness.restarts) == (1, 0)
@@ -167,15 +172,6 @@ def test_a_service_that_is_asleep_waits_until_it_is_started(start: Start, order:
     code, said = order("start", "planner")
     assert (code, "planner: started" in said) == (0, True)
     assert wait_for(lambda: service(fleet, "planner").state == "running")
-
-
-def test_a_suspended_service_is_shown_and_resumed(start: Start) -> None:
-    fleet = start()
-    pid = fleet.kill("planner", signal.SIGSTOP)
-    assert wait_for(lambda: service(fleet, "planner").state == "suspended")
-    assert fleet.kill("planner", signal.SIGCONT) == pid
-    assert wait_for(lambda: service(fleet, "planner").state == "running")
-    assert service(fleet, "planner").restarts == 0
 
 
 @pytest.mark.parametrize("program", [SLEEPER, STUBBORN])
@@ -271,20 +267,6 @@ def test_supervision_goes_on_without_a_place_for_its_logs(
     assert fleet.lost_lines()[1] in shown
 
 
-def test_status_says_why_a_service_does_not_come_up(start: Start, order: Order) -> None:
-    fleet = start({"planner": FAILING, "harness": SLEEPER}, disarmed=True)
-    assert wait_for(lambda: service(fleet, "planner").restarts > 0)
-    shown = ""
-
-    def is_told() -> bool:  # not while it is being started again
-        nonlocal shown
-        shown = " ".join(order("status")[1].split())
-        return "planner: exit status 3" in shown
-
-    assert wait_for(is_told), shown
-    assert "no drive on can0" in shown
-
-
 def test_the_wait_before_another_start_is_bounded() -> None:
     """After a power cut a planner failed 135 starts, and a mended one waited for minutes."""
     waiting = Service.__new__(Service)
@@ -314,14 +296,6 @@ def test_a_start_without_room_says_so(
         start()
 
 
-def test_a_second_fleet_in_the_same_directory_is_refused_and_harms_nothing(start: Start) -> None:
-    fleet = start()
-    before = fleet.pids()
-    with pytest.raises(FleetError, match="a fleet is up in"):
-        start()
-    assert fleet.pids() == before
-
-
 def test_a_service_that_ends_at_once_fails_the_start_with_its_log(
     start: Start, run_dir: Path
 ) -> None:
@@ -331,16 +305,24 @@ def test_a_service_that_ends_at_once_fails_the_start_with_its_log(
     assert_nothing_left(run_dir, [])
 
 
-def test_a_start_that_nobody_asked_for_ends_nothing_when_a_service_fails(start: Start) -> None:
+def test_a_start_that_nobody_asked_for_ends_nothing_when_a_service_fails_and_status_says_why(
+    start: Start, order: Order
+) -> None:
     """To end the others would idle the drives of those that hold a person."""
     fleet = start({"harness": SLEEPER, "planner": FAILING}, disarmed=True)
-    try:
-        assert wait_for(lambda: service(fleet, "harness").state == "running")
-        before = fleet.pids()["harness"]
-        assert wait_for(lambda: service(fleet, "planner").restarts > 0), "it is tried again"
-        assert fleet.pids()["harness"] == before
-    finally:
-        fleet.stop()
+    assert wait_for(lambda: service(fleet, "harness").state == "running")
+    before = fleet.pids()["harness"]
+    assert wait_for(lambda: service(fleet, "planner").restarts > 0), "it is tried again"
+    shown = ""
+
+    def is_told() -> bool:  # not while it is being started again
+        nonlocal shown
+        shown = " ".join(order("status")[1].split())
+        return "planner: exit status 3" in shown
+
+    assert wait_for(is_told), shown
+    assert "no drive on can0" in shown
+    assert fleet.pids()["harness"] == before
 
 
 def test_a_service_that_never_listens_fails_the_start(start: Start, run_dir: Path) -> None:
@@ -408,7 +390,7 @@ def test_a_leashed_fleet_ends_when_its_owner_is_killed(run_dir: Path, tmp_path: 
     assert wait_for(lambda: not procfs.fleet_pids(run_dir))
 
 
-def test_status_shows_mode_tier_age_and_rate(start: Start, order: Order) -> None:
+def test_status_hz_and_echo_show_what_the_services_send(start: Start, order: Order) -> None:
     fleet = start({"ankle_right": JOINT, "planner": SLEEPER})
     code, said = order("status", "--json")
     assert code == 0
@@ -426,22 +408,6 @@ def test_status_shows_mode_tier_age_and_rate(start: Start, order: Order) -> None
     assert status["services"]["planner"]["rate_hz"] is None
     assert "ankle_right" in order("status")[1]
 
-
-def test_kill_and_down_work_from_the_command_line(
-    start: Start, run_dir: Path, order: Order
-) -> None:
-    fleet = start()
-    pids = list(fleet.pids().values())
-    code, said = order("kill", "plannr")
-    assert (code, "one of planner, harness" in said) == (2, True)
-    assert order("kill", "planner", "--signal", "STOP")[0] == 0
-    assert wait_for(lambda: service(fleet, "planner").state == "suspended")
-    assert order("down")[0] == 0
-    assert_nothing_left(run_dir, pids)
-
-
-def test_top_hz_and_echo_show_what_the_services_send(start: Start, order: Order) -> None:
-    fleet = start({"ankle_right": JOINT, "planner": SLEEPER})
     code, said = order("topic", "hz", "joint/ankle_right/state", "--for", "1")
     row = next(line for line in said.splitlines() if "ankle_right" in line)
     assert (code, row.split()[1].endswith("/250")) == (0, True), "the rate, and the nominal one"
@@ -461,3 +427,19 @@ def test_top_hz_and_echo_show_what_the_services_send(start: Start, order: Order)
     assert str(fleet.pids()["ankle_right"]) in shown
     assert "joint/ankle_right/state" in shown
     assert "planner/status" not in shown, "on which nothing has come"
+
+
+def test_a_second_fleet_here_is_refused_and_the_first_is_killed_and_ended_by_verbs(
+    start: Start, run_dir: Path, order: Order
+) -> None:
+    fleet = start()
+    pids = list(fleet.pids().values())
+    with pytest.raises(FleetError, match="a fleet is up in"):
+        start()
+    assert list(fleet.pids().values()) == pids, "that harms nothing"
+    code, said = order("kill", "plannr")
+    assert (code, "one of planner, harness" in said) == (2, True)
+    assert order("kill", "planner", "--signal", "STOP")[0] == 0
+    assert wait_for(lambda: service(fleet, "planner").state == "suspended")
+    assert order("down")[0] == 0
+    assert_nothing_left(run_dir, pids)
