@@ -42,19 +42,19 @@ def until(source: LockstepSource, holds: Callable[[Frame], bool]) -> Frame:
         time.sleep(0.005)
 
 
-def test_the_torso_follows_the_hand_through_a_squat_and_nobody_leads_it_into_the_floor(
+def test_nobody_leads_the_torso_into_the_floor_and_it_follows_the_hand_up_again(
     source: LockstepSource,
 ) -> None:
-    for wanted in (0.95, 1.15):
-        assert source.carry_out(Order(order="hand", height=wanted)) == ""
-        frame = until(source, lambda f, w=wanted: abs(f.torso[2] - w) < 0.01)  # type: ignore[misc]
-        assert frame.modes == (Mode.TRACK,) * 6
     source.carry_out(Order(order="hand", height=-5.0))
     low = until(source, lambda f: f.torso[2] < HEIGHTS[0] + 0.03)
     until(source, lambda f: f.t_s > low.t_s + 1.0)
     frame = until(source, lambda _: True)
     assert frame.torso[2] > HEIGHTS[0] - 0.03
     assert not frame.fallen
+    for wanted in (0.95, 1.15):
+        assert source.carry_out(Order(order="hand", height=wanted)) == ""
+        frame = until(source, lambda f, w=wanted: abs(f.torso[2] - w) < 0.01)  # type: ignore[misc]
+        assert frame.modes == (Mode.TRACK,) * 6
 
 
 def test_a_killed_planner_is_held_and_a_started_one_leads(source: LockstepSource) -> None:

@@ -53,6 +53,12 @@ def lockstep() -> Any:
     made.close()
 
 
+@pytest.fixture(scope="module")
+def recorded() -> RecordSource:
+    log = read_run(LOG)
+    return RecordSource(log, robot_of(log))
+
+
 def button(order: str) -> str:
     return f"document.querySelector('[data-service=planner][data-order={order}]').click()"
 
@@ -89,61 +95,46 @@ async def until(holds: Callable[[], bool]) -> None:
             await asyncio.sleep(0.01)
 
 
-def test_a_record_is_scrubbed_stepped_and_played(tmp_path: Path) -> None:
-    log = read_run(LOG)
-    source = RecordSource(log, robot_of(log))
+async def scrub_and_play(page: Page, source: RecordSource, picture: Path) -> None:
+    """Look at a record near its end, and play it from there."""
     end_s = source.model().end_s
+    wanted = source.frame(end_s - 0.2)
+    assert wanted is not None
+    place = "document.getElementById('place')"
+    await page.until(f"{place}?.max", lambda text: text not in (None, "", "100"))
+    await page.value(f"{place}.value = {end_s - 0.2}; {place}.dispatchEvent(new Event('input'))")
+    await page.until(HEIGHT, lambda at: at is not None and abs(at - wanted.torso[2]) < 0.002)
+    await page.until(MODES, lambda text: text.count("TRACK") + text.count("HOLD") == 6)
+    marks = await page.value("document.querySelectorAll('#marks i').length")
+    assert marks == len(source.model().marks)
+    await page.value("document.getElementById('play').click()")
+    await page.until(f"Number({place}.value)", lambda at: abs(at - end_s) < 0.02)
+    await page.until("document.getElementById('play').textContent", lambda text: text == "▶")
+    await page.picture(picture)
 
+
+def test_a_record_is_scrubbed_stepped_and_played(recorded: RecordSource, tmp_path: Path) -> None:
     async def work(page: Page, address: str) -> None:
         await page.open(address)
-        place = "document.getElementById('place')"
-        seek = f"{place}.value = {end_s - 0.2}; {place}.dispatchEvent(new Event('input'))"
-        await page.until(f"{place}?.max", lambda text: text not in (None, "", "100"))
-        await page.value(seek)
-        await page.until(MODES, lambda text: text.count("TRACK") + text.count("HOLD") == 6)
-        marks = await page.value("document.querySelectorAll('#marks i').length")
-        assert marks == len(source.model().marks)
+        await scrub_and_play(page, recorded, tmp_path / "record.png")
         assert await page.value("document.getElementById('estop').hidden"), "nothing to stop"
-        await page.value("document.getElementById('play').click()")
-        await page.until(f"Number({place}.value)", lambda at: abs(at - end_s) < 0.02)
-        await page.until("document.getElementById('play').textContent", lambda text: text == "▶")
-        await page.picture(tmp_path / "record.png")
 
-    with_page(source, work)
+    with_page(recorded, work)
 
 
 def test_a_record_in_one_file_opens_without_a_server_and_is_scrubbed_and_played(
-    tmp_path: Path,
+    recorded: RecordSource, tmp_path: Path
 ) -> None:
     file = tmp_path / "run.html"
     assert cli.main(["view", str(LOG), "--html", str(file)]) == 0
     text = file.read_text(encoding="utf-8")
     assert not re.search(r'(src|href)="(?!data:)', text), "it loads nothing"
-    log = read_run(LOG)
-    source = RecordSource(log, robot_of(log))
-    end_s = source.model().end_s
-    wanted = source.frame(end_s - 0.2)
-    assert wanted is not None
-
-    async def work(page: Page) -> None:
-        await page.open(file.as_uri())
-        place = "document.getElementById('place')"
-        await page.until(f"{place}?.max", lambda text: text not in (None, "", "100"))
-        await page.value(
-            f"{place}.value = {end_s - 0.2}; {place}.dispatchEvent(new Event('input'))"
-        )
-        await page.until(HEIGHT, lambda at: at is not None and abs(at - wanted.torso[2]) < 0.002)
-        marks = await page.value("document.querySelectorAll('#marks i').length")
-        assert marks == len(source.model().marks)
-        await page.value("document.getElementById('play').click()")
-        await page.until("document.getElementById('play').textContent", lambda text: text == "▶")
-        await page.until(f"Number({place}.value)", lambda at: abs(at - end_s) < 0.02)
-        await page.picture(tmp_path / "file.png")
-        assert page.complaints == []
 
     async def main() -> None:
         async with browser() as page:
-            await work(page)
+            await page.open(file.as_uri())
+            await scrub_and_play(page, recorded, tmp_path / "file.png")
+            assert page.complaints == []
 
     asyncio.run(main())
 
