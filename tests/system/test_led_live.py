@@ -9,8 +9,10 @@ import select
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TypeVar
 
 import pytest
 
@@ -23,10 +25,11 @@ from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
 from shared.run_directory import RUN_DIR_VARIABLE
 from tests.system.fleets import heard, wait_for, xrl
-from tools.bringup.identify.body_lead import BodyLead
+from tests.system.stalls import has_stalled
+from tools.bringup.identify.body_lead import BodyLead, LeadRecord
 from tools.bringup.identify.quasi_static import moments_of
 from tools.bringup.tune.excitation import Excitation, SinePart
-from tools.bringup.tune.pose_probe import LiveProbe
+from tools.bringup.tune.pose_probe import LiveProbe, ProbeCourse
 
 pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(240)]
 
@@ -41,6 +44,18 @@ SHORT = Scenario(
 HELD = Excitation(0.008, (SinePart(2.5, 2.0, 1),))
 """Ends while the step is held."""
 STEP = Excitation(0.008, (SinePart(5.0, 1.0, 1),))
+TRIES = 3
+R = TypeVar("R", LeadRecord, ProbeCourse)
+
+
+def undisturbed(go: Callable[[], R]) -> R:
+    """Return what comes of it; it is done again if the machine stalled, which ends it as well."""
+    for _ in range(TRIES):
+        began_ns = time.monotonic_ns()
+        found = go()
+        if not found.ended or not has_stalled(began_ns):
+            break
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -63,26 +78,30 @@ def test_a_live_robot_is_led_for_a_fit_and_probed_and_leads_on(
     place: Path, robot: RobotConfig
 ) -> None:
     with open_session(robot, "identify", place) as session:
-        body = BodyLead(robot, session, simulated=True)
-        heard = body.go(SHORT, lambda *_: None, lambda: False)
-        assert heard.ended == ""
-        moments = moments_of(heard.states, heard.wrenches)
+        led = undisturbed(
+            lambda: BodyLead(robot, session, simulated=True).go(
+                SHORT, lambda *_: None, lambda: False
+            )
+        )
+        assert led.ended == ""
+        moments = moments_of(led.states, led.wrenches)
         assert len(moments.t_s) > 12
         assert moments.q[:, 5].max() - moments.q[:, 5].min() > 0.05, "the hips went down"
+        body = BodyLead(robot, session, simulated=True)
         stopped = body.go(SHORT, lambda *_: None, lambda: True)
         assert stopped.ended == "stopped"
         applied = xrl("drive", "identify", "body", "--apply", run_dir=place)
         assert applied.returncode == 2
         assert "runs with it" in applied.stderr, "and nothing was led"
     with open_session(robot, "tune", place) as session:
-        course = LiveProbe(session).go(0, STEP, lambda _: None, lambda: False)
+        course = undisturbed(lambda: LiveProbe(session).go(0, STEP, lambda _: None, lambda: False))
         assert course.ended == ""
         assert course.r.max() == pytest.approx(0.008, rel=0.05)
         at_top = (course.t_s > 3.0) & (course.t_s < 5.0)
         assert 0.004 < course.y[at_top].mean() < 0.012
-        led = LiveProbe(session).go(2, HELD, lambda _: None, lambda: False)
-        assert led.ended == "", "a led row is held and given back"
-        assert led.r.max() == pytest.approx(0.008, rel=0.1)
+        held = undisturbed(lambda: LiveProbe(session).go(2, HELD, lambda _: None, lambda: False))
+        assert held.ended == "", "a led row is held and given back"
+        assert held.r.max() == pytest.approx(0.008, rel=0.1)
     status = xrl("status", run_dir=place)
     assert "LEADING" in status.stdout
     with open_session(robot, "tune", place) as session:

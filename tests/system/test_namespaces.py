@@ -13,14 +13,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
 import pytest
 
-from shared.bus import codec, topics
+from shared.bus import topics
 from shared.bus.messages import (
     Cause,
     JointCommand,
@@ -34,7 +33,6 @@ from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
-from tests.shared.mcap_log.runs import ROBOT, sample, write
 from tests.system.multihost import BODY, LEGS, RECORDED, REPORT, Cut, Report
 from tests.system.namespaces import isolation, processes_in
 from tests.system.stalls import stalled_before_it_began
@@ -107,26 +105,17 @@ def wait_until_empty(namespaces: list[str]) -> set[int]:
 
 @pytest.fixture(scope="module")
 def led(tmp_path_factory: pytest.TempPathFactory) -> Led:
-    """Lead the fleet through every cut, once for all claims."""
-    return lead_to_the_end(lambda: tmp_path_factory.mktemp("multihost"), lead_in_a_process)
-
-
-def lead_to_the_end(folder: Callable[[], Path], lead: Callable[[Path, Path], Ended]) -> Led:
-    """Return a run that was led through every cut.
+    """Lead the fleet through every cut, once for all claims.
 
     A machine that stalls makes drop-outs of its own, after which the modules wait: a run that
     came too late is made again, but only if the robot stood and nothing went wrong in it.
-
-    Args:
-        folder: makes a new one for a run.
-        lead: takes that and a run directory, and leads the fleet.
     """
-    before = interfaces()
+    before, why = interfaces(), "this machine stalled so often that the scenario could not begin"
     for _ in range(TRIES):
-        out = folder()
+        out = tmp_path_factory.mktemp("multihost")
         with tempfile.TemporaryDirectory(dir="/tmp", prefix="xrl-t-") as parent:
             run_dir = Path(parent) / "run"
-            ended = lead(out, run_dir)
+            ended = lead_in_a_process(out, run_dir)
         if stalled_before_it_began(ended.code, ended.said, out):
             continue
         assert ended.code == 0, f"it could not be led; logs in {out}\n{ended.said}"
@@ -137,16 +126,11 @@ def lead_to_the_end(folder: Callable[[], Path], lead: Callable[[Path, Path], End
         fell = [row.scenario_s for row in truth if row.fallen]
         assert not fell, f"the robot fell at {fell[0]:.2f} s of {report.cuts}; record in {out}"
         if report.finished_ns:
-            return Led(report, log, _joined(out), run_dir, before)
-    pytest.fail(f"not all six track again after the cuts: {report.cuts}; logs in {out}")
-
-
-def _joined(out: Path) -> RunLog:
-    fleets = RunIndex(out)
-    if (out / RECORDED).exists():  # not of a run that a test only tells of
-        join(fleets, [host_record(fleets, RunIndex(out / RECORDED))], out / "joined")
-        return read_run(out / "joined")
-    return read_run(out)
+            fleets = RunIndex(out)
+            join(fleets, [host_record(fleets, RunIndex(out / RECORDED))], out / "joined")
+            return Led(report, log, read_run(out / "joined"), run_dir, before)
+        why = f"not all six track again after the cuts: {report.cuts}; logs in {out}"
+    pytest.fail(why)
 
 
 def lead_in_a_process(out: Path, run_dir: Path) -> Ended:
@@ -182,50 +166,6 @@ def states_of(led: Led, module: str) -> list[JointState]:
 def reached(cut: Cut) -> tuple[str, ...]:
     """Return the modules that the planner still reaches."""
     return () if cut.host == BODY else tuple(m for m in MODULES if m not in LEGS[cut.host])
-
-
-class Told(NamedTuple):
-    """What a run that only a test tells of came to."""
-
-    fallen: bool = False
-    finished_ns: int = 0
-    code: int = 0
-
-
-def outcome_of(*runs: Told) -> tuple[Led, int]:
-    """Judge runs that follow one another; return what was taken, and how many were made."""
-    made = 0
-
-    def lead(out: Path, _run_dir: Path) -> Ended:
-        nonlocal made
-        output = runs[made]
-        made += 1
-        (out / REPORT).write_bytes(msgspec.json.encode(Report([], [], output.finished_ns)))
-        rows = (False, output.fallen)
-        key = topics.SIM_TRUTH.key(ROBOT)
-        truths = [sample(SimTruth, seq=seq, fallen=row) for seq, row in enumerate(rows)]
-        write(out, [(key, codec.encode(truth), truth.seq) for truth in truths])
-        return Ended(output.code, "RunError")
-
-    with tempfile.TemporaryDirectory() as folder:
-        return lead_to_the_end(lambda: Path(tempfile.mkdtemp(dir=folder)), lead), made
-
-
-def test_a_run_that_came_too_late_is_made_again_if_the_robot_stood() -> None:
-    led, made = outcome_of(Told(), Told(finished_ns=7))
-    assert (led.report.finished_ns, made) == (7, 2)
-    with pytest.raises(pytest.fail.Exception, match="not all six track again"):
-        outcome_of(*[Told()] * TRIES)
-
-
-@pytest.mark.parametrize(
-    ("first", "words"),
-    [(Told(fallen=True), "fell"), (Told(code=1), "could not be led")],
-    ids=["fell", "error"],
-)
-def test_a_fall_or_an_error_is_not_hidden_by_a_second_run(first: Told, words: str) -> None:
-    with pytest.raises(AssertionError, match=words):
-        outcome_of(first, Told(finished_ns=7))
 
 
 def test_the_robot_stands_through_every_cut_and_leads_again(led: Led) -> None:

@@ -7,9 +7,14 @@ from pathlib import Path
 
 import pytest
 
+from shared.bus import topics
+from shared.bus.messages import Mode, RunEventKind
 from shared.joints import MODULES
 from tests.system.fleets import leaving_nothing, xrl_led
 from tests.usb import robot_file
+from tools.logs.run_log import read_run
+
+UNPLUGGED_S = 5.0
 
 pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(240)]
 
@@ -41,9 +46,17 @@ def test_it_stands_when_the_planner_is_killed(tmp_path: Path, robot_path: Path) 
 def test_a_killed_services_successor_takes_over_and_an_unplugged_drive_holds(
     tmp_path: Path, robot_path: Path
 ) -> None:
-    """Both at once: what each does alone, it does beside the other."""
     out = tmp_path / "out"
-    led("study crash", out, "--config", robot_path, "--only", "pair-knee-unplugged-hip")
-    (row,) = json.loads((out / "results.json").read_text())["cases"]
-    assert row["verdict"] == "stood"
-    assert row["leads_again_s"] is not None
+    killed = ("--kill", "knee_left@1", "--restart", "knee_left@1.5")
+    unplugged = ("--fault", f"knee_left:link_lost@{UNPLUGGED_S}:1")
+    led("demo", out, "--config", robot_path, "--duration", "6.5", *killed, *unplugged)
+    log = read_run(out / "run.mcap")
+    done = {RunEventKind(row.kind): row.t_ns for row in log.messages(topics.RUN_EVENT)}
+    restarted_ns, unplugged_ns = done[RunEventKind.RESTARTED], done[RunEventKind.FAULTED]
+    for module in MODULES:
+        events = log.messages(topics.JOINT_EVENT, module)
+        between = [e.mode_after for e in events if restarted_ns < e.t_ns < unplugged_ns]
+        assert between[-1] == Mode.TRACK, f"{module} is led again beside the successor"
+        if module != "knee_left":
+            after = [e.mode_after for e in events if e.t_ns > unplugged_ns]
+            assert Mode.HOLD in after, f"{module} holds with the drive that does"
