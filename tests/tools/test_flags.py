@@ -10,7 +10,19 @@ import pytest
 
 from shared.exceptions import RunError
 from shared.toml_file import Range
-from tools.flags import Arg, Flags, Seconds, add_flags, option, parsed, positional, read_flags
+from tools.flags import (
+    Arg,
+    Flags,
+    Seconds,
+    _argument,
+    add_flags,
+    fields_of,
+    option,
+    parsed,
+    positional,
+    read_flags,
+)
+from tools.verb_table import VERBS, Verb
 
 
 class Common(Flags):
@@ -87,6 +99,19 @@ def test_what_does_not_fit_is_refused_with_what_is_right(
         read(*words.split())
     assert left.value.code == 2
     assert right in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("verb", VERBS, ids=lambda verb: verb.name)
+def test_no_number_of_any_verb_takes_what_is_none_or_beyond_its_range(verb: Verb) -> None:
+    for field in fields_of(verb.declaration):
+        if field.kind not in (int, float) or field.arg.parse is not None:
+            continue
+        assert field.limits is not None, field.name
+        low, high = (field.kind(end) for end in (field.limits.low, field.limits.high))
+        beyond = (low - 1 - abs(low), high + 1 + abs(high), 1.5 if field.kind is int else "1_0")
+        for bad in ("nan", "inf", "-inf", "1e300", "one", "", *beyond):
+            with pytest.raises(argparse.ArgumentTypeError, match="is right"):
+                _argument(field)["type"](str(bad))
 
 
 def test_crossed_flags_are_refused_by_the_declaration() -> None:

@@ -17,7 +17,7 @@ import pytest
 from services.joint.rearm_guard import LastState, RearmGuard, request_stop, stop_source
 from shared.exceptions import FleetError
 from shared.joints import MODULES
-from shared.run_directory import FLEET_VARIABLE, check_own
+from shared.run_directory import FLEET_VARIABLE
 from tests.tools.fleet.plans import plan
 from tools import cli
 from tools.fleet import procfs
@@ -172,12 +172,6 @@ def test_a_strangers_directory_is_refused_by_every_verb(
         assert "belongs to another user" in capsys.readouterr().err
     with pytest.raises(FleetError, match="belongs to another user"):
         SupervisedFleet.attach(run_dir)
-
-
-def test_a_file_is_no_run_directory(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(FleetError, match="is no directory"):
-        check_own(tmp_path / "file")
 
 
 def test_a_service_of_another_fleet_gets_no_signal(claimed: RunDir) -> None:

@@ -21,12 +21,22 @@ LENGTH: Final = 40
 ZEROS: Final = ",0" * (N_JOINTS - 1)
 
 REFUSALS: Final = {
+    "levitate": "no verb 'levitate'",
+    "staus": "did you mean status",
     "demo --duration 0": "a number of at least 0.001 s",
     "demo --pace 2": "a number from 0.1 to 1",
+    "demo --config no_such.toml": "no_such.toml: (file): not found",
+    "demo --scenario flight": "no scenario 'flight'; one of",
+    "demo --kill plannner@3": "services:",
+    "demo --kill planner@3:BLINK": "signals:",
+    "demo --kill planner@30": "not inside the run",
+    "demo --restart planner@3": "kill it first",
     "demo --kill recorder@3": "without the recorder there is nothing to judge the run by",
     "demo --push 1:2": "write START:DURATION:FX,FY,FZ",
     "sim --loss 1.5": "a number from 0 to 1",
     "sim --controller x.py --control centralised": "both choose what computes the torques",
+    "up --config nowhere.toml": "nowhere.toml",
+    "up --scenario moonwalk": "no scenario 'moonwalk'; one of bad_network, crawl, ",
     "up --only planner,elbow": "no service 'elbow'; one of",
     "up --only ,": "--only names no service",
     "up --only host_recorder": "beside services of its own",
@@ -35,6 +45,8 @@ REFUSALS: Final = {
     "up --only planner,harness --snapshot 3": "--snapshot is for the recorder",
     "up --only harness --injectable": "--injectable is for the planner",
     "up --accept estop": "--accept is for the gateway to ROS 2: add --ros2",
+    "status": "no fleet is up in",
+    "kill planner": "no fleet is up in",
     "status --json --traffic": "--traffic is a screen for people",
     "status --json --watch": "not allowed with",
     "down --limp --sit": "not allowed with",
@@ -73,6 +85,7 @@ REFUSALS: Final = {
     "drive zero knee_left --resume --by 0,0": "first resume",
     "drive zero knee_left --at 0,-0.5 --untouched": "--level are for --resume",
     "drive zero --at 0,0": "one of the arguments MODULE --all is required",
+    "drive tare": "no fleet is up in",
     "drive jog elbow": "invalid choice: 'elbow' (choose from 'ankle_right'",
     "drive jog knee_left --by 0": "--by 0: up to 0.5 rad either way, and not 0",
     "drive jog knee_left --by -0.51": "a number from -0.5 to 0.5 rad",
@@ -154,6 +167,7 @@ REFUSALS: Final = {
     "topic echo estop --hz 0": "a number from 0.001 to 10000 Hz",
     "keys pack planner": "one of the arguments -o/--out --install is required",
     "keys renew": "one of the arguments NAME --all is required",
+    "gains --config nowhere.toml": "nowhere.toml",
     "gains --check --stiffness": "not allowed with",
     "bench --rounds 0": "a whole number from 1",
     "bench bus --rounds 0": "a whole number from 1",
@@ -198,8 +212,10 @@ def test_what_cannot_be_meant_is_refused_with_what_is_right(
     monkeypatch.setenv("XRL_RUN_DIR", str(tmp_path / "r"))
     monkeypatch.setattr(inject, "ProxyClient", lambda _run_dir: None)
     assert exit_code([log if word == "LOG" else word for word in shlex.split(typed)]) == 2
-    lines = capsys.readouterr().err.splitlines()
+    out, err = capsys.readouterr()
+    lines = err.splitlines()
     assert REFUSALS[typed] in " ".join(" ".join(lines).split())
     assert len(lines) == 1 or lines[0].startswith("usage: xrl ")
+    assert out == "" or typed.startswith("log play"), "which says first what it plays"
     assert list(tmp_path.iterdir()) == [], "nothing was begun"
     assert log.read_bytes() == before, "a record is never touched"

@@ -10,10 +10,12 @@ import pytest
 
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import BusError, RunError
+from shared.exceptions import BusError, FleetError, RunError
 from shared.places import DEFAULT_CONFIG
 from tests.certified import certified
+from tests.tools.exit_codes import exit_code
 from tools import cli
+from tools.fleet.supervise import SupervisedFleet
 from tools.keys import authority as authority_module
 from tools.verbs import up
 
@@ -60,3 +62,16 @@ def test_where_nobody_looks_on_a_robot_starts_without_its_record(
     assert "not recorded: " in capsys.readouterr().err
     with pytest.raises(RunError, match="cannot be made"):
         up._make_record_folder(taken / "now", must=True)
+
+
+@pytest.mark.parametrize(("service", "recorded"), [("recorder", True), ("planner", False)])
+def test_a_host_without_a_recorder_gets_no_folder_for_a_record(
+    service: str, recorded: bool, run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise FleetError("it is not to be started here")
+
+    monkeypatch.setattr(SupervisedFleet, "start", fail)
+    out = tmp_path / "out"
+    assert exit_code(["up", "--run-dir", run_dir, "--out", out, "--only", service]) == 2
+    assert out.exists() is recorded
