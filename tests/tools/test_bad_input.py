@@ -6,6 +6,7 @@ import os
 import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -22,23 +23,8 @@ from tools.output import write_atomically
 RUN = str(NEWEST)
 LONG = "x" * 5000
 READERS = ("info", "report", "explain", "resim", "play", "recover")
-NUMBERS = ("nan", "inf", "-inf", "1e300", "one", "")
 
 CASES: list[list[str]] = [
-    *(["sim", f"--{name}", bad] for name in ("jitter", "delay", "loss", "duration")
-      for bad in NUMBERS),
-    *(["sim", "--seed", bad] for bad in ("-1", "1.5", "9" * 30, "")),
-    *(["log", "explain", "--p", "0,0,0.87,0,0,0", "--assist", bad] for bad in NUMBERS),
-    *(["log", "explain", RUN, "--at", bad] for bad in NUMBERS),
-    *(["log", "report", RUN, flag, bad] for flag in ("--from", "--to") for bad in NUMBERS),
-    *(["log", "whatif", RUN, "--kill", "planner", flag, bad] for flag in ("--every", "--for")
-      for bad in NUMBERS),
-    *(["log", "resim", RUN, "--tolerance", bad] for bad in NUMBERS),
-    *(["log", "play", RUN, flag, bad] for flag in ("--rate", "--duration") for bad in NUMBERS),
-    *(["study", "kill", "--n", bad] for bad in ("99999999999", "-1", "0", "1.5")),
-    ["study", "kill", "--n", "1", "--seed", "-1"],
-    ["study", "kill", "--n", "1", "--workers", "-3"],
-    ["log", "whatif", RUN, "--kill", "planner", "--workers", "0"],
     ["sim", "--push", "1:0.3:nan,0,0"],
     ["sim", "--push", "1:nan:1,1,1"],
     ["sim", "--kill", "planner@nan"],
@@ -56,7 +42,6 @@ CASES: list[list[str]] = [
     ["gains", "--stiffness", "--config", "/dev/zero"],
     ["status", "--run-dir", LONG],
     ["down", "--run-dir", LONG],
-    ["lead", "--assist", "nan"],
 ]  # fmt: skip
 
 
@@ -117,15 +102,21 @@ def test_a_device_is_never_replaced_by_an_output(tmp_path: Path) -> None:
 # -- logs that somebody made up ------------------------------------------------------------
 
 
+@cache
+def newest() -> RunLog:
+    return read_run(NEWEST)
+
+
 def made_up(
     path: Path,
     metadata: Mapping[str, dict[str, str]] | None = None,
     attachments: Mapping[str, bytes] | None = None,
     change: Callable[[str, int, bytes], tuple[int, bytes]] = lambda _, t_ns, data: (t_ns, data),
     foreign: Sequence[str] = (),
+    most: int | None = None,
 ) -> str:
-    """Write a copy of a run with something wrong in it."""
-    log: RunLog = read_run(NEWEST)
+    """Write a copy of a run with something wrong in it; at most so many messages of each key."""
+    log = newest()
     with path.open("wb") as file:
         writer = Writer(file, compression=CompressionType.ZSTD)
         writer.start(profile="xrl")
@@ -140,7 +131,7 @@ def made_up(
             writer.add_message(number, log.offset_ns, b"{}", log.offset_ns)
         for key in log.keys():  # noqa: SIM118 - a log is no mapping
             channel = writer.register_channel(key, "json", schema)
-            for received_ns, payload, seq in log.raw(key):
+            for received_ns, payload, seq in log.raw(key)[:most]:
                 t_ns, data = change(key, received_ns + log.offset_ns, payload)
                 writer.add_message(channel, t_ns, data, t_ns, seq)
         writer.finish()
@@ -209,13 +200,13 @@ def test_a_small_file_that_expands_to_gigabytes_is_refused(
         assert "expand to over" in told(["log", verb, str(path)], capsys)
 
 
-def test_a_million_false_marks_of_chunks_are_passed_in_time(
+def test_300_000_false_marks_of_chunks_are_passed_in_time(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Each claims 50 MB; the reader searched all of them for every mark."""
     mark = b"\x06" + struct.pack("<Q", 50 << 20) + b"\0" * 28 + b"\x04\0\0\0zstd"
     path = tmp_path / "marks.mcap"
-    path.write_bytes(NEWEST.read_bytes()[:20_000] + mark * 1_000_000)
+    path.write_bytes(NEWEST.read_bytes()[:20_000] + mark * 300_000)
     assert cli.main(["log", "info", str(path)]) == 0
     assert "not finished" in capsys.readouterr().out
 

@@ -102,13 +102,13 @@ def test_nothing_of_a_hostile_log_is_obeyed(
 def test_metadata_that_is_computed_with_is_checked(
     record: str, field: str, value: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = made_up(tmp_path / "run.mcap", {record: {field: value}})
+    path = made_up(tmp_path / "run.mcap", {record: {field: value}}, most=20)
     for verb in (["log info"], ["log report", "--open", "no"]):
         assert_harmless([*verb[0].split(), path, *verb[1:]], (0, 2), capsys)
 
 
 @pytest.mark.parametrize("value", ["fast", "nan", "0", "1e400"])
 def test_a_pace_that_is_none_is_told(value: str, tmp_path: Path) -> None:
-    log = read_run(Path(made_up(tmp_path / "run.mcap", {"run": {"pace": value}})))
+    log = read_run(Path(made_up(tmp_path / "run.mcap", {"run": {"pace": value}}, most=1)))
     with pytest.raises(RunError, match=f"run.pace is {value!r}; above 0"):
         verdict._pace(log)

@@ -8,6 +8,7 @@ scripts that do the little that `xrl hosts` needs of them.
 from __future__ import annotations
 
 import os
+import shutil
 import stat
 import subprocess
 import sys
@@ -124,3 +125,12 @@ def _checkout(base: Path) -> Path:
 def _script(path: Path, text: str) -> None:
     path.write_text(text, encoding="utf-8")
     path.chmod(path.stat().st_mode | stat.S_IXUSR)
+
+
+def complaints_about(unit: Path) -> list[str]:
+    """Return what systemd says of a unit."""
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("no systemd-analyze on this machine")
+    words = ["systemd-analyze", "verify", "--man=no", str(unit)]
+    said = subprocess.run(words, capture_output=True, text=True, check=False)
+    return [line for line in said.stderr.splitlines() if unit.name in line]
