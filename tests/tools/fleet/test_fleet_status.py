@@ -5,10 +5,11 @@ from __future__ import annotations
 import io
 import os
 import re
+from functools import partial
 from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import msgspec
 import pytest
@@ -28,6 +29,7 @@ from shared.bus.session import Latest, place_of_tool
 from shared.clock import NS_PER_S, now_ns
 from shared.joints import MODULES
 from shared.robot.trip_table import JOINT_TRIPS
+from tests.messages import joint_state
 from tools.fleet import procfs
 from tools.fleet.fleet_status import (
     FleetStatus,
@@ -53,32 +55,35 @@ from tools.fleet.status_table import (
 from tools.terminal import Console
 
 
-def state(mode: Mode, cause: Cause, drive: DriveStatus) -> JointState:
-    zero = (0.0, 0.0)
-    return JointState(
-        t_ns=1, seq=1, q=(0.1, -0.5), v=zero, tau=zero, mode=mode, cause=cause, ready=False,
-        age_ns=-1, session=0, command_seq=-1, cycle=1, late=0, dropouts=0, refused=0,
-        drive=drive, drive_error=0,
-    )  # fmt: skip
+def state(mode: Mode, cause: Cause, drive: DriveStatus, **more: object) -> JointState:
+    return joint_state(mode=mode, cause=cause, drive=drive, **more)
 
 
-@pytest.mark.parametrize(("mode", "cause", "drive"), list(product(Mode, Cause, DriveStatus)))
-def test_a_way_out_is_given_only_where_a_person_must_act(
-    mode: Mode, cause: Cause, drive: DriveStatus
-) -> None:
-    status = module_status(state(mode, cause, drive))
+tracking = partial(state, Mode.TRACK, Cause.COMMANDS_FRESH, DriveStatus.ARMED)
+
+
+def shown(status: FleetStatus, **options: Any) -> str:
+    printed = io.StringIO()
+    Console(file=printed, **options).print(tables(status))
+    return printed.getvalue()
+
+
+@pytest.mark.parametrize("mode", Mode)
+def test_a_way_out_is_given_only_where_a_person_must_act(mode: Mode) -> None:
     waits = (DriveStatus.IDLE, DriveStatus.ERROR)
-    helpless = (
-        mode in (Mode.FAULT, Mode.DAMP)
-        or drive in (DriveStatus.UNZEROED, DriveStatus.HOLDING, DriveStatus.UNACKNOWLEDGED)
-        or (mode is Mode.DISARMED and drive in waits)
-        or (mode is Mode.HOLD and cause in JOINT_TRIPS)
-    )
-    assert bool(status.way_out) is helpless
-    if mode is Mode.FAULT:
-        assert "xrl kill" in status.way_out
-        is_zeroed = cause not in (Cause.DRIVE_LOST, Cause.POSITION_LOST)
-        assert ("xrl drive zero" in status.way_out) is not is_zeroed
+    for cause, drive in product(Cause, DriveStatus):
+        status = module_status(state(mode, cause, drive))
+        helpless = (
+            mode in (Mode.FAULT, Mode.DAMP)
+            or drive in (DriveStatus.UNZEROED, DriveStatus.HOLDING, DriveStatus.UNACKNOWLEDGED)
+            or (mode is Mode.DISARMED and drive in waits)
+            or (mode is Mode.HOLD and cause in JOINT_TRIPS)
+        )
+        assert bool(status.way_out) is helpless, (cause, drive)
+        if mode is Mode.FAULT:
+            assert "xrl kill" in status.way_out
+            is_zeroed = cause not in (Cause.DRIVE_LOST, Cause.POSITION_LOST)
+            assert ("xrl drive zero" in status.way_out) is not is_zeroed, (cause, drive)
 
 
 @pytest.mark.parametrize("drive", DriveStatus)
@@ -124,19 +129,17 @@ def fleet_with(lead_session: int, *modules: ModuleStatus) -> FleetStatus:
 
 @pytest.mark.parametrize("refusal", [each for each in Refusal if each])
 def test_refused_commands_are_told_with_their_cause_sender_and_what_to_do(refusal: Refusal) -> None:
-    tracks = state(Mode.TRACK, Cause.COMMANDS_FRESH, DriveStatus.ARMED)
     rows = [
-        module_status(tracks, (RefusedCommands(refusal.name, 99, hz),)) for hz in (250.0, 120.0)
+        module_status(tracking(), (RefusedCommands(refusal.name, 99, hz),)) for hz in (250.0, 120.0)
     ]
-    (line,) = describe_refusals(fleet_with(7, *rows, module_status(tracks)))
+    (line,) = describe_refusals(fleet_with(7, *rows, module_status(tracking())))
     assert f"refused, {refusal.name} of session 99: ankle_right 250/s, knee_right 120/s; " in line
     assert len(line.rpartition("; ")[2]) > 10, "and what to do"
 
 
 def test_what_is_no_command_is_told_without_a_session() -> None:
     malformed = RefusedCommands(Refusal.MALFORMED.name, 0, 40.0)
-    tracks = state(Mode.TRACK, Cause.COMMANDS_FRESH, DriveStatus.ARMED)
-    (line,) = describe_refusals(fleet_with(7, module_status(tracks, (malformed,))))
+    (line,) = describe_refusals(fleet_with(7, module_status(tracking(), (malformed,))))
     assert line.startswith("refused, MALFORMED: ankle_right 40/s; ")
 
 
@@ -144,15 +147,12 @@ def test_each_way_out_is_told_once_with_its_modules_at_any_width() -> None:
     """In a column of the table it was cut off at 80 columns, when it was needed."""
     stopped = module_status(state(Mode.DAMP, Cause.ESTOP, DriveStatus.ARMED))
     lost = module_status(state(Mode.FAULT, Cause.DRIVE_LOST, DriveStatus.LOST))
-    well = module_status(state(Mode.TRACK, Cause.COMMANDS_FRESH, DriveStatus.ARMED))
-    status = fleet_with(7, stopped, lost, stopped, well)
+    status = fleet_with(7, stopped, lost, stopped, module_status(tracking()))
     lines = describe_ways_out(status)
     assert [line.partition(":")[0] for line in lines] == ["ankle_right, hip_right", "knee_right"]
     assert "MODULE" in lines[0]
     assert "xrl kill knee_right" in lines[1]
-    printed = io.StringIO()
-    Console(width=60, file=printed).print(tables(status))
-    words = " ".join(printed.getvalue().split())
+    words = " ".join(shown(status, width=60).split())
     assert all(line in words for line in lines)
 
 
@@ -165,14 +165,10 @@ def test_another_fleet_is_named_and_the_own_is_not(monkeypatch: pytest.MonkeyPat
 
 
 def test_modules_that_follow_another_planner_are_named() -> None:
-    follows = msgspec.structs.replace(
-        state(Mode.TRACK, Cause.COMMANDS_FRESH, DriveStatus.ARMED), session=99
-    )
-    own = msgspec.structs.replace(follows, session=7)
-    rows = [module_status(own), module_status(follows)]
-    words = describe_sessions(fleet_with(7, *rows))
+    own, other = (module_status(tracking(session=session)) for session in (7, 99))
+    words = describe_sessions(fleet_with(7, own, other))
     assert words == "knee_right: last followed session 99, and the planner heard is 7"
-    assert describe_sessions(fleet_with(7, module_status(own), module_status(None))) == ""
+    assert describe_sessions(fleet_with(7, own, module_status(None))) == ""
 
 
 def test_the_other_tools_that_are_linked_are_told_with_their_hosts() -> None:
@@ -183,17 +179,17 @@ def test_the_other_tools_that_are_linked_are_told_with_their_hosts() -> None:
     assert tools_of(None) == ()
 
 
+def monitor_of(*states: JointState) -> RateMonitor:
+    messages = iter(states)
+    latest = SimpleNamespace(take=lambda: next(messages, None))
+    return RateMonitor(cast("Latest[Message]", latest))
+
+
 @pytest.mark.parametrize("apart_s", [-7200, 7200])
 def test_a_module_on_a_host_with_another_clock_is_as_old_as_its_last_message_came(
     apart_s: int,
 ) -> None:
-    there_ns = now_ns() + apart_s * NS_PER_S
-    said = msgspec.structs.replace(
-        state(Mode.TRACK, Cause.COMMANDS_FRESH, DriveStatus.ARMED), t_ns=there_ns
-    )
-    messages = iter([said])
-    latest = SimpleNamespace(take=lambda: next(messages, None))
-    monitor = RateMonitor(cast("Latest[Message]", latest))
+    monitor = monitor_of(tracking(t_ns=now_ns() + apart_s * NS_PER_S))
     assert not monitor.is_fresh()
     monitor.listen()
     assert monitor.is_fresh()
@@ -204,36 +200,30 @@ def test_a_module_on_a_host_with_another_clock_is_as_old_as_its_last_message_cam
     assert not monitor.is_fresh(), "it has been silent since"
 
 
-def heard(*states: JointState) -> RateMonitor:
-    """Return a monitor whose window began with the first of these states."""
-    messages = iter(states)
-    monitor = RateMonitor(cast("Latest[Message]", SimpleNamespace(take=lambda: next(messages))))
+def refusals_of(*states: JointState) -> tuple[RefusedCommands, ...]:
+    """Return what is refused in a window that began with the first of these states."""
+    monitor = monitor_of(*states)
     monitor.listen()
     monitor.new_window()
     for _ in states[1:]:
         monitor.listen()
-    return monitor
+    return monitor.refusals()
 
 
 def test_refusals_are_counted_by_cause_and_sender_over_the_window() -> None:
-    begin = msgspec.structs.replace(
-        state(Mode.TRACK, Cause.COMMANDS_FRESH, DriveStatus.ARMED), refused=10
-    )
-
     def later(ms: int, refused: int, refusal: Refusal, session: int) -> JointState:
-        return msgspec.structs.replace(
-            begin, t_ns=begin.t_ns + ms * 1_000_000, seq=begin.seq + ms, refused=refused,
-            refusal=int(refusal), refused_session=session,
+        return tracking(
+            t_ns=1 + ms * 1_000_000, seq=1 + ms, refused=refused, refusal=int(refusal),
+            refused_session=session,
         )  # fmt: skip
 
-    monitor = heard(
-        begin,
+    assert refusals_of(
+        tracking(refused=10),
         later(4, 12, Refusal.MALFORMED, 0),
         later(8, 13, Refusal.NOT_NEWER, 99),
         later(12, 13, Refusal.NOT_NEWER, 99),
         later(100, 16, Refusal.MALFORMED, 0),
-    )
-    assert monitor.refusals() == (
+    ) == (
         RefusedCommands("MALFORMED", 0, 50.0),
         RefusedCommands("NOT_NEWER", 99, 10.0),
     )
@@ -241,12 +231,9 @@ def test_refusals_are_counted_by_cause_and_sender_over_the_window() -> None:
 
 @pytest.mark.parametrize(("first", "last"), [(10, 10), (90, 5)])
 def test_no_refusal_is_told_where_none_came_or_the_service_restarted(first: int, last: int) -> None:
-    begin = msgspec.structs.replace(
-        state(Mode.TRACK, Cause.COMMANDS_FRESH, DriveStatus.ARMED),
-        refused=first, refusal=int(Refusal.TOO_OLD), refused_session=9,
-    )  # fmt: skip
+    begin = tracking(refused=first, refusal=int(Refusal.TOO_OLD), refused_session=9)
     end = msgspec.structs.replace(begin, t_ns=begin.t_ns + 100_000_000, seq=26, refused=last)
-    assert heard(begin, end).refusals() == ()
+    assert refusals_of(begin, end) == ()
 
 
 def test_what_others_say_is_data_in_the_status() -> None:
@@ -258,21 +245,16 @@ def test_what_others_say_is_data_in_the_status() -> None:
     status = msgspec.structs.replace(
         fleet_with(7, stopped), lead=LeadStatus(hostile, 0.0, 1.0, why=hostile), tools=(hostile,)
     )
-    printed = io.StringIO()
-    Console(file=printed).print(tables(status))
-    assert "[/b]" in printed.getvalue()
-    assert not re.search("[\x00-\x09\x0b-\x1f]", printed.getvalue())
+    printed = shown(status)
+    assert "[/b]" in printed
+    assert not re.search("[\x00-\x09\x0b-\x1f]", printed)
 
 
 def test_codes_that_this_version_does_not_know_are_told() -> None:
-    strange = msgspec.structs.replace(
-        state(Mode.TRACK, Cause.COMMANDS_FRESH, DriveStatus.ARMED),
-        mode=99, cause=98, drive=97, refusal=96, outside=95,
-    )  # fmt: skip
+    strange = joint_state(mode=99, cause=98, drive=97, refusal=96, outside=95)
     status = module_status(strange)
-    assert (status.mode, status.cause, status.drive) == (
-        "unknown (99)", "unknown (98)", "unknown (97)",
-    )  # fmt: skip
+    said = (status.mode, status.cause, status.drive)
+    assert said == ("unknown (99)", "unknown (98)", "unknown (97)")
     assert "another version" in status.way_out
 
 

@@ -45,58 +45,43 @@ class Seen(NamedTuple):
 
 _STANDARD = ((3, 4), (2, 5))
 _PEDALS = ((2, 5), (9, 10))
+_XPAD = Seen(0x045E, 0x028E, axes(S16, U8, *_STANDARD), XPAD_BUTTONS, 4, (2, 5), 0x137, 0x131)
+_HID = Seen(0x045E, 0x0B20, axes(U16, U10, *_PEDALS), HID_BUTTONS, 5, (10, 9), 0x137, 0x131)
+_SONY = _XPAD._replace(
+    vendor=0x054C, axes=axes(U8, U8, *_STANDARD),
+    buttons=(0x130, 0x131, 0x133, 0x134, *range(0x136, 0x13F)),
+)  # fmt: skip
 PADS = {
-    "Xbox 360 by cable": Seen(
-        0x045E, 0x028E, axes(S16, U8, *_STANDARD), XPAD_BUTTONS, 4, (2, 5), 0x137, 0x131
-    ),
+    "Xbox 360 by cable": _XPAD,
     "Xbox One S by Bluetooth, first firmware": Seen(
         0x045E, 0x02E0, axes(U16, U10, *_STANDARD), (0x8B, *range(0x130, 0x13A)),
         4, (2, 5), 0x135, 0x131,
     ),
-    "Xbox One S by Bluetooth": Seen(
-        0x045E, 0x02FD, axes(U16, U10, *_PEDALS), (0x9E, 0xAC, *HID_BUTTONS),
-        5, (10, 9), 0x137, 0x131,
+    "Xbox One S by Bluetooth": _HID._replace(product=0x02FD, buttons=(0x9E, 0xAC, *HID_BUTTONS)),
+    "Xbox One S by Bluetooth, xpadneo": _XPAD._replace(
+        product=0x02FD, axes=axes(S16, U10, *_STANDARD)
     ),
-    "Xbox One S by Bluetooth, xpadneo": Seen(
-        0x045E, 0x02FD, axes(S16, U10, *_STANDARD), XPAD_BUTTONS, 4, (2, 5), 0x137, 0x131
-    ),
-    "Xbox Series by Bluetooth": Seen(
-        0x045E, 0x0B13, axes(U16, U10, *_PEDALS), (0xA7, *HID_BUTTONS), 5, (10, 9), 0x137, 0x131
-    ),
-    "Xbox One S, BLE": Seen(
-        0x045E, 0x0B20, axes(U16, U10, *_PEDALS), HID_BUTTONS, 5, (10, 9), 0x137, 0x131
-    ),
-    "DualShock 4": Seen(
-        0x054C, 0x09CC, axes(U8, U8, *_STANDARD),
-        (0x130, 0x131, 0x133, 0x134, *range(0x136, 0x13F)), 4, (2, 5), 0x137, 0x131,
-    ),
+    "Xbox Series by Bluetooth": _HID._replace(product=0x0B13, buttons=(0xA7, *HID_BUTTONS)),
+    "Xbox One S, BLE": _HID,
+    "DualShock 4": _SONY._replace(product=0x09CC),
     "DualShock 4 without its driver": Seen(
         0x054C, 0x05C4, axes(U8, U8, (2, 5), (3, 4)), tuple(range(0x130, 0x13E)),
         5, (3, 4), 0x135, 0x132,
     ),
-    "DualSense": Seen(
-        0x054C, 0x0CE6, axes(U8, U8, *_STANDARD),
-        (0x130, 0x131, 0x133, 0x134, *range(0x136, 0x13F)), 4, (2, 5), 0x137, 0x131,
-    ),
+    "DualSense": _SONY._replace(product=0x0CE6),
     "Switch Pro": Seen(
         0x057E, 0x2009, axes((-32767, 32767), U8, (3, 4), ()),
         (0x130, 0x131, *range(0x133, 0x13F)), 4, (0x138, 0x139), 0x137, 0x131,
     ),
-    "8BitDo Pro 2": Seen(
-        0x2DC8, 0x6006, axes(U8, U8, *_PEDALS), HID_BUTTONS, 5, (10, 9), 0x137, 0x130
+    "8BitDo Pro 2": _HID._replace(
+        vendor=0x2DC8, product=0x6006, axes=axes(U8, U8, *_PEDALS), east=0x130
     ),
-    "8BitDo Ultimate": Seen(
-        0x2DC8, 0x3106, axes(S16, U8, *_STANDARD), XPAD_BUTTONS, 4, (2, 5), 0x137, 0x131
-    ),
-    "Logitech F310": Seen(
-        0x046D, 0xC21D, axes(S16, U8, *_STANDARD), XPAD_BUTTONS, 4, (2, 5), 0x137, 0x131
-    ),
-    "Logitech F710": Seen(
-        0x046D, 0xC21F, axes(S16, U8, *_STANDARD), XPAD_BUTTONS, 4, (2, 5), 0x137, 0x131
-    ),
-    "Stadia": Seen(
-        0x18D1, 0x9400, axes((1, 255), U8, *_PEDALS), (*XPAD_BUTTONS, *range(0x2C0, 0x2C4)),
-        5, (10, 9), 0x137, 0x131,
+    "8BitDo Ultimate": _XPAD._replace(vendor=0x2DC8, product=0x3106),
+    "Logitech F310": _XPAD._replace(vendor=0x046D, product=0xC21D),
+    "Logitech F710": _XPAD._replace(vendor=0x046D, product=0xC21F),
+    "Stadia": _HID._replace(
+        vendor=0x18D1, product=0x9400, axes=axes((1, 255), U8, *_PEDALS),
+        buttons=(*XPAD_BUTTONS, *range(0x2C0, 0x2C4)),
     ),
 }  # fmt: skip
 

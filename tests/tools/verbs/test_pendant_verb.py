@@ -8,7 +8,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -29,13 +30,6 @@ def files(tmp_path: Path) -> list[RearmGuard]:
     return [RearmGuard(tmp_path, module) for module in MODULES]
 
 
-def started(run_dir: Path, stdin: int = subprocess.DEVNULL) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "tools.cli", "pendant", "--run-dir", str(run_dir)]
-    return subprocess.Popen(
-        command, cwd=ROOT, stdin=stdin, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-
-
 def wait_for(happens: Callable[[], bool]) -> None:
     deadline = time.monotonic() + PATIENCE_S
     while not happens():
@@ -43,14 +37,26 @@ def wait_for(happens: Callable[[], bool]) -> None:
         time.sleep(0.01)
 
 
+@contextmanager
+def held(
+    run_dir: Path, files: list[RearmGuard], stdin: int = subprocess.DEVNULL
+) -> Iterator[subprocess.Popen[str]]:
+    """Give a pendant that beats, in a process of its own."""
+    command = [sys.executable, "-m", "tools.cli", "pendant", "--run-dir", str(run_dir)]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(
+        command, cwd=ROOT, stdin=stdin, stdout=pipe, stderr=pipe, text=True
+    ) as process:
+        try:
+            wait_for(lambda: all(file.beats > 3 for file in files))
+            yield process
+        finally:
+            process.kill()
+
+
 def test_after_a_kill_it_sends_no_more(tmp_path: Path, files: list[RearmGuard]) -> None:
-    process = started(tmp_path)
-    try:
-        wait_for(lambda: all(file.beats > 3 for file in files))
-        process.send_signal(signal.SIGKILL)
-    finally:
-        process.kill()
-        process.communicate()
+    with held(tmp_path, files):
+        pass
     beats = [file.beats for file in files]
     assert min(beats) > 3
     time.sleep(0.1)
@@ -59,15 +65,11 @@ def test_after_a_kill_it_sends_no_more(tmp_path: Path, files: list[RearmGuard]) 
 
 def test_enter_lays_it_down(tmp_path: Path, files: list[RearmGuard]) -> None:
     person, terminal = pty.openpty()
-    process = started(tmp_path, terminal)
-    try:
-        wait_for(lambda: files[0].beats > 3)
+    with held(tmp_path, files, terminal) as process:
         os.write(person, b"\n")
         said, _ = process.communicate(timeout=PATIENCE_S)
-    finally:
-        process.kill()
-        os.close(person)
-        os.close(terminal)
+    os.close(person)
+    os.close(terminal)
     assert process.returncode == 0
     assert "laid down" in said
     assert [file.beats for file in files] == [0] * 6
@@ -77,16 +79,12 @@ def test_ctrl_c_is_the_stop_and_names_the_services_that_have_not_stopped(
     tmp_path: Path, files: list[RearmGuard]
 ) -> None:
     """Five services stop in this test, the sixth does not hear it."""
-    rows = {module: Neighbours(tmp_path, module) for module in MODULES}
-    for module, row in rows.items():
-        row.write(NeighbourRow(1, 0.0, 0.0, Mode.DAMP if module != "hip_left" else Mode.HOLD))
-    process = started(tmp_path)
-    try:
-        wait_for(lambda: files[0].beats > 3)
+    for module in MODULES:
+        mode = Mode.DAMP if module != "hip_left" else Mode.HOLD
+        Neighbours(tmp_path, module).write(NeighbourRow(1, 0.0, 0.0, mode))
+    with held(tmp_path, files) as process:
         process.send_signal(signal.SIGINT)
         _, error = process.communicate(timeout=PATIENCE_S)
-    finally:
-        process.kill()
     assert process.returncode == 2
     assert "hip_left" in error
     assert "knee_left" not in error
@@ -96,28 +94,19 @@ def test_ctrl_c_is_the_stop_and_names_the_services_that_have_not_stopped(
 def test_a_terminal_that_is_cut_is_the_stop(tmp_path: Path, files: list[RearmGuard]) -> None:
     """Its hang-up ends the program; one that was started to outlive it stops all the same."""
     person, terminal = pty.openpty()
-    process = started(tmp_path, terminal)
-    try:
-        wait_for(lambda: files[0].beats > 3)
+    with held(tmp_path, files, terminal) as process:
         os.close(terminal)
         os.close(person)
         wait_for(lambda: all(file.stop_requested for file in files))
         process.communicate(timeout=PATIENCE_S)
-    finally:
-        process.kill()
     assert process.returncode == 2, "no service is there to stop"
 
 
 def test_a_second_pendant_is_refused_for_the_first_would_not_be_missed(
     tmp_path: Path, files: list[RearmGuard], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    process = started(tmp_path)
-    try:
-        wait_for(lambda: files[0].beats > 3)
+    with held(tmp_path, files):
         assert cli.main(["pendant", "--run-dir", str(tmp_path)]) == 2
-    finally:
-        process.kill()
-        process.communicate()
     assert "another pendant is held" in capsys.readouterr().err
 
 
