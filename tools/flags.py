@@ -284,11 +284,6 @@ def _reader(kind: Any, limits: Range | None) -> Callable[[str], Any]:
 
 
 def _number(kind: type[int] | type[float], limits: Range, text: str) -> float:
-    """Read a number.
-
-    Raises:
-        argparse.ArgumentTypeError: it is none, or out of range; says what is right.
-    """
     try:
         number = kind(text.strip()) if "_" not in text else math.nan
     except ValueError:

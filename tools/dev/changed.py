@@ -30,11 +30,7 @@ class Selection(NamedTuple):
 
 
 def changed_since(revision: str) -> set[str]:
-    """Return the files that differ from a revision, also new ones that git does not know.
-
-    Raises:
-        RunError: git does not know the revision.
-    """
+    """Return the files that differ from a revision, also new ones that git does not know."""
     lists = (
         ("diff", "--name-only", "--no-renames", revision, "--"),
         ("ls-files", "--others", "--exclude-standard"),

@@ -49,6 +49,8 @@ class Plan(NamedTuple):
 ALL: Final = Plan((LIVE, WAITING), beside=PATIENT)
 CHANGED: Final = "--changed"
 INTERRUPTED: Final = 128 + signal.SIGINT
+ENDS_BY: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""The first is ignored where a shell put us behind."""
 ENDS_IN_S: Final = 30.0
 """Time for a part to end after Ctrl-C: a fleet goes down."""
 LOOK_EVERY_S: Final = 0.2
@@ -102,11 +104,7 @@ class Check(msgspec.Struct):
 
 def main(argv: Sequence[str]) -> int:
     """Run all parts, or lint, types and the tests that pytest's arguments name; 0, 3 or 130."""
-    for number in (
-        signal.SIGINT,
-        signal.SIGTERM,
-        signal.SIGHUP,
-    ):  # SIGINT is ignored where a shell put us behind
+    for number in ENDS_BY:
         signal.signal(number, signal.default_int_handler)
     begun_s = time.monotonic()
     plan = Plan((PYTEST + tuple(argv),)) if argv else ALL

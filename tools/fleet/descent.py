@@ -91,11 +91,7 @@ class LegLoad:
         """Height of the COM at the last look, m above the ankles."""
 
     def fraction(self, states: Sequence[JointState | None]) -> float:
-        """Return the legs' upward force over the torso's weight; NaN if it is not known.
-
-        Args:
-            states: the newest of each module; None: not heard.
-        """
+        """Return the legs' upward force over the torso's weight; NaN if it is not known."""
         known = [state for state in states if state is not None]
         if len(known) < len(MODULES):
             return math.nan
@@ -154,12 +150,7 @@ class Descent:
     def step(
         self, now_s: float, states: Sequence[JointState | None], status: PlannerStatus | None
     ) -> Ask:
-        """Look once.
-
-        Args:
-            now_s: any clock that goes on.
-            states: the newest state of each module; None: not heard just now.
-            status: of the planner; None: not heard just now.
+        """Look once, by any clock; None: not heard just now.
 
         Raises:
             FleetError: it cannot go on; the robot is left as it stands.

@@ -32,11 +32,7 @@ LEADS_S: Final = 15.0
 
 
 class LedPlanner:
-    """The planner of a robot that is up.
-
-    Attributes:
-        status: the newest.
-    """
+    """The planner of a robot that is up, and its newest status."""
 
     def __init__(self, session: Session, verb: str) -> None:
         self._intents = session.publisher(topics.OPERATOR_INTENT, OperatorIntent)

@@ -35,14 +35,8 @@ Tell = Callable[[str], None]
 def lower(robot: RobotConfig, run_dir: Path, tell: Tell, *, wait_s: float, simulated: bool) -> None:
     """Go down, and wait until nothing bears on the legs; at once if nothing does.
 
-    Ctrl-C ends it: until it is down the robot stands where it is.
-
-    Args:
-        robot: the robot.
-        run_dir: of its services here.
-        tell: takes a line of progress.
-        wait_s: longest wait for its weight to be taken, s.
-        simulated: it is enough that it is down.
+    Ctrl-C ends it: until it is down the robot stands where it is. Its weight is to be taken within
+    `wait_s`; of a simulated one it is enough that it is down.
 
     Raises:
         FleetError: it bears weight and cannot go down, or nothing takes its weight.

@@ -69,16 +69,12 @@ class StallWatch:
         lines = self._file.readlines()
         if lines and not lines[-1].endswith(b"\n"):  # the rest is being written
             self._file.seek(-len(lines.pop()), os.SEEK_CUR)
-        return [_parsed(line) for line in lines]
+        return [Gap(*map(int, line.split())) for line in lines]
 
 
 def command(path: Path) -> list[str]:
     """Return the program's words; it ends with this process."""
     return [sys.executable, "-I", "-S", __file__, str(path), str(os.getpid())]
-
-
-def _parsed(line: bytes) -> Gap:
-    return Gap(*map(int, line.split()))
 
 
 def watch(path: Path, parent: int) -> None:

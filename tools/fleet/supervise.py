@@ -352,8 +352,8 @@ def _is_up(row: Process, service: ServiceInfo, endpoint: str | None) -> bool:
     return service.pid is not None and process_table.is_listening(endpoint)
 
 
-def _tail(log: Path, lines: int = 5) -> str:
+def _tail(log: Path) -> str:
     with contextlib.suppress(OSError):
         text = log.read_text(encoding="utf-8", errors="replace").rstrip()
-        return "\n".join(f"  {line}" for line in text.splitlines()[-lines:])
+        return "\n".join(f"  {line}" for line in text.splitlines()[-5:])
     return ""

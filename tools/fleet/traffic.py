@@ -30,13 +30,7 @@ class _Numbering(msgspec.Struct, gc=False):
 
 
 class KeyTraffic:
-    """The messages of one key in a window of time.
-
-    Attributes:
-        count: messages in the window.
-        size: of these, bytes.
-        lost: messages in the window that the numbers of the senders jump over.
-    """
+    """The messages of one key in a window of time: `count`, and their `size`, bytes."""
 
     def __init__(self, key: TopicKey, *, here: bool = True) -> None:
         """Count from now on; `here`: the sender is on this host, and has its clock."""
@@ -69,7 +63,7 @@ class KeyTraffic:
 
     @property
     def lost(self) -> int:
-        """Messages in the window that did not come."""
+        """Messages in the window that the numbers of the senders jump over."""
         return self._counted.missing - self._lost_before
 
     @property

@@ -90,7 +90,6 @@ def load(path: Path, robot: RobotConfig) -> Hosts:
 def _check(file: str, hosts: Hosts, robot: RobotConfig) -> None:
     services = real_services(robot)
     homes: dict[str, str] = {}
-    seen: dict[str, str] = {}
     for index, host in enumerate(hosts.host):
         where = f"host[{index}]"
         if not re.fullmatch(r"[A-Za-z0-9_-]+", host.name):
@@ -102,9 +101,7 @@ def _check(file: str, hosts: Hosts, robot: RobotConfig) -> None:
         if host.ssh.startswith("-") or not host.ssh.strip():
             raise ConfigError(file, f"{where}.ssh", f"{host.ssh!r}", "as ssh takes it: user@host")
         for key, value in (("name", host.name), ("address", host.address)):
-            if seen.setdefault(f"{key} {value}", host.name) != host.name or value in (
-                other.name for other in hosts.host[:index]
-            ):
+            if value in (getattr(other, key) for other in hosts.host[:index]):
                 raise ConfigError(file, f"{where}.{key}", f"{value!r} stands twice", "one each")
         if host.processors and not re.fullmatch(r"\d+(-\d+)?([ ,]\d+(-\d+)?)*", host.processors):
             found = f"{host.processors!r}"

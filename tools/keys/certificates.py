@@ -62,12 +62,8 @@ def issue(
 ) -> Issued:
     """Return a new certificate for both sides of a link.
 
-    Args:
-        authority: that signs it.
-        common_name: what the access rules go by (`shared.bus.security.common_name`).
-        hosts: names and addresses that the service is dialled by; the one who dials checks them.
-        now: in UTC.
-        days: until it expires.
+    The access rules go by its common name (`shared.bus.security.common_name`); who dials checks the
+    names and addresses of `hosts`.
     """
     signer = serialization.load_pem_private_key(authority.key, password=None)
     if not isinstance(signer, ec.EllipticCurvePrivateKey):

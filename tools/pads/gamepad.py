@@ -42,11 +42,7 @@ SHOWN: Final = {
 
 
 class Axis:
-    """One axis, or a button in its place: the way from where it rests.
-
-    Attributes:
-        value: as the kernel gives it now.
-    """
+    """One axis, or a button in its place: the way from where it rests."""
 
     def __init__(self, name: str, control: PadControl, device: PadDevice) -> None:
         """Take its range and its value."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import re
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -59,10 +59,10 @@ def own_file() -> Path | None:
         return None
 
 
-def given_lines(environment: Mapping[str, str] = os.environ) -> Iterator[GivenLine]:
+def given_lines() -> Iterator[GivenLine]:
     """Yield the lines of the environment, of the file that it names, and of the user's file."""
-    yield from _lines(TEXT_VARIABLE, environment.get(TEXT_VARIABLE, ""))
-    named = environment.get(FILE_VARIABLE, "")
+    yield from _lines(TEXT_VARIABLE, os.environ.get(TEXT_VARIABLE, ""))
+    named = os.environ.get(FILE_VARIABLE, "")
     if named:
         yield from _lines(named, _content(Path(named), FILE_VARIABLE))
     own = own_file()

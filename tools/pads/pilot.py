@@ -36,11 +36,7 @@ class Led(NamedTuple):
 
 
 class Pilot:
-    """Integrates deflections, while they are meant.
-
-    Attributes:
-        led: where it leads now.
-    """
+    """Integrates deflections, while they are meant; `led` is where it leads now."""
 
     def __init__(self, height: float, pitch: float, assist_max_n: float) -> None:
         self._assist_max_n = assist_max_n

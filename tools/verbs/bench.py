@@ -75,11 +75,8 @@ def measure(
 ) -> tuple[list[PartRow], list[str]]:
     """Return the table's rows, and what could not be measured.
 
-    Args:
-        config: robot file; of one in this checkout the other revision takes its own version.
-        against: a git revision that measures in turn with this tree, or None.
-        rounds: rounds of each.
-        console: for the progress.
+    A git revision to compare `against` measures in turn with this tree, and takes its own version
+    of a robot file in this checkout.
     """
     with ExitStack() as stack:
         other = None if against is None else stack.enter_context(revisions.unpacked(against))

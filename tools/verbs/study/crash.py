@@ -96,11 +96,7 @@ def run(flags: CrashFlags) -> int:
 
 
 def select(cases: Sequence[CrashCase], *, quick: bool, only: Sequence[str]) -> list[CrashCase]:
-    """Return the selected cases, in their order.
-
-    Raises:
-        RunError: a name or pattern of `only` fits no case.
-    """
+    """Return the selected cases, in their order."""
     for name in only:
         if not any(fnmatchcase(case.name, name) for case in cases):
             near = difflib.get_close_matches(name, [case.name for case in cases], n=3, cutoff=0.4)
@@ -132,11 +128,7 @@ def _run_all(
     results: list[Result],
     console: Console,
 ) -> None:
-    """Run the cases, each written as it is done.
-
-    Raises:
-        RunError: no fleet can be run here.
-    """
+    """Run the cases, each written as it is done."""
     about = _about(robot)
     bar = Progress(
         BarColumn(bar_width=20),
