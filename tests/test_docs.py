@@ -26,7 +26,7 @@ from shared.config.gain_schedule import inputs_of
 from shared.config.robot_config import SERVICES
 from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
-from tools.dev.reference.__main__ import FOLDER, PAGES
+from tools.dev.reference.__main__ import FOLDER, PAGES, text_of
 from tools.judge import standing
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -79,7 +79,7 @@ def test_a_generated_page_is_up_to_date(name: str) -> None:
     if name == "verbs.md" and sys.version_info[:2] != (3, 11):
         pytest.skip("its help is as argparse of the oldest Python, 3.11, wraps it")
     path = FOLDER / name
-    assert path.read_text(encoding="utf-8") == PAGES[name](), "run `python -m tools.dev.reference`"
+    assert path.read_text(encoding="utf-8") == text_of(name), "run `python -m tools.dev.reference`"
 
 
 def test_a_table_said_to_need_xrl_gains_is_wholly_an_input_of_the_gain_schedule() -> None:

@@ -251,18 +251,7 @@ def read_status(
     return FleetStatus(
         run_dir=str(fleet.run.path),
         config=fleet.manifest.config,
-        services={
-            row.name: ServiceStatus(
-                row.pid,
-                row.state,
-                row.uptime_s,
-                *present.get(row.name, (None, None)),
-                row.restarts,
-                row.last_exit,
-                _real_time(row),
-            )
-            for row in infos
-        },
+        services={row.name: _service_status(row, *present.get(row.name, ())) for row in infos},
         modules={
             module: module_status(
                 newest[module], monitors[module].refusals(), stop_source(fleet.run.path, module)
@@ -277,6 +266,21 @@ def read_status(
         tools=tools_of(roster),
         trouble=(*_trouble_of(fleet, infos), *recorder),
         bus_faults=bus.describe({row.name: row.pid for row in infos if row.pid is not None}),
+    )
+
+
+def _service_status(
+    info: ServiceInfo, age_s: float | None = None, rate_hz: float | None = None
+) -> ServiceStatus:
+    return ServiceStatus(
+        pid=info.pid,
+        state=info.state,
+        uptime_s=info.uptime_s,
+        age_s=age_s,
+        rate_hz=rate_hz,
+        restarts=info.restarts,
+        last_exit=info.last_exit,
+        real_time=_real_time(info),
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Final
 
@@ -12,7 +12,7 @@ from shared.exceptions import FAULT_EXIT_CODE
 from tools.dev.reference import faults, modes, robot_file, topics, verbs
 
 FOLDER: Final = Path(__file__).resolve().parents[3] / "docs" / "reference"
-PAGES: Final[dict[str, Callable[[], str]]] = {
+PAGES: Final[dict[str, Callable[[], Iterable[str]]]] = {
     "topics.md": topics.page,
     "robot-file.md": robot_file.page,
     "verbs.md": verbs.page,
@@ -20,7 +20,12 @@ PAGES: Final[dict[str, Callable[[], str]]] = {
     "modes.md": modes.page,
     "modes.svg": modes.diagram,
 }
-"""Generated files, by name."""
+"""Lines of the generated files, by name."""
+
+
+def text_of(name: str) -> str:
+    """Return a generated file."""
+    return "\n".join(PAGES[name]()).rstrip() + "\n"
 
 
 def main() -> int:
@@ -34,8 +39,8 @@ def main() -> int:
     )
     args = parser.parse_args()
     old = []
-    for name, make in PAGES.items():
-        path, text = FOLDER / name, make()
+    for name in PAGES:
+        path, text = FOLDER / name, text_of(name)
         if not path.exists() or path.read_text(encoding="utf-8") != text:
             old.append(name)
             if not args.check:

@@ -38,12 +38,8 @@ its limit, and all six modules go to HOLD. Limits are those of `[trips]` in `dep
 """
 
 
-def page() -> str:
-    """Return the page in Markdown."""
-    return "\n".join(_lines()).rstrip() + "\n"
-
-
-def _lines() -> Iterator[str]:
+def page() -> Iterator[str]:
+    """Yield the page in Markdown."""
     yield _INTRODUCTION
     yield from table(
         "fault | what it is | the drive | limp | zero lost | cause | what a person does",

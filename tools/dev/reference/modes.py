@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Iterator
 from typing import Final
 
 from services.joint.failsafe import TRANSITIONS, Event
@@ -39,8 +40,8 @@ _COLOUR: Final = {
 }  # fmt: skip
 
 
-def page() -> str:
-    """Return the page in Markdown."""
+def page() -> Iterator[str]:
+    """Yield the page in Markdown."""
     docs = cell_docs(Event)
     rows = []
     for event in Event:
@@ -49,7 +50,8 @@ def page() -> str:
             about = f": {docs[event.name]}" if event.name in docs else ""
             rows.append([f"`{event.name}`{about}", *cells])
     headings = " | ".join(["event", *(f"in {mode.name}" for mode in Mode)])
-    return "\n".join([_INTRODUCTION, *table(headings, rows)]) + "\n"
+    yield _INTRODUCTION
+    yield from table(headings, rows)
 
 
 def _after(mode: Mode, event: Event) -> str:
@@ -57,31 +59,25 @@ def _after(mode: Mode, event: Event) -> str:
     return row[0].name if row else ""
 
 
-def diagram() -> str:
-    """Return the diagram as an SVG file."""
+def diagram() -> Iterator[str]:
+    """Yield the diagram as an SVG file."""
     width, height = _SIZE
-    parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" role="img">',
-        "<title>Modes of a joint service and the events between them</title>",
-        _STYLE,
-    ]
-    for (before, after), events in _arrows().items():
-        parts.append(_arrow(before, after, events))
-    for mode, (x, y) in _AT.items():
-        w, h = _BOX
-        parts.append(
-            f'<rect x="{x - w / 2:g}" y="{y - h / 2:g}" width="{w}" height="{h}" rx="8" '
-            f'fill="{_COLOUR[mode]}"/><text class="name" x="{x}" y="{y + 5}">{mode.name}</text>'
-        )
-    return "\n".join([*parts, "</svg>"]) + "\n"
-
-
-def _arrows() -> dict[tuple[Mode, Mode], list[Event]]:
+    yield f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" role="img">'
+    yield "<title>Modes of a joint service and the events between them</title>"
+    yield _STYLE
     arrows: dict[tuple[Mode, Mode], list[Event]] = defaultdict(list)
     for before, row in TRANSITIONS.items():
         for event, (after, _) in row.items():
             arrows[before, after].append(event)
-    return arrows
+    for (before, after), events in arrows.items():
+        yield _arrow(before, after, events)
+    for mode, (x, y) in _AT.items():
+        w, h = _BOX
+        yield (
+            f'<rect x="{x - w / 2:g}" y="{y - h / 2:g}" width="{w}" height="{h}" rx="8" '
+            f'fill="{_COLOUR[mode]}"/><text class="name" x="{x}" y="{y + 5}">{mode.name}</text>'
+        )
+    yield "</svg>"
 
 
 def _arrow(before: Mode, after: Mode, events: list[Event]) -> str:

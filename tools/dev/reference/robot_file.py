@@ -37,13 +37,13 @@ _NOT_IN_THE_FILE: Final = "gain_schedule"
 """Read from the file beside it (`shared.config.gain_schedule`)."""
 
 
-def page() -> str:
-    """Return the page in Markdown."""
-    text = DEFAULT_CONFIG.read_text(encoding="utf-8")
-    shipped = _Shipped(text)
-    lines = [_INTRODUCTION.format(inputs=_schedule_inputs()), "## Top level", ""]
-    lines += [*_table(RobotConfig, "", shipped), *_sections(RobotConfig, "", shipped)]
-    return "\n".join(lines).rstrip() + "\n"
+def page() -> Iterator[str]:
+    """Yield the page in Markdown."""
+    shipped = _Shipped(DEFAULT_CONFIG.read_text(encoding="utf-8"))
+    yield _INTRODUCTION.format(inputs=_schedule_inputs())
+    yield "## Top level\n"
+    yield from _table(RobotConfig, "", shipped)
+    yield from _sections(RobotConfig, "", shipped)
 
 
 def _schedule_inputs() -> str:

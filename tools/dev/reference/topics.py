@@ -29,12 +29,8 @@ All topics are recorded unless the table says otherwise.
 """
 
 
-def page() -> str:
-    """Return the page in Markdown."""
-    return "\n".join(_lines()).rstrip() + "\n"
-
-
-def _lines() -> Iterator[str]:
+def page() -> Iterator[str]:
+    """Yield the page in Markdown."""
     yield _INTRODUCTION
     headings = "topic | message | rate | priority | from | to | purpose"
     yield from table(headings, map(_topic_row, topics.TOPICS))

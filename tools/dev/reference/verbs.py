@@ -33,8 +33,8 @@ bus or in a file's name are printed escaped, such as `\\u001b`.
 """
 
 
-def page() -> str:
-    """Return the page in Markdown."""
+def page() -> Iterator[str]:
+    """Yield the page in Markdown."""
     before = os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = _WIDTH  # argparse wraps by it
     try:
@@ -45,10 +45,10 @@ def page() -> str:
         else:
             os.environ["COLUMNS"] = before
     rows = ((f"[`{verb.name}`](#xrl-{verb.name.replace(' ', '-')})", verb.help) for verb in VERBS)
-    lines = [_INTRODUCTION, *table("verb | what it does", rows)]
+    yield _INTRODUCTION
+    yield from table("verb | what it does", rows)
     for name, text in helps:
-        lines += ["", f"## xrl {name}", "", "```text", text.rstrip(), "```"]
-    return "\n".join(lines) + "\n"
+        yield f"\n## xrl {name}\n\n```text\n{text.rstrip()}\n```"
 
 
 def _helps(parser: argparse.ArgumentParser) -> Iterator[tuple[str, str]]:
