@@ -80,7 +80,7 @@ class Place(NamedTuple):
 @pytest.fixture
 def place(robot: RobotConfig) -> Iterator[Place]:
     base = Path(tempfile.mkdtemp(prefix="xrl-h-", dir="/tmp"))
-    make_hosts(base, real=True, running=True)
+    make_hosts(base, running=True)
     own = with_drives_in(robot, base / "sim")
     (base / "robot.toml").write_text(config_file.to_toml(own), encoding="utf-8")
     shutil.copy(DEFAULT_CONFIG.with_suffix(".gains.json"), base / "robot.gains.json")

@@ -142,7 +142,7 @@ def made_up(
 def test_a_clock_that_no_machine_has_is_refused(
     digits: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = made_up(tmp_path / "a.mcap", {"clock": {"offset_ns": "9" * digits}})
+    path = made_up(tmp_path / "a.mcap", {"clock": {"offset_ns": "9" * digits}}, most=20)
     for verb in ("report", "explain", "resim"):
         assert "offset_ns" in told(["log", verb, path], capsys)
 
@@ -158,7 +158,7 @@ def test_times_beyond_64_bits_are_refused(
 def test_a_robot_file_in_a_log_that_is_none_is_refused(
     content: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = made_up(tmp_path / "a.mcap", attachments={"robot.toml": content})
+    path = made_up(tmp_path / "a.mcap", attachments={"robot.toml": content}, most=20)
     for verb in ("explain", "resim"):
         assert "robot.toml" in told(["log", verb, path], capsys)
 
@@ -167,7 +167,7 @@ def test_a_robot_file_in_a_log_that_is_none_is_refused(
 def test_gains_in_a_log_that_are_none_are_refused(
     content: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = made_up(tmp_path / "a.mcap", attachments={"robot.gains.json": content})
+    path = made_up(tmp_path / "a.mcap", attachments={"robot.gains.json": content}, most=20)
     assert "no gain schedule" in told(["log", "resim", path], capsys)
 
 

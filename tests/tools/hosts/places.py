@@ -63,12 +63,11 @@ exit 0""",
 }
 
 
-def make_hosts(base: Path, *, real: bool = False, running: bool = False) -> Path:
+def make_hosts(base: Path, *, running: bool = False) -> Path:
     """Make three hosts and return their hosts file.
 
     Args:
         base: an empty folder; a short path, for sockets are in it.
-        real: the hosts have this checkout with its environment; else scripts that only call back.
         running: their services are to run, so what files name has to be each host's own.
     """
     if running and not _may_mount():
@@ -90,12 +89,11 @@ def make_hosts(base: Path, *, real: bool = False, running: bool = False) -> Path
         )  # fmt: skip
     if running:
         (base / SHARED).mkdir()
-    checkout = _checkout(base) if real else base
     file = base / "hosts.toml"
     table = {
         "host": rows,
         "first_port": 20_000 + os.getpid() % 20_000,
-        "checkout": str(checkout),
+        "checkout": str(_checkout(base)),
         "folder": str(base / SHARED) if running else "/etc/xrl",
         "ssh": [str(base / "bin" / "ssh")],
     }

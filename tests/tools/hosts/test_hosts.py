@@ -31,7 +31,7 @@ def base(short_dir: Path) -> Path:
 
 @pytest.fixture
 def file(base: Path) -> Path:
-    return make_hosts(base, real=True)
+    return make_hosts(base)
 
 
 @pytest.fixture
@@ -255,7 +255,7 @@ def test_down_stops_no_host_before_one_of_them_has_lowered_the_robot(
 def test_a_key_that_is_lost_is_told_until_every_host_knows(
     base: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    make_hosts(base, real=True, running=True)
+    make_hosts(base, running=True)
     make_keys(base)
     assert xrl("update", base) == 0
     assert xrl("check", base) == 0, capsys.readouterr().out
@@ -271,4 +271,4 @@ def test_a_key_that_is_lost_is_told_until_every_host_knows(
     assert "other" not in said, "every host knows"
     assert xrl("update", base, "left") == 0
     assert not (keys / "planner.key").exists()
-    assert xrl("check", base) == 0, capsys.readouterr().out
+    assert xrl("check", base, "left") == 0, capsys.readouterr().out

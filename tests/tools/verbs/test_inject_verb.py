@@ -76,13 +76,3 @@ def test_the_list_shows_what_is_hidden_and_by_which_rule_and_what_is_to_come(
     assert "planner->joints delay=30ms hidden on 3 of 6 until --clear 10 0" in shown
     assert "all loss=100% in 2.0 s 5.0 s 0 0" in shown
     assert f"hidden: {inject.RULE}" in shown
-
-
-def test_the_help_states_which_of_several_counts_and_that_a_loss_of_1_is_all(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    with pytest.raises(SystemExit):
-        cli.main(["inject", "--help"])
-    shown = " ".join(capsys.readouterr().out.split())
-    assert f"O{inject.RULE[1:]}" in shown
-    assert "1 is all, and not 1%" in shown

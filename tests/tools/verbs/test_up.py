@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime as dt
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,7 +11,7 @@ import pytest
 
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import BusError, FleetError, RunError
+from shared.exceptions import FleetError, RunError
 from shared.places import DEFAULT_CONFIG
 from tests.certified import certified
 from tests.tools.exit_codes import exit_code
@@ -40,7 +41,7 @@ def test_nothing_starts_while_the_clock_is_before_the_certificates_time(
     (tmp_path / "robot.gains.json").write_bytes(schedule.read_bytes())
     where = ["--config", str(config), "--run-dir", str(run_dir), "--out", str(tmp_path / "out")]
     assert cli.main(["up", *where]) == 2
-    assert "not valid before" in capsys.readouterr().err
+    assert re.search("not valid before .*set the clock", capsys.readouterr().err)
     assert not run_dir.exists()
 
 
@@ -49,8 +50,6 @@ def test_where_nobody_looks_on_the_services_start_and_wait_for_the_clock(
 ) -> None:
     up._check_keys(not_valid_yet, must=False)
     assert "no link over TLS: " in capsys.readouterr().err
-    with pytest.raises(BusError, match="set the clock"):
-        up._check_keys(not_valid_yet, must=True)
 
 
 def test_where_nobody_looks_on_a_robot_starts_without_its_record(
