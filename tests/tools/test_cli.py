@@ -62,14 +62,10 @@ def commands(example: str) -> Iterator[list[str]]:
 
 
 @pytest.mark.parametrize("verb", VERBS, ids=lambda verb: verb.name)
-def test_every_example_of_every_help_is_read_and_its_flags_fit_each_other(
-    verb: Verb, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert exit_code([*verb.name.split(), "--help"]) == 0
-    _, _, shown = capsys.readouterr().out.rpartition("examples:\n")
+def test_every_example_of_every_help_is_read_and_its_flags_fit_each_other(verb: Verb) -> None:
     by_name = {one.name: one for one in VERBS}
     own = 0
-    for words in itertools.chain.from_iterable(map(commands, shown.splitlines())):
+    for words in itertools.chain.from_iterable(map(commands, verb.examples)):
         parser = cli._parser(words)
         asked = by_name[cli._asked(parser, words)]
         found = parser.parse_args(cli._with_values(words))

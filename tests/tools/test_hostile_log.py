@@ -72,6 +72,7 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> str:
         {HOSTILE: b"x", f"{HOSTILE}.toml": HOSTILE.encode()},
         with_hostile_words,
         [HOSTILE, f"xrl/{robot}/{HOSTILE}", f"xrl/{robot}/joint/{HOSTILE}/state"],
+        most=200,
     )
 
 
