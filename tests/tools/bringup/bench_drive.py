@@ -1,17 +1,49 @@
-"""A drive on a bench in virtual time, with a joint behind it that a test can spoil."""
+"""A drive on a bench in virtual time, with a joint behind it that a test can spoil; its motions."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 
 from services.joint.differential import joint_torque, motor_from_joint
-from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.base import Drive, DriveReading, DriveStatus, MotorTarget
 from shared.bus.messages import Pair
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
+from tools.bringup.jog import JogPlan, ThereAndBack
+from tools.bringup.motion import AnyPlan, Sample
+from tools.bringup.motion_runner import Interrupts, MotionResult, run_motion
 
 START: Pair = (0.03, -1.0)
 STEP_NS = NS_PER_S // 1000
+MODULE = "knee_left"
+PLAN = JogPlan(axis=1, course=ThereAndBack(0.05, 2.0, 2), torque_limit=10.0)
+Progress = Callable[[Sample], None]
+
+
+def unwatched(_: Sample) -> None:
+    """See nothing."""
+
+
+def jog_by(rad: float) -> JogPlan:
+    return PLAN._replace(course=PLAN.course._replace(by=rad))
+
+
+def move(
+    drives: Mapping[str, Drive],
+    robot: RobotConfig,
+    module: str,
+    plan: AnyPlan,
+    q_seen: Pair,
+    clock: Callable[[], int],
+    progress: Progress = unwatched,
+    interrupts: Interrupts | None = None,
+) -> MotionResult:
+    """Return how a motion ended, by the one runner; robot: as of `limit_drives`."""
+    return run_motion(
+        drives, robot, module, plan, q_seen=q_seen, interrupts=interrupts or Interrupts(),
+        progress=progress, clock=clock,
+    )  # fmt: skip
 
 
 class BenchDrive:
@@ -43,6 +75,19 @@ class BenchDrive:
 
     def clock(self) -> int:
         return self.now_ns
+
+    def run(
+        self,
+        robot: RobotConfig,
+        plan: AnyPlan = PLAN,
+        *,
+        q_seen: Pair = START,
+        progress: Progress = unwatched,
+        interrupts: Interrupts | None = None,
+    ) -> MotionResult:
+        """Return how a motion of it alone ended."""
+        drives = {MODULE: self}
+        return move(drives, robot, MODULE, plan, q_seen, self.clock, progress, interrupts)
 
     def read(self, timeout_s: float) -> DriveReading | None:
         for _ in range(2):

@@ -1,6 +1,10 @@
-"""The simulated robot on its hoist, feet in the air, in virtual time: each drive as a `Drive`."""
+"""The simulated robot that hangs still, feet in the air, in virtual time; each drive a `Drive`."""
 
 from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
 
 from services.joint.drivers.base import DriveReading
 from services.joint.drivers.wired_drive import MotorFrame, WiredDrive
@@ -13,10 +17,16 @@ from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Scenario
 from shared.joints import MODULES
+from tools.bringup.hanging_leg import leg_of
 from tools.sim.virtual_drive import VirtualDrive
 
 STEP_NS = NS_PER_S // 1000
 STAND = Scenario("stand", "nothing", 10.0, (Keyframe(0.0, 1.188),))
+RIGHT: Final = (0.1, 0.2, 0.0, -0.0506, 0.0, 0.0337)
+LEFT: Final = (-0.1, *RIGHT[1:])
+"""rad; where legs hang at rest, their knees on the stop: friction holds the ankles anywhere."""
+SETTLED: Final = 300
+"""ms until every drive has spoken."""
 
 
 class HungRobot:
@@ -39,14 +49,24 @@ class HungRobot:
             )
             for index, name in enumerate(MODULES)
         }
-        for _ in range(1500):
-            self.step()
+        world, hanging = self.world, np.array(RIGHT + LEFT)
+        world.data.qpos[world.joints.q_index] = hanging
+        world.actuation.settle(hanging)
+        self.wait(1e-3 * SETTLED)
 
     def step(self) -> None:
         """Move on by a millisecond."""
         self.torque = self.bank.step(self.world.time, *self.world.motor_turns())
         self.world.step(self.torque)
         self.now_ns += STEP_NS
+
+    def wait(self, seconds: float) -> None:
+        for _ in range(round(1e3 * seconds)):
+            self.step()
+
+    def leg(self, module: str) -> dict[str, HungDrive]:
+        """Return the drives of a module's leg."""
+        return {name: self.drives[name] for name in leg_of(module)}
 
     def clock(self) -> int:
         return self.now_ns

@@ -13,8 +13,7 @@ from services.joint.differential import joint_torque
 from shared.bus.messages import Pair
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
-from tests.tools.bringup.bench_drive import START, BenchDrive
-from tests.tools.bringup.moved_module import MODULE, PLAN, jog_by, on_bench
+from tests.tools.bringup.bench_drive import MODULE, PLAN, START, BenchDrive, jog_by
 from tools.bringup.hanging_leg import HangingJoint
 from tools.bringup.identify.sines import plan_for
 from tools.bringup.jog import JogCheck, judge, what_to_see
@@ -97,7 +96,7 @@ def verdict(samples: list[Sample]) -> dict[str, JogCheck]:
 
 
 def jogged(drive: BenchDrive, robot: RobotConfig, by: float = 0.05) -> list[Sample]:
-    return on_bench(drive, limit_drives(robot, PLAN), jog_by(by)).samples
+    return drive.run(limit_drives(robot, PLAN), jog_by(by)).samples
 
 
 def test_friction_is_what_both_ways_take_more_than_gravity(

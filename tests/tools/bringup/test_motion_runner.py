@@ -16,22 +16,16 @@ from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
 from shared.joints import MODULE_INDEX
-from tests.tools.bringup.bench_drive import START, BenchDrive
+from tests.tools.bringup.bench_drive import MODULE, PLAN, START, BenchDrive, jog_by, move
 from tests.tools.bringup.hung_robot import HungRobot
-from tests.tools.bringup.moved_module import (
-    MODULE,
-    PLAN,
-    hanging,
-    jog_by,
-    leg_drives,
-    on_bench,
-)
 from tools.bringup import motion_runner
 from tools.bringup.jog import JogPlan, ThereAndBack, judge
-from tools.bringup.motion import APART_MAX, Sample, limit_drives
+from tools.bringup.motion import APART_MAX, Sample, limit_drives, within_stops
 from tools.bringup.motion_runner import Interrupts, MotionResult, hanging_angles
 
 ANKLE = "ankle_left"
+HELD = JogPlan(0, ThereAndBack(0.02, 1.0, 1), 15.0)
+"""With the leg's other modules held."""
 
 
 @pytest.fixture
@@ -54,7 +48,7 @@ def test_a_free_joint_follows_and_comes_back_and_is_idle(
     drive: BenchDrive, limited: RobotConfig, plan: JogPlan
 ) -> None:
     seen: list[Sample] = []
-    result = on_bench(drive, limited, plan, progress=seen.append)
+    result = drive.run(limited, plan, progress=seen.append)
     assert (result.trouble, result.not_idle) == ("", ())
     assert all(row.good for row in judge(result.samples, plan))
     assert drive.q == pytest.approx(START, abs=0.01)
@@ -79,7 +73,7 @@ def test_a_fault_stops_it_within_the_torque_limit_and_the_drive_is_idled(
 ) -> None:
     for name, value in fault.items():
         setattr(drive, name, value)
-    result = on_bench(drive, limited, plan)
+    result = drive.run(limited, plan)
     assert re.search(words, result.trouble)
     assert drive.largest <= PLAN.torque_limit + 1e-9
     assert drive.idles >= 3
@@ -93,7 +87,7 @@ def test_samples_that_come_too_seldom_end_it(
     drive: BenchDrive, limited: RobotConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(motion_runner, "OVERTIME_S", -4.0)
-    result = on_bench(drive, limited)
+    result = drive.run(limited)
     assert "the drive's samples come too rarely" in result.trouble
     assert drive.status is DriveStatus.IDLE
 
@@ -125,7 +119,7 @@ def test_an_interrupt_idles_the_drive_first(drive: BenchDrive, limited: RobotCon
 
     drive.read = read  # type: ignore[method-assign]
     with interrupts.kept():
-        result = on_bench(drive, limited, interrupts=interrupts)
+        result = drive.run(limited, interrupts=interrupts)
     assert (result.trouble, result.not_idle) == ("stopped by SIGTERM", ())
     assert interrupts.number == signal.SIGTERM
 
@@ -134,7 +128,7 @@ def test_a_drive_is_not_armed_after_an_interrupt(drive: BenchDrive, limited: Rob
     interrupts, armed = Interrupts(), []
     interrupts.number = signal.SIGINT
     drive.arm = lambda *, onboard: armed.append(onboard)  # type: ignore[method-assign]
-    assert on_bench(drive, limited, interrupts=interrupts).trouble == "stopped by SIGINT"
+    assert drive.run(limited, interrupts=interrupts).trouble == "stopped by SIGINT"
     assert armed == []
 
 
@@ -147,7 +141,7 @@ def test_an_error_of_our_own_idles_the_drive_or_says_that_it_did_not(
 
     drive.deaf = deaf
     with pytest.raises(BrokenPipeError) as raised:
-        on_bench(drive, limited, progress=broken)
+        drive.run(limited, progress=broken)
     assert (drive.status is DriveStatus.IDLE) != deaf
     notes = "".join(getattr(raised.value, "__notes__", []))
     assert ("CUT ITS POWER" in notes) == deaf
@@ -164,7 +158,7 @@ def test_an_error_of_our_own_idles_the_drive_or_says_that_it_did_not(
 def test_a_joint_that_may_not_move_from_where_it_is_armed_is_not_moved(
     drive: BenchDrive, limited: RobotConfig, q_seen: tuple[float, float], plan: JogPlan, words: str
 ) -> None:
-    result = on_bench(drive, limited, plan, q_seen=q_seen)
+    result = drive.run(limited, plan, q_seen=q_seen)
     assert words in result.trouble
     assert result.samples == []
     assert drive.largest == 0.0
@@ -177,15 +171,15 @@ def test_a_leg_that_swings_is_waited_for_but_not_for_ever(
     hung.world.data.qvel[6:] = 0.5
     monkeypatch.setattr(motion_runner, "STILL_WAIT_S", 1.0)
     with pytest.raises(DriveError, match="swings"):
-        hanging_angles(leg_drives(hung, ANKLE), robot, interrupts, hung.clock)
+        hanging_angles(hung.leg(ANKLE), robot, interrupts, hung.clock)
     interrupts.number = 2
-    assert hanging_angles(leg_drives(hung, ANKLE), robot, interrupts, hung.clock) is None
+    assert hanging_angles(hung.leg(ANKLE), robot, interrupts, hung.clock) is None
 
 
 def run_ankle(
     hung: HungRobot, robot: RobotConfig, at_third: Callable[[], None] = lambda: None
 ) -> tuple[MotionResult, int]:
-    """Move the ankle and do something at the third look; return the end, and all looks."""
+    """Jog the ankle, its leg held, and do something at the third look; return all looks too."""
     seen: list[Sample] = []
 
     def progress(sample: Sample) -> None:
@@ -193,11 +187,14 @@ def run_ankle(
         if len(seen) == 3:
             at_third()
 
-    return hanging(hung, robot, ANKLE, 0, progress)[0], len(seen)
+    leg, limited = hung.leg(ANKLE), limit_drives(within_stops(robot), HELD)
+    q = hanging_angles(leg, robot, Interrupts(), hung.clock)
+    assert q is not None
+    return move(leg, limited, ANKLE, HELD, q[ANKLE], hung.clock, progress), len(seen)
 
 
 def all_idle(hung: HungRobot) -> bool:
-    readings = [drive.read(0.02) for drive in leg_drives(hung, ANKLE).values()]
+    readings = [drive.read(0.02) for drive in hung.leg(ANKLE).values()]
     return all(one is not None and one.status is not DriveStatus.ARMED for one in readings)
 
 

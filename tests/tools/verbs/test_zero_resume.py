@@ -46,12 +46,6 @@ class Bench:
     def __init__(self, robot: RobotConfig, run_dir: Path) -> None:
         self.robot, self.run_dir = robot, run_dir
         self.hung = HungRobot(robot, changed(PlantConfig(), {"drivetrain.joint_damping": 10.0}))
-        hanging = np.zeros(12)
-        hanging[[0, 1, 3, 6, 7, 9]] = 0.1, 0.2, -0.05, -0.1, 0.2, -0.05
-        world = self.hung.world
-        world.data.qpos[world.joints.q_index], world.data.qvel[:] = hanging, 0.0
-        world.actuation.settle(hanging)
-        self.wait(1.5)
         self.identities: dict[str, Identity] = {}
 
     @contextlib.contextmanager
@@ -75,7 +69,7 @@ class Bench:
 
     def zero(self) -> None:
         """Keep the true zero, as a perfect protractor would, and where the joints rest."""
-        self.wait(6.0)
+        self.hung.wait(2.0)
         record = zero_record.read(self.path, self.robot)
         modules: dict[str, ModuleZero] = {}
         with self.drives_of(self.robot, MODULES, self.run_dir) as drives:
@@ -95,11 +89,7 @@ class Bench:
     def cut_power(self) -> None:
         for axis in range(0, 12, 2):
             self.hung.bank.reboot(axis)
-        self.wait(2.5)
-
-    def wait(self, seconds: float) -> None:
-        for _ in range(round(seconds * 1e3)):
-            self.hung.step()
+        self.hung.wait(2.5)
 
     def push(self) -> None:
         """Push both feet forward and to the right, and let go."""
@@ -132,7 +122,7 @@ def bench(robot: RobotConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         yield False
 
     virtual = SimpleNamespace(
-        monotonic=lambda: made.hung.now_ns * 1e-9, strftime=lambda _: "now", sleep=made.wait
+        monotonic=lambda: made.hung.now_ns * 1e-9, strftime=lambda _: "now", sleep=made.hung.wait
     )
     for module in (swing, zeroing, resuming, zero_record):
         monkeypatch.setattr(module, "time", virtual)
@@ -216,7 +206,7 @@ def test_where_the_joints_rest_is_stored_of_zeroed_drives_only(
 ) -> None:
     bench.zero()
     bench.push()
-    bench.wait(12.0)
+    bench.hung.wait(12.0)
     assert bench.run(rest=True) == 0
     bench.cut_power()
     assert bench.run(resume=True) == 0

@@ -7,10 +7,9 @@ import pytest
 from services.simulator.physics.plant import PlantConfig, changed
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
-from tests.tools.bringup.bench_drive import BenchDrive
+from tests.tools.bringup.bench_drive import BenchDrive, move
 from tests.tools.bringup.hung_robot import HungRobot
-from tests.tools.bringup.moved_module import hanging, on_bench
-from tools.bringup.hanging_leg import HangingJoint
+from tools.bringup.hanging_leg import HangingJoint, hanging_joint
 from tools.bringup.identify.estimates import (
     JointResult,
     ParameterEstimate,
@@ -20,7 +19,8 @@ from tools.bringup.identify.estimates import (
     of_joints,
 )
 from tools.bringup.identify.sines import SinePlan, fit_sines, plan_for
-from tools.bringup.motion import limit_drives
+from tools.bringup.motion import limit_drives, within_stops
+from tools.bringup.motion_runner import Interrupts, hanging_angles
 
 
 def sines(axis: int, inertia: float, gravity: float = 0.0, torque: float = 15.0) -> SinePlan:
@@ -47,7 +47,7 @@ def test_a_bench_joint_has_the_inertia_and_friction_that_it_has(
     limited = limit_drives(robot, plan)
     drive = BenchDrive(limited)
     drive.friction = friction
-    result = on_bench(drive, limited, plan)
+    result = drive.run(limited, plan)
     assert (result.trouble, result.not_idle) == ("", ())
     fit = fit_sines(result.samples, plan)
     assert fit is not None
@@ -60,7 +60,14 @@ def identified(
     plant: PlantConfig, robot: RobotConfig, module: str
 ) -> tuple[dict[str, ParameterEstimate], SinePlan]:
     """Return what theta's sines show of a leg that hangs, by its name without the joint's."""
-    result, plan, joint = hanging(HungRobot(robot, plant), robot, module, 1)
+    hung = HungRobot(robot, plant)
+    leg = hung.leg(module)
+    q = hanging_angles(leg, robot, Interrupts(), hung.clock)
+    assert q is not None
+    joint = hanging_joint(robot, q, module, 1)
+    plan = plan_for(1, 15.0, robot.joint.armature, joint)
+    limited = limit_drives(within_stops(robot), plan)
+    result = move(leg, limited, module, plan, q[module], hung.clock)
     assert (result.trouble, result.not_idle) == ("", ())
     fit = fit_sines(result.samples, plan)
     assert fit is not None
