@@ -53,7 +53,7 @@ def eventually_look(robot: RobotConfig, run_dir: Path, module: str, *, zeroed: b
     try:
         deadline = time.monotonic() + 20.0
         while True:
-            seen = look(drive, robot.drive.zero_mark_turns, robot.joint.gear_ratio)
+            seen = look(drive, robot)
             if seen.zeroed == zeroed and seen.status is not DriveStatus.LOST:
                 return seen
             assert time.monotonic() < deadline, seen

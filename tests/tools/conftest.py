@@ -1,16 +1,27 @@
-"""One recorded run, for all tests that read one."""
+"""One recorded run, for all tests that read one; and a robot that is not emulated."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
 import pytest
 
+from shared.config.robot_config import RobotConfig
+from shared.config.sections import CanConfig
 from tests.tools.judge.reports import runs
 from tests.tools.judge.reports.runs import Made
 from tools import cli
 from tools.judge.reports.page import render
 from tools.logs.run_log import RunLog, read_run
+
+
+@pytest.fixture(scope="session")
+def real(robot: RobotConfig) -> RobotConfig:
+    """Return the shipped robot on real buses."""
+    buses = enumerate(robot.can)
+    can = {name: CanConfig(interface="socketcan", channel=f"can{i}") for i, name in buses}
+    return msgspec.structs.replace(robot, can=can)
 
 
 @pytest.fixture(scope="session")

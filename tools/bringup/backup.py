@@ -12,7 +12,7 @@ import msgspec
 from shared.atomic_file import atomic_file
 from shared.exceptions import DriveError
 from shared.text_file import read_text
-from tools.bringup.boards import Value
+from tools.bringup.boards import Board, Value, describe_firmware
 
 VERSION: Final = 1
 _NOT_JSON: Final = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
@@ -39,12 +39,10 @@ class Backup(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     boards: tuple[BoardBackup, ...]
 
 
-def of_board(
-    module: str, serial_number: str, firmware: str, settings: dict[str, Value]
-) -> BoardBackup:
+def of_board(module: str, board: Board) -> BoardBackup:
     """Return a board's backup, with its numbers as JSON can have them."""
-    plain = {name: _to_json(value) for name, value in settings.items()}
-    return BoardBackup(module, serial_number, firmware, plain)
+    plain = {name: _to_json(value) for name, value in board.read(board.settings).items()}
+    return BoardBackup(module, board.serial_number, describe_firmware(board.firmware), plain)
 
 
 def settings_of(backup: BoardBackup) -> dict[str, Value]:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from rich import box
 from rich.console import Group
 from rich.padding import Padding
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from shared.can.cansimple import AxisState
@@ -134,10 +134,10 @@ def describe(value: Value) -> str:
 
 def difference_table(difference: Sequence[SettingChange]) -> Group:
     """Return a difference for the terminal: a table, and below it why each is wanted."""
-    rows = Table(title="difference", title_justify="left", box=box.SIMPLE_HEAD)
-    for heading in ("module", "setting", "now"):
-        rows.add_column(heading, no_wrap=heading != "now")
-    rows.add_column("new")
+    one_line = [Column(heading, no_wrap=True) for heading in ("module", "setting")]
+    rows = Table(
+        *one_line, "now", "new", title="difference", title_justify="left", box=box.SIMPLE_HEAD
+    )
     reasons: dict[str, None] = {}
     for change in difference:
         head, _, tail = change.name.rpartition(".")

@@ -48,9 +48,9 @@ def services_up(robot: RobotConfig, run_dir: Path) -> tuple[str, ...]:
     )
 
 
-def joint_services(services: tuple[str, ...]) -> tuple[str, ...]:
-    """Return which of these services have drives."""
-    return tuple(service for service in services if service in MODULES)
+def joint_services_up(robot: RobotConfig, run_dir: Path) -> tuple[str, ...]:
+    """Return which of these have drives."""
+    return tuple(service for service in services_up(robot, run_dir) if service in MODULES)
 
 
 def endpoint_rows(robot: RobotConfig, run_dir: Path, *, fleet_is_up: bool) -> list[Finding]:
@@ -59,10 +59,10 @@ def endpoint_rows(robot: RobotConfig, run_dir: Path, *, fleet_is_up: bool) -> li
     if fleet_is_up:
         up = services_up(robot, run_dir)
         found = f"{len(up)} of {len(robot.services)} listen"
-        if len(joint_services(up)) in (0, len(MODULES)):
+        silent = [module for module in MODULES if module not in up]
+        if len(silent) in (0, len(MODULES)):
             return [ok("bus", what, found, "the fleet's")]
-        silent = ", ".join(module for module in MODULES if module not in up)
-        fix = f"`xrl status` says why {silent} is not there"
+        fix = f"`xrl status` says why {', '.join(silent)} is not there"
         return [wrong("bus", what, found, "all six modules", fix)]
     here = security.services_here(robot)
     listeners = [

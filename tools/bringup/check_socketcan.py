@@ -43,9 +43,7 @@ def query_ip() -> Links:
 def socketcan_rows(robot: RobotConfig, root: Path, links: Links) -> list[Finding]:
     """Check every interface that the robot uses, by the file system and by `query_ip`."""
     rows = []
-    used = [robot.can[name] for name in robot.buses]
-    names = {bus.channel for bus in used if bus.interface == "socketcan"}
-    for name in sorted(names):
+    for name in interfaces_of(robot):
         flags = _flags(root, name)
         if flags is None:
             fix = "plug the adapter in; `ip link` lists what is there"
@@ -54,10 +52,14 @@ def socketcan_rows(robot: RobotConfig, root: Path, links: Links) -> list[Finding
         up = bool(flags & _IFF_UP)
         rows.append(judged(up, name, "interface", "up" if up else "down", "up", up_command(name)))
         if up and name in links:
-            rows += _details(name, links[name])
-            if not _is_one_shot(links[name]):
-                rows += _restart_rows(root, name)
+            rows += _details(root, name, links[name])
     return rows
+
+
+def interfaces_of(robot: RobotConfig) -> list[str]:
+    """Return the interfaces that a robot's buses use."""
+    used = [robot.can[name] for name in robot.buses]
+    return sorted({bus.channel for bus in used if bus.interface == "socketcan"})
 
 
 def setup_commands(name: str) -> list[list[str]]:
@@ -75,7 +77,7 @@ def up_command(name: str) -> str:
     return f"`sudo ip link set {name} up type can bitrate {CAN_BAUD_RATE} restart-ms 100`"
 
 
-def _details(name: str, link: Mapping[str, Any]) -> list[Finding]:
+def _details(root: Path, name: str, link: Mapping[str, Any]) -> list[Finding]:
     """Judge an interface that is up by the output of `ip`; a missing value is not judged."""
     data = link.get("linkinfo", {}).get("info_data", {})
     again = f"`sudo ip link set {name} down`, then {up_command(name)}"
@@ -101,12 +103,8 @@ def _details(name: str, link: Mapping[str, Any]) -> list[Finding]:
         why = "too short: it overflows at arming; too long: a plugged-in drive gets old frames"
         good = low <= length <= high
         rows.append(advised(good, name, "send queue", found, wanted, fix, why))
-    return rows
-
-
-def _is_one_shot(link: Mapping[str, Any]) -> bool:
-    """Return True if a frame that nobody acknowledges is dropped by the controller itself."""
-    return "ONE-SHOT" in link.get("linkinfo", {}).get("info_data", {}).get("ctrlmode", ())
+    # in one-shot mode the controller itself drops a frame that nobody acknowledges
+    return rows if "ONE-SHOT" in data.get("ctrlmode", ()) else rows + _restart_rows(root, name)
 
 
 def _restart_rows(root: Path, name: str) -> list[Finding]:

@@ -12,7 +12,7 @@ from services.joint.torque_limiter import limits_of
 from services.planner.law.model import HangingLegs
 from shared.bus.messages import Pair
 from shared.config.robot_config import RobotConfig
-from shared.joints import MODULE_INDEX, MODULES, N_JOINTS
+from shared.joints import MODULE_INDEX, MODULES, N_JOINTS, side_of
 
 INSIDE: Final = 0.12
 """rad inside its limits that a joint is led to: room for the motion."""
@@ -24,10 +24,10 @@ BIAS_TORQUE: Final = 1.3
 """Times what gravity takes at the bias, by the robot file."""
 
 
-def leg_of(module: str) -> tuple[str, ...]:
-    """Return the modules of a module's leg."""
-    side = module.rpartition("_")[2]
-    return tuple(name for name in MODULES if name.endswith(f"_{side}"))
+def leg_of(*modules: str) -> tuple[str, ...]:
+    """Return all modules of these modules' legs."""
+    sides = {side_of(module) for module in modules}
+    return tuple(name for name in MODULES if side_of(name) in sides)
 
 
 def why_resting(robot: RobotConfig, q: Mapping[str, Pair]) -> str:

@@ -20,7 +20,6 @@ from services.joint.torque_limiter import TorqueLimits, limit_torque, limits_of
 from shared.bus.messages import Pair
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
-from shared.config.sections import StandGains
 from shared.exceptions import DriveError
 from shared.joints import AXES, KINDS
 from shared.robot.robot_model import HARD_STOP_MARGIN
@@ -112,10 +111,6 @@ class MotionPlan(NamedTuple, Generic[C]):
             for low, high in [self.course.span if axis == self.axis else pd_law.ZERO]
         )
         return phi, theta
-
-    def gains(self, stand: StandGains) -> tuple[Pair, Pair]:
-        """Return k_p and k_d of a module with these stand gains."""
-        return self.own_gains or (stand.k_p, stand.k_d)
 
     def offset(self, t_s: float) -> tuple[Pair, Pair]:
         """Return the offsets of (phi, theta), rad, and their rates, rad/s, at a time.
@@ -228,7 +223,8 @@ class GuardedMotion:
         self, robot: RobotConfig, module: str, plan: AnyPlan, q: Pair, now_ns: int
     ) -> None:
         """Begin at q, rad, with a drive that has just been armed; robot: as of `limit_drives`."""
-        self._k_p, self._k_d = plan.gains(robot.stand_gains(module))
+        stand = robot.stand_gains(module)
+        self._k_p, self._k_d = plan.own_gains or (stand.k_p, stand.k_d)
         limits = limits_of(robot, module)
         self._limits: TorqueLimits = msgspec.structs.replace(
             limits, tau_module_max=min(plan.torque_limit, limits.tau_module_max)

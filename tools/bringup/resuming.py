@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Final
 
 import msgspec
 
 from services.imu.attitude import AttitudeLaw
-from services.joint.__main__ import open_drive
 from services.joint.differential import motor_from_joint
 from services.joint.drivers.base import Drive
 from shared.bus.messages import Pair
@@ -26,9 +25,10 @@ from shared.joints import MODULES
 from tools.bringup import zero_record
 from tools.bringup.drive_access import boards_on_usb
 from tools.bringup.free_leg import Upright
+from tools.bringup.module_motion import open_drives
 from tools.bringup.swing import Swing
 from tools.bringup.whole_turns import BESIDE_MOVED, UNMOVED, ModuleEvidence
-from tools.bringup.zero_record import Identity, ZeroRecord, why_stranger
+from tools.bringup.zero_record import IDENTITY, Identity, ZeroRecord, why_stranger
 from tools.bringup.zeroing import DriveLook, look, refusal
 from tools.fleet.process_table import is_simulated
 from tools.fleet.run_dir import RunDir
@@ -48,23 +48,16 @@ ABSOLUTE: Final = 0x100
 Progress = Callable[[str], None]
 
 
-@contextlib.contextmanager
 def drives_of(
     robot: RobotConfig, modules: Iterable[str], run_dir: Path
-) -> Iterator[dict[str, Drive]]:
+) -> AbstractContextManager[dict[str, Drive]]:
     """Have modules' drives as they count themselves, without the mark of a zero."""
     unmarked = msgspec.structs.replace(robot.drive, zero_mark_turns=0.0)
-    plain = msgspec.structs.replace(robot, drive=unmarked)
-    with contextlib.ExitStack() as stack:
-        drives = {}
-        for module in modules:
-            drives[module] = open_drive(plain, module, run_dir)
-            stack.callback(drives[module].close)
-        yield drives
+    return open_drives(msgspec.structs.replace(robot, drive=unmarked), modules, run_dir)
 
 
 def looks_at_rest(
-    drives: Mapping[str, Drive], mark_turns: float, gear_ratio: float
+    drives: Mapping[str, Drive], robot: RobotConfig
 ) -> tuple[dict[str, DriveLook], set[str]]:
     """Look at drives until their joints rest, `REST_WAIT_S` at the most; return which do not.
 
@@ -74,7 +67,7 @@ def looks_at_rest(
     before: dict[str, DriveLook] = {}
     while True:
         begun = time.monotonic()
-        looks = {module: look(drive, mark_turns, gear_ratio) for module, drive in drives.items()}
+        looks = {module: look(drive, robot) for module, drive in drives.items()}
         restless = {
             module
             for module, seen in looks.items()
@@ -111,7 +104,7 @@ def identities(
             for module, serial in serials.items():
                 board = boards.boards.get(serial)
                 if board is not None:
-                    found[module] = zero_record.identity_of(board)
+                    found[module] = Identity(board.serial_number.upper(), board.read(IDENTITY))
     except XrlError as error:
         progress(f"USB: {error}")
     missing = [module for module in modules if module not in found]
@@ -207,10 +200,10 @@ def store_rests(
     known = [module for module in modules if module in record.modules]
     if not known:
         raise DriveError(f"{path}: no zero of {', '.join(modules)} is stored: `xrl drive zero`")
-    mark, ratio = robot.drive.zero_mark_turns, robot.joint.gear_ratio
+    ratio = robot.joint.gear_ratio
     rests: dict[str, Pair | None] = {}
     with drives_of(robot, known, run_dir) as drives:
-        looks, restless = looks_at_rest(drives, mark, ratio)
+        looks, restless = looks_at_rest(drives, robot)
         for module, seen in looks.items():
             why = refusal(seen) or "it does not come to rest" * (module in restless)
             why = why or not_its_zero(seen, record.modules[module].offsets, ratio)

@@ -42,7 +42,7 @@ def survey(
             *check_robot.security_rows(robot),
         ],
     }
-    services_up = bool(check_robot.joint_services(check_robot.services_up(robot, run_dir)))
+    services_up = bool(check_robot.joint_services_up(robot, run_dir))
     over_can = robot.joint_service.driver == "odrive_can"
     if is_simulated(robot) and not fleet_is_up:
         progress("starting the simulator: the drives are emulated, and no fleet is up")

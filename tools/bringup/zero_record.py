@@ -21,7 +21,7 @@ from shared.bus.messages import Pair
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
 from shared.text_file import read_text
-from tools.bringup.boards import Board, Value, equal
+from tools.bringup.boards import Value, equal
 from tools.fleet.process_table import is_simulated
 from tools.fleet.run_dir import RunDir
 
@@ -177,11 +177,6 @@ def why_stranger(
         if not equal(now, before):
             return f"it was calibrated since its zero: {name} is {now}, and was {before}"
     return ""
-
-
-def identity_of(board: Board) -> Identity:
-    """Return what a board tells of itself."""
-    return Identity(board.serial_number.upper(), board.read(IDENTITY))
 
 
 def timestamp() -> str:

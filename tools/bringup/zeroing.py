@@ -79,17 +79,12 @@ SILENT: Final = DriveLook(
 )
 
 
-def look(drive: Drive, mark_turns: float, gear_ratio: float) -> DriveLook:
-    """Observe a drive for `LOOK_S`, once it answers.
-
-    Args:
-        drive: in its own count.
-        mark_turns: a motor's reading at q = 0.
-        gear_ratio: N of the differential.
-    """
+def look(drive: Drive, robot: RobotConfig) -> DriveLook:
+    """Observe a drive, in its own count, for `LOOK_S`, once it answers."""
     reading = await_reading(drive)
     if reading is None:
         return SILENT
+    gear_ratio = robot.joint.gear_ratio
     first = newest = reading
     speed, moved, errors = 0.0, 0.0, reading.error
     there = None
@@ -105,7 +100,7 @@ def look(drive: Drive, mark_turns: float, gear_ratio: float) -> DriveLook:
         speed = max(speed, *map(abs, joint_from_motor(reading.vel_turns, gear_ratio)))
         (a1, a2), (b1, b2) = reading.pos_turns, first.pos_turns
         moved = max(moved, *map(abs, joint_from_motor((a1 - b1, a2 - b2), gear_ratio)))
-    frame = MotorFrame(mark_turns)
+    frame = MotorFrame(robot.drive.zero_mark_turns)
     counted = frame.from_drive(newest)
     q = joint_from_motor(counted.pos_turns, gear_ratio)
     zeroed = counted.status is not DriveStatus.UNZEROED

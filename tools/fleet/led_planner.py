@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable
 from typing import Final
 
 from services.planner.law.probe import NO_ROW
@@ -70,6 +71,32 @@ class LedPlanner:
         if status.requested_by not in ("", SCENARIO, self.source):
             return f"{status.requested_by} asks the robot for something else"
         return ""
+
+    def lead(
+        self,
+        duration_s: float,
+        ask: Callable[[float], None],
+        listen: Callable[[], None],
+        stopped: Callable[[], bool],
+        *,
+        every_s: float,
+    ) -> str:
+        """Ask for what is wanted at a time, s, again and again, and listen ten times as often.
+
+        Whatever ends it, nothing is asked for any more, and what was asked for fades out.
+
+        Returns:
+            Why it ended before its time; "" if it did not.
+        """
+        begin, ask_s, ended = now_ns(), 0.0, ""
+        while not ended and (t_s := (now_ns() - begin) / NS_PER_S) < duration_s:
+            if t_s >= ask_s:
+                ask(t_s)
+                ask_s = t_s + every_s
+            listen()
+            ended = "stopped" if stopped() else self.trouble()
+            time.sleep(0.1 * every_s)
+        return ended
 
     def ask(
         self,

@@ -49,6 +49,8 @@ def move(
 class BenchDrive:
     """A module on a bench in virtual time: the firmware's law, inertia and dry friction.
 
+    It has no `write_torque` and no `set_position`: a motion is by the drive's own loop.
+
     Attributes:
         friction: N m of each axis.
         load: N m that pull on (phi, theta).
@@ -109,9 +111,6 @@ class BenchDrive:
     def write(self, target: MotorTarget) -> None:
         self._target = target
 
-    def write_torque(self, torque: Pair) -> None:
-        raise AssertionError(f"{torque}: a jog is by the drive's own loop")
-
     def arm(self, *, onboard: bool) -> None:
         assert onboard
         if not self.never_arms:
@@ -121,12 +120,6 @@ class BenchDrive:
         self.idles += 1
         if not self.deaf:
             self.status = DriveStatus.IDLE
-
-    def set_position(self, turns: Pair) -> None:
-        raise AssertionError(f"{turns}: a jog tells no position")
-
-    def close(self) -> None:
-        pass
 
     def _step(self) -> None:
         """Move on by a millisecond."""

@@ -96,6 +96,3 @@ class HungDrive(WiredDrive):
 
     def write_torque(self, torque: Pair) -> None:
         raise AssertionError(torque)
-
-    def set_position(self, turns: Pair) -> None:
-        raise AssertionError(turns)

@@ -64,8 +64,8 @@ def bus(
             speaker.join()
 
 
-def test_all_that_speaks_is_taken_in_and_nothing_is_sent(short_path: Path) -> None:
-    with bus(short_path, SPOKEN, ANSWERS) as (config, asked):
+def test_all_that_speaks_is_taken_in_and_nothing_is_sent(short_dir: Path) -> None:
+    with bus(short_dir, SPOKEN, ANSWERS) as (config, asked):
         traffic = listen(config, (NODE,), poll_nodes=False, cells=True)
     axis = traffic.nodes[NODE]
     assert traffic.trouble == ""
@@ -78,9 +78,9 @@ def test_all_that_speaks_is_taken_in_and_nothing_is_sent(short_path: Path) -> No
     assert axis.vbus_voltage is None
 
 
-def test_an_imu_is_received_where_there_is_one(short_path: Path) -> None:
+def test_an_imu_is_received_where_there_is_one(short_dir: Path) -> None:
     frames = tuple(imu_can.pack([1.0, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0], valid=True))
-    with bus(short_path, frames) as (config, _):
+    with bus(short_dir, frames) as (config, _):
         traffic = listen(config, (), poll_nodes=False, imu=True)
     assert traffic.imu.samples[0].rate == (0.0, 0.5, 0.0)
     assert traffic.imu.samples[0].valid
@@ -88,8 +88,8 @@ def test_an_imu_is_received_where_there_is_one(short_path: Path) -> None:
     assert traffic.nodes == {}, "its frames are no nodes"
 
 
-def test_version_and_supply_are_asked_for_by_requests_without_data(short_path: Path) -> None:
-    with bus(short_path, SPOKEN, ANSWERS) as (config, asked):
+def test_version_and_supply_are_asked_for_by_requests_without_data(short_dir: Path) -> None:
+    with bus(short_dir, SPOKEN, ANSWERS) as (config, asked):
         axis = listen(config, (NODE,), poll_nodes=True).nodes[NODE]
     assert asked
     assert all(can_id & REMOTE_FLAG for can_id in asked)
@@ -117,10 +117,10 @@ def test_a_missing_bus_is_reported_and_not_raised(interface: str, channel: str) 
     ],
     ids=["extended", "error", "a request, or its echo", "short", "of another", "to another"],
 )  # fmt: skip
-def test_only_the_axis_that_was_asked_answers(short_path: Path, frame: Frame) -> None:
-    with bus(short_path, answers=(frame,)) as (config, _):
+def test_only_the_axis_that_was_asked_answers(short_dir: Path, frame: Frame) -> None:
+    with bus(short_dir, answers=(frame,)) as (config, _):
         assert round_trips(config, (NODE,), 3)[NODE].lost == 3
-    with bus(short_path, answers=(frame, (ASKED, ANSWER))) as (config, _):
+    with bus(short_dir, answers=(frame, (ASKED, ANSWER))) as (config, _):
         assert round_trips(config, (NODE,), 3)[NODE].lost < 3, "a busy machine may be late once"
 
 

@@ -129,7 +129,7 @@ def test_a_backup_file_reads_back_as_it_was_written(tmp_path: Path) -> None:
     values = (math.inf, -math.inf, math.nan, True, 3, 0.25, None, "axis0.error")
     settings: dict[str, Value] = dict(zip("abcdefgh", values, strict=True))
     path = tmp_path / "new" / "b.json"
-    board = backup.of_board(MODULE, "3A0000000005", "0.5.6", settings)
+    board = backup.of_board(MODULE, BoardInMemory(settings))
     backup.write(path, [board], time="2026-03-01T10:15:00+0100", robot_file="robot.toml")
     read = backup.read(path)
     assert (read.robot_file, read.boards[0].serial_number) == ("robot.toml", "3A0000000005")

@@ -8,30 +8,23 @@ import msgspec
 import pytest
 
 from shared.config.robot_config import RobotConfig
-from shared.config.sections import CanConfig
 from shared.exceptions import FleetError
 from tools.bringup import drive_access
 
 
-def on_socketcan(robot: RobotConfig, *buses: str) -> RobotConfig:
-    can = {
-        name: CanConfig(interface="socketcan", channel=name) if name in buses else bus
-        for name, bus in robot.can.items()
-    }
-    return msgspec.structs.replace(robot, can=can)
-
-
 def test_a_robot_file_with_one_bus_forgotten_never_finds_emulated_drives_right(
-    robot: RobotConfig, tmp_path: Path
+    robot: RobotConfig, real: RobotConfig, tmp_path: Path
 ) -> None:
     """Its USB would be the emulated one, and every setting there is as wanted."""
-    half = on_socketcan(robot, *(name for name in robot.can if name != "harness"))
+    half = msgspec.structs.replace(real, can=real.can | {"harness": robot.can["harness"]})
     drives = drive_access.drives_within_reach(half, tmp_path / "robot.toml", tmp_path / "r")
     with pytest.raises(FleetError, match=r"\[can\.harness\] is emulated"), drives:
         pass
     assert not (tmp_path / "r").exists()
 
 
-def test_a_robot_file_that_is_all_real_or_all_emulated_is_clear(robot: RobotConfig) -> None:
+def test_a_robot_file_that_is_all_real_or_all_emulated_is_clear(
+    robot: RobotConfig, real: RobotConfig
+) -> None:
     drive_access.refuse_half_emulated(robot)
-    drive_access.refuse_half_emulated(on_socketcan(robot, *robot.can))
+    drive_access.refuse_half_emulated(real)

@@ -4,25 +4,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import msgspec
 import pytest
 
 from shared.config import files
 from shared.config.robot_config import RobotConfig
-from shared.config.sections import CanConfig
 from tests.tools.exit_codes import exit_code
 from tools.bringup import check_socketcan
 from tools.verbs.drive import can
 
 
 @pytest.fixture
-def real_file(robot: RobotConfig, tmp_path: Path) -> Path:
-    buses = {
-        name: CanConfig(interface="socketcan", channel=f"can{i}")
-        for i, name in enumerate(robot.can)
-    }
+def real_file(real: RobotConfig, tmp_path: Path) -> Path:
     path = tmp_path / "robot.toml"
-    path.write_text(files.to_toml(msgspec.structs.replace(robot, can=buses)), encoding="utf-8")
+    path.write_text(files.to_toml(real), encoding="utf-8")
     return path
 
 

@@ -12,7 +12,7 @@ import msgspec
 import pytest
 
 from services.joint.differential import joint_from_motor, motor_from_joint
-from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.base import DriveReading, DriveStatus
 from shared.bus.messages import Pair
 from shared.can.cansimple import AxisError
 from shared.clock import now_ns
@@ -33,6 +33,8 @@ STILL = DriveLook(DriveStatus.IDLE, zeroed=True, q=(0.0, -1.0), speed=0.0, moved
 class PlayedDrive:
     """A drive as it counts itself; each reading says what the test wants.
 
+    It has no `write`, `arm` or `idle`: a zero moves nothing and changes no state.
+
     Attributes:
         pos: turns of both motors.
         vel: turn/s of both motors.
@@ -44,7 +46,7 @@ class PlayedDrive:
         self.pos: Pair = (0.3, 0.6)
         self.vel: Pair = (0.0, 0.0)
         self.status = DriveStatus.IDLE
-        self.error = self.deaf = self.told = self.asked = 0
+        self.error = self.deaf = self.told = 0
         self.creep = 0.0
 
     def read(self, timeout_s: float) -> DriveReading | None:
@@ -60,24 +62,6 @@ class PlayedDrive:
             self.deaf -= 1
         else:
             self.pos = turns
-
-    def write_torque(self, torque: Pair) -> None:
-        raise AssertionError(f"{torque}: a zero moves nothing")
-
-    def write(self, target: MotorTarget) -> None:
-        raise AssertionError(f"{target}: a zero moves nothing")
-
-    def arm(self, *, onboard: bool) -> None:
-        raise AssertionError(f"{onboard}: a zero arms nothing")
-
-    def idle(self) -> None:
-        raise AssertionError("a zero changes no state")
-
-    def ask_angles(self) -> None:
-        self.asked += 1
-
-    def close(self) -> None:
-        pass
 
 
 @pytest.fixture(autouse=True)
@@ -141,20 +125,22 @@ def test_a_drive_that_its_service_armed_meanwhile_is_not_written_again(robot: Ro
     ("turns", "zeroed"),
     [((MARK + 1.0, MARK - 2.0), True), ((0.2, 0.9), False), ((MARK, 0.4), False)],
 )
-def test_a_drive_that_lost_its_power_is_known(turns: Pair, zeroed: bool) -> None:
+def test_a_drive_that_lost_its_power_is_known(
+    robot: RobotConfig, turns: Pair, zeroed: bool
+) -> None:
     drive = PlayedDrive()
     drive.pos = turns
-    seen = look(drive, MARK, N)
+    seen = look(drive, robot)
     assert seen.zeroed == zeroed
     assert seen.status is DriveStatus.IDLE
     if zeroed:
         assert seen.q == pytest.approx(joint_from_motor((1.0, -2.0), N))
 
 
-def test_an_armed_drive_is_armed_though_it_is_unzeroed() -> None:
+def test_an_armed_drive_is_armed_though_it_is_unzeroed(robot: RobotConfig) -> None:
     drive = PlayedDrive()
     drive.status = DriveStatus.ARMED
-    assert "armed" in refusal(look(drive, MARK, N))
+    assert "armed" in refusal(look(drive, robot))
 
 
 @pytest.mark.parametrize(
@@ -177,15 +163,15 @@ def test_only_a_joint_that_is_still_and_a_drive_that_is_idle_are_zeroed(
     assert re.search(words, refusal(STILL._replace(**change)))  # type: ignore[arg-type]
 
 
-def test_motion_is_seen_by_the_rate_and_by_the_way() -> None:
+def test_motion_is_seen_by_the_rate_and_by_the_way(robot: RobotConfig) -> None:
     drive = PlayedDrive()
     drive.vel = (1.0, 1.0)
-    assert look(drive, MARK, N).speed == pytest.approx(joint_from_motor((1.0, 1.0), N)[1])
+    assert look(drive, robot).speed == pytest.approx(joint_from_motor((1.0, 1.0), N)[1])
     drive = PlayedDrive()
     drive.creep = 0.01
-    assert look(drive, MARK, N).moved > 0.005
+    assert look(drive, robot).moved > 0.005
     drive.status = DriveStatus.LOST
-    assert look(drive, MARK, N).status is DriveStatus.LOST
+    assert look(drive, robot).status is DriveStatus.LOST
 
 
 @pytest.mark.parametrize(

@@ -15,9 +15,8 @@ import pytest
 
 from services.joint.differential import joint_from_motor
 from services.joint.drivers.base import Drive
-from services.joint.drivers.wired_drive import MotorFrame, WiredDrive
+from services.joint.drivers.wired_drive import MotorFrame
 from services.simulator.physics.plant import PlantConfig, changed
-from shared.bus.messages import Pair
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, DriveError
 from shared.joints import MODULES
@@ -33,13 +32,6 @@ EXACT = 3e-4
 """rad; a count of the encoder is 0.01 mrad at the joint."""
 
 
-class Counting(HungDrive):
-    """A drive in its own count, which may be told where it is."""
-
-    def set_position(self, turns: Pair) -> None:
-        WiredDrive.set_position(self, turns)
-
-
 class Bench:
     """The robot that hangs, and the verb on it."""
 
@@ -53,7 +45,7 @@ class Bench:
         self, robot: RobotConfig, modules: Iterable[str], _run_dir: Path
     ) -> Iterator[Mapping[str, Drive]]:
         yield {
-            name: Counting(
+            name: HungDrive(
                 self.hung,
                 self.hung.drives[name]._drive,  # type: ignore[arg-type]
                 MotorFrame(0.0, robot.module_named(name).motor_signs),
@@ -74,7 +66,7 @@ class Bench:
         modules: dict[str, ModuleZero] = {}
         with self.drives_of(self.robot, MODULES, self.run_dir) as drives:
             for name, drive in drives.items():
-                seen = zeroing.look(drive, self.robot.drive.zero_mark_turns, 17.5)
+                seen = zeroing.look(drive, self.robot)
                 assert seen.angles is not None
                 identity = self.identities.get(name)
                 modules[name] = zero_record.zeroed(
@@ -103,7 +95,7 @@ class Bench:
         found = []
         with self.drives_of(self.robot, MODULES, self.run_dir) as drives:
             for index, (name, drive) in enumerate(drives.items()):
-                seen = zeroing.look(drive, self.robot.drive.zero_mark_turns, 17.5)
+                seen = zeroing.look(drive, self.robot)
                 turns = self.hung.world.motor_turns()[0][2 * index : 2 * index + 2]
                 signs = self.robot.module_named(name).motor_signs
                 true = joint_from_motor((turns[0] * signs[0], turns[1] * signs[1]), 17.5)
@@ -190,7 +182,7 @@ def test_without_a_stored_zero_the_protractor_is_named(bench: Bench) -> None:
 
 def test_a_zero_is_kept_with_the_angles_and_a_correction_too(bench: Bench) -> None:
     with bench.drives_of(bench.robot, ["knee_left"], bench.run_dir) as drives:
-        q = zeroing.look(drives["knee_left"], 64.0, 17.5).q
+        q = zeroing.look(drives["knee_left"], bench.robot).q
     assert bench.run(module="knee_left", all=False, by=(0.01, -0.02)) == 0
     before = zero_record.read(bench.path, bench.robot).modules["knee_left"]
     rest = before.rest

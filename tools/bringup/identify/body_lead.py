@@ -18,7 +18,6 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Lead, Scenario, lead
 from shared.joints import MODULES
 from tools.bringup.identify.quasi_static import TimedRows
-from tools.bringup.led_run import run_led
 from tools.fleet.led_planner import LedPlanner
 
 ASK_S: Final = 0.02
@@ -68,7 +67,7 @@ class BodyLead:
                 wrenches[1].append(wrench)
             self._planner.listen()
 
-        ended = run_led(self._planner, scenario.duration, ask, listen, stopped, every_s=ASK_S)
+        ended = self._planner.lead(scenario.duration, ask, listen, stopped, every_s=ASK_S)
         return LeadRecord(tuple(TimedRows(*one) for one in states), TimedRows(*wrenches), ended)
 
     def _limited(self, wanted: Lead) -> Lead:

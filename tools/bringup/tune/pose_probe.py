@@ -22,7 +22,6 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Scenario
 from shared.exceptions import RunError
 from shared.robot.robot_model import stand_pose
-from tools.bringup.led_run import run_led
 from tools.bringup.tune.excitation import Excitation
 from tools.fleet.led_planner import LedPlanner
 from tools.sim.lockstep import Lockstep
@@ -130,7 +129,7 @@ class LiveProbe:
             if self._planner.listen() and self._planner.status.probe_row == row:
                 statuses.append(self._planner.status)
 
-        ended = run_led(self._planner, excitation.duration_s, ask, listen, stopped, every_s=ASK_S)
+        ended = self._planner.lead(excitation.duration_s, ask, listen, stopped, every_s=ASK_S)
         self._planner.ask()
         return course_of(statuses, row, ended)
 

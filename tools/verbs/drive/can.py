@@ -20,7 +20,6 @@ from shared.places import FILES
 from tools.bringup import check_robot
 from tools.bringup.can_monitor import (
     BusTraffic,
-    NodeTraffic,
     RoundTrips,
     bus_config,
     bus_nodes,
@@ -28,7 +27,7 @@ from tools.bringup.can_monitor import (
     mean_ms,
     round_trips,
 )
-from tools.bringup.check_socketcan import setup_commands
+from tools.bringup.check_socketcan import interfaces_of, setup_commands
 from tools.bringup.drive_access import drives_within_reach
 from tools.flags import Arg, ConfigFlags, Count, Duration, RunDirFlags, option
 from tools.terminal import Console, marked
@@ -76,14 +75,27 @@ class LatencyFlags(CanFlags):
 
 def set_up(flags: SetUpFlags) -> int:
     """Print the commands, or run them; a fault if one failed."""
-    return _set_up(load(flags.config), apply=flags.apply)
+    names = interfaces_of(load(flags.config))
+    if not names:
+        print("nothing to bring up: no bus of this robot file is a socketcan interface")
+        return 0
+    for name in names:
+        for words in setup_commands(name):
+            print(shlex.join(words))
+            if flags.apply and not _ran(words):
+                return FAULT_EXIT_CODE
+    if not flags.apply:
+        print(
+            f"# printed only; --apply runs them, as root. {FILES}/udev/92-can.rules does it at boot"
+        )
+    return 0
 
 
 def test(flags: TestFlags) -> int:
     """Listen; a drive or sensor that is missing is a fault."""
     robot = load(flags.config)
     buses = _buses(robot, flags.bus)
-    with drives_within_reach(robot, flags.config, flags.run_dir, ()):
+    with drives_within_reach(robot, flags.config, flags.run_dir):
         return _listen(robot, flags, buses)
 
 
@@ -91,45 +103,22 @@ def latency(flags: LatencyFlags) -> int:
     """Measure; an axis that does not answer is a fault."""
     robot = load(flags.config)
     buses = _buses(robot, flags.bus)
-    with drives_within_reach(robot, flags.config, flags.run_dir, ()):
+    with drives_within_reach(robot, flags.config, flags.run_dir):
         return _measure(robot, flags, buses)
 
 
-def _buses(robot: RobotConfig, only: str | None) -> dict[str, tuple[int, ...]]:
+def _buses(robot: RobotConfig, only: str | None) -> Mapping[str, tuple[int, ...]]:
     """Return the nodes of each bus that is asked for.
 
     Raises:
         FleetError: there is none of that name.
     """
-    known = {name: tuple(nodes) for name, nodes in bus_nodes(robot).items()}
+    known = bus_nodes(robot)
     if only is None:
         return known
     if only not in known:
         raise FleetError(f"--bus {only}: the robot has {', '.join(known)}")
     return {only: known[only]}
-
-
-def _set_up(robot: RobotConfig, *, apply: bool) -> int:
-    names = sorted(
-        {
-            robot.can[name].channel
-            for name in robot.buses
-            if robot.can[name].interface == "socketcan"
-        }
-    )
-    if not names:
-        print("nothing to bring up: no bus of this robot file is a socketcan interface")
-        return 0
-    for name in names:
-        for words in setup_commands(name):
-            print(shlex.join(words))
-            if apply and not _ran(words):
-                return FAULT_EXIT_CODE
-    if not apply:
-        print(
-            f"# printed only; --apply runs them, as root. {FILES}/udev/92-can.rules does it at boot"
-        )
-    return 0
 
 
 def _ran(words: list[str]) -> bool:
@@ -190,16 +179,12 @@ def _node_table(robot: RobotConfig, traffic: BusTraffic) -> Table:
             state = Text(AxisState(axis.heartbeat.axis_state).name if known else "?")
         turns = "-" if axis.pos_turns is None else f"{axis.pos_turns:.3f}"
         owner = owners.get(node, Text("nobody's", "red"))
-        table.add_row(str(node), owner, state, *_periods(axis), turns)
+        periods = (
+            f"{mean_ms(times):.1f}" if len(times) > 1 else "-"
+            for times in (axis.heartbeats_s, axis.estimates_s)
+        )
+        table.add_row(str(node), owner, state, *periods, turns)
     return table
-
-
-def _periods(axis: NodeTraffic) -> tuple[str, str]:
-    heartbeat, estimates = (
-        f"{mean_ms(times):.1f}" if len(times) > 1 else "-"
-        for times in (axis.heartbeats_s, axis.estimates_s)
-    )
-    return heartbeat, estimates
 
 
 def _rate(times_s: list[float], seconds: float) -> Text:
@@ -212,7 +197,7 @@ def _measure(robot: RobotConfig, flags: LatencyFlags, buses: Mapping[str, tuple[
     Raises:
         FleetError: joint services are up.
     """
-    up = check_robot.joint_services(check_robot.services_up(robot, flags.run_dir))
+    up = check_robot.joint_services_up(robot, flags.run_dir)
     if up:
         raise FleetError(
             f"{', '.join(up)}: up, and a request would feed a drive's watchdog; `xrl down` first"

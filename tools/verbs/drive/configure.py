@@ -17,7 +17,7 @@ from shared.joints import MODULES
 from tools.bringup import backup, calibrate_robot, calibration, changes, drive_access
 from tools.bringup.boards import FIRMWARE, Board, FoundBoards, describe_firmware, is_known
 from tools.bringup.changes import ChangeResult, SettingChange
-from tools.bringup.check_robot import joint_services, services_up
+from tools.bringup.check_robot import joint_services_up
 from tools.bringup.drive_access import (
     DriveSettingFlags,
     boards_on_usb,
@@ -187,19 +187,14 @@ def refuse_services(robot: RobotConfig, run_dir: Path, modules: Sequence[str]) -
     Raises:
         FleetError: naming it, and what to do.
     """
-    for service in joint_services(services_up(robot, run_dir)):
+    for service in joint_services_up(robot, run_dir):
         if service in modules:
             raise FleetError(
                 f"the joint service of {service} is up in {run_dir}: saving settings restarts the "
                 "board under it. Hang the robot; `xrl down` first"
             )
     for module in modules:
-        other = drive_access.service_on(robot, module, run_dir)
-        if other is not None:
-            raise FleetError(
-                f"a joint service has the drive of {module}, in {other.run.path}; hang the robot; "
-                f"`xrl down --run-dir {other.run.path}` first"
-            )
+        drive_access.refuse_service(robot, module, run_dir)
 
 
 def boards_of(robot: RobotConfig, modules: Sequence[str], found: FoundBoards) -> dict[str, Board]:
@@ -260,15 +255,7 @@ def keep(folder: Path, boards: Mapping[str, Board], robot_file: Path) -> Path:
         DriveError: it cannot be written, or a board does not answer.
     """
     path = folder / time.strftime("%Y%m%d-%H%M%S.json")
-    rows = [
-        backup.of_board(
-            module,
-            board.serial_number,
-            describe_firmware(board.firmware),
-            board.read(board.settings),
-        )
-        for module, board in boards.items()
-    ]
+    rows = [backup.of_board(module, board) for module, board in boards.items()]
     backup.write(path, rows, time=time.strftime("%Y-%m-%dT%H:%M:%S%z"), robot_file=str(robot_file))
     return path
 

@@ -116,9 +116,7 @@ def report(moved: Moved[ThereAndBack], module: str, console: Console) -> int:
     """Print the verdict; return 0 if the joint followed."""
     plan = moved.plan
     rows = judge(moved.samples, plan)
-    table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("", "measured", "wanted", ""):
-        table.add_column(heading)
+    table = Table("", "measured", "wanted", "", box=box.SIMPLE_HEAD)
     for row in rows:
         verdict = Text("ok") if row.good else Text("not good", "bold red")
         table.add_row(row.what, row.value, row.wanted, verdict if row.wanted else "")

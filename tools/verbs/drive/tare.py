@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 import time
 from pathlib import Path
-from typing import Annotated, Final, Protocol
+from typing import Annotated, Final
 
 from shared.bus import topics
 from shared.bus.messages import Tare, TareRequest, Wrench
+from shared.bus.ports import Inbox, Outbox
 from shared.bus.session import open_session
 from shared.clock import now_ns
 from shared.config.files import load
@@ -25,20 +26,6 @@ REPEAT_S: Final = 0.02
 HEARD_S: Final = 3.0
 """Longest wait for the first wrench."""
 GIVE_UP_S: Final = 10.0
-
-
-class TareClient(Protocol):
-    """The way to the harness service."""
-
-    def put(self, message: TareRequest) -> bool:
-        """Send without waiting."""
-
-
-class Wrenches(Protocol):
-    """The way back."""
-
-    def take(self) -> Wrench | None:
-        """Return the newest wrench since the last call, or None."""
 
 
 EXAMPLES: Final = """
@@ -69,7 +56,7 @@ def run(flags: TareFlags) -> int:
     return 0
 
 
-def tare(requests: TareClient, wrenches: Wrenches, *, anyway: bool) -> Wrench:
+def tare(requests: Outbox[TareRequest], wrenches: Inbox[Wrench], *, anyway: bool) -> Wrench:
     """Request the tare until it has started, wait until it is done; return the reading before."""
     before = newest = _first(wrenches)
     if before.valid and math.hypot(*before.force) > LOADED_N and not anyway:
@@ -98,7 +85,7 @@ def describe(wrench: Wrench) -> str:
     return f"{math.hypot(*wrench.force):.1f} N, {math.hypot(*wrench.moment):.1f} N m"
 
 
-def _first(wrenches: Wrenches) -> Wrench:
+def _first(wrenches: Inbox[Wrench]) -> Wrench:
     deadline = time.monotonic() + HEARD_S
     while time.monotonic() < deadline:
         wrench = wrenches.take()

@@ -10,7 +10,7 @@ from typing import Annotated, Final, NamedTuple
 
 import msgspec
 from rich import box
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from services.joint.differential import motor_from_joint
@@ -21,21 +21,15 @@ from shared.bus.session import open_session
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, DriveError, FleetError
-from shared.joints import MODULES, kind_of, side_of
+from shared.joints import MODULES, kind_of
 from tools.bringup import drive_access, resuming, swing, zero_record
+from tools.bringup.hanging_leg import leg_of
 from tools.bringup.motion import within_stops
 from tools.bringup.swing import Swing
 from tools.bringup.whole_turns import UNMOVED, Decision, decide
 from tools.bringup.zero_record import Identity, ZeroRecord
 from tools.bringup.zeroing import DriveLook, is_right, look, refusal, why_outside, zero
-from tools.flags import (
-    Arg,
-    FleetRobotFlags,
-    Number,
-    numbers,
-    parsed,
-    positional,
-)
+from tools.flags import Arg, FleetRobotFlags, Number, numbers, parsed, positional
 from tools.fleet.supervise import SupervisedFleet
 from tools.terminal import Console, marked
 
@@ -131,12 +125,11 @@ def run(flags: ZeroFlags) -> int:
         refuse_services(robot, holders)
         known = resuming.identities(robot, flags.run_dir, modules, console.print)
         record = zero_record.read(zero_record.path_of(robot, path, flags.run_dir), robot)
+        work = _Work(robot, path, flags, holders, known, record, console)
         if flags.resume:
-            work = _Work(robot, path, flags, holders, known, record, console)
             code = _resume(work, wanted)
         else:
             with resuming.drives_of(robot, modules, flags.run_dir) as drives:
-                work = _Work(robot, path, flags, holders, known, record, console)
                 code = _zero(work, drives, wanted)
     if started:
         console.print(drive_access.GONE)
@@ -182,9 +175,8 @@ def _zero(work: _Work, drives: Mapping[str, Drive], wanted: Mapping[str, Pair]) 
         wanted = corrected(now, by, robot)
     done = _set_all(robot, drives, wanted, console)
     modules = dict(work.record.modules)
-    mark, gear_ratio = robot.drive.zero_mark_turns, robot.joint.gear_ratio
     for module in done:
-        seen = look(drives[module], mark, gear_ratio)
+        seen = look(drives[module], robot)
         identity, angles = work.known.get(module), seen.angles
         modules.pop(module, None)
         why = resuming.why_not_kept(robot, seen, identity)
@@ -200,7 +192,7 @@ def _zero(work: _Work, drives: Mapping[str, Drive], wanted: Mapping[str, Pair]) 
 def _resume(work: _Work, about: Mapping[str, Pair]) -> int:
     """Find the whole turns again, ask, set; return the exit code."""
     robot, flags, console = work.robot, work.flags, work.console
-    mark, gear_ratio = robot.drive.zero_mark_turns, robot.joint.gear_ratio
+    gear_ratio = robot.joint.gear_ratio
     unknown = [module for module in flags.modules if module not in work.record.modules]
     if len(unknown) == len(flags.modules):
         raise DriveError(
@@ -208,13 +200,13 @@ def _resume(work: _Work, about: Mapping[str, Pair]) -> int:
             "as on the first day: from then on it can be resumed"
         )
     up = resuming.upright(robot, flags.run_dir, level=flags.level)
-    with resuming.drives_of(robot, _legs_of(flags.modules), flags.run_dir) as drives:
+    with resuming.drives_of(robot, leg_of(*flags.modules), flags.run_dir) as drives:
         swings: dict[str, Swing] = {}
         if flags.swing:
             console.print(swing.HOW)
             legs = {name: one for name, one in drives.items() if kind_of(name) != "ankle"}
             swings = swing.watch(legs, gear_ratio, console.print)
-        looks, _ = resuming.looks_at_rest(drives, mark, gear_ratio)
+        looks, _ = resuming.looks_at_rest(drives, robot)
         faults = {module: refusal(seen) for module, seen in looks.items()}
         fit = {module: seen for module, seen in looks.items() if not faults[module]}
         found = decide(
@@ -246,7 +238,7 @@ def _resume(work: _Work, about: Mapping[str, Pair]) -> int:
             console.print("nothing was changed")
             return DECLINED_EXIT_CODE
         refuse_services(robot, work.holders)
-        now = {module: look(drives[module], mark, gear_ratio) for module in taken}
+        now = {module: look(drives[module], robot) for module in taken}
         for module, seen in now.items():
             if refusal(seen) or not resuming.same_angles(seen, looks[module], UNMOVED):
                 raise DriveError(f"{module}: it has moved meanwhile; nothing was changed; again")
@@ -265,20 +257,13 @@ def _is_its_zero(work: _Work, module: str, drive: Drive) -> bool:
 
     A joint that creeps while it is written has another.
     """
-    mark, gear_ratio = work.robot.drive.zero_mark_turns, work.robot.joint.gear_ratio
-    seen = look(drive, mark, gear_ratio)
-    why = resuming.not_its_zero(seen, work.record.modules[module].offsets, gear_ratio)
+    seen, offsets = look(drive, work.robot), work.record.modules[module].offsets
+    why = resuming.not_its_zero(seen, offsets, work.robot.joint.gear_ratio)
     if why:
         work.console.print(marked("[bold red]{}: it moved as it was written; again[/]", module))
         if seen.status is not DriveStatus.ARMED:
             drive.set_position((0.0, 0.0))
     return not why
-
-
-def _legs_of(modules: tuple[str, ...]) -> tuple[str, ...]:
-    """Return all modules of these modules' legs."""
-    sides = {side_of(module) for module in modules}
-    return tuple(module for module in MODULES if side_of(module) in sides)
 
 
 def resumed_table(found: Mapping[str, Decision]) -> Table:
@@ -421,8 +406,7 @@ def _look_all(robot: RobotConfig, drives: Mapping[str, Drive]) -> dict[str, Driv
     Raises:
         DriveError: one cannot be zeroed now; names all that cannot.
     """
-    mark, gear_ratio = robot.drive.zero_mark_turns, robot.joint.gear_ratio
-    seen = {module: look(drive, mark, gear_ratio) for module, drive in drives.items()}
+    seen = {module: look(drive, robot) for module, drive in drives.items()}
     faults = [f"{module}: {why}" for module, one in seen.items() if (why := refusal(one))]
     if faults:
         raise DriveError("; ".join(faults) + "; nothing was changed")
@@ -476,7 +460,5 @@ def _angles(q: Pair) -> str:
 
 
 def _table(*columns: str) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, caption="phi, theta", caption_justify="left")
-    for heading in ("module", *columns):
-        table.add_column(heading, no_wrap=True)
-    return table
+    headings = [Column(heading, no_wrap=True) for heading in ("module", *columns)]
+    return Table(*headings, box=box.SIMPLE_HEAD, caption="phi, theta", caption_justify="left")
