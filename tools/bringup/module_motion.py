@@ -44,7 +44,7 @@ from tools.terminal import Console, marked
 
 LIFTED: Final = 0.2
 """m; the emulated robot is hung this much higher for a leg's motion, feet clear of the floor."""
-TIMES: Final = 3
+LIMITS_TIMES: Final = 3
 """CAN of firmware 0.5 does not tell its limits, and a frame may be lost."""
 _APART_S: Final = 0.02
 
@@ -189,7 +189,7 @@ def _over_can(robot: RobotConfig, module: str, run_dir: Path) -> None:
     link = CanLink(bus_config(robot, wiring.bus, run_dir), wiring.node_ids)
     try:
         taken = link.connect()
-        for _ in range(TIMES):
+        for _ in range(LIMITS_TIMES):
             link.receive(_APART_S)  # nothing is sent to a drive that is not heard
             taken = taken and link.send(messages_of(wiring.node_ids, (limits,)))
     finally:

@@ -1,4 +1,4 @@
-"""The limits of a jog are taken back."""
+"""The limits of a motion are taken back."""
 
 from __future__ import annotations
 
@@ -62,7 +62,9 @@ def test_over_can_both_axes_get_the_robot_files_limits_more_than_once(
         cansimple.arbitration_id(node, Command.SET_LIMITS)
         for node in robot.module_named(MODULE).node_ids
     ]
-    assert sorted(can_id for can_id, _ in sent) == sorted(ids * module_motion.TIMES), "nothing else"
+    assert sorted(can_id for can_id, _ in sent) == sorted(ids * module_motion.LIMITS_TIMES), (
+        "nothing else"
+    )
     assert all(limits == pytest.approx(wanted) for _, limits in sent)
     assert not link.open
 

@@ -8,7 +8,6 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -20,6 +19,7 @@ from shared.can.drive_settings import of_module
 from shared.config.robot_config import RobotConfig, expand
 from shared.exceptions import DriveError, FleetError
 from shared.joints import MODULES
+from tests.system.fleets import xrl
 from tests.tools.bringup.board_in_memory import BoardInMemory, as_wanted
 from tools.bringup import backup, changes, drive_access
 from tools.bringup.boards import FoundBoards, Value
@@ -54,10 +54,8 @@ def run_dir() -> Iterator[Path]:
 
 
 def verb(run_dir: Path, out: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "tools.cli", "drive", "configure", "--run-dir", str(run_dir)]
-    command += ["--out", str(out), *arguments]
-    environment = {**os.environ, "COLUMNS": "120"}
-    return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    words = ("drive", "configure", "--out", out, *arguments)
+    return xrl(*words, run_dir=run_dir, timeout_s=170.0)
 
 
 @pytest.mark.system

@@ -18,7 +18,8 @@ import pytest
 from shared.can import cansimple
 from shared.can.cansimple import Command
 from shared.can.cansimple_06 import Command06
-from shared.places import DEFAULT_CONFIG
+from shared.places import CHECKOUT, DEFAULT_CONFIG
+from tests.system.fleets import command, xrl
 from tools import cli
 from tools.bringup.findings import ok, wrong
 from tools.fleet import procfs
@@ -53,9 +54,7 @@ def run_dir(run_dir: Path) -> Iterator[Path]:
 
 def doctor(run_dir: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     """Run the verb in a process of its own: the stand-in of libusb is for a whole process."""
-    command = [sys.executable, "-m", "tools.cli", "doctor", "--run-dir", str(run_dir), *arguments]
-    environment = {**os.environ, "COLUMNS": "100"}
-    return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    return xrl("doctor", *arguments, run_dir=run_dir, timeout_s=170.0)
 
 
 def rows_of(result: subprocess.CompletedProcess[str]) -> list[dict[str, Any]]:
@@ -125,7 +124,7 @@ def test_nothing_is_wrong_with_the_robot_as_shipped_and_it_is_asked_questions_on
     """No endpoint is written, and no function called."""
     result = subprocess.run(
         [sys.executable, "-c", RECORDED, str(run_dir)],
-        capture_output=True, text=True, cwd=DEFAULT_CONFIG.parents[1], check=False,
+        capture_output=True, text=True, cwd=CHECKOUT, check=False,
     )  # fmt: skip
     assert bad_rows_of(result, "warning", "wrong") == []
     whats = Counter(row["what"] for row in rows_of(result))
@@ -170,10 +169,10 @@ def test_the_terminal_ends_in_what_is_wrong(
 
 
 def test_ctrl_c_stops_the_simulator_that_was_started(run_dir: Path) -> None:
-    command = [sys.executable, "-m", "tools.cli", "doctor", "--run-dir", str(run_dir)]
     process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
-    )
+        command("doctor", "--run-dir", run_dir),
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
+    )  # fmt: skip
     deadline = time.monotonic() + START_S
     while not (run_dir / "can_knee_left.sock").exists() and process.poll() is None:
         assert time.monotonic() < deadline

@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import pytest
 
 from shared.bus.messages import Tare, TareRequest, Wrench
 from shared.exceptions import FleetError
+from tests.messages import sample
 from tools.verbs.drive import tare
 
 
 def wrench(up: float = 0.0, state: Tare = Tare.DONE, *, saturated: bool = False) -> Wrench:
-    return Wrench(
-        t_ns=1,
-        seq=1,
-        force=(0.0, 0.0, up),
-        moment=(0.0, 0.0, 0.0),
-        valid=state is Tare.DONE and not saturated,
-        saturated=saturated,
-        tare=state,
-        age_ns=0,
-    )
+    valid = state is Tare.DONE and not saturated
+    return sample(Wrench, force=(0.0, 0.0, up), valid=valid, saturated=saturated, tare=state)
 
 
 class Service:
@@ -42,10 +36,14 @@ class Service:
 
 
 @pytest.fixture(autouse=True)
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tare, "REPEAT_S", 0.001)
-    monkeypatch.setattr(tare, "HEARD_S", 0.05)
-    monkeypatch.setattr(tare, "GIVE_UP_S", 0.05)
+def virtual_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = [0.0]
+
+    def sleep(seconds: float) -> None:
+        now_s[0] += seconds
+
+    clock = SimpleNamespace(monotonic=lambda: now_s[0], sleep=sleep)
+    monkeypatch.setattr(tare, "time", clock)
 
 
 def test_it_asks_until_the_tare_has_begun_and_waits_until_it_is_done() -> None:
