@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 import re
-import time
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -15,10 +15,11 @@ from services.joint.differential import joint_from_motor, motor_from_joint
 from services.joint.drivers.base import DriveReading, DriveStatus
 from shared.bus.messages import Pair
 from shared.can.cansimple import AxisError
-from shared.clock import now_ns
+from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError, RunError, XrlError
-from tools.bringup import drive_access, motion_runner, zeroing
+from tools.bringup import drive_access, zeroing
+from tools.bringup.motion_runner import await_reading
 from tools.bringup.stand_angles import stand_angles
 from tools.bringup.zeroing import Back, DriveLook, is_right, look, refusal, why_outside, zero
 from tools.fleet.supervise import SupervisedFleet
@@ -28,6 +29,21 @@ MODULE = "knee_left"
 MARK = 64.0
 N = 17.5
 STILL = DriveLook(DriveStatus.IDLE, zeroed=True, q=(0.0, -1.0), speed=0.0, moved=0.0, error=0)
+
+
+class VirtualTime:
+    """Moves on while a drive is read."""
+
+    now_s = 1.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def now_ns(self) -> int:
+        return round(self.now_s * NS_PER_S)
+
+
+TIME = VirtualTime()
 
 
 class PlayedDrive:
@@ -50,11 +66,12 @@ class PlayedDrive:
         self.creep = 0.0
 
     def read(self, timeout_s: float) -> DriveReading | None:
-        time.sleep(min(timeout_s, 0.001))
         if self.status is DriveStatus.LOST:
+            TIME.now_s += timeout_s
             return None
+        TIME.now_s += 0.001
         self.pos = (self.pos[0] + self.creep, self.pos[1] + self.creep)
-        return DriveReading(now_ns(), self.pos, self.vel, self.status, self.error)
+        return DriveReading(TIME.now_ns(), self.pos, self.vel, self.status, self.error)
 
     def set_position(self, turns: Pair) -> None:
         self.told += 1
@@ -65,11 +82,10 @@ class PlayedDrive:
 
 
 @pytest.fixture(autouse=True)
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(zeroing, "LOOK_S", 0.02)
-    monkeypatch.setattr(motion_runner, "ANSWER_S", 0.02)
-    monkeypatch.setattr(zeroing, "SET_S", 0.02)
-    monkeypatch.setattr(zeroing, "TAKEN_S", 0.0)
+def virtual_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(zeroing, "time", TIME)
+    monkeypatch.setattr(zeroing, "now_ns", TIME.now_ns)
+    monkeypatch.setattr(zeroing, "await_reading", partial(await_reading, clock=TIME.now_ns))
 
 
 def test_motors_are_set_to_the_mark_and_the_joints_angles_there(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import msgspec
 import numpy as np
 import pytest
@@ -12,7 +14,9 @@ from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.exceptions import RunError
 from shared.joints import JOINTS
 from shared.robot.robot_model import stand_pose
+from tests.conftest import ROBOT_FILE
 from tests.planner.oracle import Array
+from tools.bringup.identify import report
 from tools.bringup.identify.body_fit import (
     COM,
     HARNESS,
@@ -33,6 +37,7 @@ from tools.bringup.identify.estimates import (
     zero_corrections,
 )
 from tools.bringup.identify.quasi_static import Moments
+from tools.terminal import Console
 
 FRICTION = 0.3
 SCALE_TRUE, PAYLOAD_TRUE = 0.94, 17.0
@@ -152,6 +157,17 @@ def test_the_findings_name_the_lines_to_write_and_the_zeros_to_correct(
     corrections = zero_corrections(estimates)
     assert corrections["knee_right"][1] == pytest.approx(0.01, abs=5e-3)
     assert corrections["hip_left"][1] == pytest.approx(-0.012, abs=6e-3)
+
+
+def test_a_file_that_is_not_the_records_robot_is_not_written(
+    robot: RobotConfig, fitted: BodyFit, tmp_path: Path
+) -> None:
+    lab, text = tmp_path / "lab.toml", ROBOT_FILE.read_text(encoding="utf-8")
+    other = text.replace("payload = 20.4", "payload = 15.0", 1)
+    lab.write_text(other, encoding="utf-8")
+    with pytest.raises(RunError, match=r"mass\.payload is 15\.0, and was 20\.4"):
+        report.tell(of_body(fitted, robot), robot, lab, Console(quiet=True))
+    assert lab.read_text(encoding="utf-8") == other
 
 
 def test_a_record_that_hardly_moves_claims_little(
