@@ -7,9 +7,9 @@ import fnmatch
 import graphlib
 import subprocess
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import pytest
 
@@ -17,6 +17,7 @@ from shared.extras import EXTRAS
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("services", "shared", "tools")
+N = TypeVar("N", bound=ast.AST)
 
 
 class Import(NamedTuple):
@@ -34,10 +35,10 @@ class Import(NamedTuple):
         return f"{self.module}.{self.name}".rstrip(".")
 
 
-def imports_in(source: str) -> list[Import]:
-    """Return every import of a source text, also those inside functions."""
+def imports_in(tree: ast.AST) -> list[Import]:
+    """Return every import below a node, also those inside functions."""
     found = []
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             found += [Import(alias.name, "") for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -51,7 +52,20 @@ SOURCES = {
     for package in PACKAGES
     for path in sorted((ROOT / package).rglob("*.py"))
 }
-IMPORTS = {file: imports_in(source) for file, source in SOURCES.items()}
+TREES = {file: ast.parse(source) for file, source in SOURCES.items()}
+IMPORTS = {file: imports_in(tree) for file, tree in TREES.items()}
+
+
+def is_among(file: str, patterns: Iterable[str]) -> bool:
+    return any(fnmatch.fnmatch(file, pattern) for pattern in patterns)
+
+
+def nodes_of(kind: type[N], *folders: str) -> Iterator[tuple[str, N]]:
+    """Yield file and node of all of a kind in the files below some folders."""
+    for file, tree in TREES.items():
+        if file.startswith(folders or ""):
+            yield from ((file, node) for node in ast.walk(tree) if isinstance(node, kind))
+
 
 VENDORS = {
     "getpass": ["shared/user.py"],
@@ -155,10 +169,6 @@ TOOL_LAWS = [
 ]
 
 
-def is_among(file: str, patterns: list[str]) -> bool:
-    return any(fnmatch.fnmatch(file, pattern) for pattern in patterns)
-
-
 LAWS = [
     file
     for file in SOURCES
@@ -195,7 +205,7 @@ def test_the_sources_are_read() -> None:
 
 def test_an_import_is_found_wherever_it_stands() -> None:
     source = "import a.b as c\ndef f():\n    from d.e import g, h\nfrom .i import j"
-    found = {imported.full for imported in imports_in(source)}
+    found = {imported.full for imported in imports_in(ast.parse(source))}
     assert found == {"a.b", "d.e.g", "d.e.h", ".i.j"}
 
 
@@ -231,6 +241,13 @@ def test_a_tool_imports_no_test() -> None:
     assert offenders(in_folder("tools/"), lambda _, i: i.top == "tests") == set()
 
 
+def printed(code: str) -> str:
+    """Return what a process of its own prints."""
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, cwd=ROOT, check=True, capture_output=True, text=True, timeout=100)
+    return done.stdout
+
+
 LOADED = """
 import importlib, sys
 for name in {modules}:
@@ -245,15 +262,14 @@ def test_a_service_holds_what_its_process_imports_and_nothing_else() -> None:
     modules = {f"services.{service_of(file)}.__main__" for file in files}
     modules |= {
         imported.module
-        for file in files
-        for node in ast.walk(ast.parse(SOURCES[file]))
-        if isinstance(node, ast.FunctionDef)
-        for imported in imports_in(ast.unparse(node))
+        for _, node in nodes_of(ast.FunctionDef, "services/")
+        for imported in imports_in(node)
         if imported.top == "services"
     }
-    words = [sys.executable, "-c", LOADED.format(modules=sorted(modules))]
-    done = subprocess.run(words, cwd=ROOT, check=True, capture_output=True, text=True, timeout=100)
-    loaded = {Path(name).relative_to(ROOT).as_posix() for name in done.stdout.split()}
+    loaded = {
+        Path(name).relative_to(ROOT).as_posix()
+        for name in printed(LOADED.format(modules=sorted(modules))).split()
+    }
     assert files - loaded == set()
 
 
@@ -318,10 +334,7 @@ def test_the_design_of_the_gains_knows_the_planners_law_and_no_other_service() -
 @pytest.mark.parametrize("vendor", VENDORS)
 def test_a_vendor_package_has_its_owner_and_no_other(vendor: str) -> None:
     users = {file for file, found in IMPORTS.items() if any(i.top == vendor for i in found)}
-    strangers = {
-        file for file in users if not any(fnmatch.fnmatch(file, owner) for owner in VENDORS[vendor])
-    }
-    assert strangers == set()
+    assert {file for file in users if not is_among(file, VENDORS[vendor])} == set()
     assert users, f"nothing imports {vendor}: the row can go"
 
 
@@ -341,39 +354,29 @@ def test_a_module_can_be_imported_without_the_packages_of_extras_but_those_liste
     """Services, `--help` and completion are made of these."""
     hidden = sorted({name for names in EXTRAS.values() for name in names})
     modules = [file.removesuffix(".py").replace("/", ".") for file in SOURCES]
-    code = ALONE.format(hidden=hidden, modules=modules)
-    words = [sys.executable, "-c", code]
-    done = subprocess.run(words, cwd=ROOT, check=True, capture_output=True, text=True, timeout=100)
-    failed = dict(line.split() for line in done.stdout.splitlines())
+    told = printed(ALONE.format(hidden=hidden, modules=modules))
+    failed = dict(line.split() for line in told.splitlines())
     assert all(package.split(".")[0] in hidden for package in failed.values()), failed
     files = {name.replace(".", "/") + ".py" for name in failed}
-    listed = {file for file in SOURCES if any(fnmatch.fnmatch(file, row) for row in NEEDS_EXTRA)}
-    assert files == listed
+    assert files == set(NEEDS_EXTRA)
 
 
 def extra_of(imported: Import) -> str:
     """Return the extra that the imported module of ours cannot do without; "" if there is none."""
-    for module in (imported.module, imported.full):
-        file = module.replace(".", "/") + ".py"
-        if file in SOURCES:
-            for row, extra in NEEDS_EXTRA.items():
-                if fnmatch.fnmatch(file, row):
-                    return extra
-    return ""
+    files = (f"{name.replace('.', '/')}.py" for name in (imported.module, imported.full))
+    return next((NEEDS_EXTRA[file] for file in files if file in NEEDS_EXTRA), "")
 
 
 def test_what_needs_an_extra_is_imported_where_it_is_required() -> None:
     wrong = []
-    for file, source in SOURCES.items():
-        if any(fnmatch.fnmatch(file, row) for row in NEEDS_EXTRA):
-            continue
-        wanted = {extra for imported in IMPORTS[file] if (extra := extra_of(imported))}
-        for node in ast.walk(ast.parse(source)):
+    for file in SOURCES.keys() - NEEDS_EXTRA.keys():
+        wanted = {extra_of(imported) for imported in IMPORTS[file]} - {""}
+        for node in ast.walk(TREES[file]) if wanted else ():
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-                text = ast.unparse(node)
-                extras = {extra_of(imported) for imported in imports_in(text)} - {""}
+                extras = {extra_of(imported) for imported in imports_in(node)} - {""}
                 wanted -= extras
-                wrong += [(file, node.name, e) for e in extras if f"require('{e}'" not in text]
+                required = [e for e in extras if f"require('{e}'" in ast.unparse(node)]
+                wrong += [(file, node.name, e) for e in extras.difference(required)]
         wrong += [(file, "at its top", extra) for extra in wanted]
     assert wrong == []
 
@@ -389,32 +392,19 @@ def test_a_law_knows_no_clock_bus_thread_process_or_log() -> None:
 
 
 def test_an_edge_is_one() -> None:
-    pure = [
-        pattern
-        for pattern in EDGES
-        if not offenders((file for file in SOURCES if fnmatch.fnmatch(file, pattern)), is_impure)
-    ]
+    pure = [row for row in EDGES if not offenders(fnmatch.filter(SOURCES, row), is_impure)]
     assert pure == []
-    assert [
-        pattern for pattern in TOOL_LAWS if not any(fnmatch.fnmatch(f, pattern) for f in LAWS)
-    ] == []
+    assert [row for row in TOOL_LAWS if not fnmatch.filter(LAWS, row)] == []
 
 
 def test_only_tools_write_to_the_terminal() -> None:
-    printing = {
-        file
-        for file, source in SOURCES.items()
-        if not file.startswith("tools/")
-        for node in ast.walk(ast.parse(source))
-        if isinstance(node, ast.Call)
-        and isinstance(node.func, ast.Name)
-        and node.func.id == "print"
-    }
+    calls = nodes_of(ast.Call, "services/", "shared/")
+    printing = {file for file, call in calls if ast.unparse(call.func) == "print"}
     assert printing <= {"shared/process.py"}, "errors at the start go through run_service"
 
 
 def test_every_package_describes_itself() -> None:
-    silent = [file for file, source in SOURCES.items() if not ast.get_docstring(ast.parse(source))]
+    silent = [file for file, tree in TREES.items() if not ast.get_docstring(tree)]
     assert silent == []
 
 
@@ -422,16 +412,15 @@ def test_there_is_no_folder_beside_those_of_the_design() -> None:
     ignored = (ROOT / ".gitignore").read_text(encoding="utf-8").split()
     patterns = [".git", *(line.rstrip("/") for line in ignored)]
     folders = {
-        path.name
-        for path in ROOT.iterdir()
-        if path.is_dir() and not any(fnmatch.fnmatch(path.name, pattern) for pattern in patterns)
+        path.name for path in ROOT.iterdir() if path.is_dir() and not is_among(path.name, patterns)
     }
     assert folders == FOLDERS
 
 
 def test_no_file_is_so_long_that_it_has_two_reasons_to_change() -> None:
-    files = [path for folder in ("services", "shared", "tools", "tests", "examples")
-             for path in (ROOT / folder).rglob("*.py")]  # fmt: skip
+    files = [
+        path for name in (*PACKAGES, "tests", "examples") for path in (ROOT / name).rglob("*.py")
+    ]
     long = {str(p.relative_to(ROOT)) for p in files if len(p.read_text().splitlines()) > LINES_MAX}
     assert long == set()
 
@@ -457,47 +446,28 @@ def test_no_class_has_so_many_attributes_that_it_should_be_several() -> None:
     """Fields of messages and of the robot file are not counted: these are layouts."""
     many = {
         node.name
-        for source in SOURCES.values()
-        for node in ast.walk(ast.parse(source))
-        if isinstance(node, ast.ClassDef) and len(attributes_set_in(node)) > ATTRIBUTES_MAX
+        for _, node in nodes_of(ast.ClassDef)
+        if len(attributes_set_in(node)) > ATTRIBUTES_MAX
     }
     assert many == MANY_ATTRIBUTES
 
 
 def test_no_controller_can_see_the_plant() -> None:
     """What is true of the simulated robot is the simulator's alone, and the tools' that run it."""
-    readers = {
-        file
-        for file, found in IMPORTS.items()
-        if any(i.full.startswith("services.simulator") for i in found)
-    }
-    assert {file for file in readers if not file.startswith(("services/simulator/", "tools/"))} == (
-        set()
-    )
-    believing = [
-        file
-        for file, source in SOURCES.items()
-        if file.startswith(
-            (
-                "services/planner/",
-                "services/joint/",
-                "services/harness/",
-                "services/imu/",
-                "tools/lab/design/",
-            )
-        )
-        and ("simulation" in source and ".simulation" in source)
-    ]
-    assert believing == []
+    others = [file for file in SOURCES if not file.startswith(("services/simulator/", "tools/"))]
+    assert offenders(others, lambda _, i: i.full.startswith("services.simulator")) == set()
+    controllers = [f"services/{name}/" for name in ("planner", "joint", "harness", "imu")]
+    for file in in_folder(*controllers, "tools/lab/design/"):
+        assert ".simulation" not in SOURCES[file], file
 
 
-def bare_exit_codes(source: str) -> list[int]:
+def bare_exit_codes(tree: ast.AST) -> list[int]:
     """Return the lines at which a function of type int, or an exit, gives a code without its name.
 
     A truth that is made an int is code 1 as well, and so is an exit with a text.
     """
     found = []
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef) and ast.unparse(node.returns or node) == "int":
             found += _bare_codes_of(node)
         elif isinstance(node, ast.Call) and ast.unparse(node.func) in EXITS:
@@ -554,28 +524,21 @@ def _is_bare_code(value: ast.expr, *, texts: bool = False) -> bool:
     ],
 )
 def test_an_exit_code_without_its_name_is_found(line: str) -> None:
-    assert bare_exit_codes(f"def run(args) -> int:\n    {line}") == [2]
+    assert bare_exit_codes(ast.parse(f"def run(args) -> int:\n    {line}")) == [2]
 
 
 def test_an_exit_code_is_given_by_its_name() -> None:
     """1 is a robot that fell, and nothing else: whoever means a fall says `FELL_EXIT_CODE`."""
-    sources = {file: text for file, text in SOURCES.items() if not file.startswith("shared/")}
-    sources |= {
-        path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8")
-        for path in (ROOT / "examples").glob("*.py")
-    }
-    found = {file: lines for file, text in sources.items() if (lines := bare_exit_codes(text))}
-    assert found == {}
+    trees = {file: TREES[file] for file in in_folder("services/", "tools/")}
+    trees |= {path.name: ast.parse(path.read_text()) for path in (ROOT / "examples").glob("*.py")}
+    assert {file: lines for file, tree in trees.items() if (lines := bare_exit_codes(tree))} == {}
 
 
 def test_no_two_classes_have_the_same_name() -> None:
     """There were fourteen `Outcome`s: a name is to say which one is meant."""
     found: dict[str, set[str]] = {}
-    for package in PACKAGES:
-        for path in (ROOT / package).rglob("*.py"):
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                if isinstance(node, ast.ClassDef):
-                    found.setdefault(node.name, set()).add(str(path.relative_to(ROOT)))
+    for file, node in nodes_of(ast.ClassDef):
+        found.setdefault(node.name, set()).add(file)
     assert {name: files for name, files in found.items() if len(files) > 1} == {}
 
 
