@@ -143,20 +143,14 @@ def service_directory(text: str) -> Path:
     crashed begins whatever has become of it, because its module is to be held. Raises
     argparse.ArgumentTypeError as `check_own`.
     """
-    path = Path(text)
-    if FLEET_VARIABLE not in os.environ:
-        try:
-            check_own(path)
-        except FleetError as error:
-            raise argparse.ArgumentTypeError(str(error)) from None
-    return path
+    return Path(text) if FLEET_VARIABLE in os.environ else own_directory(text, alone=True)
 
 
-def own_directory(text: str) -> Path:
-    """Return a run directory named on a command line; ArgumentTypeError for somebody else's."""
+def own_directory(text: str, *, alone: bool = False) -> Path:
+    """Return a run directory named on a command line; ArgumentTypeError where `check_own` fails."""
     path = Path(text)
     try:
-        check_own(path, alone=False)
+        check_own(path, alone=alone)
     except FleetError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
     return path

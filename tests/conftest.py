@@ -10,6 +10,7 @@ import pytest
 from hypothesis import Phase, settings
 
 from shared.config import files as config_file
+from shared.config.gain_table import GainSchedule
 from shared.config.robot_config import RobotConfig
 
 # A shell without job control starts its background with SIGINT ignored, and every program that a
@@ -72,3 +73,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def robot() -> RobotConfig:
     """Return the shipped robot; it is frozen, so every test may share it."""
     return config_file.load(ROBOT_FILE)
+
+
+@pytest.fixture(scope="session")
+def schedule(robot: RobotConfig) -> GainSchedule:
+    """Return its gain schedule."""
+    assert robot.gain_schedule is not None
+    return robot.gain_schedule

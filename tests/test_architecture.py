@@ -241,36 +241,25 @@ def test_a_tool_imports_no_test() -> None:
     assert offenders(in_folder("tools/"), lambda _, i: i.top == "tests") == set()
 
 
-def printed(code: str) -> str:
-    """Return what a process of its own prints."""
-    words = [sys.executable, "-c", code]
-    done = subprocess.run(words, cwd=ROOT, check=True, capture_output=True, text=True, timeout=100)
-    return done.stdout
-
-
-LOADED = """
-import importlib, sys
-for name in {modules}:
-    importlib.import_module(name)
-print(*(found.__file__ for name, found in sys.modules.items() if name.startswith("services.")))
-"""
+FILE_OF = {
+    file.removesuffix(".py").removesuffix("/__init__").replace("/", "."): file for file in SOURCES
+}
+GRAPH = {
+    file: {FILE_OF.get(i.full) or FILE_OF.get(i.module, file) for i in imports} - {file}
+    for file, imports in IMPORTS.items()
+}
+"""Files of ours that a file imports, at its top or in a function."""
 
 
 def test_a_service_holds_what_its_process_imports_and_nothing_else() -> None:
     """At its start, or later by a function: what only tools import is a tool's."""
-    files = {file for file in SOURCES if service_of(file)}
-    modules = {f"services.{service_of(file)}.__main__" for file in files}
-    modules |= {
-        imported.module
-        for _, node in nodes_of(ast.FunctionDef, "services/")
-        for imported in imports_in(node)
-        if imported.top == "services"
-    }
-    loaded = {
-        Path(name).relative_to(ROOT).as_posix()
-        for name in printed(LOADED.format(modules=sorted(modules))).split()
-    }
-    assert files - loaded == set()
+    files = {file for file in SOURCES if service_of(file) and not file.endswith("/__init__.py")}
+    reached: set[str] = set()
+    coming = {file for file in files if file.endswith("/__main__.py")}
+    while coming:
+        reached |= coming
+        coming = set().union(*(GRAPH[file] for file in coming)) - reached
+    assert files - reached == set()
 
 
 ORDER = {
@@ -311,15 +300,7 @@ def test_a_room_imports_only_those_below_it(storey: str) -> None:
 
 
 def test_no_files_import_each_other_in_a_circle_not_even_for_a_type() -> None:
-    file_of = {
-        file.removesuffix(".py").removesuffix("/__init__").replace("/", "."): file
-        for file in SOURCES
-    }
-    graph = {
-        file: {file_of.get(i.full) or file_of.get(i.module, file) for i in imports} - {file}
-        for file, imports in IMPORTS.items()
-    }
-    tuple(graphlib.TopologicalSorter(graph).static_order())  # raises CycleError, which names them
+    tuple(graphlib.TopologicalSorter(GRAPH).static_order())  # raises CycleError, which names them
 
 
 def test_the_design_of_the_gains_knows_the_planners_law_and_no_other_service() -> None:
@@ -354,8 +335,10 @@ def test_a_module_can_be_imported_without_the_packages_of_extras_but_those_liste
     """Services, `--help` and completion are made of these."""
     hidden = sorted({name for names in EXTRAS.values() for name in names})
     modules = [file.removesuffix(".py").replace("/", ".") for file in SOURCES]
-    told = printed(ALONE.format(hidden=hidden, modules=modules))
-    failed = dict(line.split() for line in told.splitlines())
+    code = ALONE.format(hidden=hidden, modules=modules)
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, cwd=ROOT, check=True, capture_output=True, text=True, timeout=100)
+    failed = dict(line.split() for line in done.stdout.splitlines())
     assert all(package.split(".")[0] in hidden for package in failed.values()), failed
     files = {name.replace(".", "/") + ".py" for name in failed}
     assert files == set(NEEDS_EXTRA)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import ast
 import fnmatch
-import io
 import pkgutil
 import re
 import subprocess
 import sys
-import tokenize
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import msgspec
@@ -48,18 +47,35 @@ _ABROAD = {
 """Names in backticks that are other programs'."""
 _EQUATION = re.compile(r"docs/law\.md\s+((?:(?:,|\s+and)?\s*\(\d+\))+)")
 """One or several numbers of its equations: `docs/law.md (6) and (12)`."""
-_OLD = re.compile(r"design,?\s+(?:#\s+)?sections?\s+\d", re.IGNORECASE)
 
 
-def _tracked(*suffixes: str) -> Iterator[Path]:
+_SUFFIXES = (".py", ".toml", ".c", ".js", ".json", ".sh", ".md", ".lock", ".rules", "")
+
+
+@cache
+def _tracked() -> dict[Path, str]:
+    """Return the text of each file of code, data and pages, but this one."""
     names = subprocess.run(
         ["git", "ls-files", "-co", "--exclude-standard"], cwd=ROOT, capture_output=True, text=True,
         check=True,
     ).stdout  # fmt: skip
-    for name in names.splitlines():
-        path = ROOT / name
-        if path.suffix in suffixes and path.is_file() and path != Path(__file__):
-            yield path
+    paths = [ROOT / name for name in names.splitlines()]
+    return {
+        path: path.read_text(encoding="utf-8")
+        for path in paths
+        if path.suffix in _SUFFIXES and path.is_file() and path != Path(__file__)
+    }
+
+
+def _texts(*suffixes: str) -> Iterator[tuple[Path, str]]:
+    return ((path, text) for path, text in _tracked().items() if path.suffix in suffixes)
+
+
+def _pages() -> Iterator[tuple[Path, str]]:
+    """Yield the pages of docs/, and README.md."""
+    for path, text in _texts(".md"):
+        if path == ROOT / "README.md" or DOCS in path.parents:
+            yield path, text
 
 
 def _slug(heading: str) -> str:
@@ -68,6 +84,7 @@ def _slug(heading: str) -> str:
     return kept.replace(" ", "-")
 
 
+@cache
 def _anchors(page: Path) -> set[str]:
     text = page.read_text(encoding="utf-8")
     labels = set(re.findall(r"^\(([\w-]+)\)=$", text, re.MULTILINE))
@@ -148,21 +165,12 @@ def test_a_page_has_the_codes_figure(page: str, text: str) -> None:
 
 def test_every_reference_to_a_page_leads_to_a_page_and_an_anchor() -> None:
     broken = []
-    for path in _tracked(".py", ".md", ".toml", ".sh"):
-        for page, anchor in _PAGE.findall(path.read_text(encoding="utf-8")):
+    for path, text in _texts(".py", ".md", ".toml", ".sh"):
+        for page, anchor in _PAGE.findall(text):
             target = DOCS / page
             if not target.exists() or (anchor and anchor not in _anchors(target)):
                 broken.append(f"{path.relative_to(ROOT)}: docs/{page}#{anchor}")
     assert broken == []
-
-
-def test_no_design_section_is_left() -> None:
-    found = [
-        str(path.relative_to(ROOT))
-        for path in _tracked(".py", ".md", ".toml", ".sh")
-        if _OLD.search(path.read_text(encoding="utf-8"))
-    ]
-    assert found == []
 
 
 def _functions_in_code() -> dict[str, set[int]]:
@@ -178,9 +186,10 @@ def _functions_in_code() -> dict[str, set[int]]:
                     found.setdefault(inside, set()).update(map(int, re.findall(r"\d+", numbers)))
             visit(child, inside)
 
-    for path in _tracked(".py"):
-        module = path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".")
-        visit(ast.parse(path.read_text(encoding="utf-8")), module)
+    for path, text in _texts(".py"):
+        if _EQUATION.search(text):
+            module = path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".")
+            visit(ast.parse(text), module)
     return found
 
 
@@ -203,35 +212,28 @@ def test_each_equation_of_the_law_names_its_function_and_that_function_names_it(
 def test_every_file_that_a_page_names_exists() -> None:
     missing = [
         f"{page.relative_to(ROOT)}: {name}"
-        for page in [*DOCS.rglob("*.md"), ROOT / "README.md"]
-        for name in _PATH.findall(page.read_text(encoding="utf-8"))
+        for page, text in _pages()
+        for name in _PATH.findall(text)
         if not (ROOT / name).exists()
     ]
     assert missing == []
 
 
-_MIDDLE = getattr(tokenize, "FSTRING_MIDDLE", None)
-"""Text in an f-string: a token of its own since Python 3.12."""
+_STRINGS = re.compile(
+    r'''("(?!"")(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'|\w+"""[\s\S]*?""")|"""[\s\S]*?"""|#.*'''
+)
+"""The strings of a Python file, or else a docstring or a comment."""
 
 
 def _known_names() -> set[str]:
     """Return every name in code, in its strings other than docstrings, in data and in paths."""
     known = set(_ABROAD)
-    for path in _tracked(".py", ".toml", ".c", ".js", ".json", ".sh", ".md", ".lock", ".rules", ""):
+    for path, text in _tracked().items():
         known.update(re.findall(r"\w+", str(path.relative_to(ROOT))))
-        if path.suffix == ".md":
-            continue
-        text = path.read_text(encoding="utf-8")
-        if path.suffix != ".py":
+        if path.suffix == ".py":
+            known.update(re.findall(r"\w+", _STRINGS.sub(lambda found: found[1] or " ", text)))
+        elif path.suffix != ".md":
             known.update(re.findall(r"\w+", text))
-            continue
-        for token in tokenize.generate_tokens(io.StringIO(text).readline):
-            if token.type == tokenize.NAME:
-                known.add(token.string)
-            elif token.type == tokenize.STRING and token.string.startswith('"""'):
-                continue
-            elif token.type in (tokenize.STRING, _MIDDLE):
-                known.update(re.findall(r"\w+", token.string))
     return known
 
 
@@ -239,9 +241,9 @@ def test_every_name_in_backticks_exists() -> None:
     known = _known_names()
     stale = [
         f"{path.relative_to(ROOT)}: {name}"
-        for path in _tracked(".py", ".md")
+        for path, text in _texts(".py", ".md")
         if path.name != "CHANGELOG.md"
-        for name in _NAME.findall(path.read_text(encoding="utf-8"))
+        for name in _NAME.findall(text)
         if not known.issuperset(name.split("."))
     ]
     assert stale == [], "renamed or removed"
@@ -249,16 +251,15 @@ def test_every_name_in_backticks_exists() -> None:
 
 def test_a_dotted_name_on_a_page_is_in_the_module_or_class_that_it_names() -> None:
     words: dict[str, set[str]] = {}
-    for path in _tracked(".py"):
-        text = path.read_text(encoding="utf-8")
+    for path, text in _texts(".py"):
         found = set(re.findall(r"\w+", text))
         for name in (path.stem, *re.findall(r"^class (\w+)", text, re.MULTILINE)):
             words.setdefault(name, set()).update(found)
     config = files.load(DEFAULT_CONFIG)
     stale = [
         f"{page.relative_to(ROOT)}: {owner}.{name}"
-        for page in [*DOCS.rglob("*.md"), ROOT / "README.md"]
-        for owner, name in _DOTTED.findall(page.read_text(encoding="utf-8"))
+        for page, text in _pages()
+        for owner, name in _DOTTED.findall(text)
         if name not in words.get(owner, {name}) and not hasattr(getattr(config, owner, None), name)
     ]
     assert stale == [], "renamed, removed or moved"

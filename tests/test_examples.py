@@ -18,13 +18,18 @@ ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
 
 
-def run(name: str, *arguments: str) -> str:
-    """Return what a script prints."""
+def run(*words: str | Path, code: int = 0) -> subprocess.CompletedProcess[str]:
+    """Run Python; the exit code is as expected."""
     done = subprocess.run(
-        [sys.executable, EXAMPLES / name, *arguments], capture_output=True, text=True, check=False
+        [sys.executable, *words], cwd=ROOT, capture_output=True, text=True, check=False
     )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    assert done.returncode == code, done.stdout + done.stderr
+    return done
+
+
+def lines_of(name: str, *arguments: str) -> list[str]:
+    """Return the lines that a script prints."""
+    return run(EXAMPLES / name, *arguments).stdout.splitlines()
 
 
 def test_every_example_is_listed_and_tested() -> None:
@@ -36,18 +41,18 @@ def test_every_example_is_listed_and_tested() -> None:
 
 
 def test_the_drive_of_its_own_holds_its_target_under_load() -> None:
-    assert run("own_drive.py").startswith("ARMED: theta -0.99")
+    assert lines_of("own_drive.py")[0].startswith("ARMED: theta -0.99")
 
 
 def test_one_module_holds_and_gives_back_what_the_load_takes() -> None:
-    lines = run("hold_one_module.py").splitlines()
+    lines = lines_of("hold_one_module.py")
     assert all("HOLD" in line for line in lines)
     assert "torque  -20.00" in lines[2]
     assert "theta  -1.0000" in lines[-1]
 
 
 def test_the_robot_in_virtual_time_holds_while_the_planner_is_dead_and_is_led_again() -> None:
-    lines = run("virtual_planner.py").splitlines()
+    lines = lines_of("virtual_planner.py")
     assert lines[-1] == "stood"
     assert "HHHHHH" in lines[2]
     assert lines[-2].endswith("TTTTTT")
@@ -71,7 +76,7 @@ def test_a_controller_that_is_not_there_leaves_nothing_behind(
 
 
 def test_a_gentler_hand_leads_the_same_squat_with_less_force() -> None:
-    shipped, gentle = (line.split() for line in run("own_operator.py").splitlines())
+    shipped, gentle = (line.split() for line in lines_of("own_operator.py"))
     force, height = 2, 8
     assert float(gentle[force]) <= 12.0 < float(shipped[force])
     assert float(gentle[height]) == pytest.approx(float(shipped[height]), abs=0.005)
@@ -79,14 +84,11 @@ def test_a_gentler_hand_leads_the_same_squat_with_less_force() -> None:
 
 def test_a_run_is_read_into_numpy(tmp_path: Path, robot: RobotConfig) -> None:
     simulate(robot, still(1.0), BASE, 0, tmp_path)
-    lines = run("read_a_run.py", str(tmp_path / "run.mcap")).splitlines()
+    lines = lines_of("read_a_run.py", str(tmp_path / "run.mcap"))
     assert lines[0].startswith("1.0 s, COM x ")
     assert "states, age 4." in lines[1]
 
 
 def test_without_a_log_the_reader_names_its_usage() -> None:
-    done = subprocess.run(
-        [sys.executable, EXAMPLES / "read_a_run.py"], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 2
+    done = run(EXAMPLES / "read_a_run.py", code=2)
     assert "usage: read_a_run.py [-h] RUN.mcap" in done.stderr

@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 
 import msgspec
 
-from services.planner.checkpoint import Checkpoints
 from services.planner.intents import Intents, OperatorRequest
 from services.planner.planner import EARLY_FRACTION, Planner
 from shared import log
@@ -57,6 +56,36 @@ def requests_of(
         return kept.request(now_ns)
 
     return request
+
+
+class Checkpoints:
+    """Says when the planner's state is recorded, so that re-execution can start from it.
+
+    After every tick whose number is a power of two, then once a second. It is frequent at first,
+    because a recorder discovers a new planner with a short delay.
+    """
+
+    def __init__(self, rate_hz: float) -> None:
+        """Set the planner's rate, Hz."""
+        self._every = round(rate_hz)
+        self._tick = 0
+        self._seq = 0
+        self._encode = msgspec.json.Encoder().encode
+
+    def after(self, planner: Planner, now_ns: int) -> PlannerCheckpoint | None:
+        """Return the state after the tick just run, if it is due."""
+        self._tick += 1
+        tick = self._tick
+        first = tick < self._every and tick & (tick - 1) == 0
+        if not first and tick % self._every:
+            return None
+        self._seq += 1
+        return PlannerCheckpoint(
+            t_ns=now_ns,
+            seq=self._seq,
+            session=planner.session,
+            snapshot=self._encode(planner.snapshot()).decode(),
+        )
 
 
 POLL_NS = 200 * NS_PER_US

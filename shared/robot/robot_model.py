@@ -41,7 +41,7 @@ def mjcf(config: RobotConfig) -> str:
     """Return the robot as MJCF text."""
     geometry = config.geometry
     legs = "".join(_leg(config, side) for side in SIDES)
-    harness = _numbers(*geometry.harness_point)
+    harness = numbers(*geometry.harness_point)
     torso_inertia = box_inertia(config.torso_mass, geometry.torso_size)
     return f"""<mujoco model="{config.name}">
   <compiler angle="radian" autolimits="true"/>
@@ -56,8 +56,8 @@ def mjcf(config: RobotConfig) -> str:
           contype="1" conaffinity="1"/>
     <body name="torso" pos="0 0 {config.simulation.stand_height}">
       <freejoint name="torso"/>
-      {_inertial(config.torso_mass, torso_inertia, _numbers(*config.torso_com))}
-      <geom name="torso" type="box" size="{_numbers(*(s / 2 for s in geometry.torso_size))}"/>
+      {_inertial(config.torso_mass, torso_inertia, numbers(*config.torso_com))}
+      <geom name="torso" type="box" size="{numbers(*(s / 2 for s in geometry.torso_size))}"/>
       <site name="harness" pos="{harness}"/>{legs}
     </body>
   </worldbody>
@@ -71,7 +71,7 @@ def _leg(config: RobotConfig, side: str) -> str:
     module = _inertial(config.mass.module, ball_inertia(config.mass.module))
     half_at_origin = _inertial(half, ball_inertia(half))
     half_at_knee = _inertial(half, ball_inertia(half), f"0 0 -{geometry.l1}")
-    sole = _numbers(geometry.l_foot / 2, geometry.w_foot / 2, geometry.foot_height / 4)
+    sole = numbers(geometry.l_foot / 2, geometry.w_foot / 2, geometry.foot_height / 4)
     sole_z = -0.75 * geometry.foot_height
     return f"""
       <body name="thigh_{side}" pos="{hip}">{_joints(config, "hip", side)}
@@ -96,14 +96,14 @@ def _joints(config: RobotConfig, kind: str, side: str) -> str:
         ("theta", "0 -1 0", limit.theta),
         ("phi", "-1 0 0", limit.phi),
     ):
-        stop = _numbers(low - HARD_STOP_MARGIN, high + HARD_STOP_MARGIN)
+        stop = numbers(low - HARD_STOP_MARGIN, high + HARD_STOP_MARGIN)
         text += f"""
         <joint name="{kind}_{side}_{axis}" axis="{direction}" range="{stop}"/>"""
     return text
 
 
 def _inertial(mass: float, inertia: tuple[float, float, float], pos: str = "0 0 0") -> str:
-    return f'<inertial pos="{pos}" mass="{mass}" diaginertia="{_numbers(*inertia)}"/>'
+    return f'<inertial pos="{pos}" mass="{mass}" diaginertia="{numbers(*inertia)}"/>'
 
 
 def box_inertia(mass: float, size: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -118,7 +118,8 @@ def ball_inertia(mass: float) -> tuple[float, float, float]:
     return inertia, inertia, inertia
 
 
-def _numbers(*values: float) -> str:
+def numbers(*values: float) -> str:
+    """Return numbers as the attribute of an XML element; read again, they are the same."""
     return " ".join(repr(float(value)) for value in values)
 
 

@@ -7,7 +7,6 @@ The joints have the names and signs of q (`shared.joints`).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Final
 from xml.etree import ElementTree as ET
 
@@ -16,7 +15,7 @@ from shared.config.robot_config import RobotConfig
 from shared.config.sections import LimitConfig
 from shared.joints import SIDES, kind_of
 from shared.robot.frames import ORIGIN, leg_offsets
-from shared.robot.robot_model import MODULE_RADIUS, ball_inertia, box_inertia
+from shared.robot.robot_model import MODULE_RADIUS, ball_inertia, box_inertia, numbers
 
 THETA_AXIS: Final[Vector3] = (0.0, -1.0, 0.0)
 PHI_AXIS: Final[Vector3] = (-1.0, 0.0, 0.0)
@@ -38,7 +37,7 @@ def urdf(config: RobotConfig) -> str:
     size = geometry.torso_size
     inertia = box_inertia(config.torso_mass, size)
     _add_inertial(torso, config.torso_mass, inertia, config.torso_com)
-    _add_visual(torso, "box", size=_numbers(size))
+    _add_visual(torso, "box", size=numbers(*size))
     _add_fixed(root, "torso", "harness", geometry.harness_point)
     for side in SIDES:
         parent = "torso"
@@ -62,7 +61,7 @@ def _add_body(link: ET.Element, config: RobotConfig, kind: str) -> None:
         _add_inertial(link, module, ball_inertia(module))
         size = (geometry.l_foot, geometry.w_foot, geometry.foot_height / 2)
         centre = (0.0, 0.0, -0.75 * geometry.foot_height)
-        _add_visual(link, "box", centre, size=_numbers(size))
+        _add_visual(link, "box", centre, size=numbers(*size))
         return
     length = geometry.l1 if kind == "hip" else geometry.l2
     at = (0.0, 0.0, -length) if kind == "hip" else ORIGIN  # half of the knee's module on each side
@@ -80,8 +79,8 @@ def _add_joint(
     joint = ET.SubElement(root, "joint", name=name, type="revolute")
     ET.SubElement(joint, "parent", link=links[0])
     ET.SubElement(joint, "child", link=links[1])
-    ET.SubElement(joint, "origin", xyz=_numbers(at))
-    ET.SubElement(joint, "axis", xyz=_numbers(THETA_AXIS if axis == "theta" else PHI_AXIS))
+    ET.SubElement(joint, "origin", xyz=numbers(*at))
+    ET.SubElement(joint, "axis", xyz=numbers(*(THETA_AXIS if axis == "theta" else PHI_AXIS)))
     effort, velocity = config.joint.tau_module_max, config.joint_service.v_max
     ET.SubElement(
         joint, "limit", lower=repr(low), upper=repr(high), effort=repr(effort),
@@ -94,12 +93,12 @@ def _add_fixed(root: ET.Element, parent: str, child: str, at: Vector3) -> None:
     joint = ET.SubElement(root, "joint", name=f"to_{child}", type="fixed")
     ET.SubElement(joint, "parent", link=parent)
     ET.SubElement(joint, "child", link=child)
-    ET.SubElement(joint, "origin", xyz=_numbers(at))
+    ET.SubElement(joint, "origin", xyz=numbers(*at))
 
 
 def _add_inertial(link: ET.Element, mass: float, inertia: Vector3, at: Vector3 = ORIGIN) -> None:
     inertial = ET.SubElement(link, "inertial")
-    ET.SubElement(inertial, "origin", xyz=_numbers(at))
+    ET.SubElement(inertial, "origin", xyz=numbers(*at))
     ET.SubElement(inertial, "mass", value=repr(mass))
     (ixx, iyy, izz), off = map(repr, inertia), "0"
     ET.SubElement(inertial, "inertia", ixx=ixx, iyy=iyy, izz=izz, ixy=off, ixz=off, iyz=off)
@@ -107,11 +106,7 @@ def _add_inertial(link: ET.Element, mass: float, inertia: Vector3, at: Vector3 =
 
 def _add_visual(link: ET.Element, shape: str, at: Vector3 = ORIGIN, **size: str) -> None:
     visual = ET.SubElement(link, "visual")
-    ET.SubElement(visual, "origin", xyz=_numbers(at))
+    ET.SubElement(visual, "origin", xyz=numbers(*at))
     ET.SubElement(ET.SubElement(visual, "geometry"), shape, size)
     material = ET.SubElement(visual, "material", name="grey")
     ET.SubElement(material, "color", rgba=_GREY)
-
-
-def _numbers(values: Iterable[float]) -> str:
-    return " ".join(repr(float(value)) for value in values)

@@ -126,20 +126,14 @@ def harness(config: RobotConfig, q: Array, side: int = RIGHT) -> Array:
 
 def derivative(f: Callable[[Array], Array], q: Array, step: float = 1e-6) -> Array:
     """Return df/dq by central differences, the joint last."""
-    columns = []
-    for index in range(len(q)):
-        e = np.zeros(len(q))
-        e[index] = step
-        columns.append((f(q + e) - f(q - e)) / (2 * step))
+    columns = [(f(q + e) - f(q - e)) / (2 * step) for e in step * np.eye(len(q))]
     return np.stack(columns, axis=-1)
 
 
 def precise_derivative(f: Callable[[Array], Array], q: Array, step: float = 3e-3) -> Array:
     """Return df/dq as `derivative` does, to 1e-12 of f's size: differences of sixth order."""
     columns = []
-    for index in range(len(q)):
-        e = np.zeros(len(q))
-        e[index] = step
+    for e in step * np.eye(len(q)):
         near, mid, far = (f(q + n * e) - f(q - n * e) for n in (1, 2, 3))
         columns.append((45.0 * near - 9.0 * mid + far) / (60.0 * step))
     return np.stack(columns, axis=-1)

@@ -9,11 +9,13 @@ import numpy as np
 
 from services.planner.law.kinematics import Kinematics
 from services.planner.planner import Planner
-from shared.bus.messages import DriveStatus, JointState, Mode, PlannerMode, Tare, Wrench
+from shared.bus.messages import DriveStatus, JointState, Mode, PlannerMode, Wrench
 from shared.clock import NS_PER_MS
 from shared.config import files as config_file
+from shared.config.gain_schedule import digest_of, inputs_of
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.joints import N_MODULES
+from tests import messages
 from tests.conftest import ROBOT_FILE
 from tests.planner.oracle import Array
 
@@ -27,11 +29,27 @@ def with_law(robot: RobotConfig, **changes: object) -> RobotConfig:
     return msgspec.structs.replace(robot, law=msgspec.structs.replace(robot.law, **changes))
 
 
+def requiring(robot: RobotConfig, **changes: object) -> RobotConfig:
+    """Return the robot with some keys of [certificate] changed, its schedule made out to fit."""
+    certificate = msgspec.structs.replace(robot.certificate, **changes)
+    changed = msgspec.structs.replace(robot, certificate=certificate)
+    schedule = robot.gain_schedule
+    assert schedule is not None
+    inputs = inputs_of(changed)
+    fitting = msgspec.structs.replace(schedule, inputs=inputs, digest=digest_of(inputs))
+    return msgspec.structs.replace(changed, gain_schedule=fitting)
+
+
+@cache
+def shipped() -> tuple[RobotConfig, Kinematics]:
+    robot = config_file.load(ROBOT_FILE)
+    return robot, Kinematics(robot)
+
+
 @cache
 def standing_torque(q: tuple[float, ...]) -> Array:
     """Return the torques (12,) of the shipped robot's stand at q (12,), rad; N m."""
-    robot = config_file.load(ROBOT_FILE)
-    kinematics = Kinematics(robot)
+    robot, kinematics = shipped()
     kinematics.update(np.array(q))
     return np.asarray(robot.total_mass * GRAVITY * kinematics.J[2])
 
@@ -76,8 +94,5 @@ def lead(planner: Planner, q: Array, now_ns: int = START_NS) -> int:
 
 def wrench(force_z: float = 0.0, **changes: object) -> Wrench:
     """Return a reading of the harness, valid unless told otherwise."""
-    fields: dict[str, object] = {
-        "t_ns": 1, "seq": 1, "force": (0.0, 0.0, force_z), "moment": (0.0, 0.0, 0.0),
-        "valid": True, "saturated": False, "tare": int(Tare.DONE), "age_ns": 0,
-    }  # fmt: skip
-    return Wrench(**(fields | changes))  # type: ignore[arg-type]
+    pull = {"force": (0.0, 0.0, force_z), "moment": (0.0, 0.0, 0.0), "age_ns": 0}
+    return messages.wrench(**(pull | changes))

@@ -199,21 +199,6 @@ def test_it_reports_how_long_it_waits_and_leads_when_that_is_over(dropouts: int)
         assert engagement.hold is (left_ns > 0)
 
 
-def test_each_good_while_makes_one_drop_out_forgotten() -> None:
-    engagement = leading()
-    engagement.dropouts = Dropouts(3, last_ns=T0, steady_since_ns=T0)
-    for now_ns, left in (
-        (T0 + FORGET_NS - 1, 3),
-        (T0 + FORGET_NS, 2),
-        (T0 + 2 * FORGET_NS - 1, 2),
-        (T0 + 2 * FORGET_NS, 1),
-        (T0 + 3 * FORGET_NS, 0),
-        (T0 + 4 * FORGET_NS, 0),
-    ):
-        engagement.advance(now_ns, YES, YES, TRACK)
-        assert engagement.dropouts.count == left, now_ns - T0
-
-
 TICK_NS = 4 * NS_PER_MS
 
 
@@ -240,10 +225,6 @@ class Led:
         while self.tick() is not PlannerMode.LEADING:
             assert self.now_ns - start_ns < 120 * NS_PER_S
         return self.now_ns - start_ns
-
-    def lead_for(self, time_ns: int) -> None:
-        for _ in range(time_ns // TICK_NS):
-            assert self.tick() is PlannerMode.LEADING
 
     def drop_out(self) -> int:
         """Lose a module and find it again at once; return the time until it leads again."""

@@ -17,20 +17,23 @@ from services.planner.law.load import Load
 from services.planner.law.probe import ReferenceProbe
 from services.planner.law.shift import ShiftReference
 from services.planner.planner import Planner, PlannerState
+from services.planner.state_phases import StatePhases
 from services.planner.watch.trips import PlannerTrips
 from services.planner.watch.unattended import HAND_LOST_NS, Unattended
 from shared.bus.messages import STRAIGHT, DriveStatus, Mode, Trip
 from shared.config.robot_config import RobotConfig
+from shared.joints import N_MODULES
 from shared.robot.trip_table import PLANNER_TRIPS
 from tests.planner.conftest import Closed
 from tests.planner.oracle import Array
-from tests.planner.states import SESSION, START_NS, TICK_NS, receive_all
+from tests.planner.states import SESSION, START_NS, TICK_NS, receive_all, state
 
 DT = 0.004
 UP = np.array((0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
 P, REST = np.array([0.0, 0.0, 0.9, 0.0, 0.1, 0.0]), np.zeros(6)
 APART = tuple({Trip.LEGS: 0.2, Trip.UNLOADED: 200.0}.get(trip, 0.0) for trip in PLANNER_TRIPS)
 """Legs that disagree."""
+STATE = state(0, np.zeros(12))
 
 
 class Part(NamedTuple):
@@ -76,6 +79,12 @@ def drift(watch: Unattended, tick: int) -> Any:
     return watch.drift(now_ns, (0.8, 0.01 * tick), hand_n, 0.0)
 
 
+def phase(phases: StatePhases, tick: int) -> Any:
+    arrived = [tick * TICK_NS + 1_700_000 * (module == 1) for module in range(N_MODULES)]
+    phases.advance([STATE] * N_MODULES, arrived, arrived[0] - 1)
+    return phases.state.phases, list(phases.state.sums)
+
+
 def loaded(kg: float) -> Part:
     return Part(
         lambda _: Load((8.0, 20.0), 700.0, 40.0, 0.5), lambda one, n: weigh(one, n, kg), 400
@@ -90,6 +99,7 @@ PARTS = {
     "levelling": Part(lambda _: Levelling(1.0), level),
     "a load of 9 kg": loaded(9.0),
     "3 kg less": loaded(-3.0),
+    "phases": Part(lambda _: StatePhases(500.0, 250.0), phase, 120),
     "probe": Part(lambda _: ReferenceProbe(MOST, (0, 0, 1, 0, 1, 0)), probe, 500),
     "shift": Part(lambda _: ShiftReference((0.03, 0.04, 0.06, 0.12)), shift),
     "trips": Part(PlannerTrips, trip, 24),

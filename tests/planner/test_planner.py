@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -14,7 +13,6 @@ from services.planner.planner import EARLY_FRACTION, LATE_FRACTION, TICK_GAP_MAX
 from services.planner.watch.engagement_fsm import WAITS_NS
 from shared.bus.messages import Attitude, JointCommand, Mode, PlannerMode, SplitSource
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import gain_schedule
 from shared.config.robot_config import RobotConfig
 from shared.joints import N_MODULES
 from tests.imu.robots import with_imu
@@ -27,6 +25,7 @@ from tests.planner.states import (
     lead,
     receive_all,
     receive_but,
+    requiring,
     state,
     wrench,
 )
@@ -214,14 +213,7 @@ def test_gains_that_fall_hold_at_once(robot: RobotConfig, planner: Planner, q: A
 
 
 def test_a_robot_that_nothing_holds_is_never_lead(robot: RobotConfig, q: Array) -> None:
-    certificate = msgspec.structs.replace(robot.certificate, K_required=(1e5,) * 6)
-    stiff = msgspec.structs.replace(robot, certificate=certificate)
-    inputs = gain_schedule.inputs_of(stiff)
-    assert robot.gain_schedule is not None
-    fitting = msgspec.structs.replace(
-        robot.gain_schedule, inputs=inputs, digest=gain_schedule.digest_of(inputs)
-    )
-    planner = Planner(msgspec.structs.replace(stiff, gain_schedule=fitting), SESSION)
+    planner = Planner(requiring(robot, K_required=(1e5,) * 6), SESSION)
     for tick in range(10):
         now = START_NS + tick * 4 * NS_PER_MS
         receive_all(planner, q, now, seq=tick)

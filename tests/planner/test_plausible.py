@@ -69,7 +69,7 @@ def test_absurd_angles_alone_are_silence(planner: Planner, closed: Closed, angle
     assert all(math.isfinite(value) for command in commands for value in command.q_ref)
 
 
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=80, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(ANY, min_size=N_JOINTS, max_size=N_JOINTS), ANY, st.booleans())
 def test_whatever_angles_come_no_tick_ends_and_it_leads_again_by_good_ones(
     robot: RobotConfig, closed: Closed, angles: list[float], speed: float, led: bool

@@ -16,7 +16,6 @@ from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.kinematics import Kinematics
 from services.planner.law.split import GainSplit, ScheduledGains
 from shared.bus.messages import SplitSource
-from shared.config.gain_schedule import digest_of, inputs_of
 from shared.config.gain_table import GainSchedule
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.config.sections import CertificateConfig
@@ -25,7 +24,7 @@ from shared.robot.robot_model import stand_pose
 from tests.planner.conftest import Closed
 from tests.planner.oracle import Array
 from tests.planner.stands import Stand
-from tests.planner.states import with_law
+from tests.planner.states import requiring, with_law
 
 POSES = ((1.188, 0.0), (0.948, 0.0), (0.85, 0.6), (0.80, 1.2))
 
@@ -49,29 +48,12 @@ def stand(request: pytest.FixtureRequest, robot: RobotConfig, closed: Closed) ->
     return Stand(robot, closed(height, pitch=pitch), assist)
 
 
-@pytest.fixture(scope="session")
-def schedule(robot: RobotConfig) -> GainSchedule:
-    assert robot.gain_schedule is not None
-    return robot.gain_schedule
-
-
 def with_table(robot: RobotConfig, scale: float) -> RobotConfig:
     """Return the robot with its schedule's D scaled; what it was made from is kept."""
     schedule = robot.gain_schedule
     assert schedule is not None
     D = msgspec.convert((scale * np.array(schedule.D)).tolist(), type=RowsOfGains)
     return msgspec.structs.replace(robot, gain_schedule=msgspec.structs.replace(schedule, D=D))
-
-
-def requiring(robot: RobotConfig, **changes: object) -> RobotConfig:
-    """Return the robot with some keys of [certificate] changed, its schedule made out to fit."""
-    certificate = msgspec.structs.replace(robot.certificate, **changes)
-    changed = msgspec.structs.replace(robot, certificate=certificate)
-    schedule = robot.gain_schedule
-    assert schedule is not None
-    inputs = inputs_of(changed)
-    fitting = msgspec.structs.replace(schedule, inputs=inputs, digest=digest_of(inputs))
-    return msgspec.structs.replace(changed, gain_schedule=fitting)
 
 
 def made_of(function: object, z: list[float], pitch: list[float]) -> GainSchedule:

@@ -16,7 +16,6 @@ from services.planner.state_phases import COMPARED_TICKS, EVERY_TICKS, SOON_TICK
 from shared.bus.messages import JointState
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.joints import N_MODULES
-from shared.state import copied
 from tests.planner.states import state
 
 RATE_HZ, STATE_HZ = 500.0, 250.0
@@ -29,8 +28,8 @@ class Modules:
 
     def __init__(
         self,
-        begin_ns: Sequence[int],
-        counts: Sequence[int],
+        begin_ns: Sequence[int] = (0,) * N_MODULES,
+        counts: Sequence[int] = (0,) * N_MODULES,
         *,
         n: int = 2,
         ppm: Sequence[float] = (0.0,) * N_MODULES,
@@ -53,14 +52,23 @@ class Modules:
         arrives += self._dice.uniform(0.0, self._jitter_ns)
         return msgspec.structs.replace(STATE, state_phase=self.phases[module]), round(arrives)
 
+    def send_all(self) -> tuple[list[JointState], list[int]]:
+        """Return the modules' next states and their arrivals."""
+        states, arrived = zip(*map(self.send, range(N_MODULES)), strict=True)
+        return list(states), list(arrived)
+
+
+@pytest.fixture
+def phases() -> StatePhases:
+    return StatePhases(RATE_HZ, STATE_HZ)
+
 
 def run(phases: StatePhases, modules: Modules, ticks: int, *, heard: bool = True) -> list[float]:
     """Return the spread of the arrivals of each tick, cycles."""
     spreads = []
     for _ in range(ticks):
-        sent = [modules.send(module) for module in range(N_MODULES)]
-        arrived = [arrival for _, arrival in sent]
-        phases.advance([state for state, _ in sent], arrived, min(arrived) - 1)
+        states, arrived = modules.send_all()
+        phases.advance(states, arrived, min(arrived) - 1)
         if heard:
             modules.phases = list(phases.state.phases)
         period = modules.n * CYCLE_NS
@@ -80,10 +88,9 @@ def test_after_one_comparison_all_are_close(begin: list[int], counts: list[int],
     assert max(spreads[-10:]) <= 1.0 + 2 * 0.15 + 1e-9
 
 
-def test_jitter_of_a_cycle_moves_no_module_to_and_fro() -> None:
+def test_jitter_of_a_cycle_moves_no_module_to_and_fro(phases: StatePhases) -> None:
     begin = [module * CYCLE_NS // 10 for module in range(N_MODULES)]
-    modules = Modules(begin, [0] * N_MODULES, jitter_ns=CYCLE_NS)
-    phases = StatePhases(RATE_HZ, STATE_HZ)
+    modules = Modules(begin, jitter_ns=CYCLE_NS)
     seen = set()
     for _ in range(2500):
         run(phases, modules, 1)
@@ -91,9 +98,10 @@ def test_jitter_of_a_cycle_moves_no_module_to_and_fro() -> None:
     assert seen == {(0,) * N_MODULES}
 
 
-def test_drives_whose_clocks_drift_change_phase_once_for_each_cycle_they_drift() -> None:
-    modules = Modules([0] * N_MODULES, [0] * N_MODULES, ppm=[0, 200, 0, 0, 0, 0])
-    phases = StatePhases(RATE_HZ, STATE_HZ)
+def test_drives_whose_clocks_drift_change_phase_once_for_each_cycle_they_drift(
+    phases: StatePhases,
+) -> None:
+    modules = Modules(ppm=[0, 200, 0, 0, 0, 0])
     changes, last, spreads = 0, 0, []
     for _ in range(11_000):  # 44 s: 8.8 ms, four cycles and a bit
         spreads += run(phases, modules, 1)
@@ -103,27 +111,24 @@ def test_drives_whose_clocks_drift_change_phase_once_for_each_cycle_they_drift()
     assert max(spreads) < 0.5 + 0.15 + 200e-6 * 2 * EVERY_TICKS + 0.05
 
 
-def test_one_late_state_moves_nothing() -> None:
-    modules = Modules([0] * N_MODULES, [0] * N_MODULES)
-    phases = StatePhases(RATE_HZ, STATE_HZ)
+def test_one_late_state_moves_nothing(phases: StatePhases) -> None:
+    modules = Modules()
     run(phases, modules, 1)
-    states = [modules.send(module)[0] for module in range(N_MODULES)]
+    states, _ = modules.send_all()
     for late_ns in (1, CYCLE_NS, 100 * NS_PER_MS):
         phases.advance(states, [0, late_ns, 0, 0, 0, 0], -1)
     run(phases, modules, COMPARED_TICKS)
     assert phases.state.phases == [0] * N_MODULES
 
 
-def test_modules_that_do_not_hear_are_not_told_again_and_again() -> None:
-    modules = Modules([0, CYCLE_NS, 0, 0, 0, 0], [0] * N_MODULES)
-    phases = StatePhases(RATE_HZ, STATE_HZ)
-    run(phases, modules, 3 * EVERY_TICKS, heard=False)
+def test_modules_that_do_not_hear_are_not_told_again_and_again(phases: StatePhases) -> None:
+    run(phases, Modules([0, CYCLE_NS, 0, 0, 0, 0]), 3 * EVERY_TICKS, heard=False)
     assert phases.state.phases == [0, 1, 0, 0, 0, 0]
 
 
-def test_a_new_planner_adopts_the_phases_that_the_last_one_left() -> None:
-    modules = Modules([0, CYCLE_NS, 0, 0, 0, 0], [0] * N_MODULES)
-    run(StatePhases(RATE_HZ, STATE_HZ), modules, 250)
+def test_a_new_planner_adopts_the_phases_that_the_last_one_left(phases: StatePhases) -> None:
+    modules = Modules([0, CYCLE_NS, 0, 0, 0, 0])
+    run(phases, modules, 250)
     left = list(modules.phases)
     new = StatePhases(RATE_HZ, STATE_HZ)
     assert max(run(new, modules, 500)) < 0.5
@@ -137,10 +142,11 @@ def test_where_every_cycle_sends_a_state_there_is_nothing_to_choose() -> None:
 
 
 @pytest.mark.parametrize("silent", [0, 3])
-def test_while_a_module_is_silent_the_others_keep_their_phases(silent: int) -> None:
+def test_while_a_module_is_silent_the_others_keep_their_phases(
+    phases: StatePhases, silent: int
+) -> None:
     """Compared with what came last from it, long ago, they would all drift through all phases."""
-    modules = Modules([0] * N_MODULES, [0] * N_MODULES, ppm=[20, 40, 60, 80, 100, 0])
-    phases = StatePhases(RATE_HZ, STATE_HZ)
+    modules = Modules(ppm=[20, 40, 60, 80, 100, 0])
     run(phases, modules, COMPARED_TICKS)
     last = modules.send(silent)
     compared = 0
@@ -167,58 +173,46 @@ def begun_after(phases: StatePhases, modules: Modules, comparisons: int) -> list
     return [later - earlier for earlier, later in pairwise([0, *begins])]
 
 
-def test_what_is_settled_is_compared_ever_more_rarely() -> None:
-    phases = StatePhases(RATE_HZ, STATE_HZ)
-    gaps = begun_after(phases, Modules([0] * N_MODULES, [0] * N_MODULES), 4)
-    assert gaps == [512, 1024, 1024, 1024, 1024]
+def test_what_is_settled_is_compared_ever_more_rarely(phases: StatePhases) -> None:
+    assert begun_after(phases, Modules(), 4) == [512, 1024, 1024, 1024, 1024]
 
 
 @pytest.mark.parametrize("moved", [1, 5])
-def test_after_a_module_was_moved_it_is_compared_again_in_a_second(moved: int) -> None:
+def test_after_a_module_was_moved_it_is_compared_again_in_a_second(
+    phases: StatePhases, moved: int
+) -> None:
     begin = [CYCLE_NS * (module == moved) for module in range(N_MODULES)]
-    gaps = begun_after(StatePhases(RATE_HZ, STATE_HZ), Modules(begin, [0] * N_MODULES), 3)
-    assert gaps == [256, 512, 1024, 1024]
+    assert begun_after(phases, Modules(begin), 3) == [256, 512, 1024, 1024]
 
 
-def test_after_a_module_was_silent_it_is_compared_again_in_a_second() -> None:
-    modules, phases = Modules([0] * N_MODULES, [0] * N_MODULES), StatePhases(RATE_HZ, STATE_HZ)
+def test_after_a_module_was_silent_it_is_compared_again_in_a_second(phases: StatePhases) -> None:
+    modules = Modules()
     run(phases, modules, 512 - 1)
     for _ in range(COMPARED_TICKS):  # nothing new in all of the second
-        sent = [modules.send(module) for module in range(N_MODULES)]
-        arrived = [arrival for _, arrival in sent]
-        phases.advance([state for state, _ in sent], arrived, max(arrived))
+        states, arrived = modules.send_all()
+        phases.advance(states, arrived, max(arrived))
     assert 150 < begun_after(phases, modules, 1)[0] <= 256
 
 
 @pytest.mark.parametrize(("behind", "phase"), [(0.6, 0), (-0.6, 0), (0.7, 1), (-0.7, 1)])
-def test_a_module_behind_by_half_a_period_and_a_bit_moves(behind: float, phase: int) -> None:
+def test_a_module_behind_by_half_a_period_and_a_bit_moves(
+    phases: StatePhases, behind: float, phase: int
+) -> None:
     begin = [round(CYCLE_NS * (10.0 + behind * (module == 2))) for module in range(N_MODULES)]
-    phases = StatePhases(RATE_HZ, STATE_HZ)
-    run(phases, Modules(begin, [0] * N_MODULES), COMPARED_TICKS)
+    run(phases, Modules(begin), COMPARED_TICKS)
     assert phases.state.phases == [0, 0, phase, 0, 0, 0]
 
 
-def test_arrivals_in_all_phases_move_nothing_and_are_not_remembered() -> None:
-    modules, phases = Modules([0] * N_MODULES, [0] * N_MODULES), StatePhases(RATE_HZ, STATE_HZ)
+def test_arrivals_in_all_phases_move_nothing_and_are_not_remembered(phases: StatePhases) -> None:
+    modules = Modules()
     run(phases, modules, 1)
     for tick in range(COMPARED_TICKS):
-        sent = [modules.send(module) for module in range(N_MODULES)]
-        arrived = [arrival for _, arrival in sent]
+        states, arrived = modules.send_all()
         arrived[3] += tick % 8 * CYCLE_NS // 4
-        phases.advance([state for state, _ in sent], arrived, min(arrived) - 1)
+        phases.advance(states, arrived, min(arrived) - 1)
     assert phases.state.phases == [0] * N_MODULES
     assert phases.state.sums == [(0.0, 0.0)] * N_MODULES
 
 
-def test_before_there_are_six_modules_nothing_is_compared() -> None:
-    assert not StatePhases(RATE_HZ, STATE_HZ).compares
-
-
-@pytest.mark.parametrize("ticks", [0, 1, 30, 63, 64, 1000])
-def test_it_continues_from_a_state_bit_for_bit(ticks: int) -> None:
-    one, other = StatePhases(RATE_HZ, STATE_HZ), StatePhases(RATE_HZ, STATE_HZ)
-    run(one, Modules([0, 1_700_000, 300_000, 0, 0, 0], [0] * N_MODULES), ticks)
-    other.state = copied(one.state)
-    for phases in (one, other):
-        run(phases, Modules([0, 1_700_000, 300_000, 0, 0, 0], [0] * N_MODULES), 60)
-    assert other.state == one.state
+def test_before_there_are_six_modules_nothing_is_compared(phases: StatePhases) -> None:
+    assert not phases.compares

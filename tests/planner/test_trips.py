@@ -311,11 +311,11 @@ def test_a_load_that_is_not_known_is_half_of_the_weight_and_none_makes_no_edge_i
 HERE: Pair = (0.8, 0.1)
 
 
-def left(at: Pair = HERE) -> Unattended:
+def left() -> Unattended:
     """Return one that a hand has left."""
     found = Unattended()
-    assert found.drift(T0, at, 2.0 * HAND_MIN[0], 0.0) == 0.0
-    assert found.drift(T0 + HAND_LOST_NS, at, 0.0, 0.0) == 0.0
+    assert found.drift(T0, HERE, 2.0 * HAND_MIN[0], 0.0) == 0.0
+    assert found.drift(T0 + HAND_LOST_NS, HERE, 0.0, 0.0) == 0.0
     return found
 
 

@@ -43,7 +43,8 @@ def test_what_is_no_host_and_port_is_refused(endpoint: str) -> None:
 
 def test_a_placeholder_is_filled_in_once_whatever_it_is_filled_with() -> None:
     assert filled("{a}/{b}/{c}", {"{a}": "{b}", "{b}": "2"}) == "{b}/2/{c}"
-    assert expand("{run}/x", Path("/tmp/{run}")) == "/tmp/{run}/x"
+    assert expand("unixsock-stream/{run}/x", Path("/tmp/{run}")) == "unixsock-stream//tmp/{run}/x"
+    assert expand("tcp/10.0.0.1:7447", Path("/tmp")) == "tcp/10.0.0.1:7447"
 
 
 @pytest.mark.parametrize(

@@ -21,14 +21,9 @@ from shared.config.gain_table import GainSchedule
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
 from tests.conftest import ROBOT_FILE
+from tests.shared.test_config import check_refusal
 
 INPUTS = inputs_of(config_file.load(ROBOT_FILE))
-
-
-@pytest.fixture
-def schedule(robot: RobotConfig) -> GainSchedule:
-    assert robot.gain_schedule is not None
-    return robot.gain_schedule
 
 
 def changed(robot: RobotConfig, **sections: dict[str, object]) -> RobotConfig:
@@ -147,12 +142,7 @@ def test_a_corrupt_file_is_refused_in_one_line_with_the_command_to_run(
     shutil.copy(ROBOT_FILE, robot_file)
     path = tmp_path / "lab.gains.json"
     path.mkdir() if content is None else path.write_bytes(content)
-    with pytest.raises(ConfigError) as caught:
-        config_file.load(robot_file)
-    error = caught.value
-    assert (error.file, error.key) == (str(path), key)
-    assert found in error.found
-    assert "xrl gains" in error.expected
+    error = check_refusal(lambda _: config_file.load(robot_file), path, key, found, "xrl gains")
     assert "\n" not in str(error)
 
 

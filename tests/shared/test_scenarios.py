@@ -1,15 +1,12 @@
 from __future__ import annotations
 
-import copy
 import math
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import msgspec
 import numpy as np
 import pytest
-import tomli_w
 
 from shared.config import scenarios
 from shared.config.robot_config import RobotConfig
@@ -24,15 +21,14 @@ from shared.config.scenarios import (
     lead,
     push_at,
 )  # fmt: skip
-from shared.exceptions import ConfigError
 from tests.conftest import ROBOT_FILE
+from tests.shared.test_config import Change, Table, changed_file, check_refusal
 
 SHIPPED = sorted((ROBOT_FILE.parent / "scenarios").glob("*.toml"))
 SQUAT = ROBOT_FILE.parent / "scenarios" / "squat.toml"
 CRAWL = ROBOT_FILE.parent / "scenarios" / "crawl.toml"
 SHIFT = ROBOT_FILE.parent / "scenarios" / "shift.toml"
 
-Table = dict[str, Any]
 RAW: Table = {
     "name": "two",
     "about": "one way and back",
@@ -45,21 +41,13 @@ RAW: Table = {
 }
 
 
-def load_changed(tmp_path: Path, change: Callable[[Table], object]) -> Scenario:
-    raw = copy.deepcopy(RAW)
-    change(raw)
-    path = tmp_path / "scenario.toml"
-    path.write_text(tomli_w.dumps(raw), encoding="utf-8")
-    return scenarios.load(path)
-
-
-def row(table: str, **changes: object) -> Callable[[Table], object]:
+def row(table: str, **changes: object) -> Change:
     """Return a change of a table's first row; of a keyframe, the second."""
     return lambda raw: raw[table][-1].update(changes)
 
 
 # change; the key the error names; what stands there; a word of what would be right
-REFUSALS: list[tuple[Callable[[Table], object], str, str, str]] = [
+REFUSALS: list[tuple[Change, str, str, str]] = [
     (lambda raw: raw.update(speed=1), "speed", "unknown", "spelling"),
     (row("keyframe", roll=0.1), "keyframe[1].roll", "unknown", "spelling"),
     (row("keyframe", height="low"), "keyframe[1].height", "'low'", "float"),
@@ -100,27 +88,19 @@ REFUSALS: list[tuple[Callable[[Table], object], str, str, str]] = [
     ("change", "key", "found", "right"), REFUSALS, ids=[f"{r[1]}-{r[2]}" for r in REFUSALS]
 )
 def test_a_refusal_names_file_key_value_and_what_would_be_right(
-    tmp_path: Path, change: Callable[[Table], object], key: str, found: str, right: str
+    tmp_path: Path, change: Change, key: str, found: str, right: str
 ) -> None:
-    with pytest.raises(ConfigError) as caught:
-        load_changed(tmp_path, change)
-    error = caught.value
-    assert (error.file, error.key) == (str(tmp_path / "scenario.toml"), key)
-    assert found in error.found
-    assert right in error.expected
-    for part in (error.file, error.key, error.found, error.expected):
-        assert part in str(error)
+    path = changed_file(tmp_path / "scenario.toml", RAW, change)
+    check_refusal(scenarios.load, path, key, found, right)
 
 
 PLAIN_FAULT = {"module": "hip_left", "kind": "watchdog", "at": 1}
 
 
-@pytest.mark.parametrize("change", [dict.copy, lambda raw: raw.update(fault=[PLAIN_FAULT])])
-def test_a_scenario_is_taken_and_comes_back_from_its_own_toml(
-    tmp_path: Path, change: Callable[[Table], object]
-) -> None:
-    first = load_changed(tmp_path, change)
-    path = tmp_path / "again.toml"
+@pytest.mark.parametrize("about", [{"hand": False}, {"fault": [PLAIN_FAULT]}])
+def test_a_scenario_is_taken_and_comes_back_from_its_own_toml(tmp_path: Path, about: Table) -> None:
+    path = changed_file(tmp_path / "scenario.toml", RAW, lambda raw: raw.update(about))
+    first = scenarios.load(path)
     path.write_text(scenarios.to_toml(first), encoding="utf-8")
     assert scenarios.load(path) == first
     assert first.name == "two"
@@ -218,10 +198,6 @@ def test_pushes_at_one_time_add_up() -> None:
     both = Scenario(name="both", about="", duration=5.0, keyframe=frames, push=(one, other))
     found = [push_at(both, t) for t in (0.5, 1.5, 2.5)]
     assert found == [one.force, (11.0, 2.0, 0.0), other.force]
-
-
-def test_the_reference_scenarios_are_shipped() -> None:
-    assert {"squat", "crawl", "stand"} <= {path.stem for path in SHIPPED}
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
