@@ -40,7 +40,6 @@ class Intents:
     """Keeps the newest intent, and fades it out once it is stale."""
 
     def __init__(self, config: AssistConfig) -> None:
-        """Set the age at which an intent is stale, and the time of its fade."""
         self._stale_ns = round(config.stale_ms * NS_PER_MS)
         self._fade_ns = round(config.fade_s * NS_PER_S)
         self._request = OperatorRequest()

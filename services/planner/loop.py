@@ -66,7 +66,6 @@ class Checkpoints:
     """
 
     def __init__(self, rate_hz: float) -> None:
-        """Set the planner's rate, Hz."""
         self._every = round(rate_hz)
         self._tick = 0
         self._seq = 0

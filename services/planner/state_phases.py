@@ -55,7 +55,6 @@ class StatePhases:
     """Phases of six modules."""
 
     def __init__(self, rate_hz: float, state_rate_hz: float) -> None:
-        """Set the rates of the drives' samples and of the states, Hz."""
         self._n = round(rate_hz / state_rate_hz)
         self._radians_per_ns = 2.0 * math.pi * state_rate_hz / NS_PER_S
         self.state = PhasesState()

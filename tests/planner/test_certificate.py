@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from services.joint.differential import motor_from_joint
 from services.planner.law.certificate import DIRECTIONS, UNITS, Certificate, motor_mean
-from services.planner.law.gains import GainLaw, JointGains
+from services.planner.law.gains import GainLaw
 from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.kinematics import Kinematics
 from shared.config.robot_config import RobotConfig
@@ -67,9 +67,8 @@ def smallest(robot: RobotConfig, K: Array) -> tuple[float, Array]:
     return float(values[index].real), np.asarray(vectors[:, index].real, float)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_failsafe_stiffness_is_the_curvature_of_the_energy(stand: Stand, seed: int) -> None:
-    D = random_stiffness(seed)
+def test_failsafe_stiffness_is_the_curvature_of_the_energy(stand: Stand) -> None:
+    D = random_stiffness(1)
     want, got = stand.stiffness_felt(D), stand.certificate.failsafe_stiffness(D)
     np.testing.assert_allclose(got, want, atol=5e-5 * np.abs(want).max())
     np.testing.assert_allclose(got, got.T, rtol=1e-9, atol=1e-6)
@@ -100,9 +99,8 @@ def in_motor_space(D_module: Array, gear_ratio: float) -> Array:
     return np.asarray(motors.T @ np.diag(np.diagonal(at_motors)) @ motors, float)
 
 
-@pytest.mark.parametrize("seed", [4, 5])
-def test_onboard_margin_is_of_motors_alone(robot: RobotConfig, stand: Stand, seed: int) -> None:
-    D = random_stiffness(seed)
+def test_onboard_margin_is_of_motors_alone(robot: RobotConfig, stand: Stand) -> None:
+    D = random_stiffness(4)
     D_onboard = np.zeros(12)
     for module in range(6):
         pair = slice(2 * module, 2 * module + 2)
@@ -119,8 +117,8 @@ def test_all_of_k_q_gives_k_p_in_the_closed_directions(stand: Stand) -> None:
     robot, T = stand.robot, stand.T
     K_q = GainLaw(robot).gains(stand.kinematics, stand.hessian_O).K_q
     K_geo = stand.certificate.failsafe_stiffness(np.zeros(12))
-    J, law = stand.kinematics.J, robot.law
-    N = np.eye(12) - J.T @ np.linalg.inv(J @ J.T + law.damping_lambda**2 * np.eye(6)) @ J
+    law = robot.law
+    N = damped_null_space(stand.kinematics.J, law.damping_lambda)
     K_p = np.diag(np.array(law.K_p) * (1.0 - np.array(law.S)))
     assert np.abs(K_geo).max() > 500.0
     np.testing.assert_allclose(T.T @ K_q @ T + K_geo, K_p + law.K_0 * T.T @ N @ T, atol=1e-5)
@@ -232,9 +230,6 @@ def test_a_stiffness_that_was_returned_stays_when_another_is_asked_for(robot: Ro
 WEIGHT = np.array([0.0, 0.0, 731.6, 0.0, 0.0, 0.0])
 
 
-NO_HESSIAN = np.zeros((12, 12))
-
-
 OPEN = (2, 4)
 """z and pitch, where the person leads."""
 LEVEL_POSES = ((1.25, 0.0), (1.188, 0.0), (0.948, 0.0), (0.85, 0.6), (0.80, 1.2))
@@ -247,61 +242,23 @@ def at(request: pytest.FixtureRequest, kinematics: Kinematics, closed: Closed) -
     return kinematics
 
 
-def gains_under_weight(robot: RobotConfig, at: Kinematics) -> JointGains:
-    return GainLaw(robot).gains(at, at.hessian_times(WEIGHT, np.array([0.0, 0.0, 200.0])))
+def damped_null_space(J: Array, damping: float) -> Array:
+    """Return N = lambda^2 (J^T J + lambda^2 I)^-1 (12, 12)."""
+    return np.asarray(np.linalg.inv(J.T @ J / damping**2 + np.eye(12)), float)
 
 
-def null_space(robot: RobotConfig, at: Kinematics) -> Array:
-    """Return N (12, 12) as the law uses it: with no K_p, K_q = N K_0."""
-    return GainLaw(with_law(robot, K_p=(0.0,) * 6, K_0=1.0)).gains(at, NO_HESSIAN).K_q
-
-
-def test_gains_are_symmetric(robot: RobotConfig, at: Kinematics) -> None:
-    gains = gains_under_weight(robot, at)
-    np.testing.assert_array_equal(gains.K_q, gains.K_q.T)
-    np.testing.assert_array_equal(gains.B_q, gains.B_q.T)
-
-
-def test_gains_are_the_papers_sum(robot: RobotConfig, at: Kinematics) -> None:
-    law, J = robot.law, at.J.copy()
-    hessian = at.hessian_times(WEIGHT, np.zeros(3)).copy()
-    gains = GainLaw(robot).gains(at, hessian)
+@pytest.mark.parametrize("open_K_p", [0.0, 2000.0])
+def test_gains_are_symmetric_and_the_papers_sum_without_the_open_directions(
+    robot: RobotConfig, at: Kinematics, open_K_p: float
+) -> None:
+    K_p = tuple(open_K_p if i in OPEN else k for i, k in enumerate(robot.law.K_p))
+    law, J = with_law(robot, K_p=K_p).law, at.J.copy()
+    hessian = at.hessian_times(WEIGHT, np.array([0.0, 0.0, 200.0])).copy()
+    gains = GainLaw(with_law(robot, K_p=K_p)).gains(at, hessian)
     closed = 1.0 - np.array(law.S)
-    N = null_space(robot, at)
+    N = damped_null_space(J, law.damping_lambda)
     K_q = law.K_0 * N + J.T @ np.diag(law.K_p * closed) @ J - hessian
     B_q = law.B_0 * N + J.T @ np.diag(law.B_p * closed) @ J
-    np.testing.assert_allclose(gains.K_q, K_q, atol=1e-9)
-    np.testing.assert_allclose(gains.B_q, B_q, atol=1e-9)
-
-
-def test_k_p_in_an_open_direction_is_filtered_out(robot: RobotConfig, at: Kinematics) -> None:
-    K_p = tuple(2000.0 if i in OPEN else k for i, k in enumerate(robot.law.K_p))
-    same = GainLaw(with_law(robot, K_p=K_p)).gains(at, NO_HESSIAN)
-    np.testing.assert_array_equal(same.K_q, GainLaw(robot).gains(at, NO_HESSIAN).K_q)
-
-
-def test_unloaded_stiffness_is_k_p_and_a_known_leak(robot: RobotConfig, at: Kinematics) -> None:
-    """Holds exactly: (J^+)^T K_q J^+ = K_p + K_0 lambda^2 (A (A + lambda^2 I))^-1, A = J J^T."""
-    gains = GainLaw(robot).gains(at, NO_HESSIAN)
-    J_plus, A = np.linalg.pinv(at.J), at.J @ at.J.T
-    damping = robot.law.damping_lambda**2
-    leak = robot.law.K_0 * damping * np.linalg.inv(A @ (A + damping * np.eye(6)))
-    K_p = np.diag(np.where(np.array(robot.law.S) == 1, 0.0, robot.law.K_p))
-    np.testing.assert_allclose(J_plus.T @ gains.K_q @ J_plus, K_p + leak, rtol=1e-6, atol=1e-6)
-
-
-def test_undamped_the_open_directions_are_free(robot: RobotConfig, at: Kinematics) -> None:
-    gains = GainLaw(with_law(robot, damping_lambda=1e-6)).gains(at, NO_HESSIAN)
-    J_plus = np.linalg.pinv(at.J)
-    for gain in (gains.K_q, gains.B_q):
-        np.testing.assert_allclose((J_plus.T @ gain @ J_plus)[list(OPEN)], 0.0, atol=1e-3)
-
-
-def test_the_null_space_is_clear_of_the_task(robot: RobotConfig, at: Kinematics) -> None:
-    """Singular values of J N are s lambda^2 / (s^2 + lambda^2), at most lambda / 2."""
-    N = null_space(robot, at)
-    values = np.linalg.eigvalsh(N)
-    assert values.min() >= -1e-12
-    assert values.max() <= 1.0 + 1e-12
-    assert np.sum(values > 1 - 1e-9) == 6  # the six directions that J does not see are whole
-    assert np.linalg.norm(at.J @ N, 2) <= robot.law.damping_lambda / 2 + 1e-12
+    for found, wanted in ((gains.K_q, K_q), (gains.B_q, B_q)):
+        np.testing.assert_allclose(found, wanted, atol=1e-9)
+        np.testing.assert_array_equal(found, found.T)

@@ -25,6 +25,7 @@ from shared.places import DEFAULT_CONFIG
 from shared.robot.frames import capture_point
 from shared.robot.robot_model import stand_pose
 from shared.state import copied
+from tests.planner.states import with_law
 
 GOOD = """
 class Controller:
@@ -233,10 +234,7 @@ def test_stiffer_gains_that_stand_are_sent(hocca: Hocca, seen: Observation, scal
 
 
 def test_no_own_gains_without_a_schedule(robot: RobotConfig, seen: Observation) -> None:
-    papers = msgspec.structs.replace(
-        robot, law=msgspec.structs.replace(robot.law, split="diagonal"), gain_schedule=None
-    )
-    hocca = Hocca(papers)
+    hocca = Hocca(msgspec.structs.replace(with_law(robot, split="diagonal"), gain_schedule=None))
     hocca.tick(seen.q, seen.v, 0.0, 0.004)
     local: LocalGains = hocca.certify(seen.law.local.D)
     assert local.source is SplitSource.UNCERTIFIED

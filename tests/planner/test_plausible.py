@@ -13,7 +13,7 @@ from services.planner.planner import Planner
 from services.planner.watch.plausible import BEYOND_RAD, SPEED_MAX, Plausible
 from shared.bus.messages import Attitude, PlannerMode, Vector3
 from shared.config.robot_config import RobotConfig
-from shared.joints import N_JOINTS, N_MODULES
+from shared.joints import N_JOINTS
 from tests.planner.conftest import Closed
 from tests.planner.states import SESSION, START_NS, TICK_NS, lead, receive_all, state, wrench
 
@@ -23,28 +23,18 @@ ANY = st.one_of(
 )
 
 
-@pytest.mark.parametrize("module", range(N_MODULES))
-@pytest.mark.parametrize("joint", [0, 1])
+@pytest.mark.parametrize("joint", range(N_JOINTS))
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_an_angle_is_taken_up_to_half_a_radian_beyond_its_soft_stop(
-    robot: RobotConfig, module: int, joint: int, side: float
+    robot: RobotConfig, joint: int, side: float
 ) -> None:
-    plausible, index = Plausible(robot), 2 * module + joint
-    low, high = robot.joint_limits()[index]
-    q = np.zeros(N_JOINTS)
-    for beyond, taken in ((0.99, True), (1.01, False)):
-        q[index] = (high if side > 0.0 else low) + side * beyond * BEYOND_RAD
-        assert plausible.is_state(module, state(module, q)) is taken
-
-
-def test_at_its_very_bounds_a_state_is_still_one(robot: RobotConfig) -> None:
-    plausible = Plausible(robot)
-    for index, (low, high) in enumerate(robot.joint_limits()):
-        for angle in (low - BEYOND_RAD, high + BEYOND_RAD):
-            q = np.zeros(N_JOINTS)
-            q[index] = angle
-            fast = state(index // 2, q, v=(SPEED_MAX, -SPEED_MAX))
-            assert plausible.is_state(index // 2, fast)
+    """At its very bounds, and at those of its speed, a state is still one."""
+    plausible, module, q = Plausible(robot), joint // 2, np.zeros(N_JOINTS)
+    bound = robot.joint_limits()[joint][side > 0.0] + side * BEYOND_RAD
+    for angle, taken in ((bound, True), (np.nextafter(bound, side * np.inf), False)):
+        q[joint] = angle
+        fastest = state(module, q, v=(SPEED_MAX, -SPEED_MAX))
+        assert plausible.is_state(module, fastest) is taken
 
 
 @pytest.mark.parametrize("speed", [math.nan, math.inf, -math.inf, 1e300, -101.0])

@@ -135,7 +135,7 @@ def test_lead_and_its_rates_are_continuous_and_fit_each_other(path: Path) -> Non
     shipped = scenarios.load(path)
     dt = 1e-4
     times = np.arange(-1.0, shipped.duration + 1.0, dt)
-    rows = np.array([(*lead(shipped, t)[:5], *lead(shipped, t).shift) for t in times])
+    rows = np.array([(*at[:5], *at.shift) for at in (lead(shipped, t) for t in times)])
     height, height_rate, pitch, pitch_rate, assist, *shift = rows.T
     for value, rate in ((height, height_rate), (pitch, pitch_rate)):
         assert np.abs(rate).max() > 0.0 or not np.ptp(value)

@@ -63,7 +63,6 @@ class ControllerGuard:
         law: Hocca,
         geometry: GeometryConfig,
     ) -> None:
-        """Take the controller, the law that knows the pose of the tick, and the soles."""
         half = geometry.l_foot / 2, (geometry.w_base + geometry.w_foot) / 2
         self._room = SUPPORT * half[0], SUPPORT * half[1]
         self._controller, self._law = controller, law

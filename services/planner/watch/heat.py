@@ -79,7 +79,6 @@ class HeatWatch:
     """Decides what is done against the heat."""
 
     def __init__(self, config: HeatConfig) -> None:
-        """Take the limits."""
         self._ease_s, self._stand_s = config.ease_s, config.stand_s
         self.state = HeatWatchState()
 

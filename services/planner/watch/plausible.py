@@ -28,7 +28,6 @@ class Plausible:
     """
 
     def __init__(self, config: RobotConfig) -> None:
-        """Compute the bounds from the soft stops and the load cells' range."""
         self.refused = 0
         """Messages refused so far."""
         self._force_max = N_CELLS * config.harness.leg_force_max

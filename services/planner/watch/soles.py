@@ -28,7 +28,6 @@ class Soles:
     """Loads of the right and the left sole."""
 
     def __init__(self, config: RobotConfig) -> None:
-        """Take sizes and weights."""
         self._half_width = 0.5 * config.geometry.w_foot
         self._leg_weight = config.leg_weight
         self._at_rest = 0.5 * (config.total_mass * GRAVITY + config.leg_weight)

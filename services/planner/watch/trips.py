@@ -76,7 +76,6 @@ class PlannerTrips:
     """Checks the trips in each tick."""
 
     def __init__(self, config: RobotConfig) -> None:
-        """Load the limits."""
         limits = limits_of(config)
         rows = [getattr(limits, PLANNER_TRIPS[trip].key) for trip in _TRIPS]
         self._limits = [row.limit for row in rows]

@@ -38,7 +38,6 @@ class Unattended:
     """Keeps the pose at which a hand was last felt."""
 
     def __init__(self) -> None:
-        """Start without a hand."""
         self.state = UnattendedState()
 
     def drift(self, now_ns: int, pose: Pair, force: float, moment: float) -> float:
