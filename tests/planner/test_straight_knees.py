@@ -215,21 +215,17 @@ def test_led_above_straight_and_back_the_ik_stops_at_the_soft_limit_and_leaves_n
 
 
 def test_with_knees_free_to_straighten_a_height_beyond_is_finite_and_the_least_miss(
-    robot: RobotConfig, limits: Array, closed: Closed
+    robot: RobotConfig, limits: Array, closed: Closed, leaning: Path
 ) -> None:
+    """With straight knees only the legs' lean from ankle to hip remains."""
     wide = limits.copy()
     wide[KNEES, 1] = 0.1
     ik = InverseKinematics(Kinematics(robot), wide)
     ik.q[:] = closed(1.188)
-    straight = float(oracle.pose(robot, leaning_straight(robot))[2])
+    straight = float(oracle.pose(robot, leaning.q[100])[2])
     for z in np.linspace(0.92, straight + 0.1, 500):
         before = ik.q.copy()
         ik.solve(led(float(z)))
         assert np.isfinite(ik.q).all()
         assert np.abs(ik.q - before).max() <= 0.2 * 4
     assert oracle.pose(robot, ik.q)[2] == pytest.approx(straight, abs=1e-4)
-
-
-def leaning_straight(robot: RobotConfig) -> Array:
-    """Return q (12,) with straight knees: only the legs' lean from ankle to hip remains."""
-    return path_of(robot).q[100]

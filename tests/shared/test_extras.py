@@ -4,6 +4,8 @@ import importlib.metadata
 import re
 import sys
 import tomllib
+from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -43,6 +45,11 @@ def packages_of(extra: str) -> set[str]:
     return found
 
 
+@cache
+def distributions() -> Mapping[str, list[str]]:
+    return importlib.metadata.packages_distributions()
+
+
 def locked_lines(name: str) -> list[str]:
     text = (ROOT / name).read_text(encoding="utf-8")
     return [line for line in text.splitlines() if re.match(r"[a-z].*==", line)]
@@ -58,9 +65,8 @@ def test_the_table_has_the_extras_of_the_project() -> None:
 
 @pytest.mark.parametrize("extra", EXTRAS)
 def test_an_extra_brings_the_packages_that_the_table_says(extra: str) -> None:
-    known = importlib.metadata.packages_distributions()
     for name in EXTRAS[extra]:
-        brings = {one.lower() for one in known.get(name, [])}
+        brings = {one.lower() for one in distributions().get(name, [])}
         assert brings & packages_of(extra) or (not brings and extra in UNLOCKED), name
 
 
