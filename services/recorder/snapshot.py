@@ -86,7 +86,9 @@ class SnapshotRing:
                     self._watch(row[1], item)
             ring.append(item)
             self._bytes += len(payload) + OVERHEAD
-        self._drop_what_does_not_fit()
+        while self._bytes > self._most and ring:
+            self._bytes -= len(ring.popleft()[1]) + OVERHEAD
+            self.dropped += 1
         return taken
 
     def trigger(self, reason: str, now_ns: int) -> bool:
@@ -136,8 +138,3 @@ class SnapshotRing:
         ring = self._ring
         while ring and ring[0][2] < oldest_ns:
             self._bytes -= len(ring.popleft()[1]) + OVERHEAD
-
-    def _drop_what_does_not_fit(self) -> None:
-        while self._bytes > self._most and self._ring:
-            self._bytes -= len(self._ring.popleft()[1]) + OVERHEAD
-            self.dropped += 1

@@ -46,9 +46,12 @@ def recovered_name(path: Path) -> Path:
 
 
 def in_use(path: Path) -> bool:
-    """Return True if a recorder that lives is writing a file; OSError if it cannot be opened."""
-    with locked(path) as acquired:
-        return not acquired
+    """Return True if a recorder that lives is writing a file; False if it cannot be opened."""
+    try:
+        with locked(path) as acquired:
+            return not acquired
+    except OSError:
+        return False
 
 
 @contextlib.contextmanager

@@ -33,12 +33,10 @@ class Interrupted(Exception):  # noqa: N818 - not an error: the recorder is to s
 class RecoveryResult(msgspec.Struct, frozen=True, kw_only=True):
     """Outcome of a recovery: what it kept and what it lost."""
 
-    source: Path
     out: Path
     finished: bool
     """The file was finished already."""
     messages: int
-    channels: int
     attachments: int
     first_ns: int
     """Log time of the first and the last message kept; 0 without any."""
@@ -91,11 +89,9 @@ def recover(path: Path, out: Path, stop: Stop = lambda: False) -> RecoveryResult
                 "free space there, or recover elsewhere with -o"
             ) from None
     return RecoveryResult(
-        source=path,
         out=out,
         finished=reader.finished,
         messages=copy.counts.message_count,
-        channels=len(copy.channels),
         attachments=copy.counts.attachment_count,
         first_ns=copy.counts.message_start_time,
         last_ns=copy.counts.message_end_time,

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, get_args, get_origin
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, get_args, get_origin
 
 import msgspec
 
@@ -60,16 +60,6 @@ Kinds = Mapping[str, type]
 """Type of each column, by its name."""
 
 
-class TableFile(Protocol):
-    """A table that is being written."""
-
-    def add(self, columns: Columns) -> None:
-        """Append rows."""
-
-    def close(self) -> None:
-        """Finish it."""
-
-
 class CsvFile:
     """A CSV file."""
 
@@ -110,6 +100,9 @@ class ParquetFile:
         self._writer.close()
 
 
+TableKind: TypeAlias = type[CsvFile] | type[ParquetFile]
+
+
 def stamped(
     log: RunLog, topic: Topic, module: str, *, margins: bool = False
 ) -> Iterator[tuple[int, Any]]:
@@ -140,7 +133,7 @@ def write_tables(
     part: RunPart,
     keys: Sequence[TopicKey],
     folder: Path,
-    make: Callable[[Path, Kinds], TableFile],
+    make: TableKind,
     done: Callable[[float], None],
 ) -> dict[str, int]:
     """Write a file for each key that has messages; return the rows of each file.
@@ -148,7 +141,7 @@ def write_tables(
     `make` begins a file at a path without suffix; `done` takes the s that are written.
     """
     zero = zero_ns(index)
-    open_files: dict[str, TableFile] = {}
+    open_files: dict[str, CsvFile | ParquetFile] = {}
     rows: dict[str, int] = {}
     readers = {key.topic: columns_of(key.topic.type) for key in keys}
     try:
@@ -181,7 +174,7 @@ def write_grid(
     keys: Sequence[TopicKey],
     rate_hz: float,
     path: Path,
-    make: Callable[[Path, Kinds], TableFile],
+    make: TableKind,
     done: Callable[[float], None],
 ) -> int:
     """Write one table on a grid of time: at each time the newest message of each key.

@@ -38,8 +38,6 @@ def part_of(flags: PartFlags, index: RunIndex) -> RunPart:
     begin_s, end_s = flags.begin_s, flags.end_s
     if math.isinf(begin_s) and math.isinf(end_s):
         return RunPart()
-    if not begin_s < end_s:
-        raise RunError(f"--from {begin_s:g} --to {end_s:g}: the first is to be the smaller one")
     offset_s = (zero_ns(index) - index.span_ns[0]) / 1e9
     first_s, last_s = -offset_s, index.length_s - offset_s
     if begin_s > last_s or end_s < first_s:

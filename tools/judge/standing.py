@@ -53,6 +53,8 @@ LIMITS: Final = (
 any kill; `held`: after a kill, or in HOLD by an impaired network. What a stall of the machine made
 of a run counts as neither (`tools.judge.stalls`)."""
 
+BY_KEY: Final = {row.key: row for row in LIMITS}
+
 SOUND: Final = ("torque_at_limit_ms", "shaking_nm", "sinking_m_s")
 """A run in which one of these is over its limit did not stand. The limit of sinking: a person who
 catches up with a robot that held leads it down at up to 0.73 m/s (`bad_network`)."""
@@ -121,7 +123,7 @@ def soundness(log: RunLog, truth: Sequence[SimTruth], robot: RobotConfig) -> dic
 
 def why_not_sound(figures: Mapping[str, Any]) -> str:
     """Return the exceeded limits as text; "" if none is."""
-    rows = (row for row in LIMITS if row.key in SOUND)
+    rows = (BY_KEY[key] for key in SOUND)
     over = [row for row in rows if (figures.get(row.key) or 0.0) > row.limit]
     return "; ".join(
         f"{row.what}: {figures[row.key]:.3g} {row.unit} (limit {row.limit:g})" for row in over

@@ -33,7 +33,7 @@ from tools.judge.stalls import (
     inside,
     stalls_of,
 )
-from tools.judge.standing import LIMITS, soundness, why_not_sound, why_not_standing
+from tools.judge.standing import BY_KEY, soundness, why_not_sound, why_not_standing
 from tools.logs.impairment_intervals import Impaired, impairments, touches
 from tools.logs.run_log import RunLog, robot_of
 
@@ -183,8 +183,7 @@ def _across(
             max(0.0, min(end_ns, row.stall.end_ns) - max(begin_ns, row.begin_ns))
             for row in disturbed
         ]
-        limit = next(row.limit for row in LIMITS if row.key == key)
-        if summary[key] - sum(overlaps_ns) / NS_PER_S / unit_s <= limit:
+        if summary[key] - sum(overlaps_ns) / NS_PER_S / unit_s <= BY_KEY[key].limit:
             found.append(key)
     return found + _lost_in_stalls(summary)
 

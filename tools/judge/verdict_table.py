@@ -7,7 +7,7 @@ from typing import Final
 from rich.table import Table
 from rich.text import Text
 
-from tools.judge.standing import LIMITS, SOUND, VerdictLimit
+from tools.judge.standing import BY_KEY, LIMITS, SOUND, VerdictLimit
 from tools.judge.verdict import Summary
 from tools.terminal import Console, marked
 
@@ -34,7 +34,7 @@ def show(summary: Summary, console: Console) -> None:
         table.add_row(*cells, Text(word, colour))
     console.print(table)
     if summary["stood"] and any(word.startswith(OVER) for *_, word in figures):
-        decide = ", ".join(row.what for row in LIMITS if row.key in SOUND)
+        decide = ", ".join(BY_KEY[key].what for key in SOUND)
         console.print(
             "A figure over its limit is reported and does not decide: standing to the end does, "
             f"and {decide}.",

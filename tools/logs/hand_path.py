@@ -36,7 +36,9 @@ def hand_path(log: RunLog) -> tuple[HandRow, ...]:
     newest = NewestAt(truths)
     begin_ns = truths[0].t_ns - round(truths[0].scenario_s * NS_PER_S)
     before = [hand for hand in led if hand.t_ns < begin_ns and hand.leads]
-    rows = [HandRow(0.0, _without_push(before[-1]))] if before else []
+    rows = []
+    if before:
+        rows.append(HandRow(0.0, msgspec.structs.replace(before[-1], push=(0.0, 0.0, 0.0))))
     for hand in led:
         if hand.t_ns >= begin_ns:
             # by the newest truth: a simulator that is late leaves time out
@@ -44,7 +46,3 @@ def hand_path(log: RunLog) -> tuple[HandRow, ...]:
             after_ns = hand.t_ns - truth.t_ns - EARLY_NS
             rows.append(HandRow(max(0.0, truth.scenario_s + after_ns / NS_PER_S), hand))
     return tuple(rows)
-
-
-def _without_push(hand: HandLead) -> HandLead:
-    return msgspec.structs.replace(hand, push=(0.0, 0.0, 0.0))

@@ -120,11 +120,6 @@ class RunLog:
         self.complete, self.damage, self.cut = index.complete, index.damage, index.cut
 
     @property
-    def damaged(self) -> int:
-        """Number of places in the middle of the file that could not be read."""
-        return len(self.damage)
-
-    @property
     def has_world(self) -> bool:
         """True if a simulated world is in it."""
         return bool(self.count(topics.SIM_TRUTH.key(self.robot)))

@@ -102,7 +102,7 @@ class Survey:
         for take in (_Reading.skim, _Reading.read) if by_index else (_Reading.read,):
             with open_log(path) as reader:
                 facts = FileFacts(
-                    path=path, size=reader.size, finished=reader.finished, in_use=_in_use(path)
+                    path=path, size=reader.size, finished=reader.finished, in_use=in_use(path)
                 )
                 taken = take(_Reading(facts, self.topics), reader)
                 facts.cut, facts.damage = reader.cut, reader.damage
@@ -229,10 +229,3 @@ def _counted(
     counted = {key: count for key, count in counts.items() if count.count or key in names}
     fits = total is None or total == sum(count.count for count in counted.values())
     return counted if counted and fits and counted.keys() <= names.keys() else None
-
-
-def _in_use(path: Path) -> bool:
-    try:
-        return in_use(path)
-    except OSError:
-        return False

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,11 +15,14 @@ from shared.bus.messages import JointState
 from shared.bus.topics import Topic
 from shared.mcap_log.writer import SCHEMA_VERSION, RunWriter
 from tests.messages import sample
+from tools.logs.run_log import RunLog
 
 ROBOT = "lab"
 OFFSET_NS = 1_700_000_000_000_000_000
 METADATA = {"run": {"robot": ROBOT, "schema_version": SCHEMA_VERSION}, "packages": {"xrl": "0"}}
 ATTACHMENTS = {"robot.toml": b'name = "lab"\n', "model.xml": b"<mujoco/>"}
+FROM_RECORDER = ("clock", "split", "counts")
+"""Metadata written by the recorder itself."""
 STATE_KEY = topics.JOINT_STATE.key(ROBOT, "knee_right")
 
 
@@ -68,6 +71,40 @@ def writer(
         chunk_kib=chunk_kib,
         begin=begin,
     )
+
+
+def writer_like(log: RunLog, directory: Path) -> RunWriter:
+    """Return what writes another run with all that is said about a log."""
+    return RunWriter(
+        directory,
+        {key: topic for key, topic in topics.all_keys(log.robot).items() if topic.recorded},
+        offset_ns=log.offset_ns,
+        metadata={name: row for name, row in log.metadata.items() if name not in FROM_RECORDER},
+        attachments=log.attachments,
+        chunk_kib=64,
+    )
+
+
+def write_in_parts(
+    run: RunWriter, rows: Sequence[tuple[str, bytes, int]], parts: int = 3
+) -> list[Path]:
+    """Write messages into several files, as many into each, and return their paths."""
+    size, paths = -(-len(rows) // parts), []
+    with run:
+        for part in range(parts):
+            if part:
+                run.finish()
+                run.begin({"why": "size"})
+            run.take_from(Queue(rows[part * size : (part + 1) * size]), size)
+            paths.append(run.path)
+    return paths
+
+
+def recorded_in_parts(whole: RunLog, folder: Path) -> Path:
+    """Record the messages of a run once more, in three files; return their folder."""
+    rows = sorted((t, key, data) for key in whole.keys() for t, data, _ in whole.raw(key))  # noqa: SIM118
+    write_in_parts(writer_like(whole, folder), [(key, data, t) for t, key, data in rows])
+    return folder
 
 
 def write(directory: Path, items: Iterable[tuple[str, bytes, int]]) -> Path:

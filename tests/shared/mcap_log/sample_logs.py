@@ -10,10 +10,9 @@ from typing import Any
 
 from mcap.writer import Writer
 
-from shared.bus import codec, topics
+from shared.bus import codec
 from shared.clock import NS_PER_S
 from shared.mcap_log import recover
-from shared.mcap_log.writer import RunWriter
 from tests.shared.mcap_log import runs
 from tests.shared.mcap_log.runs import Queue, sample
 from tools import cli
@@ -38,12 +37,7 @@ def make(log: RunLog, out: Path) -> dict[str, Path]:
     rows = sorted((t, key, body) for key in log.keys() for t, body, _ in log.raw(key))  # noqa: SIM118
     since_ns = rows[-1][0] - round(RECENT_S * NS_PER_S)
     recent = [(key, body, t) for t, key, body in rows if t >= since_ns]
-    with _writer(log, out / "split") as run:
-        run.take_from(Queue(recent[: len(recent) // 2]), len(recent))
-        run.finish()
-        run.begin({"why": "size"})
-        run.take_from(Queue(recent[len(recent) // 2 :]), len(recent))
-    with _writer(log, out / "whole") as run:
+    with runs.writer_like(log, out / "whole") as run:
         run.take_from(Queue(recent), len(recent))
     cut = out / "cut.mcap"
     cut.write_bytes(run.path.read_bytes()[: run.path.stat().st_size * 2 // 3])
@@ -57,8 +51,6 @@ def make(log: RunLog, out: Path) -> dict[str, Path]:
         "cut": cut,
         "recovered": out / "recovered.mcap",
         "exported": out / "exported.mcap",
-        "split": out / "split" / "run.mcap",
-        "split_1": out / "split" / "run_1.mcap",
         "every": _every_topic(out / "every"),
     }
 
@@ -77,18 +69,6 @@ def write_one(
             writer.add_message(channel, t_ns, data, t_ns)
         writer.finish()  # type: ignore[no-untyped-call]
     return path
-
-
-def _writer(log: RunLog, directory: Path) -> RunWriter:
-    known = {key: topic for key, topic in topics.all_keys(log.robot).items() if topic.recorded}
-    return RunWriter(
-        directory,
-        known,
-        offset_ns=log.offset_ns,
-        metadata={name: log.metadata[name] for name in ("run", "packages")},
-        attachments=log.attachments,
-        chunk_kib=64,
-    )
 
 
 def _every_topic(directory: Path) -> Path:

@@ -134,9 +134,10 @@ def test_each_combination_of_features_is_read_as_the_specification_says(
     name: str, compression: str
 ) -> None:
     records = CONTENTS[name]
-    for features in (features for of, features in COMBINATIONS if of == name):
-        if compression and Feature.CHUNK not in features:
-            continue
+    every = [features for of, features in COMBINATIONS if of == name]
+    # how a chunk is compressed does not meet the other features: some of them do
+    compressed = [features for features in every if Feature.CHUNK in features][::5]
+    for features in compressed if compression else every:
         for per_chunk in (2, 100)[: 2 if Feature.CHUNK in features and len(records) < 15 else 1]:
             data = file_of(records, features, compression=compression, per_chunk=per_chunk)
             if not features >= UNREAD_BY_THE_PACKAGE:
@@ -147,7 +148,7 @@ def test_each_combination_of_features_is_read_as_the_specification_says(
 @pytest.mark.parametrize("name", CONTENTS)
 def test_each_is_recovered_to_a_file_with_the_same_in_it(tmp_path: Path, name: str) -> None:
     path = tmp_path / "foreign.mcap"
-    for features in [features for of, features in COMBINATIONS if of == name][::3]:
+    for features in [features for of, features in COMBINATIONS if of == name][::6]:
         path.write_bytes(file_of(CONTENTS[name], features, per_chunk=3))
         outcome = recover.recover(path, tmp_path / "copy.mcap")
         assert (outcome.damage, outcome.cut, outcome.orphans) == ((), None, 0)

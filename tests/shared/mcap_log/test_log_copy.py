@@ -61,7 +61,7 @@ def test_the_copy_is_a_log_like_any_other(record: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     write_extended(record, out, [CHANNEL], added(5))
     log = read_run(out)
-    assert (log.complete, log.damaged, log.attachments) == (True, 0, ATTACHMENTS)
+    assert (log.complete, log.damage, log.attachments) == (True, [], ATTACHMENTS)
     assert log.metadata[NOTE] == {"from": record.name}
     assert "recovered" not in log.metadata
     summary = summary_of(out)

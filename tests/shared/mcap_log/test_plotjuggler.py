@@ -2,8 +2,8 @@
 
 The rules are those of PlotJuggler 3 (3.9 to 3.17: DataLoadMCAP, nlohmann_parsers) and 4 (plugins
 data_load_mcap 1.2, parser_json 1.1.1). A run in virtual time is opened as it was recorded, as
-recovered after a cut, as exported with its scene, and split (the last second of it, for speed);
-and a file with a message of every topic. Foxglove's own library takes every schema in
+recovered after a cut, and as exported with its scene (the last second of it, for speed); and a
+file with a message of every topic. Foxglove's own library takes every schema in
 tests/tools/judge/reports/test_scene.py.
 """
 
@@ -20,7 +20,6 @@ import pytest
 
 from shared.bus import topics
 from shared.joints import MODULES
-from shared.mcap_log import schema
 from tests.shared.mcap_log import runs, sample_logs
 from tests.shared.mcap_log.mcap_doctor import Examined
 from tests.shared.mcap_log.plotjuggler import LAST, Opened, Refused, opened_by_3, opened_by_4
@@ -33,7 +32,7 @@ KEPT_OUT = {"not chosen: no messages"}
 SCENE = {"scene/frames", "scene/links", "scene/state", "robot_description"}
 """What an exported copy has more: protobuf, and for Rerun a text of ROS 2 in CDR."""
 OTHER_PARSERS = {opened_by_3: {"protobuf", "ros2msg"}, opened_by_4: {"protobuf", "cdr"}}
-MADE = ("whole", "recovered", "exported", "split", "split_1", "every")
+MADE = ("whole", "recovered", "exported", "every")
 Reader = Callable[[Path], Opened]
 Open = Callable[[Reader, str], Opened]
 
@@ -73,16 +72,6 @@ def leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:
             yield from leaves(entry, f"{path}[{number}]")
     else:
         yield path, value
-
-
-def words_in(node: dict[str, Any]) -> Iterator[str]:
-    """Yield the names of the fields of a schema that hold text."""
-    for name, member in node["properties"].items():
-        inner = member.get("items", member)
-        if inner["type"] == "object":
-            yield from words_in(inner)
-        elif inner["type"] == "string":
-            yield name
 
 
 @pytest.mark.parametrize("name", MADE)
@@ -129,37 +118,6 @@ def test_every_number_and_flag_of_a_run_is_a_point_and_only_text_is_not(
     assert opened(opened_by_3, "whole").words == texts
 
 
-def test_text_is_in_the_fields_of_text_in_the_schema_and_nowhere_else(opened: Open) -> None:
-    described = {
-        name for topic in topics.TOPICS for name in words_in(schema.json_schema(topic.type))
-    }
-    dropped = {path.rpartition("/")[2] for path in opened(opened_by_3, "whole").words}
-    assert dropped
-    assert dropped <= described
-    assert not described & {field for _, field in schema.ENUMERATIONS}
-
-
-@pytest.mark.parametrize("reader", VERSIONS)
-def test_modes_causes_and_kinds_are_series_of_numbers(
-    log: RunLog, opened: Open, reader: Reader
-) -> None:
-    points = opened(reader, "whole").points
-    held = 0
-    for key, messages in typed(log):
-        for (message_type, field), kind in schema.ENUMERATIONS.items():
-            if isinstance(messages[0], message_type):
-                values = [value for _, value in points[f"{key}/{field}"]]
-                assert values == [getattr(message, field) for message in messages]
-                assert {kind(int(value)) for value in values}
-                held += 1
-    assert held > len(schema.ENUMERATIONS)
-    every = opened(reader, "every").points
-    for message_type, field in schema.ENUMERATIONS:
-        (topic,) = [topic for topic in topics.TOPICS if topic.type is message_type]
-        for key in topics.keys(topic, runs.ROBOT):
-            assert [value for _, value in every[f"{key}/{field}"]] == [1, 1, 1]
-
-
 def test_integers_keep_their_value_as_doubles(opened: Open) -> None:
     """PlotJuggler keeps 53 bits of an integer."""
     exact = opened(opened_by_4, "whole").points
@@ -181,18 +139,6 @@ def test_points_a_millisecond_apart_stay_apart_in_seconds_since_1970(
     off_s = [t_s - (OFFSET_NS + 1_000_000 * seq) * 1e-9 for seq, t_s in enumerate(times)]
     assert max(map(abs, off_s[1:])) < 1e-6
     assert abs(off_s[0]) < 2e-6
-
-
-def test_the_halves_of_a_split_run_are_the_run(opened: Open) -> None:
-    """PlotJuggler opens several files at once and joins series of one name."""
-    halves = [opened(opened_by_3, name) for name in ("split", "split_1")]
-    whole = opened(opened_by_3, "whole")
-    assert all(half.messages for half in halves)
-    joined: dict[str, list[Any]] = {}
-    for half in halves:
-        for name, row in half.points.items():
-            joined.setdefault(name, []).extend(row)
-    assert joined == whole.points
 
 
 def test_what_is_cut_off_by_a_kill_needs_its_recovery(files: dict[str, Path]) -> None:

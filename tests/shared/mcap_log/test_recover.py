@@ -18,7 +18,7 @@ from shared.exceptions import RunError
 from shared.mcap_log import recover
 from shared.mcap_log.recover import Interrupted
 from tests.shared.mcap_log import runs
-from tests.shared.mcap_log.runs import ATTACHMENTS, STATE_KEY, Queue, item
+from tests.shared.mcap_log.runs import ATTACHMENTS, Queue, item
 from tools.logs.run_log import read_run
 
 LOGGER = logging.getLogger("test")
@@ -210,15 +210,3 @@ def test_the_rescue_of_a_directory_takes_what_is_unfinished_and_survives_the_res
     warned = [r.getMessage() for r in caplog.records if r.levelno == logging.WARNING]
     assert len(warned) == 3
     assert "killed.mcap was not finished; recovered to killed.mcap: kept: 1200" in caplog.text
-
-
-def test_a_key_is_still_there_after_its_first_chunk_was_lost(tmp_path: Path) -> None:
-    killed = runs.killed_file(tmp_path)
-    data = bytearray(killed.path.read_bytes())
-    data[data.index(b"zstd") + 40] ^= 0xFF
-    killed.path.write_bytes(data)
-    outcome = recover.recover(killed.path, tmp_path / "out.mcap")
-    found = by_the_package(outcome.out)
-    assert (outcome.orphans, len(outcome.damage)) == (0, 1)
-    assert len(found) > 1000
-    assert read_run(outcome.out).count(STATE_KEY) == len(found)

@@ -51,12 +51,6 @@ def read_by_the_package(path: Path) -> list[bytes]:
         return [m.data for _, _, m in make_reader(file, validate_crcs=True).iter_messages()]
 
 
-def test_a_finished_file_is_readable_by_the_ordinary_reader(tmp_path: Path) -> None:
-    items = [item(seq) for seq in range(300)]
-    found = read_by_the_package(runs.write(tmp_path, items))
-    assert found == [payload for _, payload, _ in items]
-
-
 def test_times_are_mapped_to_the_wall_clock_by_one_offset(tmp_path: Path) -> None:
     with runs.write(tmp_path, [item(7)]).open("rb") as file:
         ((_, channel, message),) = make_reader(file).iter_messages()
@@ -127,13 +121,8 @@ def test_a_block_left_by_an_exception_leaves_a_readable_file_without_summary(
 
 def test_a_split_run_is_one_file_after_the_other_and_each_stands_for_itself(tmp_path: Path) -> None:
     items = [item(seq) for seq in range(30)]
-    with runs.writer(tmp_path) as run:
-        for number in range(3):
-            if number:
-                run.finish()
-                run.begin({"why": "size"})
-            run.take_from(Queue(items[number * 10 : number * 10 + 10]), 100)
-    paths = [tmp_path / name for name in ("run.mcap", "run_1.mcap", "run_2.mcap")]
+    paths = runs.write_in_parts(runs.writer(tmp_path), items)
+    assert [path.name for path in paths] == ["run.mcap", "run_1.mcap", "run_2.mcap"]
     assert sorted(tmp_path.iterdir()) == sorted(paths)
     payloads = [read_by_the_package(path) for path in paths]
     assert [len(found) for found in payloads] == [10, 10, 10]

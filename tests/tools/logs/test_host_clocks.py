@@ -18,7 +18,6 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.files import to_toml
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
-from shared.mcap_log.writer import SCHEMA_VERSION, RunWriter
 from tests.conftest import ROBOT_FILE
 from tests.shared.mcap_log.runs import Queue, sample
 from tests.tools.exit_codes import exit_code
@@ -34,6 +33,7 @@ from tests.tools.logs.three_hosts import (
     sent_by_all,
     states,
     write_record,
+    writer_of,
 )
 from tools.hosts.records import fleets_run, join_fetched
 from tools.logs.host_clocks import OffsetBounds, offset_bounds
@@ -149,18 +149,6 @@ def test_info_tells_the_clocks(record: Path, capsys: pytest.CaptureFixture[str])
     left = json.loads(capsys.readouterr().out)["clocks"][LEFT]
     assert left["services"] == ["ankle_left", "knee_left", "hip_left"]
     assert left["clocks"][0]["offset_s"] == pytest.approx(252_000.0, abs=0.01)
-
-
-def writer_of(folder: Path, robot: RobotConfig, robot_file: bytes) -> RunWriter:
-    about = {"schema_version": SCHEMA_VERSION, "robot": robot.name}
-    return RunWriter(
-        folder,
-        topics.all_keys(robot.name),
-        offset_ns=0,
-        metadata={"run": about},
-        attachments={"robot.toml": robot_file},
-        chunk_kib=256,
-    )
 
 
 def test_on_one_host_nothing_is_compared(tmp_path: Path, robot: RobotConfig) -> None:

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import random
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,8 +11,7 @@ from shared.mcap_log.reader import ChunkPlace, LogReader
 from shared.mcap_log.records import PREFIX
 from shared.mcap_log.writer import SCHEMA_VERSION
 from tests.shared.mcap_log import runs
-from tests.shared.mcap_log.runs import ATTACHMENTS, OFFSET_NS, ROBOT, STATE_KEY, Queue, item
-from tools.logs.playback import reading
+from tests.shared.mcap_log.runs import ATTACHMENTS, OFFSET_NS, ROBOT, STATE_KEY, Killed, Queue, item
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import parts_of, read_run
 
@@ -27,7 +24,7 @@ def test_a_finished_file_gives_back_every_message_in_order(tmp_path: Path) -> No
     assert log.received_ns(topics.JOINT_STATE, "knee_right")[3] == 3_000_500
     assert log.count(STATE_KEY) == 1000
     assert log.keys() == [STATE_KEY]
-    assert (log.complete, log.damaged, log.offset_ns, log.robot) == (True, 0, OFFSET_NS, ROBOT)
+    assert (log.complete, log.damage, log.offset_ns, log.robot) == (True, [], OFFSET_NS, ROBOT)
 
 
 def test_a_key_without_messages_is_empty_and_no_error(tmp_path: Path) -> None:
@@ -53,41 +50,6 @@ def test_gaps_are_those_the_recorder_counted(tmp_path: Path) -> None:
     assert (gaps[WRENCH_KEY].missing, gaps[WRENCH_KEY].restarts) == (2, 1)
 
 
-def test_a_file_cut_anywhere_is_read_up_to_the_last_flush(tmp_path: Path) -> None:
-    path, flushed = runs.killed_file(tmp_path)
-    data = path.read_bytes()
-    assert len(data) == flushed[-1][0]
-    dice = random.Random(7)
-    sent = [runs.state(seq) for seq in range(flushed[-1][1])]
-    cuts = [dice.randint(flushed[0][0], len(data)) for _ in range(200)]
-    cut_path = tmp_path / "cut.mcap"
-    for cut in [*cuts, *(size for size, _ in flushed)]:
-        cut_path.write_bytes(data[:cut])
-        log = read_run(cut_path)
-        found = log.messages(topics.JOINT_STATE, "knee_right")
-        assert len(found) >= max(count for size, count in flushed if size <= cut)
-        assert found == sent[: len(found)]
-        assert (log.complete, log.damaged) == (False, 0)
-        assert log.attachments == ATTACHMENTS
-
-
-def test_a_file_cut_before_its_first_messages_is_read_or_one_run_error(tmp_path: Path) -> None:
-    path, flushed = runs.killed_file(tmp_path)
-    data = path.read_bytes()
-    cut_path = tmp_path / "cut.mcap"
-    outcomes = []
-    end = flushed[0][0]
-    for cut in sorted({*range(150), *range(150, end, 13), *range(end - 50, end)}):
-        cut_path.write_bytes(data[:cut])
-        try:
-            outcomes.append(str(read_run(cut_path).keys()))
-        except RunError as error:
-            outcomes.append(str(error))
-    assert outcomes[-1] == "[]"
-    assert outcomes[0].endswith("is empty; an MCAP file is right")
-    assert not any("\n" in outcome for outcome in outcomes)
-
-
 def test_zeros_after_a_power_cut_are_the_end(tmp_path: Path) -> None:
     path, flushed = runs.killed_file(tmp_path)
     with path.open("ab") as file:
@@ -104,7 +66,7 @@ def test_a_damaged_chunk_is_counted_and_the_others_are_read(tmp_path: Path, batc
     data[position : position + 50] = bytes(50)
     path.write_bytes(data)
     log = read_run(path)
-    assert log.damaged == 1
+    assert len(log.damage) == 1
     assert 0 < log.count(STATE_KEY) < flushed[-1][1]
     assert log.messages(topics.JOINT_STATE, "knee_right")[-1] == runs.state(1199)
 
@@ -115,27 +77,10 @@ def test_a_wrong_length_costs_its_own_chunk_only(tmp_path: Path) -> None:
     data[flushed[3][0] + 1 : flushed[3][0] + 9] = (2**62).to_bytes(8, "little")
     path.write_bytes(data)
     log = read_run(path)
-    assert (log.damaged, log.cut) == (1, None)
+    assert (len(log.damage), log.cut) == (1, None)
     assert [m.seq for m in log.messages(topics.JOINT_STATE, "knee_right")[:300]] == list(range(300))
     assert log.messages(topics.JOINT_STATE, "knee_right")[-1] == runs.state(1199)
     assert log.count(STATE_KEY) > 1000
-
-
-@pytest.mark.parametrize(
-    "content", [None, b"", b"\x89", b"no mcap file at all", bytes(100), b"\x89MCAP0\r\n" * 9]
-)
-@pytest.mark.parametrize("reader", [read_run, lambda path: reading.read([path])])
-def test_what_is_no_mcap_file_is_one_line(
-    tmp_path: Path, reader: Callable[[Path], object], content: bytes | None
-) -> None:
-    path = tmp_path / "x.mcap"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(
-        RunError, match=r"x\.mcap: (is (empty|no MCAP)|cannot be|no meta)"
-    ) as caught:
-        reader(path)
-    assert "\n" not in str(caught.value)
 
 
 def test_messages_of_another_version_are_refused_with_the_key(tmp_path: Path) -> None:
@@ -154,6 +99,11 @@ def test_a_module_is_asked_for_exactly_where_there_is_one(tmp_path: Path) -> Non
         log.messages(topics.WRENCH, "knee_right")
 
 
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory: pytest.TempPathFactory) -> Killed:
+    return runs.killed_file(tmp_path_factory.mktemp("killed"))
+
+
 def heads_of_chunks(data: bytes) -> list[int]:
     """Return where the two times of each chunk with messages are."""
     reader = LogReader(data)
@@ -161,15 +111,13 @@ def heads_of_chunks(data: bytes) -> list[int]:
 
 
 @pytest.mark.parametrize("which", [0, 1, -1])
-@pytest.mark.parametrize("bit", [34, 40, 50, 60])
+@pytest.mark.parametrize("bit", [34, 60])
 @pytest.mark.parametrize("time", ["first", "last"])
 def test_a_flipped_bit_in_the_times_of_a_chunk_loses_none_of_its_messages(
-    tmp_path: Path, which: int, bit: int, time: str
+    killed: Killed, tmp_path: Path, which: int, bit: int, time: str
 ) -> None:
     """No CRC covers them: 34 is the first bit of more than 10 s."""
-    path, _ = runs.killed_file(tmp_path)
-    data = bytearray(path.read_bytes())
-    sent = read_run(path).messages(topics.JOINT_STATE, "knee_right")
+    data = bytearray(killed.path.read_bytes())
     at = heads_of_chunks(bytes(data))[which] + (8 if time == "last" else 0) + bit // 8
     data[at] ^= 1 << bit % 8
     flipped = tmp_path / "flipped.mcap"
@@ -178,4 +126,4 @@ def test_a_flipped_bit_in_the_times_of_a_chunk_loses_none_of_its_messages(
     found = []
     for part in parts_of(index, part_s=index.length_s / 5, margin_s=0.0):
         found += part.messages(topics.JOINT_STATE, "knee_right")
-    assert found == sent
+    assert found == [runs.state(seq) for seq in range(killed.flushed[-1][1])]

@@ -80,20 +80,26 @@ def write_record(
             newest[key] = max(newest.get(key, 0), clock.read(at_ns) + dice.randrange(NS_PER_MS))
             rows.append((key, payload, newest[key]))
     rows.sort(key=lambda row: row[2])
-    about = {"schema_version": SCHEMA_VERSION, "robot": robot.name, "of": ",".join(of)}
-    with RunWriter(
-        folder,
-        topics.all_keys(robot.name),
-        offset_ns=1_700_000_000 * NS_PER_S - clock.offset_ns,
-        metadata={"run": about},
-        attachments={
-            "robot.toml": to_toml(on_three_hosts(robot)).encode(),
-            "robot.gains.json": ROBOT_FILE.with_name("robot.gains.json").read_bytes(),
-        },
-        chunk_kib=256,
-    ) as writer:
+    robot_file, offset_ns = to_toml(on_three_hosts(robot)), 1_700_000_000 * NS_PER_S
+    with writer_of(folder, robot, robot_file.encode(), offset_ns - clock.offset_ns, of) as writer:
         writer.take_from(Queue(rows), len(rows))
     return writer.path
+
+
+def writer_of(
+    folder: Path, robot: RobotConfig, robot_file: bytes, offset_ns: int = 0, of: Sequence[str] = ()
+) -> RunWriter:
+    """Return what writes a record with a robot file in it; `of`: of these services alone."""
+    about = {"schema_version": SCHEMA_VERSION, "robot": robot.name, "of": ",".join(of)}
+    gains = ROBOT_FILE.with_name("robot.gains.json").read_bytes()
+    return RunWriter(
+        folder,
+        topics.all_keys(robot.name),
+        offset_ns=offset_ns,
+        metadata={"run": about},
+        attachments={"robot.toml": robot_file, "robot.gains.json": gains},
+        chunk_kib=256,
+    )
 
 
 def on_three_hosts(robot: RobotConfig) -> RobotConfig:

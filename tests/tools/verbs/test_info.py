@@ -59,19 +59,6 @@ def test_counts_rates_gaps_losses_and_restarts_are_those_of_the_messages(
     assert found["files"][0]["finished"]
 
 
-def test_every_number_of_the_recorder_s_own_count_is_found_again(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    items = [state(seq, seq) for seq in (0, 1, 5, 6, 2, 3, 9)]
-    with runs.writer(tmp_path) as run:
-        run.take_from(Queue(items), 100)
-    count = run.counts[STATE_KEY]
-    topic = as_json(capsys, run.path)["topics"][STATE_KEY]
-    assert (topic["count"], topic["lost"], topic["gaps"], topic["restarts"]) == (
-        count.count, count.missing, count.gaps, count.restarts,
-    )  # fmt: skip
-
-
 def test_an_unfinished_file_is_counted_and_names_how_to_recover(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -111,15 +98,8 @@ def test_a_cut_is_described_with_its_extent_and_end(
 
 @pytest.fixture
 def split_run(tmp_path: Path) -> list[Path]:
-    paths = []
-    with runs.writer(tmp_path) as run:
-        for number in range(12):
-            if number:
-                run.finish()
-                run.begin({"why": "time"})
-            start = number * 11  # one is lost between two files
-            run.take_from(Queue(state(seq, seq) for seq in range(start, start + 10)), 100)
-            paths.append(run.path)
+    rows = [state(seq, seq) for seq in range(12 * 11) if seq % 11 < 10]  # one lost between files
+    paths = runs.write_in_parts(runs.writer(tmp_path), rows, 12)
     runs.write(tmp_path, [state(0, 0)])  # another run in the same directory
     return paths
 

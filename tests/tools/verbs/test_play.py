@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -16,8 +14,9 @@ from shared.places import DEFAULT_CONFIG
 from tests.certified import certified, opened
 from tests.shared.mcap_log import runs
 from tests.shared.mcap_log.runs import item, write
+from tests.tools.exit_codes import exit_code
 from tools.flags import add_flags, read_flags
-from tools.logs.playback import arguments, reading
+from tools.logs.playback import reading
 from tools.verbs.log import play
 
 LENGTH = 40
@@ -29,29 +28,23 @@ def log(tmp_path: Path) -> Path:
     return write(tmp_path, [item(n) for n in range(LENGTH)])
 
 
-def test_help_shows_the_keys_and_the_way_to_subscribe() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "tools.cli", "log", "play", "--help"],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+def test_help_shows_the_keys_and_the_way_to_subscribe(capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_code(["log", "play", "--help"]) == 0
+    shown = capsys.readouterr().out
     for words in (
         "examples:\n  xrl log play",
         "replay/xrl/<robot>/x",
-        arguments.LISTEN,
+        play.LISTEN,
         "space",
         "130",
     ):
-        assert words in done.stdout
+        assert words in shown
 
 
-def arguments_of(log: Path, *words: str) -> arguments.PlayFlags:
+def arguments_of(log: Path, *words: str) -> play.PlayFlags:
     parser = argparse.ArgumentParser()
-    add_flags(parser, arguments.PlayFlags)
-    return read_flags(arguments.PlayFlags, parser.parse_args([str(log), *words]))
+    add_flags(parser, play.PlayFlags)
+    return read_flags(play.PlayFlags, parser.parse_args([str(log), *words]))
 
 
 def test_the_bus_is_that_of_the_robot_file_given_else_of_the_log_else_as_shipped(

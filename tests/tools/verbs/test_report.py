@@ -44,18 +44,6 @@ def test_an_impossible_output_prints_one_line(
     assert capsys.readouterr().err.count("\n") == 1
 
 
-@pytest.mark.parametrize("content", [None, b"", b"no record", bytes(200)])
-def test_a_file_that_is_no_log_prints_one_line(
-    tmp_path: Path, content: bytes | None, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "x.mcap"
-    if content is not None:
-        path.write_bytes(content)
-    assert report(path) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-    assert not path.with_suffix(".html").exists()
-
-
 def test_a_browser_opens_on_request(record: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []
     monkeypatch.setattr("webbrowser.open", opened.append)

@@ -20,7 +20,7 @@ from shared.links import GROUPS
 from tools.judge.reports.page_model import BarRow, Bars, LevelLine, Line, Panel, Plot
 from tools.judge.reports.run_data import RunData
 from tools.judge.reports.signals import GAP_S, Array
-from tools.judge.standing import LIMITS
+from tools.judge.standing import BY_KEY
 
 NO_WORLD: Final = "no sim/truth in this log"
 NO_PLANNER: Final = "no planner/status in this log"
@@ -29,9 +29,6 @@ NO_STATES: Final = "no joint/*/state in this log"
 NO_IMPAIRMENTS: Final = "no impairment in this log"
 XYZ: Final = ("x", "y", "z")
 ANGLES: Final = ("roll", "pitch", "yaw")
-
-ALLOWED: Final = {row.key: row.limit for row in LIMITS}
-"""Limits of the verdict; the panels show those that hold while the planner leads."""
 
 
 class ImpairedLink(IntEnum):
@@ -338,7 +335,7 @@ def _components(names: Iterable[str], t: Array, values: Array) -> list[Line]:
 
 def _leading_limits(key: str, label: str) -> list[LevelLine]:
     """Return a limit of the verdict for both signs; visible once a line comes close."""
-    most = ALLOWED[key]
+    most = BY_KEY[key].limit
     return [LevelLine(most, label, shown=False), LevelLine(-most, label, shown=False)]
 
 

@@ -68,11 +68,7 @@ class RunData:
         """Return a monotonic stamp as time on the axis, s."""
         return _s(t_ns - self.zero_ns)
 
-    def is_inside(self, t: float) -> bool:
-        """Return True for a time on the axis that is not in a margin."""
-        return self.begin_s <= t < self.end_s
-
-    def inside(self, t: Array) -> NDArray[np.bool_]:
+    def inside(self, t: Array | float) -> NDArray[np.bool_]:
         """Return True for times on the axis that are not in a margin."""
         return np.asarray((t >= self.begin_s) & (t < self.end_s))
 

@@ -66,7 +66,7 @@ class Timeline:
             *_world(run),
             *_network(run),
         )
-        self._found += [event for event in found if run.is_inside(event.t)]
+        self._found += [event for event in found if run.inside(event.t)]
         self._violations.add(run)
         self._silences.add(run)
 
@@ -197,7 +197,7 @@ class Successive:
             for t, message in zip(
                 run.times(topic, module).tolist(), run.log.messages(topic, module), strict=True
             )
-            if run.is_inside(t)
+            if run.inside(t)
         ]
         before = self._last.get((topic.name, module))
         if rows:

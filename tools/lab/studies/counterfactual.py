@@ -23,8 +23,8 @@ from shared.exceptions import RunError
 from shared.joints import MODULES
 from tools.lab.studies.sweeps.figures import NOBODY, sole_tilt_max_rad
 from tools.logs.hand_path import HandRow
+from tools.logs.reexecution.compare import ReexecutionResult
 from tools.logs.reexecution.joint import JointExecution
-from tools.logs.reexecution.outcome import ReexecutionResult
 from tools.logs.reexecution.planner import PlannerExecution
 from tools.logs.run_log import RunLog
 from tools.output import new_figure, save_figure
@@ -89,7 +89,7 @@ def moments_of(log: RunLog, robot: RobotConfig, every_s: float) -> list[Moment]:
         )
     for name in MODULES:
         joint = JointExecution(robot, name, ReexecutionResult(name, 0.0, exact=False))
-        rows = ((message.t_ns, joint) for message in joint.run(log))
+        rows = ((message.t_ns, joint) for _, message in joint.run(log))
         for moment, snapshot in _at(found, rows, _copy):
             if snapshot is not None:
                 moment.modules[name] = snapshot

@@ -1,1 +1,1 @@
-"""Parts of `xrl log play`: arguments, guard, reading, selection, schedule, player."""
+"""Parts of `xrl log play`: guard, reading, selection, schedule, player."""

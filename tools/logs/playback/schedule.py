@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future
-from typing import Final, NamedTuple, Protocol, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 from shared.clock import NS_PER_MS, NS_PER_S
 
@@ -95,59 +95,6 @@ class Playhead:
         self._since_ns, self._from_ns = now_ns, position_ns
 
 
-class EntrySource(Protocol):
-    """The messages of a window, in order."""
-
-    def rewind(self) -> None:
-        """Begin again."""
-
-    def peek(self) -> Entry | None:
-        """Return the next message, which stays the next; None behind the last."""
-
-    def pop(self) -> Entry:
-        """Return the next message, which `peek` has returned."""
-
-
-class Schedule:
-    """The messages of a window in order, once or for ever."""
-
-    def __init__(self, source: EntrySource, part: Window, *, loop: bool) -> None:
-        self._source = source
-        self._start_ns = part.start_ns
-        self.length_ns = max(0, part.end_ns - part.start_ns)
-        """Length of one pass, ns."""
-        self.is_empty = source.peek() is None
-        self._loop = loop and not self.is_empty
-        self._period_ns = max(self.length_ns, PASS_MIN_NS)
-        self.passes = 0
-        """Passes that are over."""
-
-    def next_ns(self) -> int | None:
-        """Return the position of the next message; None behind the last."""
-        entry = self._source.peek()
-        if entry is None and self._loop:
-            self._source.rewind()
-            self.passes += 1
-            entry = self._source.peek()
-        if entry is None:
-            return None
-        return self.passes * self._period_ns + entry.time_ns - self._start_ns
-
-    def pop(self) -> Entry:
-        """Return the next message, whose position `next_ns` has returned."""
-        return self._source.pop()
-
-    def recorded_ns(self, position_ns: int) -> int:
-        """Return the recorder's clock at a position, within the window."""
-        return self._start_ns + self.elapsed_ns(position_ns)
-
-    def elapsed_ns(self, position_ns: int) -> int:
-        """Return the time since the start of the pass that a position belongs to."""
-        if self._loop:
-            position_ns %= self._period_ns
-        return min(position_ns, self.length_ns)
-
-
 BLOCK_NS: Final = 60 * NS_PER_S
 """Length of a block: some 160 MB of messages."""
 
@@ -196,3 +143,43 @@ class EntryStream:
 
     def _bounds(self) -> tuple[int, int]:
         return self._from_ns, min(self._from_ns + self._block_ns, self._part.end_ns)
+
+
+class Schedule:
+    """The messages of a window in order, once or for ever."""
+
+    def __init__(self, source: EntryStream, part: Window, *, loop: bool) -> None:
+        self._source = source
+        self._start_ns = part.start_ns
+        self.length_ns = max(0, part.end_ns - part.start_ns)
+        """Length of one pass, ns."""
+        self.is_empty = source.peek() is None
+        self._loop = loop and not self.is_empty
+        self._period_ns = max(self.length_ns, PASS_MIN_NS)
+        self.passes = 0
+        """Passes that are over."""
+
+    def next_ns(self) -> int | None:
+        """Return the position of the next message; None behind the last."""
+        entry = self._source.peek()
+        if entry is None and self._loop:
+            self._source.rewind()
+            self.passes += 1
+            entry = self._source.peek()
+        if entry is None:
+            return None
+        return self.passes * self._period_ns + entry.time_ns - self._start_ns
+
+    def pop(self) -> Entry:
+        """Return the next message, whose position `next_ns` has returned."""
+        return self._source.pop()
+
+    def recorded_ns(self, position_ns: int) -> int:
+        """Return the recorder's clock at a position, within the window."""
+        return self._start_ns + self.elapsed_ns(position_ns)
+
+    def elapsed_ns(self, position_ns: int) -> int:
+        """Return the time since the start of the pass that a position belongs to."""
+        if self._loop:
+            position_ns %= self._period_ns
+        return min(position_ns, self.length_ns)

@@ -73,7 +73,7 @@ class Comparison:
         self.compared += 1
         if _encode(recorded) == _encode(recomputed):
             return True
-        pairs = _apart(recorded, recomputed)
+        pairs = _walk("", msgspec.to_builtins(recorded), msgspec.to_builtins(recomputed))
         rows = [
             Difference(recorded.t_ns, tick, key, field, a, b)
             for field, a, b in pairs
@@ -98,6 +98,52 @@ class Comparison:
             before = self.largest.get((row.key, row.field))
             if before is None or size(row) > size(before):
                 self.largest[row.key, row.field] = row
+
+
+class ReexecutionResult:
+    """Counts of one service, filled in as it is executed.
+
+    Attributes:
+        service: its name.
+        exact: the memory is compared as well; not where a parameter was changed.
+        ticks: cycles or ticks that were executed.
+        skipped: that were not: before the first memory in the log, or after a loss.
+        starts: how often execution began from a recorded memory.
+        lost_inputs: messages that the service took and the log lacks.
+        comparison: of what came out.
+    """
+
+    def __init__(self, service: str, tolerance: float, *, exact: bool) -> None:
+        self.service = service
+        self.exact = exact
+        self._tolerance = tolerance
+        self.forget()
+
+    def forget(self) -> None:
+        """Count from here on."""
+        self.ticks = 0
+        self.skipped = 0
+        self.starts = 0
+        self.lost_inputs = 0
+        self.comparison = Comparison(self._tolerance)
+
+    def add(self, later: ReexecutionResult) -> None:
+        """Add what came of the same service in a later part of the run."""
+        self.ticks += later.ticks
+        self.skipped += later.skipped
+        self.starts += later.starts
+        self.lost_inputs += later.lost_inputs
+        self.comparison.add(later.comparison)
+
+    @property
+    def differs(self) -> bool:
+        """True once something came out otherwise than recorded."""
+        return self.comparison.first is not None
+
+    @property
+    def equal(self) -> bool:
+        """True if something was executed, and nothing came out otherwise."""
+        return self.ticks > 0 and not self.differs
 
 
 def size(row: Difference) -> float:
@@ -136,12 +182,8 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _apart(a: Message, b: Message) -> Iterator[tuple[str, Any, Any]]:
-    """Yield every plain value of two messages of one type, with its name."""
-    yield from _walk("", msgspec.to_builtins(a), msgspec.to_builtins(b))
-
-
 def _walk(name: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
+    """Yield every plain value of two messages of one type, with its name."""
     if name == "snapshot" and isinstance(a, str) and isinstance(b, str) and a and b:
         a, b = msgspec.json.decode(a), msgspec.json.decode(b)
     if isinstance(a, dict) and isinstance(b, dict):

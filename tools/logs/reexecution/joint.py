@@ -23,9 +23,8 @@ from shared.bus.messages import (
 from shared.bus.traces import CycleTrace, JointTrace
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from tools.logs.reexecution.compare import Comparison
-from tools.logs.reexecution.memory import memory_of
-from tools.logs.reexecution.outcome import ReexecutionResult
+from tools.logs.reexecution.compare import ReexecutionResult
+from tools.logs.reexecution.inputs import memory_of
 from tools.logs.run_log import RunLog
 
 _encode: Final = msgspec.json.Encoder().encode
@@ -96,16 +95,15 @@ class JointExecution:
 
     def __init__(self, robot: RobotConfig, name: str, outcome: ReexecutionResult) -> None:
         """Take the robot to execute with, the module's name and what to fill in."""
-        self._robot, self._name, self._outcome = robot, name, outcome
+        self._robot, self._name, self.outcome = robot, name, outcome
         self._cycle = _Cycle()
         self._loop: JointLoop | None = None
         self._expected = 0
 
-    def run(self, log: RunLog) -> Iterator[Message]:
-        """Execute every cycle that can be; yield what comes out, where the log has its like.
+    def run(self, log: RunLog) -> Iterator[tuple[str, Message]]:
+        """Execute a run, or its next part: every cycle that can be.
 
-        Args:
-            log: a run, or its parts one after the other.
+        Yields what comes out, with its full key, where the log has its like.
         """
         self._load(log)
         traces: list[JointTrace] = log.messages(topics.JOINT_TRACE, self._name)
@@ -121,13 +119,13 @@ class JointExecution:
             for cycle in trace.cycles:
                 if self._loop is None or not self._receive(cycle):
                     self._loop = None
-                    self._outcome.skipped += 1
+                    self.outcome.skipped += 1
                 else:
                     yield from self._execute(self._loop, cycle)
 
     def _load(self, log: RunLog) -> None:
         """Look up what the cycles of a part took and sent."""
-        name = self._name
+        name, self._log_robot = self._name, log.robot
         commands: list[JointCommand] = log.messages(topics.JOINT_COMMAND, name)
         self._commands = {(command.session, command.seq): command for command in commands}
         states: list[JointState] = log.messages(topics.JOINT_STATE, name)
@@ -144,9 +142,9 @@ class JointExecution:
             module = DriveManager(self._robot, self._name)
             module.restore(memory_of(trace.snapshot, DriveManagerState))
             self._loop = self._loop_of(module)
-            self._outcome.starts += 1
+            self.outcome.starts += 1
             return
-        if self._outcome.exact:
+        if self.outcome.exact:
             computed = msgspec.structs.replace(
                 trace, snapshot=_encode(self._loop.module.snapshot()).decode()
             )
@@ -172,33 +170,34 @@ class JointExecution:
         if trace.command_seq >= 0:
             cycle.command = self._commands.get((trace.session, trace.command_seq))
             if cycle.command is None:
-                self._outcome.lost_inputs += 1
+                self.outcome.lost_inputs += 1
                 return False
         return True
 
-    def _execute(self, loop: JointLoop, trace: CycleTrace) -> Iterator[Message]:
+    def _execute(self, loop: JointLoop, trace: CycleTrace) -> Iterator[tuple[str, Message]]:
         step, controller, sent = loop.cycle(), loop.module.controller, self._cycle.sent
-        self._outcome.ticks += 1
+        self.outcome.ticks += 1
         drive_command, tau = step.command.value, controller.tau
         if drive_command != trace.drive_command or tau != trace.tau:
             computed = msgspec.structs.replace(trace, drive_command=drive_command, tau=tau)
             self._compare("trace", controller.cycle, _single(trace), _single(computed))
         for message in sent:
-            is_state = isinstance(message, JointState)
-            recorded = (
-                self._states.get((message.t_ns, message.cycle))
-                if isinstance(message, JointState)
-                else self._events.get(message.t_ns)
-            )
+            recorded: Message | None
+            if isinstance(message, JointState):
+                topic = topics.JOINT_STATE
+                recorded = self._states.get((message.t_ns, message.cycle))
+            else:
+                topic = topics.JOINT_EVENT
+                recorded = self._events.get(message.t_ns)
             if recorded is not None:
-                what = "state" if is_state else "event"
+                what = topic.name.rpartition("/")[2]
                 self._compare(what, controller.cycle, recorded, message)
-                yield message
+                yield topic.key(self._log_robot, self._name), message
         sent.clear()
 
     def _compare(self, what: str, tick: int, recorded: Message, recomputed: Message) -> None:
-        comparison: Comparison = self._outcome.comparison
-        comparison.take(f"joint/{self._name}/{what}", tick, recorded, recomputed)
+        key = f"joint/{self._name}/{what}"
+        self.outcome.comparison.take(key, tick, recorded, recomputed)
 
 
 def _single(cycle: CycleTrace) -> JointTrace:

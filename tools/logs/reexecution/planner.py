@@ -16,9 +16,8 @@ from shared.bus.messages import Attitude, JointCommand, Message, PlannerStatus, 
 from shared.bus.traces import PlannerCheckpoint
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
-from tools.logs.reexecution.found import BySeq
-from tools.logs.reexecution.memory import memory_of
-from tools.logs.reexecution.outcome import ReexecutionResult
+from tools.logs.reexecution.compare import ReexecutionResult
+from tools.logs.reexecution.inputs import BySeq, memory_of
 from tools.logs.run_log import RunLog
 
 M = TypeVar("M", bound=Message)
@@ -78,17 +77,13 @@ class PlannerExecution:
         controller: Callable[[], Controller] | None = None,
     ) -> None:
         """Take the robot to execute with, what to fill in, and somebody's own controller."""
-        self._robot, self._outcome, self._controller = robot, outcome, controller
+        self._robot, self.outcome, self._controller = robot, outcome, controller
         self._tick = _Tick()
         self._loop: PlannerLoop | None = None
         self._last: PlannerStatus | None = None
 
     def run(self, log: RunLog) -> Iterator[tuple[str, Message]]:
-        """Execute every tick that can be; yield module (or "") and what comes out.
-
-        Args:
-            log: a run, or its parts one after the other.
-        """
+        """Execute a run, or its next part: every tick that can be; yield what comes out, by key."""
         self._load(log)
         statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
         received = log.received_ns(topics.PLANNER_STATUS)
@@ -100,13 +95,14 @@ class PlannerExecution:
                 self._loop = None  # another planner, or ticks that the log lacks
             if self._loop is None or not self._receive(self._loop.planner, status):
                 self._loop = None
-                self._outcome.skipped += 1
+                self.outcome.skipped += 1
                 self._begin(status)
                 continue
             yield from self._execute(self._loop, status)
 
     def _load(self, log: RunLog) -> None:
         """Look up what the ticks of a part took and sent."""
+        self._log_robot = log.robot
         snapshots: list[PlannerCheckpoint] = log.messages(topics.PLANNER_CHECKPOINT)
         self._snapshots = {(snapshot.session, snapshot.t_ns): snapshot for snapshot in snapshots}
         self._states = [BySeq(log.messages(topics.JOINT_STATE, name)) for name in MODULES]
@@ -140,7 +136,7 @@ class PlannerExecution:
             known.wrench_seq,
             known.attitude_seq,
         )
-        self._outcome.starts += 1
+        self.outcome.starts += 1
 
     def _receive(self, planner: Planner, status: PlannerStatus) -> bool:
         """Give the planner what this tick took; False if the log lacks something of it."""
@@ -163,7 +159,7 @@ class PlannerExecution:
             tick.attitude.message = self._attitudes.at(status.attitude_seq, status.t_ns)
             given = tick.attitude.message is not None
         self._taken = list(status.state_seq), status.wrench_seq, status.attitude_seq
-        self._outcome.lost_inputs += not given
+        self.outcome.lost_inputs += not given
         tick.t_ns = status.t_ns
         tick.request = OperatorRequest(
             assist_n=status.assist_requested_n,
@@ -176,21 +172,21 @@ class PlannerExecution:
         return given
 
     def _execute(self, loop: PlannerLoop, status: PlannerStatus) -> Iterator[tuple[str, Message]]:
-        outcome, compare, tick = self._outcome, self._outcome.comparison.take, self._tick
+        outcome, compare, tick = self.outcome, self.outcome.comparison.take, self._tick
         loop.tick(status.t_ns)
         outcome.ticks += 1
         for name, command in zip(MODULES, tick.commands.messages, strict=False):
             recorded = self._commands.get((name, status.session, command.seq))
             if recorded is not None:
                 compare(f"joint/{name}/command", status.seq, recorded, command)
-                yield name, command
+                yield topics.JOINT_COMMAND.key(self._log_robot, name), command
         (computed,) = tick.status.messages
         tick.commands.messages.clear()
         tick.status.messages.clear()
         # tick_us is a time that was measured
         computed = msgspec.structs.replace(computed, tick_us=status.tick_us)
         compare("planner/status", status.seq, status, computed)
-        yield "", computed
+        yield topics.PLANNER_STATUS.key(self._log_robot), computed
         snapshot = self._snapshots.get((status.session, status.t_ns))
         if snapshot is not None and outcome.exact:
             text = _encode(loop.planner.snapshot()).decode()

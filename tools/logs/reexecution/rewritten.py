@@ -15,9 +15,9 @@ from shared.bus import topics
 from shared.bus.messages import Message
 from shared.exceptions import RunError
 from shared.mcap_log import schema
+from shared.mcap_log.writer import PROFILE
 from tools.logs.run_log import RunLog
 
-PROFILE: Final = "xrl"
 _SEQUENCE_MASK: Final = 0xFFFFFFFF
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple
 
@@ -21,6 +22,7 @@ from shared.bus import topics
 from shared.bus.messages import (
     JointCommand,
     JointState,
+    Mode,
     PlannerMode,
     PlannerStatus,
     SplitSource,
@@ -39,7 +41,7 @@ from tools.flags import Arg, Flags, Number, Run, finite_numbers, robot_file_of
 from tools.judge.run_parts import zero_ns
 from tools.lab.design.push_limit import PushLimits
 from tools.lab.design.torque_breakdown import TorqueBreakdown, torque_breakdown
-from tools.logs import snapshot_text
+from tools.logs.impairment_intervals import impairments
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import RunLog, RunPart, refuse_own_controller, robot_of
 from tools.terminal import Console, marked
@@ -245,12 +247,12 @@ def _introduce(log: RunLog, tick: Tick, at_s: float | None, zero_ns: int, consol
             status.ik_residual,
         )
     )
-    words = snapshot_text.describe_modules(tick.states)
+    words = _modules(tick.states)
     console.print(f"modules, and how old their commands were: {words}", style="dim")
     at_ns = status.t_ns if at_s is None else zero_ns + round(at_s * 1e9)
     late_s = (at_ns - status.t_ns) / 1e9
     if late_s > AWAY_S:
-        words = snapshot_text.describe_modules(snapshot_text.states_at(log, at_ns))
+        words = _modules([log.newest(topics.JOINT_STATE, name).at(at_ns) for name in MODULES])
         console.print(
             marked(
                 "[yellow]at {:g} s the planner did not tick: its last, {:.2f} s before, "
@@ -261,9 +263,27 @@ def _introduce(log: RunLog, tick: Tick, at_s: float | None, zero_ns: int, consol
                 words,
             )
         )
-    network = snapshot_text.describe_network(log, at_ns, zero_ns)
-    if network:
+    if network := _network(log, at_ns, zero_ns):
         console.print(f"network: {network}", style="yellow", markup=False, highlight=False)
+
+
+def _modules(states: Sequence[JointState | None]) -> str:
+    """Return each module's mode, and how old the newest command was that it had."""
+    found = []
+    for module, state in zip(MODULES, states, strict=True):
+        words = "not heard yet"
+        if state is not None:
+            age = "none" if state.age_ns < 0 else f"{state.age_ns / NS_PER_MS:.1f} ms"
+            words = f"{name_of(Mode, state.mode)} {age}"
+        found.append(f"{module} {words}")
+    return ", ".join(found)
+
+
+def _network(log: RunLog, at_ns: int, zero_ns: int) -> str:
+    """Return the impairments in force at a monotonic time; empty for a run without any."""
+    done = impairments(log.messages(topics.LINK_EVENT))
+    now = [f"{row.title}, {row.when(zero_ns)}" for row in done if row.at(at_ns)]
+    return "; ".join(now) or ("nothing is done to it here" if done else "")
 
 
 def show(robot: RobotConfig, found: TorqueBreakdown, console: Console) -> None:

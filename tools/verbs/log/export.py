@@ -21,6 +21,7 @@ from tools.export.tables import (
     GRID_NAME,
     CsvFile,
     ParquetFile,
+    TableKind,
     write_grid,
     write_tables,
 )
@@ -106,7 +107,7 @@ class ExportFlags(PartFlags):
 
 def run(flags: ExportFlags) -> int:
     """Write the requested files."""
-    tables: list[tuple[Path | None, type[CsvFile] | type[ParquetFile]]] = [
+    tables: list[tuple[Path | None, TableKind]] = [
         (flags.csv, CsvFile), (flags.parquet, ParquetFile),
     ]  # fmt: skip
     for extra, wanted, otherwise in (
@@ -150,7 +151,7 @@ def _write_tables(
     part: RunPart,
     flags: ExportFlags,
     out: Path,
-    kind: type[CsvFile] | type[ParquetFile],
+    kind: TableKind,
     console: Console,
 ) -> None:
     """Write a folder of tables, with progress."""

@@ -213,10 +213,11 @@ def _injected(survey: Survey) -> list[str]:
             for index in indices
             for event in RunLog(index, NOTHING).messages(topics.LINK_EVENT)
         ]
-        zero, since = _zero(indices[0])
+        zero = zero_ns(indices[0])
     except XrlError as error:
         return [str(error)]
     lines = [f"{row.title}: {row.when(zero)}; {row.counts()}" for row in impairments(events)]
+    since = " (s since the log begins)" if zero == indices[0].span_ns[0] else ""
     more = len(lines) - INJECTED_MAX
     if more > 0:
         lines[INJECTED_MAX:] = [f"and {more} more"]
@@ -242,13 +243,6 @@ def _clocks_as_json(file: FileFacts) -> dict[str, Any]:
 
 def _clocks_of(file: FileFacts) -> HostClocks | None:
     return clocks_of(RunIndex(file.path)) if file.ours else None
-
-
-def _zero(index: RunIndex) -> tuple[int, str]:
-    """Return time zero of the listed impairments, and its name if not the scenario's start."""
-    zero = zero_ns(index)
-    since = " (s since the log begins)" if zero == index.began_ns - index.offset_ns else ""
-    return zero, since
 
 
 def _table(found: dict[str, TopicFacts], prefix: str, *, events: bool) -> Table:

@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Final
 
-from shared.exceptions import RunError
 from shared.mcap_log import recover
 from shared.mcap_log.files import in_use, recovered_name
 from tools.flags import Flags, option, positional
 from tools.guarded_streams import printable
-from tools.logs.run_index import MetadataByName, head_of
+from tools.logs.run_index import head_of
 from tools.output import refuse_taken
 from tools.terminal import Console, marked
 
@@ -43,13 +42,13 @@ def run(flags: RecoverFlags) -> int:
         return 0
     out = flags.out or recovered_name(path)
     refuse_taken(out, path, force=flags.force)
-    if _in_use(path):
+    if in_use(path):
         console.print("a recorder is writing this file: what follows is not in the copy")
     outcome = recover.recover(path, out)
     console.print(marked("[bold]{}[/]: a finished file", out), soft_wrap=True)
     for line in recover.describe(outcome):
         console.print(f"  {line}", soft_wrap=True)
-    flush_ms = _head(path).get("recorder", {}).get("flush_ms", "")
+    flush_ms = head_of(path).get("recorder", {}).get("flush_ms", "")
     if not outcome.finished and flush_ms:
         console.print(
             f"  the recorder wrote every {printable(flush_ms)} ms: what came after its last write "
@@ -57,17 +56,3 @@ def run(flags: RecoverFlags) -> int:
             soft_wrap=True,
         )
     return 0
-
-
-def _in_use(path: Path) -> bool:
-    try:
-        return in_use(path)
-    except OSError:
-        return False
-
-
-def _head(path: Path) -> MetadataByName:
-    try:
-        return head_of(path)
-    except RunError:
-        return {}

@@ -24,11 +24,16 @@ from tools.judge.run_parts import PartFlags, part_of
 from tools.lab.studies.sweeps.pool import cores, results
 from tools.live.experiment import ControllerFlags
 from tools.logs.reexecution import rewritten
-from tools.logs.reexecution.compare import likely_reason, size
-from tools.logs.reexecution.execution import Execution
-from tools.logs.reexecution.outcome import ReexecutionResult
+from tools.logs.reexecution.compare import ReexecutionResult, likely_reason, size
+from tools.logs.reexecution.execution import (
+    Execution,
+    RangeTask,
+    execute_range,
+    execution_of,
+    merged,
+    ranges_of,
+)
 from tools.logs.reexecution.params import with_params
-from tools.logs.reexecution.ranges import RangeTask, execute_range, merged, ranges_of
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import RunLog, has_own_controller, parts_of, read_part, robot_of
 from tools.terminal import Console, marked
@@ -112,7 +117,7 @@ def run(flags: ResimFlags) -> int:
     changed = bool(flags.param or flags.controller)
     for outcome in outcomes:
         tell(outcome, index, console, changed=changed)
-    if not changed and any(outcome.comparison.first for outcome in outcomes):
+    if not changed and any(outcome.differs for outcome in outcomes):
         _tell_reason(index, console)
     if not any(outcome.ticks for outcome in outcomes):
         raise RunError(
@@ -157,11 +162,11 @@ def _one_by_one(
             make = controller_maker(flags.controller, robot) if flags.controller else None
             exact = not (flags.param or flags.controller)
             executions = [
-                Execution(robot, name, flags.tolerance, exact=exact, controller=make)
+                execution_of(robot, name, flags.tolerance, exact=exact, controller=make)
                 for name in names
             ]
         for number, execution in enumerate(executions):
-            if flags.until_first_difference and execution.differs:
+            if flags.until_first_difference and execution.outcome.differs:
                 continue
             done_s = number / len(executions) * (log.end_ns - log.begin_ns) / 1e9
             progress.update(
@@ -173,9 +178,9 @@ def _one_by_one(
             for key, message in execution.run(log):
                 if flags.param:
                     recomputed.setdefault(key, []).append(message)
-                if flags.until_first_difference and execution.differs:
+                if flags.until_first_difference and execution.outcome.differs:
                     break
-        if flags.until_first_difference and all(one.differs for one in executions):
+        if flags.until_first_difference and all(one.outcome.differs for one in executions):
             break
     return [execution.outcome for execution in executions]
 

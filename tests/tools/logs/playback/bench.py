@@ -22,8 +22,8 @@ from shared.bus.traces import SimTruth
 from shared.config import files as config_file
 from shared.places import DEFAULT_CONFIG
 from tests.shared.mcap_log import runs
-from tests.shared.mcap_log.runs import Queue, sample
-from tools.logs.playback.arguments import LISTEN
+from tests.shared.mcap_log.runs import sample
+from tools.verbs.log.play import LISTEN
 
 ROOT = DEFAULT_CONFIG.parents[1]
 ROBOT = config_file.load(DEFAULT_CONFIG)
@@ -63,13 +63,7 @@ def write(
     """Write a run of the shipped robot, in one file or several, and return its directory."""
     monkeypatch.setitem(runs.METADATA, "run", {**runs.METADATA["run"], "robot": NAME})
     monkeypatch.setitem(runs.ATTACHMENTS, "robot.toml", config_file.to_toml(ROBOT).encode())
-    with runs.writer(directory, keys=topics.all_keys(NAME)) as run:
-        size = -(-len(rows) // parts)
-        for part in range(parts):
-            if part:
-                run.finish()
-                run.begin()
-            run.take_from(Queue(rows[part * size : (part + 1) * size]), size)
+    runs.write_in_parts(runs.writer(directory, keys=topics.all_keys(NAME)), rows, parts)
     return directory
 
 

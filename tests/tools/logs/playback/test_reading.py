@@ -10,7 +10,7 @@ import pytest
 from shared.bus import codec, topics
 from shared.exceptions import RunError
 from tests.shared.mcap_log import runs
-from tests.shared.mcap_log.runs import STATE_KEY, Queue, item, killed_file, write, writer
+from tests.shared.mcap_log.runs import STATE_KEY, item, killed_file, write, writer
 from tools.logs.playback import reading
 from tools.logs.playback.reading import files_named, read
 from tools.logs.run_index import further_files
@@ -23,16 +23,8 @@ def payloads(path: Path) -> list[bytes]:
 
 
 def split_run(directory: Path, parts: int = 3, size: int = 10) -> list[Path]:
-    """Write a run in several files."""
-    paths = []
-    with writer(directory, keys=runs.few_topics()) as run:
-        for part in range(parts):
-            if part:
-                run.finish()
-                run.begin()
-            paths.append(run.path)
-            run.take_from(Queue(item(part * size + n) for n in range(size)), size)
-    return paths
+    rows = [item(n) for n in range(parts * size)]
+    return runs.write_in_parts(writer(directory, keys=runs.few_topics()), rows, parts)
 
 
 def test_messages_are_given_as_recorded_in_the_order_of_their_reception(tmp_path: Path) -> None:

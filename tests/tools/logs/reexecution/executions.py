@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from shared.config.robot_config import RobotConfig
-from tools.logs.reexecution.execution import Execution
-from tools.logs.reexecution.outcome import ReexecutionResult
+from tools.logs.reexecution.compare import ReexecutionResult
+from tools.logs.reexecution.execution import execution_of
 from tools.logs.run_log import RunLog, robot_of
 
 
@@ -20,7 +20,7 @@ def executed(
     exact: bool = True,
 ) -> ReexecutionResult:
     """Execute a service; from a log, or from its parts one after the other."""
-    execution = Execution(robot or robot_of(log), name, tolerance, exact=exact)
+    execution = execution_of(robot or robot_of(log), name, tolerance, exact=exact)
     for part in parts or (log,):
         for _ in execution.run(part):
             pass

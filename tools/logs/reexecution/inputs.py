@@ -1,4 +1,4 @@
-"""Finds the messages that a service consumed, by the numbers in its trace."""
+"""What a service consumed and knew, as its log has it."""
 
 from __future__ import annotations
 
@@ -6,9 +6,13 @@ from bisect import bisect_right
 from collections.abc import Iterable
 from typing import Generic, TypeVar
 
+import msgspec
+
 from shared.bus.messages import Message
+from shared.exceptions import RunError
 
 M = TypeVar("M", bound=Message)
+State = TypeVar("State")
 
 
 class BySeq(Generic[M]):
@@ -25,3 +29,14 @@ class BySeq(Generic[M]):
         if not rows:
             return None
         return rows[max(0, bisect_right(rows, by_ns, key=lambda row: row.t_ns) - 1)]
+
+
+def memory_of(text: str, kind: type[State]) -> State:
+    """Return a recorded memory."""
+    try:
+        return msgspec.json.decode(text, type=kind)
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise RunError(
+            f"a service's memory in the log is no {kind.__name__}: {error}; execute it again with "
+            "the checkout that wrote it (`xrl log info` tells its commit)"
+        ) from None
