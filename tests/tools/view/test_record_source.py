@@ -11,8 +11,8 @@ from shared.bus import topics
 from shared.bus.messages import JointState
 from shared.bus.traces import SimTruth
 from shared.joints import MODULES
-from tests.tools.judge.reports.runs import rewritten
-from tests.tools.logs.split_runs import recorded_in_parts
+from tests.shared.mcap_log.runs import recorded_in_parts
+from tests.tools.judge.reports.runs import changed
 from tools.judge.stalls import MACHINE, Stall
 from tools.logs.run_log import RunLog, read_run, robot_of
 from tools.view.record import RecordSource
@@ -48,13 +48,11 @@ def test_a_frame_holds_the_newest_messages_at_its_time(log: RunLog, source: Reco
     assert {"kill", "push", "fault"} <= {mark.kind for mark in model.marks}
 
 
-def test_a_stall_of_the_machine_is_shown_for_moments_after_it_and_marked(
-    log: RunLog, tmp_path: Path
-) -> None:
+def test_a_stall_of_the_machine_is_shown_for_moments_after_it_and_marked(log: RunLog) -> None:
     zero_ns = next(row.t_ns for row in log.messages(topics.SIM_TRUTH) if row.scenario_s >= 0.0)
     event = Stall(zero_ns + 2_430_000_000, zero_ns + 2_493_000_000, MACHINE).event(99, zero_ns)
     more = [(event.t_ns, "run/event", msgspec.json.encode(event))]
-    found = rewritten(log, tmp_path, more=more)
+    found = changed(log, more=more)
     source = RecordSource(found, robot_of(found))
     shown = [source.frame(t_s) for t_s in (2.4, 2.6, 3.1, 2.6)]
     words = "the machine stood still for 63 ms"

@@ -20,7 +20,7 @@ from tools.judge.reports.page_model import TimelineEvent
 from tools.judge.reports.run_data import RunData
 from tools.judge.reports.signals import Array
 from tools.judge.stalls import together
-from tools.judge.standing import LIMITS
+from tools.judge.standing import BY_KEY
 from tools.judge.verdict import leading
 
 TOGETHER_S: Final = 0.1
@@ -32,7 +32,6 @@ AT_LIMIT: Final = 0.999
 
 TORQUE: Final = "torque at its limit"
 
-ALLOWED: Final = {row.key: (row.limit, row.unit) for row in LIMITS}
 WORLD: Final = (
     ("COM x", "com", 0, 1e3, "alive_com_x_max_mm", "hold_com_x_max_mm"),
     ("COM y", "com", 1, 1e3, "alive_com_y_max_mm", "hold_com_y_max_mm"),
@@ -118,13 +117,6 @@ def _shared(row: tuple[float, Violation]) -> tuple[str, str]:
     return one.what, "" if one.name in (*MODULES, *JOINTS) else one.name
 
 
-def limit_violations(run: RunData) -> list[TimelineEvent]:
-    """Return the first violation of each limit of a whole run, in no order."""
-    found = LimitViolations()
-    found.add(run)
-    return list(found.events())
-
-
 def first_violation(what: str, name: str, t: Array, beyond: NDArray[np.bool_]) -> Violation | None:
     """Return the first time beyond a limit and the total duration; None if there is none.
 
@@ -154,9 +146,9 @@ def _world(run: RunData) -> Iterator[Beyond]:
             (other_key, ~leads, "while the planner does not lead"),
         ):
             if key:
-                most, unit = ALLOWED[key]
-                what = f"over {most:g} {unit}, the limit {condition}"
-                yield what, name, t, (values > most) & mask & ~stalled, None
+                row = BY_KEY[key]
+                what = f"over {row.limit:g} {row.unit}, the limit {condition}"
+                yield what, name, t, (values > row.limit) & mask & ~stalled, None
 
 
 def _torques(run: RunData) -> Iterator[Beyond]:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import copy
 import fnmatch
 import io
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import msgspec
@@ -18,18 +20,16 @@ from numpy.typing import NDArray
 
 from shared.bus import topics
 from shared.clock import NS_PER_S
-from shared.mcap_log.writer import RunWriter
-from tests.shared.mcap_log.runs import Queue
+from tests.shared.mcap_log.runs import Queue, writer_like
 from tools import cli
+from tools.judge.reports.page_model import PageModel, Panel
 from tools.judge.reports.run_data import RunData
-from tools.logs.run_log import RunLog, read_run
+from tools.logs.run_log import RunLog, Series, read_run
 
 SIM = (
     "sim --duration 4 --kill planner@1 --restart planner@1.8 --push 0.5:0.2:20,0,0 "
     "--fault hip_left:link_lost@3.2:0.4"
 )
-FROM_RECORDER = ("clock", "split", "counts")
-"""Metadata written by the recorder itself."""
 
 
 class Made(NamedTuple):
@@ -46,70 +46,70 @@ def make(directory: Path) -> Made:
     return Made(directory / "run.mcap", printed.getvalue())
 
 
-def rewritten(
-    log: RunLog,
-    directory: Path,
-    *,
-    keep: Callable[[str], bool] = lambda _: True,
-    attachments: Mapping[str, bytes] | None = None,
-    about: Mapping[str, str] | None = None,
-    payload: Callable[[str, bytes], bytes] = lambda _, payload: payload,
-    more: Sequence[tuple[int, str, bytes]] = (),
-    repeats: int = 1,
-) -> RunLog:
-    """Write a copy of a log with other topics, attachments or payloads, and read it.
-
-    `more` holds further messages: time, name of the key below the robot, payload.
-    """
-    known = {key: topic for key, topic in topics.all_keys(log.robot).items() if topic.recorded}
-    prefix = f"xrl/{log.robot}/"
-    rows = []
-    for key in known:
-        name = key.removeprefix(prefix)
-        if keep(name):
-            rows += [(t, key, payload(name, body)) for t, body, _ in log.raw(key)]
-    rows += [(t, prefix + name, body) for t, name, body in more]
-    rows.sort(key=lambda row: row[0])
-    length_ns = rows[-1][0] - rows[0][0] + NS_PER_S // 1000
-    metadata = {name: row for name, row in log.metadata.items() if name not in FROM_RECORDER}
-    if about is not None:
-        metadata["run"] = dict(about)
-    writer = RunWriter(
-        directory,
-        known,
-        offset_ns=log.offset_ns,
-        metadata=metadata,
-        attachments=log.attachments if attachments is None else attachments,
-        chunk_kib=64,
-    )
-    with writer as run:
-        for number in range(repeats):
-            moved = (_moved(row, known, number, length_ns) for row in rows)
-            run.take_from(Queue(moved), len(rows))
-    return read_run(run.path)
+Change = Callable[[float, dict[str, Any]], object]
+"""Takes the scenario time of a message, s, and the message; False leaves it out."""
 
 
 def changed(
     log: RunLog,
-    directory: Path,
-    name: str,
-    change: Callable[[float, dict[str, Any]], object],
-    **more: Any,
+    changes: Mapping[str, Change] = MappingProxyType({}),
+    *,
+    keep: Callable[[str], bool] = lambda _: True,
+    attachments: Mapping[str, bytes] | None = None,
+    about: Mapping[str, str] | None = None,
+    more: Sequence[tuple[int, str, bytes]] = (),
 ) -> RunLog:
-    """Write a copy of a log in which the messages of some keys, by pattern, are changed in place.
+    """Return a copy of a log whose messages are changed by the patterns of their keys.
 
-    `change` takes the scenario time of a message, s, and the message.
+    `more` holds further messages: time, name of the key below the robot, payload.
     """
-    zero_ns = RunData(log).zero_ns
+    zero_ns, prefix = RunData(log).zero_ns, f"xrl/{log.robot}/"
+    found = copy.copy(log)
+    found._series = {
+        key: series for key, series in log._series.items() if keep(key.removeprefix(prefix))
+    }
+    for key, series in found._series.items():
+        for pattern, change in changes.items():
+            if fnmatch.fnmatch(key.removeprefix(prefix), pattern):
+                rows = zip(series.received_ns, series.payloads, strict=True)
+                found._series[key] = _series(_changed(rows, change, zero_ns))
+    for t_ns, name, body in more:
+        old = found._series.get(prefix + name, Series())
+        rows = zip(old.received_ns, old.payloads, strict=True)
+        found._series[prefix + name] = _series(sorted([*rows, (t_ns, body)]))
+    found.attachments = log.attachments if attachments is None else dict(attachments)
+    found.metadata = log.metadata if about is None else log.metadata | {"run": dict(about)}
+    return found
 
-    def payload(key: str, body: bytes) -> bytes:
-        if not fnmatch.fnmatch(key, name):
-            return body
-        message = msgspec.json.decode(body)
-        change((message["t_ns"] - zero_ns) / NS_PER_S, message)
-        return msgspec.json.encode(message)
 
-    return rewritten(log, directory, payload=payload, **more)
+def _changed(
+    rows: Iterable[tuple[int, bytes]], change: Change, zero_ns: int
+) -> Iterator[tuple[int, bytes]]:
+    for received_ns, payload in rows:
+        message = msgspec.json.decode(payload)
+        if change((message["t_ns"] - zero_ns) / NS_PER_S, message) is not False:
+            yield received_ns, msgspec.json.encode(message)
+
+
+def _series(rows: Iterable[tuple[int, bytes]]) -> Series:
+    found = Series()
+    for received_ns, payload in rows:
+        found.received_ns.append(received_ns)
+        found.payloads.append(payload)
+        found.seq.append(msgspec.json.decode(payload)["seq"])
+    return found
+
+
+def written(log: RunLog, directory: Path, *, repeats: int = 1) -> RunLog:
+    """Write a log, or several times after each other, as a recorder does; and read it."""
+    known = topics.all_keys(log.robot)
+    rows = sorted((t, key, body) for key in log.keys() for t, body, _ in log.raw(key))  # noqa: SIM118
+    length_ns = rows[-1][0] - rows[0][0] + NS_PER_S // 1000
+    with writer_like(log, directory) as run:
+        for number in range(repeats):
+            moved = (_moved(row, known, number, length_ns) for row in rows)
+            run.take_from(Queue(moved), len(rows))
+    return read_run(run.path)
 
 
 def _moved(
@@ -133,6 +133,16 @@ def data_of(page: str) -> dict[str, Any]:
     found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.S)
     assert found is not None
     return json.loads(found[1])
+
+
+def drawn(log: RunLog, *makes: Callable[[RunData], Iterable[Panel]]) -> dict[str, Any]:
+    """Return the data of some panels of a page."""
+    run = RunData(log)
+    model = PageModel(run.span)
+    for make in makes:
+        for one in make(run):
+            model.add(one)
+    return model.as_data([])[0]
 
 
 def panel(data: dict[str, Any], title: str) -> dict[str, Any]:

@@ -64,13 +64,6 @@ def test_curves_grow_beside_it_until_they_are_whole(made: Made, tmp_path: Path) 
     assert ends[2] == pytest.approx(WIDTH - RIGHT, abs=4)
 
 
-def test_curves_without_a_picture_are_refused(
-    made: Made, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.main(["log", "export", str(made.path), "--scene", "--curves"]) == 2
-    assert "name it with --gif FILE" in capsys.readouterr().err
-
-
 def test_modules_change_their_colour_from_track_to_hold_when_the_planner_dies(drawn: Path) -> None:
     seen = []
     with Image.open(drawn) as picture:

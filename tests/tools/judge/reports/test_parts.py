@@ -12,7 +12,6 @@ import pytest
 
 from shared.bus import topics
 from shared.bus.messages import DriveStatus
-from shared.clock import NS_PER_S
 from shared.exceptions import RunError
 from tests.tools.judge.reports import runs
 from tests.tools.judge.reports.runs import Made
@@ -22,7 +21,6 @@ from tools.judge.judgement import summarise_parts
 from tools.judge.reports import scene
 from tools.judge.reports.page import render, render_parts
 from tools.judge.reports.page_model import Line, PageModel, PageWindow, Plot
-from tools.judge.reports.run_data import RunData
 from tools.judge.reports.signals import Span
 from tools.judge.run_parts import zero_ns
 from tools.logs.run_index import RunIndex
@@ -212,7 +210,7 @@ def test_before_the_drives_are_armed_no_soft_stop_is_passed(log: RunLog, tmp_pat
         if t <= -1.0:
             state |= {"q": (9.0, 9.0), "drive": int(DriveStatus.IDLE)}
 
-    hung = runs.changed(log, tmp_path, "joint/*/state", hanging)
+    hung = runs.written(runs.changed(log, {"joint/*/state": hanging}), tmp_path)
     for page in (render(hung), render_parts(hung.index, part_s=PART_S)):
         assert "beyond a soft stop" not in page
 
@@ -221,15 +219,8 @@ def test_a_change_across_a_silence_at_the_edge_of_a_part_has_its_row(
     log: RunLog, tmp_path: Path
 ) -> None:
     """The planner is dead for longer than a part and its margins."""
-    begin_ns = RunData(log).zero_ns + NS_PER_S
-    key = topics.PLANNER_STATUS.key(log.robot)
-    heard = [
-        (t_ns, topics.PLANNER_STATUS.name, body)
-        for t_ns, body, _ in log.raw(key)
-        if not begin_ns <= t_ns < begin_ns + 4 * NS_PER_S
-    ]
-    others = lambda name: name != topics.PLANNER_STATUS.name  # noqa: E731
-    quiet = runs.rewritten(log, tmp_path, keep=others, more=heard)
+    dead = {topics.PLANNER_STATUS.name: lambda t, _: not 1.0 <= t < 5.0}
+    quiet = runs.written(runs.changed(log, dead), tmp_path)
     whole, parts = (
         [row for row in section(page, "timeline") if "planner: " in row]
         for page in (render(quiet), render_parts(quiet.index, part_s=PART_S))

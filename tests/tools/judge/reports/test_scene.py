@@ -59,9 +59,15 @@ def in_world(frames: list[FramePose]) -> dict[str, tuple[Array, Array]]:
     return found
 
 
-def bodies(robot: RobotConfig, torso: Any, angles: Any, q: Any) -> dict[str, tuple[Array, Array]]:
+@pytest.fixture(scope="module")
+def model(robot: RobotConfig) -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(mjcf(robot))
+
+
+def bodies(
+    model: mujoco.MjModel, torso: Any, angles: Any, q: Any
+) -> dict[str, tuple[Array, Array]]:
     """Return the position and rotation of each frame in MuJoCo."""
-    model = mujoco.MjModel.from_xml_string(mjcf(robot))
     data = mujoco.MjData(model)
     roll, pitch, yaw = angles
     turn = np.array([math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)])
@@ -90,7 +96,7 @@ def deviation(found: Any, right: Any) -> float:
 
 
 def test_the_frames_are_those_of_the_model_at_random_times(
-    poses: list[RobotPose], log: RunLog, robot: RobotConfig
+    poses: list[RobotPose], log: RunLog, robot: RobotConfig, model: mujoco.MjModel
 ) -> None:
     dice = random.Random(3)
     for pose in dice.sample(poses, 25):
@@ -103,7 +109,7 @@ def test_the_frames_are_those_of_the_model_at_random_times(
                 row.q for row in log.messages(topics.JOINT_STATE, module) if row.t_ns <= t_ns
             ][-1]
         ]
-        right = bodies(robot, truth.torso, truth.angles, q)
+        right = bodies(model, truth.torso, truth.angles, q)
         found = in_world(scene.frames(robot, pose))
         assert deviation(found, right) < 1e-9
         assert found["com"][0].tolist() == list(truth.com)
@@ -112,16 +118,15 @@ def test_the_frames_are_those_of_the_model_at_random_times(
 
 @given(st.lists(st.floats(-3.0, 3.0), min_size=18, max_size=18))
 def test_the_frames_are_those_of_the_model_in_any_pose(
-    robot: RobotConfig, numbers: list[float]
+    robot: RobotConfig, model: mujoco.MjModel, numbers: list[float]
 ) -> None:
     torso, angles, q = tuple(numbers[:3]), tuple(numbers[3:6]), tuple(numbers[6:])
     nothing = (0.0, 0.0, 0.0)
     pose = RobotPose(0, torso, angles, nothing, q, (0,) * 6, nothing, nothing)
-    assert deviation(in_world(scene.frames(robot, pose)), bodies(robot, torso, angles, q)) < 1e-9
+    assert deviation(in_world(scene.frames(robot, pose)), bodies(model, torso, angles, q)) < 1e-9
 
 
-def test_the_bodies_are_those_of_the_model(robot: RobotConfig) -> None:
-    model = mujoco.MjModel.from_xml_string(mjcf(robot))
+def test_the_bodies_are_those_of_the_model(robot: RobotConfig, model: mujoco.MjModel) -> None:
     found = {entity.name: entity for entity in scene.links(robot)}
     for name, form in (("torso", "cube"), ("sole_left", "cube"), ("shin_right", "cylinder")):
         (solid,) = found[name].solids
@@ -154,9 +159,9 @@ def test_an_arrow_points_along_its_force(force: tuple[float, float, float]) -> N
 
 
 def test_without_a_simulated_world_the_robot_stands_on_its_feet(
-    log: RunLog, robot: RobotConfig, tmp_path: Path
+    log: RunLog, robot: RobotConfig
 ) -> None:
-    real = runs.rewritten(log, tmp_path, keep=lambda name: not name.startswith("sim/"))
+    real = runs.changed(log, keep=lambda name: not name.startswith("sim/"))
     poses = list(scene.poses(real, robot))
     ankles = dict(zip(SIDES, ankle_positions(robot), strict=True))
     for pose in poses[:: len(poses) // 20]:
@@ -275,8 +280,9 @@ def test_foxgloves_own_library_accepts_every_schema(tmp_path: Path) -> None:
 def test_an_impossible_export_prints_one_line(
     made: Made, shown: Path, log: RunLog, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    half = runs.rewritten(log, tmp_path / "half", keep=lambda name: "hip_left" not in name).path
-    bare = runs.rewritten(log, tmp_path / "bare", attachments={}).path
+    one_leg = runs.changed(log, keep=lambda name: "hip_left" not in name)
+    half = runs.written(one_leg, tmp_path / "half").path
+    bare = runs.written(runs.changed(log, attachments={}), tmp_path / "bare").path
     out = str(tmp_path / "x.mcap")
     for arguments, words in (
         ([made.path], "say what to write"),

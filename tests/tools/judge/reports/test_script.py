@@ -98,8 +98,7 @@ def report(page: str, tab: Tab, tmp_path_factory: pytest.TempPathFactory) -> Rep
     return Report(tab, path)
 
 
-@pytest.mark.parametrize("theme", ["light", "dark"])
-@pytest.mark.parametrize("width", [380, 1400])
+@pytest.mark.parametrize(("width", "theme"), [(380, "dark"), (1400, "light")])
 def test_every_panel_draws_narrow_and_wide_light_and_dark(
     report: Report, width: int, theme: str
 ) -> None:
@@ -264,7 +263,7 @@ def test_a_lone_sample_between_two_gaps_is_a_point(
     t_ns = run.zero_ns + 1_400_000_000
     body = msgspec.json.encode(msgspec.structs.replace(status, t_ns=t_ns, margin=0.7))
     path = tmp_path / "lone.html"
-    with_sample = runs.rewritten(log, tmp_path, more=[(t_ns, topics.PLANNER_STATUS.name, body)])
+    with_sample = runs.changed(log, more=[(t_ns, topics.PLANNER_STATUS.name, body)])
     path.write_text(render(with_sample), encoding="utf-8")
     points, lines = Report(report.tab, path).do(["points", "Certificate"], ["lines", "Certificate"])
     assert [colour for colour, _ in points] == ["#0b5fa5", "#c4501b"]

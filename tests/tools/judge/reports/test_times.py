@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -20,6 +19,7 @@ from shared.joints import MODULES
 from shared.links import DIRECTIONS, WRENCHES
 from shared.network.impairment_schedule import ImpairmentSchedule
 from tests.tools.judge.reports import runs
+from tools.judge.reports import times
 from tools.judge.reports.page import render
 from tools.judge.reports.panels import ImpairedLink, histories
 from tools.judge.reports.run_data import RunData
@@ -33,9 +33,7 @@ def test_the_rate_of_control_cycles_is_that_of_the_service(page: str) -> None:
         assert np.abs(rate - 500.0).max() < 10.0
 
 
-def test_late_cycles_are_counted_from_arming_and_across_a_restart(
-    log: RunLog, tmp_path: Path
-) -> None:
+def test_late_cycles_are_counted_from_arming_and_across_a_restart(log: RunLog) -> None:
     armed_s = RunData(log).armed_s()
 
     def late(t: float, state: dict[str, Any]) -> None:
@@ -43,8 +41,8 @@ def test_late_cycles_are_counted_from_arming_and_across_a_restart(
         since = max(0.0, t - armed_s)
         state["late"] = 40 + int(10.0 * since) if t < 2.0 else int(10.0 * (t - 2.0))
 
-    page = render(runs.changed(log, tmp_path, "joint/hip_right/state", late))
-    _, counted = runs.line(runs.data_of(page), "Late control cycles", "hip_right")
+    data = runs.drawn(runs.changed(log, {"joint/hip_right/state": late}), times.times)
+    _, counted = runs.line(data, "Late control cycles", "hip_right")
     assert counted[0] == 0.0
     assert counted[-1] == pytest.approx(10.0 * (4.0 - armed_s), abs=3.0)
     assert (np.diff(counted[np.isfinite(counted)]) >= 0.0).all()
@@ -58,23 +56,19 @@ def test_panels_of_real_time_are_left_out_in_virtual_time(page: str) -> None:
         assert f"<li>{line}</li>" in page
 
 
-def test_a_machine_too_slow_for_real_time_is_named_with_the_verdict(
-    log: RunLog, tmp_path: Path
-) -> None:
+def test_a_machine_too_slow_for_real_time_is_named_with_the_verdict(log: RunLog) -> None:
     def slow(_t: float, truth: dict[str, Any]) -> None:
         truth["late_s"] = 1.5
 
     about = {key: value for key, value in log.metadata["run"].items() if key != "lockstep"}
-    page = render(runs.changed(log, tmp_path, "sim/truth", slow, about=about))
+    page = render(runs.changed(log, {"sim/truth": slow}, about=about))
     caution = page.partition('<p class="caution">')[2].partition("</p>")[0]
     assert "too slow for real time" in caution
     assert "1.50 s" in caution
     assert 'class="caution">' not in render(log), "virtual time is never too slow"
 
 
-def test_drives_that_start_together_share_one_row_and_are_no_alarm(
-    log: RunLog, tmp_path: Path
-) -> None:
+def test_drives_that_start_together_share_one_row_and_are_no_alarm(log: RunLog) -> None:
     def coming_up(t: float, state: dict[str, Any]) -> None:
         if t < -2.0:
             state["drive"] = int(DriveStatus.LOST if t < -2.1 else DriveStatus.IDLE)
@@ -83,10 +77,8 @@ def test_drives_that_start_together_share_one_row_and_are_no_alarm(
         if 3.0 <= t < 3.1:
             state["drive"] = int(DriveStatus.IDLE)
 
-    idling = runs.changed(log, tmp_path / "idle", "joint/knee_left/state", idle)
-    rows = timeline_events(
-        RunData(runs.changed(idling, tmp_path / "up", "joint/*/state", coming_up))
-    )
+    idling = runs.changed(log, {"joint/knee_left/state": idle})
+    rows = timeline_events(RunData(runs.changed(idling, {"joint/*/state": coming_up})))
     kinds = {row.text: row.kind for row in rows if "drive" in row.text}
     assert kinds["all six: drive LOST to IDLE"] == "note"
     assert kinds["all six: drive IDLE to ARMED"] == "note"
@@ -102,7 +94,7 @@ def impairment(number: int, link: str, t_ns: int, *, begins: bool, cut: bool) ->
     )  # fmt: skip
 
 
-def test_network_impairments_have_a_panel_marks_and_rows(log: RunLog, tmp_path: Path) -> None:
+def test_network_impairments_have_a_panel_marks_and_rows(log: RunLog) -> None:
     run = RunData(log)
     more: list[tuple[int, str, bytes]] = []
     for number, cut, begin, end in ((1, False, 0.5, 2.0), (2, True, 1.0, 1.5)):
@@ -111,10 +103,13 @@ def test_network_impairments_have_a_panel_marks_and_rows(log: RunLog, tmp_path: 
                 t_ns = run.zero_ns + round(t * 1e9)
                 event = impairment(number, f"planner->{module}", t_ns, begins=begins, cut=cut)
                 more.append((t_ns, topics.LINK_EVENT.name, msgspec.json.encode(event)))
-    impaired = runs.rewritten(log, tmp_path, more=more)
+    impaired = runs.changed(log, more=more)
     data = runs.data_of(render(impaired))
     rows = [row.text for row in timeline_events(RunData(impaired))]
-    (row,) = runs.panel(data, "Injected network impairments")["rows"]
+    titles = [panel["title"] for panel in data["panels"]]
+    place = titles.index("Injected network impairments")
+    assert titles[place + 1] == "Command age", "to be compared with it"
+    (row,) = data["panels"][place]["rows"]
     assert row["label"] == "to left"
     starts, _, codes = zip(*row["spans"][1:], strict=True)
     assert starts == pytest.approx((0.5, 1.0, 1.5, 2.0), abs=1e-3)
@@ -127,43 +122,32 @@ def test_network_impairments_have_a_panel_marks_and_rows(log: RunLog, tmp_path: 
     assert "network, planner->left partition ends; 60 messages passed, 21 lost" in rows
 
 
-def test_the_ages_follow_the_panel_of_network_impairments(log: RunLog, tmp_path: Path) -> None:
-    t_ns = RunData(log).zero_ns + 10**9
-    event = msgspec.json.encode(impairment(1, "planner->knee_left", t_ns, begins=True, cut=True))
-    data = runs.data_of(
-        render(runs.rewritten(log, tmp_path, more=[(t_ns, topics.LINK_EVENT.name, event)]))
-    )
-    titles = [panel["title"] for panel in data["panels"]]
-    place = titles.index("Injected network impairments")
-    assert titles[place + 1] == "Command age"
-
-
-def test_ages_of_seconds_do_not_flatten_ages_of_milliseconds(log: RunLog, tmp_path: Path) -> None:
+def test_ages_of_seconds_do_not_flatten_ages_of_milliseconds(log: RunLog) -> None:
     def cut_off(_t: float, status: dict[str, Any]) -> None:
         status["state_age_ns"] = [3_000_000_000] * 6
 
-    page = render(runs.changed(log, tmp_path, "planner/status", cut_off))
-    panel = runs.panel(runs.data_of(page), "Age of the planner's inputs")
+    data = runs.drawn(runs.changed(log, {"planner/status": cut_off}), times.ages)
+    panel = runs.panel(data, "Age of the planner's inputs")
     assert panel["reach"] == pytest.approx(200.0)
     assert "The delay before the arrival is not included" in panel["note"]
 
 
-def test_the_back_off_of_the_planner_is_in_the_timeline(log: RunLog, tmp_path: Path) -> None:
+def test_the_back_off_of_the_planner_is_in_the_timeline(log: RunLog) -> None:
     def waits(t: float, status: dict[str, Any]) -> None:
         status["wait_s"] = 3.5 - t if 2.5 <= t < 3.5 else 0.0
 
-    found = timeline_events(RunData(runs.changed(log, tmp_path, "planner/status", waits)))
+    found = timeline_events(RunData(runs.changed(log, {"planner/status": waits})))
     (row,) = [row for row in found if "backs off" in row.text]
     assert row.t == pytest.approx(2.5, abs=0.01)
     assert row.text.startswith("planner: backs off for 1.0 s or more")
 
 
-def test_a_trip_of_the_planner_is_named_in_the_timeline(log: RunLog, tmp_path: Path) -> None:
+def test_a_trip_of_the_planner_is_named_in_the_timeline(log: RunLog) -> None:
     def tripped(t: float, status: dict[str, Any]) -> None:
         if t >= 2.5:
             status |= {"mode": int(PlannerMode.TRIPPED), "trip": int(Trip.SAGGING)}
 
-    found = timeline_events(RunData(runs.changed(log, tmp_path, "planner/status", tripped)))
+    found = timeline_events(RunData(runs.changed(log, {"planner/status": tripped})))
     assert any(row.text.startswith("planner: LEADING to TRIPPED, SAGGING") for row in found)
 
 
