@@ -46,3 +46,19 @@ def shown(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("shown") / "shown.mcap"
     assert cli.main(["log", "export", str(made.path), "--scene", "-o", str(out)]) == 0
     return out
+
+
+IMPAIRED = (
+    "planner->joints delay=25 at=0.4 for=0.6",
+    "planner->left delay=40 jitter=5 at=0.7 for=0.6",
+    "all partition at=1.5 for=0.4",
+)
+
+
+@pytest.fixture(scope="session")
+def impaired(tmp_path_factory: pytest.TempPathFactory) -> RunLog:
+    """A run over a network that is impaired twice, one over the other, and then cut."""
+    out = tmp_path_factory.mktemp("impaired")
+    flags = [word for impairment in IMPAIRED for word in ("--inject", impairment)]
+    assert cli.main(["sim", "--out", str(out), "--duration", "2", *flags]) == 0
+    return read_run(out / "run.mcap")

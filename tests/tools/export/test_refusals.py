@@ -19,8 +19,10 @@ WAIT_S = 60.0
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
-@pytest.mark.parametrize("flag", ["--ros2bag", "--csv"])
+@pytest.mark.parametrize(
+    ("flag", "number"),
+    [("--csv", signal.SIGKILL), ("--csv", signal.SIGINT), ("--ros2bag", signal.SIGTERM)],
+)
 def test_a_folder_that_is_ended_half_way_is_not_there_and_is_written_the_next_time(
     run_file: Path, tmp_path: Path, flag: str, number: signal.Signals
 ) -> None:

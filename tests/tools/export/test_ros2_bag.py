@@ -92,12 +92,12 @@ def test_when_the_planner_is_dead_the_diagnostics_say_so(bag: Path, run_file: Pa
     assert set(said) == {"silent: each module holds by itself"}
 
 
-@pytest.mark.parametrize("years", [80, 540])
 def test_a_run_after_2038_is_refused_as_a_bag_and_has_its_other_exports(
-    run_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], years: int
+    run_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """In 2510 also 32-bit seconds are over."""
     log = read_run(run_file)
-    log.offset_ns += years * 365 * 86_400 * 10**9
+    log.offset_ns += 540 * 365 * 86_400 * 10**9
     log.metadata["clock"]["offset_ns"] = str(log.offset_ns)
     path = tmp_path / "late.mcap"
     rewritten.write(log, path, {}, {})

@@ -9,25 +9,12 @@ import pytest
 from matplotlib.figure import Figure
 
 from shared.config.robot_config import RobotConfig
-from tools import cli
 from tools.judge import figure, verdict
-from tools.logs.run_log import RunLog, read_run
-
-LATE = "planner->joints delay=25 at=0.4 for=0.6"
-LEFT = "planner->left delay=40 jitter=5 at=0.7 for=0.6"
+from tools.logs.run_log import RunLog
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> RunLog:
-    """Return a run over a network that is impaired twice, one over the other."""
-    out = tmp_path_factory.mktemp("figure")
-    flags = ["--duration", "1.5", "--inject", LATE, "--inject", LEFT]
-    assert cli.main(["sim", "--out", str(out), *flags]) == 0
-    return read_run(out / "run.mcap")
-
-
-@pytest.fixture(scope="module")
-def drawn(log: RunLog, tmp_path_factory: pytest.TempPathFactory) -> Figure:
+def drawn(impaired: RunLog, tmp_path_factory: pytest.TempPathFactory) -> Figure:
     kept: list[Figure] = []
     patch = pytest.MonkeyPatch()
     save = Figure.savefig
@@ -39,7 +26,7 @@ def drawn(log: RunLog, tmp_path_factory: pytest.TempPathFactory) -> Figure:
     patch.setattr(Figure, "savefig", keep)
     try:
         path = tmp_path_factory.mktemp("drawn") / "run.png"
-        figure.draw(log, "x", verdict.summarise(log, 1.5), path)
+        figure.draw(impaired, "x", verdict.summarise(impaired, 2.0), path)
     finally:
         patch.undo()
     return kept[0]
@@ -65,9 +52,10 @@ def test_each_impairment_has_a_lane_with_its_words_and_no_curve(drawn: Figure) -
     assert [text.get_text() for text in axis.texts] == [
         "planner->joints delay=25ms, 0.40 to 1.00 s",
         "planner->left delay=40ms jitter=5ms, 0.70 to 1.30 s",
+        "all partition, 1.50 to 1.90 s",
     ]
     assert not axis.get_lines()
-    assert len({text.xy[1] for text in axis.texts}) == 2, "one below the other"
+    assert len({text.xy[1] for text in axis.texts}) == 3, "one below the other"
 
 
 def test_where_two_impairments_overlap_each_begin_and_end_has_a_line(drawn: Figure) -> None:
@@ -77,7 +65,7 @@ def test_where_two_impairments_overlap_each_begin_and_end_has_a_line(drawn: Figu
         for line in axis.get_lines()
         if line.get_color() == figure.IMPAIRED_COLOUR
     }
-    assert edges == {0.4, 0.7, 1.0, 1.3}
+    assert edges == {0.4, 0.7, 1.0, 1.3, 1.5, 1.9}
 
 
 def test_no_legend_covers_a_curve(drawn: Figure) -> None:
@@ -89,23 +77,24 @@ def test_no_legend_covers_a_curve(drawn: Figure) -> None:
 
 
 def test_a_panel_for_the_network_is_there_only_if_something_was_done_to_it(
-    log: RunLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    impaired: RunLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    summary = verdict.summarise(log, 1.5)
+    summary = verdict.summarise(impaired, 2.0)
     monkeypatch.setattr(figure, "impairments", lambda _: [])
     labels: list[str] = []
     monkeypatch.setattr(
         Figure, "savefig", lambda self, *_, **__: labels.extend(a.get_ylabel() for a in self.axes)
     )
-    figure.draw(log, "x", summary, tmp_path / "run.png")
+    figure.draw(impaired, "x", summary, tmp_path / "run.png")
     assert "network" not in labels
     assert len(labels) == 6
 
 
-def test_ages_while_impaired_and_otherwise_are_separate(log: RunLog) -> None:
-    summary = verdict.summarise(log, 1.5)
-    impaired, otherwise = (summary[f"command_age_{when}_ms"] for when in ("impaired", "otherwise"))
+def test_ages_while_impaired_and_otherwise_are_separate(impaired: RunLog) -> None:
+    summary = verdict.summarise(impaired, 2.0)
+    late, otherwise = (summary[f"command_age_{when}_ms"] for when in ("impaired", "otherwise"))
     assert otherwise["median"] <= otherwise["p99"] < 20.0
-    assert 25.0 <= impaired["median"] <= impaired["p99"]
-    assert [row["link"] for row in summary["impairments"]] == ["planner->joints", "planner->left"]
-    assert summary["links_impaired"] == 2
+    assert 25.0 <= late["median"] <= late["p99"]
+    links = [row["link"] for row in summary["impairments"]]
+    assert links == ["planner->joints", "planner->left", "all"]
+    assert summary["links_impaired"] == 3

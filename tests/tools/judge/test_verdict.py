@@ -13,7 +13,6 @@ from services.simulator.physics.plant import IDEAL
 from services.simulator.physics.world import World
 from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
-from shared.config.scenarios import Push
 from tests.lockstep.runs import still
 from tools import cli
 from tools.judge import verdict, verdict_table
@@ -85,8 +84,8 @@ def test_a_run_is_judged_by_how_it_stands_at_its_end(
 def sound(tmp_path_factory: pytest.TempPathFactory) -> Summary:
     """The summary of a run to which nothing happens."""
     out = tmp_path_factory.mktemp("sound")
-    assert cli.main(["sim", "--duration", "4", "--out", str(out)]) == 0
-    return verdict.summarise(read_run(out / "run.mcap"), 4.0)
+    assert cli.main(["sim", "--duration", "2", "--out", str(out)]) == 0
+    return verdict.summarise(read_run(out / "run.mcap"), 2.0)
 
 
 def test_a_run_in_virtual_time_has_no_stalls_and_says_nothing_of_them(sound: Summary) -> None:
@@ -141,15 +140,6 @@ def test_each_figure_of_soundness_is_judged_by_its_limit(key: str) -> None:
     assert why_not_sound(calm | {key: limit.limit}) == ""
     assert limit.what in why_not_sound(calm | {key: 1.01 * limit.limit})
     assert why_not_sound(dict.fromkeys(SOUND)) == "", "of which nothing is known"
-
-
-def test_hard_pushes_are_reported(tmp_path: Path) -> None:
-    """130 N from the side keep a knee's motors at their limit."""
-    push = Push(at=0.5, duration=0.5, force=(0.0, 130.0, 0.0))
-    words = f"{push.at:g}:{push.duration:g}:0,130,0"
-    cli.main(["sim", "--duration", "2", "--push", words, "--out", str(tmp_path)])
-    summary = verdict.summarise(read_run(tmp_path / "run.mcap"), 2.0)
-    assert summary["torque_at_limit_ms"] > 50.0
 
 
 def test_nothing_is_reported_of_a_gap_in_the_log() -> None:

@@ -21,23 +21,12 @@ from shared.robot.robot_model import stand_pose
 from tools import cli
 from tools.judge.run_parts import zero_ns
 from tools.lab.design.torque_breakdown import torque_breakdown
-from tools.logs.run_log import RunLog, read_run, robot_of
+from tools.logs.run_log import RunLog, robot_of
 from tools.verbs.log import explain
 
 
-@pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> RunLog:
-    """Return a run: down for 1.5 s, the planner killed, back, and down again."""
-    out = tmp_path_factory.mktemp("explain")
-    flags = ["--duration", "2.5", "--kill", "planner@1.5", "--restart", "planner@1.8"]
-    assert cli.main(["sim", "--out", str(out), *flags]) == 0
-    return read_run(out / "run.mcap")
-
-
-@pytest.mark.parametrize("at_s", [0.3, 1.2, 2.4, None])
-def test_a_tick_recomputed_from_the_log_is_the_tick_that_was_sent(
-    log: RunLog, at_s: float | None
-) -> None:
+@pytest.mark.parametrize("at_s", [0.3, 0.9, 2.4, 3.0])
+def test_a_tick_recomputed_from_the_log_is_the_tick_that_was_sent(log: RunLog, at_s: float) -> None:
     tick = explain.tick_at(log, at_s, zero_ns(log.index))
     robot = robot_of(log)
     q, v = (np.array([getattr(s, n) for s in tick.states]).ravel() for n in ("q", "v"))
@@ -61,60 +50,50 @@ def test_a_tick_recomputed_from_the_log_is_the_tick_that_was_sent(
 def test_the_tick_is_the_last_at_or_before_the_time(log: RunLog) -> None:
     statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
     zero = zero_ns(log.index)
-    early, late = (explain.tick_at(log, at_s, zero).status for at_s in (1.0, 1.004))
+    early, late = (explain.tick_at(log, at_s, zero).status for at_s in (0.8, 0.804))
     assert late.seq == early.seq + 1
     assert explain.tick_at(log, None, zero).status == statuses[-1]
-
-
-@pytest.fixture(scope="module")
-def cut(tmp_path_factory: pytest.TempPathFactory) -> RunLog:
-    """Return a run: late commands from 0.5 s, then nothing passes from 1.2 s on."""
-    out = tmp_path_factory.mktemp("cut")
-    late, gone = "planner->joints delay=20 at=0.5 for=0.5", "all partition at=1.2 for=0.4"
-    flags = ["--duration", "2", "--inject", late, "--inject", gone]
-    assert cli.main(["sim", "--out", str(out), *flags]) == 0
-    return read_run(out / "run.mcap")
 
 
 @pytest.mark.parametrize(
     ("at", "words"),
     [
         ("0.3", "network: nothing is done to it here"),
-        ("0.8", "network: planner->joints delay=20ms, 0.50 to 1.00 s"),
-        ("1.5", "network: all partition, 1.20 to 1.60 s"),
+        ("0.6", "network: planner->joints delay=25ms, 0.40 to 1.00 s"),
+        ("1.8", "network: all partition, 1.50 to 1.90 s"),
     ],
 )
 def test_the_impairments_at_the_tick_are_reported(
-    cut: RunLog, at: str, words: str, capsys: pytest.CaptureFixture[str]
+    impaired: RunLog, at: str, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli.main(["log", "explain", str(cut.path), "--at", at]) == 0
+    assert cli.main(["log", "explain", str(impaired.path), "--at", at]) == 0
     assert words in capsys.readouterr().out
 
 
 def test_the_age_of_each_command_is_reported(
-    cut: RunLog, capsys: pytest.CaptureFixture[str]
+    impaired: RunLog, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli.main(["log", "explain", str(cut.path), "--at", "0.8"]) == 0
+    assert cli.main(["log", "explain", str(impaired.path), "--at", "0.6"]) == 0
     shown = " ".join(capsys.readouterr().out.split())
     for module in MODULES:
         found = re.search(rf"{module} TRACK (\d+\.\d) ms", shown)
         assert found is not None
-        assert 20.0 <= float(found[1]) < 32.0
+        assert 25.0 <= float(found[1]) < 37.0
 
 
 def test_where_the_planner_did_not_tick_the_modules_are_described_as_they_were_then(
-    cut: RunLog, capsys: pytest.CaptureFixture[str]
+    impaired: RunLog, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli.main(["log", "explain", str(cut.path), "--at", "1.5"]) == 0
+    assert cli.main(["log", "explain", str(impaired.path), "--at", "1.8"]) == 0
     shown = " ".join(capsys.readouterr().out.split())
-    assert "at 1.5 s the planner did not tick" in shown
-    assert re.search(r"The modules at 1.5 s: ankle_right HOLD 30\d\.\d ms", shown)
+    assert "at 1.8 s the planner did not tick" in shown
+    assert re.search(r"The modules at 1.8 s: ankle_right HOLD 30\d\.\d ms", shown)
 
 
 def test_the_torques_by_origin_of_every_joint_are_printed(
     log: RunLog, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli.main(["log", "explain", str(log.path), "--at", "1.2"]) == 0
+    assert cli.main(["log", "explain", str(log.path), "--at", "0.9"]) == 0
     shown = capsys.readouterr().out
     for joint in JOINTS:
         rows = re.findall(rf"^ ?{joint} +(.*)$", shown, re.MULTILINE)
