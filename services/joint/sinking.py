@@ -2,7 +2,7 @@
 
 Every phi holds. The theta axes of `damp_sinks` lose their stiffness and carry their load
 as feedforward that fades: a slow sink, never a drop. A knee is caught at its stop, or at its
-present angle when the other knee does not sink with it. An ankle holds; as its knee folds, its
+present angle when another module does not go down with it. An ankle holds; as its knee folds, its
 reference turns so that the hip joint stays as far ahead of it as it was, and with it the COM:
 
     ahead = l2 sin(ankle) + l1 sin(ankle + knee)

@@ -90,9 +90,8 @@ class Bench(ModuleBench):
     """One module that passes torques on; the joint stays where it is."""
 
     def __init__(self, robot: RobotConfig) -> None:
-        super().__init__(
-            torques_only(robot), "service", make=lambda config, name, _: PassThrough(config, name)
-        )
+        super().__init__(torques_only(robot), "service")
+        self.module = PassThrough(self.robot, "knee_right")
         self.cycle()
         for _ in range(400):  # until the blend into TRACK is over
             self.passes(TAU)

@@ -32,9 +32,10 @@ from tools.logs.run_log import read_run
 
 pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(480)]
 
-KILL_S, RESTART_S = 1.2, 3.6
+KILL_S, RESTART_S = 2.45, 4.3
+"""At the bottom of the squat a kill that comes late changes no height."""
 UPHILL = ("--imu", "--plant", "floor.slope=[0.05,0.0]")
-PUSHES = ("--push", "2:0.3:40,0,0", "--push", "3:0.3:0,40,0")
+PUSHES = ("--push", "3:0.3:40,0,0", "--push", "3.8:0.3:0,40,0")
 
 BANDS = {
     "alive_com_x_max_mm": 6.0,
@@ -96,7 +97,7 @@ def lead(verb: str, out: Path, *flags: str) -> Run:
 def experiment(restart_s: float) -> tuple[str, ...]:
     """Return the flags of a run whose planner is started again at a time of the scenario."""
     times = ("--kill", f"planner@{KILL_S}", "--restart", f"planner@{restart_s:.3f}")
-    return ("--duration", "7", *times, *UPHILL, *PUSHES)
+    return ("--duration", "7.5", *times, *UPHILL, *PUSHES)
 
 
 def is_undisturbed(live: Run, lockstep: Run) -> bool:
