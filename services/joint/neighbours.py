@@ -39,6 +39,8 @@ SILENT_NS: Final = 40 * NS_PER_MS
 before the drive counts as lost, which is for good."""
 GONE_NS: Final = round(LOST_S * NS_PER_S)
 """Age of a row beyond which its service is dead or its drive is lost, ns."""
+_LEG: Final = N_MODULES // 2
+"""From a module to its like of the other leg."""
 _SUM: Final = struct.Struct("<Q")
 _BODY: Final = struct.Struct("<QddQQQ")
 _ROW: Final = struct.Struct("<QQddQQQ")
@@ -113,6 +115,9 @@ def view_of(module: str, rows: Sequence[NeighbourRow | None], now_ns: int) -> Ne
             return NeighbourView(stiffen=stiffen)
         return NeighbourView((ankle.theta + knee.theta, ankle.rate + knee.rate), stiffen=stiffen)
     if kind == "knee":
+        other = rows[(own + _LEG) % N_MODULES]
+        if other is None or _is_elsewhere(other, now_ns):
+            return NeighbourView(stiffen=stiffen)  # to stop alone would tip the robot for sure
         others = (row for at, row in enumerate(rows) if at != own and row is not None)
         stays = any(_stays(row, now_ns) for row in others)
         return NeighbourView(sinks=not stays, stiffen=stiffen)
@@ -127,10 +132,15 @@ def _is_fresh(row: NeighbourRow, now_ns: int) -> bool:
     return abs(now_ns - row.t_ns) <= STALE_NS
 
 
+def _is_elsewhere(row: NeighbourRow, now_ns: int) -> bool:
+    """Return True for a module of another host, or of its clock."""
+    return row.t_ns == 0 or row.t_ns > now_ns + STALE_NS
+
+
 def _stays(row: NeighbourRow, now_ns: int) -> bool:
-    """Return True if a module that was seen before does not go down with the others."""
-    if row.t_ns == 0 or row.t_ns > now_ns + STALE_NS:
-        return False  # of another host, or its clock
+    """Return True if a module of this host does not go down with the others."""
+    if _is_elsewhere(row, now_ns):
+        return False
     return now_ns - row.t_ns > GONE_NS or row.mode != Mode.DAMP or row.caught > 0
 
 

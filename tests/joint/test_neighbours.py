@@ -82,6 +82,14 @@ def test_which_module_holds_beside_which() -> None:
         assert found.stiffen is stiffens, (asks, other, mode, age_ns)
 
 
+def test_a_knee_whose_like_is_on_another_host_sinks_on_with_it() -> None:
+    """The other leg knows nothing: to stop alone would tip the robot for sure."""
+    dead = NeighbourRow(T0 - GONE_NS - 1, 0.0, 0.0, Mode.DAMP)
+    assert not view_of("knee_left", rows(hip_left=dead), T0).sinks
+    for elsewhere in (NeighbourRow(0, 0.0, 0.0, 0), NeighbourRow(T0 + STALE_NS + 1, 0.0, 0.0, 3)):
+        assert view_of("knee_left", rows(hip_left=dead, knee_right=elsewhere), T0).sinks
+
+
 @pytest.mark.parametrize("own_age_ns", [0, STALE_NS, STALE_NS + 1])
 def test_a_drive_that_is_silent_beside_one_that_is_heard_may_be_limp(own_age_ns: int) -> None:
     """A machine that stood still silences them all, and is no reason to stiffen."""
