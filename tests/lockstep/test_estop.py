@@ -201,8 +201,9 @@ def test_it_comes_down_on_its_feet_without_a_planner(
     assert found.sank > 0.1
 
 
-@pytest.mark.parametrize("hand", [False, True])
-@pytest.mark.parametrize(("height", "at", "sank"), [(1.0, 3.6, 0.02), (1.188, 5.2, 0.1)])
+@pytest.mark.parametrize(
+    ("height", "at", "sank", "hand"), [(1.0, 3.6, 0.02, False), (1.188, 5.2, 0.1, True)]
+)
 @pytest.mark.parametrize("dead", MODULES[:3])
 def test_beside_a_dead_service_whose_drive_holds_the_others_hold_where_they_are(
     heavy: RobotConfig, led_to: Callable[[float], FleetMoment], dead: str, height: float,
