@@ -86,8 +86,17 @@ def test_a_knee_whose_like_is_on_another_host_sinks_on_with_it() -> None:
     """The other leg knows nothing: to stop alone would tip the robot for sure."""
     dead = NeighbourRow(T0 - GONE_NS - 1, 0.0, 0.0, Mode.DAMP)
     assert not view_of("knee_left", rows(hip_left=dead), T0).sinks
+    limp = NeighbourRow(T0, 0.0, 0.0, Mode.FAULT)
     for elsewhere in (NeighbourRow(0, 0.0, 0.0, 0), NeighbourRow(T0 + STALE_NS + 1, 0.0, 0.0, 3)):
         assert view_of("knee_left", rows(hip_left=dead, knee_right=elsewhere), T0).sinks
+        assert view_of("knee_left", rows(ankle_left=limp, knee_right=elsewhere), T0).stiffen
+
+
+def test_a_knee_waits_neither_for_itself_nor_for_what_is_not_known() -> None:
+    caught = NeighbourRow(T0, 0.0, 0.0, Mode.DAMP, caught=1)
+    never = NeighbourRow(0, 0.0, 0.0, 0)
+    for known in ({"knee_left": caught}, {"hip_right": None}, {"hip_right": never}):
+        assert view_of("knee_left", rows(**known), T0).sinks
 
 
 @pytest.mark.parametrize("own_age_ns", [0, STALE_NS, STALE_NS + 1])

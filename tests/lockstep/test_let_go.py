@@ -109,6 +109,17 @@ def test_half_a_payload_too_much_or_too_little_or_too_far_back_is_not_led(
     assert words in status.why
 
 
-def test_with_a_hand_on_it_a_heavier_robot_is_led(robot: RobotConfig) -> None:
-    outcome, *_ = let_go(robot, {"body.payload_scale": 1.2}, duration=LET_GO_S)
+def test_a_hand_that_comes_back_leads_again(robot: RobotConfig) -> None:
+    """Let go of for 2.5 s, with a payload that pulls it down."""
+    modes: list[tuple[float, int]] = []
+
+    def look(fleet: Lockstep, row: SimTruth) -> None:
+        fleet.world.outside.holds = not LET_GO_S <= row.scenario_s < LET_GO_S + 2.5
+        modes.append((row.scenario_s, status_of(fleet).mode))
+
+    heavy = changed(PlantConfig(), {"body.payload_scale": 1.2})
+    outcome = run(robot, led_to((2.0, 1.1), duration=8.0), plant=heavy, each=look)
+    assert outcome.stood
+    assert {mode for t, mode in modes if t < LET_GO_S} == {PlannerMode.LEADING}
+    assert modes[-250][1] == PlannerMode.TRIPPED, "on its own it was held"
     assert outcome.status.mode == PlannerMode.LEADING

@@ -115,7 +115,7 @@ class Compared(NamedTuple):
 
     live: list[Run]
     apart: list[dict[str, tuple[float, float]]]
-    """Of each undisturbed run the figures that differ; the last is empty if one agreed."""
+    """Figures that differ, for each undisturbed run; the last is empty if one agreed."""
     began_ns: int
 
 

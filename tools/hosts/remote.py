@@ -61,7 +61,11 @@ class Remote:
         self._as_user = ["env", "-C", "/", "runuser", "-u", hosts.user, "--"]
 
     def run(self, *words: str, **manner: Unpack[Manner]) -> Said:
-        """Run a command, which no shell takes apart, and wait for it; its failure is no error."""
+        """Run a command, which no shell takes apart, and wait for it; how it ends is no error.
+
+        Raises:
+            FleetError: the host is not reached, or the command does not end in time.
+        """
         timeout_s = manner.get("timeout_s", TIMEOUT_S)
         command, name = self._command(words, manner), self.host.name
         try:
@@ -79,7 +83,11 @@ class Remote:
         return Said(done.returncode, done.stdout.decode(errors="replace"), errors)
 
     def follow(self, *words: str, tell: Callable[[str], None], **manner: Unpack[Manner]) -> None:
-        """Run a command that has to succeed, and hand on each line as it prints it."""
+        """Run a command, and hand on each line as it prints it.
+
+        Raises:
+            FleetError: the host is not reached, or the command fails.
+        """
         pipe = subprocess.PIPE
         command, name = self._command(words, manner), self.host.name
         try:

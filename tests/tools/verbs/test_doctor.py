@@ -39,7 +39,7 @@ TRAPS = {
 PRE_CALIBRATED = "motor.config.pre_calibrated"
 RAW = f"{MODULE}.axis1.{PRE_CALIBRATED}"
 ODD = "hip_left.axis1.motor.config.pole_pairs"
-"""Of one board otherwise than of the others."""
+"""One board has another number than the others."""
 MEASURED = ("heartbeat", "encoder frames", "load cells", "processors")
 """What depends on how busy the machine is: a full one may find any of it wrong."""
 START_S = 60.0

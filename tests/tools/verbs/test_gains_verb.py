@@ -17,7 +17,7 @@ from tools.lab.design import split_program
 
 TEXT = ROBOT_FILE.read_text(encoding="utf-8")
 GRID = {"N_HEIGHTS": 5, "DYNAMIC_HEIGHTS": 2, "DYNAMIC_PITCHES": (0.0,)}
-"""Of the schedule made here; tests/tools/lab/design makes one as it is shipped."""
+"""Grid of the schedule made here; tests/tools/lab/design makes one as it is shipped."""
 
 
 def robot_file(tmp_path: Path, key: str = "", value: str = "") -> Path:

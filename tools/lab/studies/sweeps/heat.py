@@ -229,7 +229,7 @@ class HeldMoment(NamedTuple):
 
     t_s: float
     height: float
-    """Of the torso, m."""
+    """Height of the torso, m."""
     true: float
     """Warmest winding, C."""
     estimated: float

@@ -69,7 +69,7 @@ class HeatTrial(msgspec.Struct, frozen=True, kw_only=True):
     seed: int
     ambient: float
     height: float
-    """Of the torso, m."""
+    """Height of the torso, m."""
     pitch: float
     assist: float
     """N"""

@@ -42,9 +42,9 @@ DPI: Final = 120
 SHARES_IN: Final = 2.7
 """Height of the curves, inches."""
 BOUNDS_COLUMNS: Final = 8
-"""In a map of more delays there is room in a cell for falls and trials only;"""
+"""In a map of more delays a cell has room for falls and trials only."""
 COUNTS_COLUMNS: Final = 24
-"""of more than these, for nothing."""
+"""In a map of more delays a cell has room for no number."""
 
 
 class Falls(NamedTuple):
