@@ -228,7 +228,7 @@ def test_interrupted_it_stands_where_it_is(robot: RobotConfig, at: float) -> Non
 def test_a_hand_that_holds_it_up_is_not_pressed_down(robot: RobotConfig) -> None:
     found = go_down(robot, still(40.0))
     assert "held up" in found.fleet.error
-    assert max(abs(row.operator_force[2]) for row in found.rows) < 90.0
+    assert max(abs(row.operator_force[2]) for row in found.rows) < 95.0
     assert found.height > 1.05
 
 

@@ -19,7 +19,17 @@ from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Push, Scenario
 from shared.robot.trip_table import JOINT_TRIPS, untripped
-from tests.lockstep.runs import Heard, Run, modes_of, push, run, standing_as, still, variant
+from tests.lockstep.runs import (
+    Heard,
+    Run,
+    kill,
+    modes_of,
+    push,
+    run,
+    standing_as,
+    still,
+    variant,
+)
 from tools.lab.studies.sweeps.trips_trial import PLANTS, unfiltered
 from tools.sim.lockstep import Lockstep
 
@@ -202,6 +212,39 @@ def test_leaned_on_from_the_side_it_holds_and_is_led_again(
     assert outcome.stood
     assert {Trip(status.trip) for status in said} == {Trip.NONE, Trip.EDGE}
     assert outcome.status.mode == PlannerMode.LEADING
+
+
+def lean_slowly(*force: float) -> tuple[Push, ...]:
+    """Return a push that rises in 20 steps from 2.5 s to 5.5 s, and lasts until 9.5 s."""
+    x, y = (part / 20 for part in force)
+    starts = [2.5 + 3.0 * step / 20 for step in range(20)]
+    return tuple(Push(at=at, duration=9.5 - at, force=(x, y, 0.0)) for at in starts)
+
+
+@pytest.mark.parametrize(
+    ("height", "force", "row"),
+    [
+        (1.188, (0.0, 55.0), 1),
+        (0.95, (0.0, -55.0), 1),
+        (1.188, (45.0, 0.0), 0),
+        (0.95, (-50.0, 0.0), 0),
+    ],
+)
+def test_leaned_on_slowly_it_is_led_on_and_comes_back_and_killed_then_it_stands(
+    robot: RobotConfig, height: float, force: tuple[float, float], row: int
+) -> None:
+    """The push goes on while the planner dies, and ends afterwards."""
+    led: list[float] = []
+
+    def look(fleet: Lockstep, truth: SimTruth) -> None:
+        if truth.scenario_s < 8.0:
+            led.append(truth.com[row])
+            assert set(modes_of(fleet)) == {Mode.TRACK}
+
+    leant = still(11.0, height, push=lean_slowly(*force), kill=kill(8.0))
+    outcome = run(robot, leant, each=look)
+    assert outcome.stood
+    assert abs(led[-1]) < 0.8 * max(map(abs, led))
 
 
 def test_leaned_on_by_30_newtons_it_is_led_on(robot: RobotConfig) -> None:

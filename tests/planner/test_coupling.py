@@ -7,8 +7,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.planner.law.coupling import CouplingFilter, UncoupledGains, pole_gain
+from services.planner.law.coupling import (
+    FAST,
+    BodyIntegral,
+    CoupledTorque,
+    UncoupledGains,
+    pole_gain,
+)
 from services.planner.law.small_matrices import LuDecomposition, eigenvalue_min, positive_part
+from shared.config.robot_config import RobotConfig
+from tests.planner.states import with_law
 
 K_P = np.array([2810.0, 2810.0, 0.0, 800.0, 0.0, 400.0])
 
@@ -17,6 +25,12 @@ B_P = np.array([300.0, 300.0, 0.0, 60.0, 0.0, 40.0])
 
 
 S = np.array([0.0, 0.0, 1.0, 0.0, 1.0, 0.0])
+
+
+Y = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+
+
+STILL = np.zeros(6)
 
 
 CLOSED = np.ix_([0, 1, 3, 5], [0, 1, 3, 5])
@@ -67,30 +81,86 @@ def test_a_pole_follows_its_bandwidth() -> None:
     assert pole_gain(0.0, 1.0) == 0.0
 
 
-def test_a_step_comes_through_two_poles_and_all_of_it() -> None:
-    filtered, share = CouplingFilter(4.0), pole_gain(4.0, 0.004)
+def at_rest(robot: RobotConfig, bandwidth_hz: float) -> CoupledTorque:
+    return CoupledTorque(bandwidth_hz, BodyIntegral(robot.law))
+
+
+def integral_of(robot: RobotConfig, **law: object) -> BodyIntegral:
+    return BodyIntegral(with_law(robot, **law).law)
+
+
+def test_a_step_comes_through_two_poles_and_all_of_it(robot: RobotConfig) -> None:
+    filtered, share = at_rest(robot, 4.0), pole_gain(4.0, 0.004)
     course = [filtered.advance(np.ones(12), 0.004)[0] for _ in range(250)]
     assert course[0] == share * share
     assert (np.diff(course) > 0.0).all()
     np.testing.assert_allclose(course[-1], 1.0, atol=1e-6)
 
 
-def test_above_its_bandwidth_it_falls_with_the_square() -> None:
+def test_above_its_bandwidth_it_falls_with_the_square(robot: RobotConfig) -> None:
     gains = []
     for hz in (20.0, 40.0):
-        filtered = CouplingFilter(2.0)
+        filtered = at_rest(robot, 2.0)
         t = np.arange(2000) * 1e-3
         out = [filtered.advance(np.full(12, np.sin(2 * np.pi * hz * s)), 1e-3)[0] for s in t]
         gains.append(np.abs(out[1000:]).max())
     assert 3.5 < gains[0] / gains[1] < 4.5
 
 
-def test_it_forgets_on_reset() -> None:
-    filtered = CouplingFilter(3.0)
+def test_it_forgets_on_reset(robot: RobotConfig) -> None:
+    filtered = at_rest(robot, 3.0)
     for step in range(20):
         filtered.advance(np.full(12, float(step)), 0.004)
+        filtered.integral.advance(0.01 * Y, STILL, 0.004)
     filtered.reset()
+    np.testing.assert_array_equal(filtered.integral.force, 0.0)
     np.testing.assert_array_equal(filtered.advance(np.zeros(12), 0.004), 0.0)
+
+
+# ---- its integral
+
+
+def test_in_its_time_the_integral_grows_to_what_the_body_s_stiffness_gives(
+    robot: RobotConfig,
+) -> None:
+    integral = integral_of(robot, push_integral_s=(2.0, 2.0))
+    for _ in range(500):
+        integral.advance(0.01 * Y, STILL, 0.004)
+    np.testing.assert_allclose(integral.force, [0.0, robot.law.K_p[1] * 0.01])
+    J = np.random.default_rng(1).normal(size=(6, 12))
+    np.testing.assert_allclose(integral.torque(J), integral.force[1] * J[1])
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_at_its_limit_the_integral_stays_and_comes_back_at_once(
+    robot: RobotConfig, sign: float
+) -> None:
+    integral = integral_of(robot, push_integral_max=(40.0, 60.0))
+    for _ in range(5000):
+        integral.advance(sign * (Y + np.eye(6)[0]), STILL, 0.004)
+    np.testing.assert_array_equal(integral.force, [sign * 40.0, sign * 60.0])
+    integral.advance(-sign * 1e-3 * Y, STILL, 0.004)
+    assert abs(integral.force[1]) < 60.0
+
+
+@pytest.mark.parametrize(
+    ("rate", "share"), [(0.0, 1.0), (0.5, 0.5), (-0.5, 0.5), (1.0, 0.0), (-2.0, 0.0)]
+)
+def test_the_faster_an_error_changes_the_less_of_it_is_integrated(
+    robot: RobotConfig, rate: float, share: float
+) -> None:
+    integral = integral_of(robot, push_integral_s=(2.0, 2.0))
+    integral.advance(0.01 * Y, rate * FAST * Y, 0.004)
+    np.testing.assert_allclose(integral.force[1], share * 0.002 * robot.law.K_p[1] * 0.01)
+
+
+def test_it_integrates_only_closed_directions_that_have_a_limit(robot: RobotConfig) -> None:
+    assert integral_of(robot).rows == [0, 1]
+    assert integral_of(robot, S=(0, 1, 1, 0, 1, 0)).rows == [0]
+    assert integral_of(robot, split="diagonal").rows == []
+    without = integral_of(robot, push_integral_max=(0.0, 60.0))
+    without.advance(np.full(6, 0.01), STILL, 0.004)
+    assert without.force[0] == 0.0 < without.force[1]
 
 
 # ---- the matrices that it solves

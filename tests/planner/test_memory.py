@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from services.planner.intents import OperatorRequest
-from services.planner.law.coupling import CouplingFilter
+from services.planner.law.coupling import BodyIntegral, CoupledTorque
 from services.planner.law.levelling import Levelling, up_of
 from services.planner.law.load import Load
 from services.planner.law.probe import ReferenceProbe
@@ -49,6 +49,12 @@ def weigh(load: Load, tick: int, kg: float) -> Any:
     force = (0.3 * 700.0 if tick < 25 else 700.0 + 9.81 * kg) * UP
     load.advance(force, UP, 0.002 * tick, (0.0, 0.0), DT, led=False)
     return load.refused, load.refusal(), load.state.kg, load.state.a, load.state.b
+
+
+def couple(coupled: CoupledTorque, tick: int) -> Any:
+    coupled.integral.advance(1e-5 * tick * np.ones(6), np.zeros(6), DT)
+    body = coupled.integral.torque(np.ones((6, 12)))
+    return tuple(coupled.advance(body + tick, DT))
 
 
 def shift(follower: ShiftReference, tick: int) -> Any:
@@ -93,9 +99,7 @@ def loaded(kg: float) -> Part:
 
 MOST = (0.01,) * 6
 PARTS = {
-    "coupling": Part(
-        lambda _: CouplingFilter(3.0), lambda one, n: tuple(one.advance(np.full(12, n), DT))
-    ),
+    "coupling": Part(lambda robot: CoupledTorque(3.0, BodyIntegral(robot.law)), couple),
     "levelling": Part(lambda _: Levelling(1.0), level),
     "a load of 9 kg": loaded(9.0),
     "3 kg less": loaded(-3.0),

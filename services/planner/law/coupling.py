@@ -8,7 +8,7 @@ is
 
 (.)+ keeps the positive part: the planner only ever adds stiffness and damping. It requests
 
-    tau_coupled = low-pass { J^T [K_c (p_ref - p) + B_c (pdot_ref - pdot)] }
+    tau_coupled = low-pass { J^T [K_c (p_ref - p) + B_c (pdot_ref - pdot) + F_I] }
 
 through two poles at `coupling_bandwidth_hz`. The feedback is some milliseconds old and acts on the
 bare rotors of a flexible drivetrain. Without the filter, the robot shook below 40 000 N m/rad and
@@ -19,15 +19,20 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.law.small_matrices import positive_part
+from shared.config.sections import LawConfig
 from shared.joints import N_JOINTS
 
 Array = NDArray[np.float64]
 
 
+FAST = 0.04
+"""m/s; the integral takes no error that changes so fast: a shove, and the sway after it. With all
+of the error, a robot shoved to one side swung to the other twice as far as without an integral."""
 GAIN_MIN = 1e-9
 """Smallest gain of the body; a smaller one counts as zero."""
 
@@ -82,11 +87,69 @@ def pole_gain(bandwidth_hz: float, dt: float) -> float:
     return 1.0 - math.exp(-2.0 * math.pi * bandwidth_hz * dt)
 
 
-class CouplingFilter:
-    """Low-pass with two equal poles."""
+class CoupledState(msgspec.Struct, frozen=True):
+    """State of `CoupledTorque`."""
 
-    def __init__(self, bandwidth_hz: float) -> None:
+    first: tuple[float, ...] = (0.0,) * N_JOINTS
+    """N m"""
+    second: tuple[float, ...] = (0.0,) * N_JOINTS
+    force: tuple[float, ...] = ()
+    """F_I, N; () is at rest."""
+
+
+class BodyIntegral:
+    """F_I: force along x and y that grows against a lasting push, until the error is gone.
+
+    A push that lasts is then borne by the coupled torque, whose load sharing asks little of a
+    sole, and no longer by the local springs, which bend the feet's shares until a sole tips:
+
+        F_I' = (1 - |e_p'| / FAST)+ K_p e_p / push_integral_s,    |F_I| <= push_integral_max
+
+    HOLD drops it with the coupled torque: `push_integral_max` is a push that HOLD stands.
+
+    Attributes:
+        rows: of p that are closed and integrated, also those with a limit of 0: the dynamic
+            certificate holds for any limit.
+        gains: rate of the force per error, N/(m s).
+        force: along these rows, N.
+    """
+
+    def __init__(self, law: LawConfig) -> None:
         """Start at rest."""
+        certified = law.split == "certified"  # the paper's has none
+        self.rows = [row for row in (0, 1) if certified and not law.S[row]]
+        self.gains: Array = np.array([law.K_p[row] / law.push_integral_s[row] for row in self.rows])
+        self._most: Array = np.array([law.push_integral_max[row] for row in self.rows])
+        self.force: Array = np.zeros(len(self.rows))
+
+    def advance(self, e_p: Array, e_pdot: Array, dt: float) -> None:
+        """Integrate for dt seconds, within the limits.
+
+        Args:
+            e_p: p_ref - p (6,), m and rad.
+            e_pdot: its rate (6,).
+            dt: time since the last tick, s.
+        """
+        slow = np.maximum(0.0, 1.0 - np.abs(e_pdot[self.rows]) / FAST)
+        force = self.force + dt * slow * self.gains * e_p[self.rows]
+        self.force[:] = np.clip(force, -self._most, self._most)
+
+    def torque(self, J: Array) -> Array:
+        """Return J^T F_I (12,), N m; J is (6, 12)."""
+        torque: Array = self.force @ J[self.rows]
+        return torque
+
+
+class CoupledTorque:
+    """tau_coupled: the body's request with its integral, through a low-pass with two equal poles.
+
+    Attributes:
+        integral: F_I.
+    """
+
+    def __init__(self, bandwidth_hz: float, integral: BodyIntegral) -> None:
+        """Start at rest."""
+        self.integral = integral
         self._bandwidth_hz = bandwidth_hz
         self._first: Array = np.zeros(N_JOINTS)
         self._second: Array = np.zeros(N_JOINTS)
@@ -104,14 +167,16 @@ class CouplingFilter:
         return self._second.copy()
 
     def reset(self) -> None:
-        """Reset the filter to zero."""
-        self._first[:] = 0.0
-        self._second[:] = 0.0
+        """Reset filter and integral to zero."""
+        self._first[:] = self._second[:] = 0.0
+        self.integral.force[:] = 0.0
 
-    def snapshot(self) -> tuple[float, ...]:
-        """Return both poles' states (24,), N m."""
-        return (*self._first.tolist(), *self._second.tolist())
+    def snapshot(self) -> CoupledState:
+        """Return the state between two ticks."""
+        first, second = tuple(self._first.tolist()), tuple(self._second.tolist())
+        return CoupledState(first, second, tuple(self.integral.force.tolist()))
 
-    def restore(self, state: tuple[float, ...]) -> None:
+    def restore(self, state: CoupledState) -> None:
         """Continue from a state that `snapshot` returned."""
-        self._first[:], self._second[:] = state[:N_JOINTS], state[N_JOINTS:]
+        self._first[:], self._second[:] = state.first, state.second
+        self.integral.force[:] = state.force or 0.0

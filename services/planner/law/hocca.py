@@ -12,7 +12,7 @@ One tick, in the paper's letters:
     D, D_B               local gains that the joint services hold: schedule and certificate
     K_c, B_c             the part of K_p and B_p that D and D_B lack
     tau_ff  = J^T (m g up) + J_harness^T (F_assist + F_load) up
-    tau_coupled = low-pass { J^T [K_c (p_ref - p) + B_c (pdot_ref - pdot)] }
+    tau_coupled = low-pass { J^T [K_c (p_ref - p) + B_c (pdot_ref - pdot) + F_I] }
 
 Pure: no clock, bus or thread.
 """
@@ -34,7 +34,7 @@ from services.planner.law.assist import (
     is_still,
     wrench_in_world,
 )
-from services.planner.law.coupling import CouplingFilter
+from services.planner.law.coupling import BodyIntegral, CoupledState, CoupledTorque
 from services.planner.law.gains import GainLaw
 from services.planner.law.height import HeightReference, HeightState, Toward
 from services.planner.law.kinematics import Measured
@@ -76,7 +76,7 @@ class LawOutput(NamedTuple):
     dtau_ff: Array
     tau_coupled: Array
     tau_unfiltered: Array
-    """J^T [K_c e + B_c e'], `tau_coupled` before its low-pass."""
+    """J^T [K_c e + B_c e' + F_I], `tau_coupled` before its low-pass."""
     local: LocalGains
     """D and D_B, certified."""
     p: Array
@@ -105,8 +105,7 @@ class LawState(msgspec.Struct):
     assist: AssistState = msgspec.field(default_factory=AssistState)
     easing: EasingState = msgspec.field(default_factory=EasingState)
     has_led: bool = False
-    coupling: tuple[float, ...] = (0.0,) * (2 * N_JOINTS)
-    """State of `CouplingFilter`, N m."""
+    coupling: CoupledState = CoupledState()
     levelling: tuple[bool, float, float] = (False, 0.0, 0.0)
     """State of `Levelling`: True if a slope is known, and the slope, rad."""
     shift: ShiftState = msgspec.field(default_factory=ShiftState)
@@ -128,7 +127,7 @@ class Hocca:
         self._split = GainSplit(config)
         self._S = gains.S
         self._terms = LawAtReference(gains, self._split)
-        self._coupling = CouplingFilter(self._split.coupling.bandwidth_hz)
+        self._coupling = CoupledTorque(self._split.coupling.bandwidth_hz, BodyIntegral(config.law))
         self._S_perp = 1.0 - self._S
         self._levelling = Levelling(config.imu.levelling_s)
         self._shift = ShiftReference(config.law.shift_max)
@@ -275,8 +274,13 @@ class Hocca:
             measured.D_left,
         )
         result = reference.solve(p_ref)
-        terms = self._terms.evaluate(reference, p_ref - measured.p, pdot_ref - pdot)
-        tau_coupled = self._coupling.advance(terms.coupled, dt)
+        e_p, e_pdot = p_ref - measured.p, pdot_ref - pdot
+        terms = self._terms.evaluate(reference, e_p, e_pdot)
+        integral = self._coupling.integral
+        if probe[0] == NO_ROW:  # it measures the body's answer to an error
+            integral.advance(e_p, e_pdot, dt)
+        tau_unfiltered = terms.coupled + integral.torque(reference.J)
+        tau_coupled = self._coupling.advance(tau_unfiltered, dt)
         # the eased lead goes into tau_coupled, which HOLD drops; in tau_ff it would outlive the
         # hand. It is a force fed forward, not fed-back joint rates, so the harness filter is enough
         tau_coupled += ease_z * reference.J_harness[2] + ease_pitch * reference.J[4]
@@ -287,7 +291,7 @@ class Hocca:
             tau_ff=reference.gravity + reference.assist,
             dtau_ff=reference.dtau_ff.copy(),
             tau_coupled=tau_coupled,
-            tau_unfiltered=terms.coupled,
+            tau_unfiltered=tau_unfiltered,
             local=terms.local,
             p=measured.p.copy(),
             pdot=pdot.copy(),

@@ -34,7 +34,7 @@ Progress = Callable[[str], None]
 STEP: Final = 1.25
 """Ratio between neighbours on the ladders."""
 ROUNDS: Final = 3
-START: Final = Design((40.0, 30.0, 40.0, 8.0, 40.0, 6.0), CouplingGains(3.0, 1.7))
+START: Final = Design((40.0, 30.0, 40.0, 8.0, 40.0, 6.0), CouplingGains(3.0, 2.125))
 LEAD_HZ: Final = 0.3
 """Frequency at which the squat's effort is computed: between its 0.2 Hz and a quick person's."""
 LEAD_M_S: Final = 0.15

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.law.certificate import motor_mean
-from services.planner.law.coupling import UncoupledGains
+from services.planner.law.coupling import BodyIntegral, UncoupledGains
 from services.planner.law.model import BodyInertia
 from services.planner.law.split import CouplingGains
 from shared.config.robot_config import RobotConfig
@@ -205,6 +205,7 @@ class DynamicCertificate:
         S = np.array(law.S, float)
         self._K_p, self._B_p = (np.array(gain) * (1.0 - S) for gain in (law.K_p, law.B_p))
         self._S = S
+        self._integral = BodyIntegral(law)
         self._hands = [HandModel(*hand) for hand in wanted.hands]
         self._halves = (*halves(), whole())
         self._hold = _hold_gains(config)
@@ -225,6 +226,8 @@ class DynamicCertificate:
             design.coupling.bandwidth_hz,
             self._config.law.lead_easing,
             self._config.harness.low_pass_hz,
+            J[self._integral.rows],
+            self._integral.gains,
         )
 
     def held(self, node: StiffnessNode, design: Design, *, onboard: bool) -> Feedback:

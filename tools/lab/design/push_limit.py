@@ -8,6 +8,8 @@ module adds them, for a constant horizontal push F u at the torso's origin:
 
        (K_fail + K_c) dp = F pi,   pi = (dr_torso/dp)^T u,   dtau = -D T dp - J^T K_c dp
 
+   Led, a push that grew slowly leaves no error along x and y up to `law.push_integral_max`.
+
 2. Limit of the body, whatever the control does, at fixed joint angles. A linear program chooses how
    the two legs share weight and push. No gains hold a harder push at that pose.
 
@@ -42,6 +44,8 @@ DIRECTIONS: Final = {
     "sideways": (0.0, 1.0),
 }
 """World x and y of each push. Left and right are symmetric."""
+RIGID: Final = 1e9
+"""N/m; an integral leaves no error."""
 _SLOPE_MIN: Final = 1e-12
 _LEGS: Final = (slice(0, N_LEG), slice(N_LEG, N_JOINTS))
 
@@ -59,7 +63,7 @@ class PushLimits(NamedTuple):
     """The hardest constant push along one direction, for each set of active controllers."""
 
     led: PushLimit
-    """TRACK: joint services and planner."""
+    """TRACK: joint services and planner; a push that has grown slowly."""
     held: PushLimit
     """HOLD: joint services only, the planner is dead."""
     drives: PushLimit
@@ -171,15 +175,48 @@ class LoadedStand:
     ) -> PushLimit:
         """Return the hardest constant push that the gains hold; arguments as for `response`."""
         response = self.response(D, direction, K_c)
+        return self._hardest(response, np.zeros(2 * N_JOINTS))
+
+    def limit_led(
+        self,
+        D: Array,
+        direction: tuple[float, float],
+        K_c: Array,
+        integral_max: tuple[float, float],
+    ) -> PushLimit:
+        """Return the hardest push that gains and integral hold, which grew slowly.
+
+        Args:
+            D: local stiffnesses (12,), N m/rad.
+            direction: world x and y, a unit vector.
+            K_c: stiffness that the planner adds along p (6, 6).
+            integral_max: of F_I along x and y, N; 0: none (`services.planner.law.coupling`).
+        """
+        rows = [row for row in (0, 1) if direction[row] and integral_max[row] > 0.0]
+        rigid = np.zeros((6, 6))
+        rigid[rows, rows] = RIGID
+        response = self.response(D, direction, K_c + rigid)
+        if not rows or response is None:
+            return self.limit_held(D, direction, K_c)
+        until_n = min(integral_max[row] / abs(RIGID * response.dp[row]) for row in rows)
+        hardest = self._hardest(response, np.zeros(2 * N_JOINTS))
+        if hardest.force_n <= until_n:
+            return hardest
+        borne = until_n * np.concatenate((response.dtau, response.soles))
+        beyond = self._hardest(self.response(D, direction, K_c), borne)
+        return beyond._replace(force_n=until_n + beyond.force_n)
+
+    def _hardest(self, response: Response | None, borne: Array) -> PushLimit:
+        """Return the hardest push on top of what torques and soles (24,) bear already."""
         if response is None:
             return PushLimit(0.0, "the stiffness")
-        unpushed = np.concatenate((self._tau, self._soles(self._W)))
+        before = borne + np.concatenate((self._tau, self._soles(self._W)))
         per_newton = np.concatenate((response.dtau, response.soles))
         hardest = PushLimit(math.inf, "nothing")
         for part, row, bound in self._limits:
             slope = float(row @ per_newton)
             if slope > _SLOPE_MIN:
-                force = max(0.0, (bound - float(row @ unpushed)) / slope)
+                force = max(0.0, (bound - float(row @ before)) / slope)
                 hardest = min(hardest, PushLimit(force, part))
         return hardest
 
@@ -247,7 +284,7 @@ def limits_along(
     K_c, _ = uncoupled.at(stand.stiffness(D), stand.along_p(D_B))
     D_hold = np.maximum(D, np.ravel([config.hold_gains(module)[0] for module in MODULES]))
     return PushLimits(
-        stand.limit_held(D, direction, K_c),
+        stand.limit_led(D, direction, K_c, law.push_integral_max),
         stand.limit_held(D_hold, direction),
         stand.limit_held(motor_mean(D_hold), direction),
         stand.limit_of_body(direction),

@@ -12,7 +12,8 @@ The controllers run on it, each at its own rate:
 
     drive          u = W - D_m q^ - D_Bm v^                     D_m: the module's mean
     joint service  W = tau + D_m q^ + D_Bm v^, tau the law of `services.joint.pd_law` on q^, v^
-    planner        r = S J q^, q_ref = T r, tau_coupled filtered, sent d later than sampled
+    planner        r = S J q^, q_ref = T r, tau_coupled filtered, sent d later than sampled;
+                   F_I' = K_p e_p / integral_s along x and y is part of tau_coupled
 
 One planner period is a linear map. The loop is stable if the map's spectral radius is below 1.
 
@@ -64,6 +65,8 @@ class HandModel(NamedTuple):
     b_pitch: float
 
 
+MOVES_MIN: Final = 1e-9
+"""Largest entry of a row of J that a half of the loop does not move."""
 NO_HAND: Final = HandModel(0.0, 0.0, 0.0, 0.0)
 
 
@@ -96,6 +99,9 @@ class Feedback(NamedTuple):
     lead_easing: float = 0.0
     easing_bandwidth_hz: float = 40.0
     """Bandwidth of the pole on the hand's measured wrench."""
+    integral: Array = np.zeros((0, N_JOINTS))
+    """(n, 12): rows of J whose errors are integrated, with their gains, N/(m s)."""
+    integral_gains: Array = np.zeros(0)
     seen: Array = np.eye(N_JOINTS)
     """(12, 12): the local loops see `seen` q; the identity, but while an encoder is blind."""
 
@@ -179,6 +185,9 @@ class _Laws(NamedTuple):
     ease_p: Array
     ease_v: Array
     """Torques that ease the hand's force, per p and p'."""
+    integral: Array
+    """(n, n_q): rows of J that are integrated in this half."""
+    integral_gains: Array
 
 
 class _State(NamedTuple):
@@ -287,13 +296,14 @@ class SampledLoop:
         steps = round(t.joint_period / t.drive_step)
         late = round(t.write_delay / t.drive_step)
         slots = max(0, math.ceil(t.delay / t.planner_period - 1e-9))
-        sizes = [len(self.A), n, n, n, n, *[2 * len(laws.J_open) + n] * slots]
+        command = 2 * len(laws.J_open) + n
+        sizes = [len(self.A), n, n, n, n, len(laws.integral), *[command] * slots]
         ends = np.cumsum(sizes)
         width = int(ends[-1])
         X = np.eye(width, width + self._n_p)
         force = np.eye(width + self._n_p)[width:]
-        x, W, f_1, f_2, eased, *queue = (part.copy() for part in np.split(X, ends[:-1]))
-        f_1, f_2, eased, newest = self._tick(x, f_1, f_2, eased)
+        x, W, f_1, f_2, eased, F_I, *queue = (part.copy() for part in np.split(X, ends[:-1]))
+        f_1, f_2, eased, F_I, newest = self._tick(x, f_1, f_2, eased, F_I)
         queue.insert(0, newest)
         step, torque = self._drive_step, gains.torque
         closed = step.F.copy()
@@ -308,7 +318,7 @@ class SampledLoop:
             old, W = W, self._target(x, queue[slot], age, gains)
             for (F, G, G_f), w in ((before, old), (after, W)):
                 x = F @ x + G @ w + G_f @ force
-        out = np.vstack((x, W, f_1, f_2, eased, *queue[:slots]))
+        out = np.vstack((x, W, f_1, f_2, eased, F_I, *queue[:slots]))
         return out[:, :width], out[:, width:]
 
     def eigenvalues(self, gains: Gains = NOMINAL) -> NDArray[np.complex128]:
@@ -336,21 +346,22 @@ class SampledLoop:
         return complex(1.0 / (self.n_z @ X[self._at.pd]))
 
     def _tick(
-        self, x: Array, f_1: Array, f_2: Array, eased: Array
-    ) -> tuple[Array, Array, Array, Array]:
-        """Run the planner on the current samples; return its filter states and its command."""
+        self, x: Array, f_1: Array, f_2: Array, eased: Array, F_I: Array
+    ) -> tuple[Array, Array, Array, Array, Array]:
+        """Run the planner on the current samples; return its own states and its command."""
         laws, at, period = self._laws, self._at, self._timing.planner_period
         q, v = x[at.q], x[at.v]
         r, rate = laws.J_open @ q, laws.J_open @ v
         e_q, e_v = laws.T_open @ r - q, laws.T_open @ rate - v
-        raw = laws.C_q @ e_q + laws.C_v @ e_v
+        F_I = F_I + period * laws.integral_gains[:, np.newaxis] * (laws.integral @ e_q)
+        raw = laws.C_q @ e_q + laws.C_v @ e_v + laws.integral.T @ F_I
         gain = pole_gain(self.feedback.bandwidth_hz, period)
         f_1 = f_1 + gain * (raw - f_1)
         f_2 = f_2 + gain * (f_1 - f_2)
         gain = pole_gain(self.feedback.easing_bandwidth_hz, period)
         felt = laws.ease_p @ x[at.p] + laws.ease_v @ x[at.pd]
         eased = eased + gain * (felt - eased)
-        return f_1, f_2, eased, np.vstack((r, rate, f_2 + eased))
+        return f_1, f_2, eased, F_I, np.vstack((r, rate, f_2 + eased))
 
     def _target(self, x: Array, entry: Array, age: float, gains: Gains) -> Array:
         """Run the joint service on the current samples; return W of the drives' law."""
@@ -373,6 +384,9 @@ def _laws(
     D, D_B, D_m, D_Bm = (V.T @ (gain[:, np.newaxis] * feedback.seen) @ V for gain in gains)
     easing = np.outer(V.T @ stand.J_harness[2], n_z), np.outer(V.T @ stand.J[4], n_pitch)
     alpha = feedback.lead_easing
+    integral = feedback.integral @ V
+    # the integral of a row that this half does not move would stay as it is
+    moves = np.abs(integral).max(axis=1, initial=0.0) > MOVES_MIN
     return _Laws(
         D=D,
         D_B=D_B,
@@ -385,4 +399,6 @@ def _laws(
         T_open=(V.T @ stand.T @ P)[:, opened],
         ease_p=-alpha * (hand.k_z * easing[0] + hand.k_pitch * easing[1]),
         ease_v=-alpha * (hand.b_z * easing[0] + hand.b_pitch * easing[1]),
+        integral=integral[moves],
+        integral_gains=feedback.integral_gains[moves],
     )

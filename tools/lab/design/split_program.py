@@ -46,7 +46,7 @@ Progress = Callable[[int, int], None]
 """Called with the number of nodes done and their total."""
 
 N_HEIGHTS: Final = 25
-DYNAMIC_HEIGHTS: Final = 5
+DYNAMIC_HEIGHTS: Final = 13
 DYNAMIC_PITCHES: Final = (0.0, 1.2)
 """rad"""
 PITCHES: Final = (-0.4, 0.0, 0.4, 0.8, 1.2, 1.5)

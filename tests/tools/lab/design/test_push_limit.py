@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 
 HEIGHTS = (0.7, 0.8, 0.9)
 STIFF = np.tile([900.0, 1500.0, 900.0, 1500.0, 900.0, 900.0], 2)
+SOFT = np.tile([600.0, 1000.0, 50.0, 60.0, 50.0, 30.0], 2)
 DAMPING = 60.0
 PUSH_N = 15.0
 FLOOR_S = 0.004
@@ -122,6 +123,24 @@ def test_the_planner_adds_to_what_is_held(robot: RobotConfig, poses: dict[float,
         alone = posed.stand.limit_held(STIFF, (0.0, 1.0))
         led = posed.stand.limit_held(STIFF, (0.0, 1.0), K_c)
         assert led.force_n > alone.force_n
+
+
+@pytest.mark.parametrize("direction", DIRECTIONS.values(), ids=DIRECTIONS)
+def test_an_integral_bears_its_part_of_a_push_as_the_body_shares_loads(
+    poses: dict[float, Posed], direction: tuple[float, float]
+) -> None:
+    """With an endless one the springs bear nothing; with none, or one of 1 N, hardly less."""
+    K_c = np.diag([1600.0, 2000.0, 0.0, 500.0, 0.0, 250.0])
+    for posed in poses.values():
+        held = posed.stand.limit_held(SOFT, direction, K_c).force_n
+        led = [
+            posed.stand.limit_led(SOFT, direction, K_c, (most, most)).force_n
+            for most in (0.0, 1.0, 20.0, 1e4)
+        ]
+        assert led[0] == held < led[1] < led[2] < led[3]
+        stiff = posed.stand.limit_held(1e-3 * SOFT, direction, 1e7 * np.eye(6)).force_n
+        assert led[3] == pytest.approx(stiff, rel=0.3)
+        assert led[3] <= posed.stand.limit_of_body(direction).force_n
 
 
 def test_a_slope_pulls_by_its_sine_of_the_weight(robot: RobotConfig) -> None:
