@@ -340,8 +340,8 @@ class JointCommand(Message, frozen=True):
     dtau_ff: Pair
     """Rate of the feedforward torque, N m/s."""
     tau_coupled: Pair
-    """Coupled torque, N m: stiffness and damping of the body beyond the local gains, low-passed,
-    plus the eased lead; dropped in HOLD."""
+    """Coupled torque, N m: stiffness and damping of the body beyond the local gains and what bears a
+    lasting push, low-passed, plus the eased lead; dropped in HOLD."""
     k_p: Pair
     """Local stiffness D, N m/rad."""
     k_d: Pair

@@ -59,14 +59,14 @@ class TorqueBreakdown(NamedTuple):
     local_pd: Array
     coupled: Array
     """Torque that the planner adds, before its low-pass."""
-    eased: Array
-    """Change of the coupled torque by its low-pass, plus the easing of the operator's lead. Not
-    computed here, because the log holds the state of neither filter."""
+    filtered: Array
+    """Change of the coupled torque by its low-pass, plus the integral F_I and the easing of the
+    operator's lead. Not computed here, because no tick in the log holds their states."""
 
     @property
     def total(self) -> Array:
         """Torque requested from the joints at command age zero (12,), N m."""
-        return self.gravity + self.assist + self.local_pd + self.coupled + self.eased
+        return self.gravity + self.assist + self.local_pd + self.coupled + self.filtered
 
 
 def torque_breakdown(
@@ -131,7 +131,7 @@ def torque_breakdown(
         assist=reference.assist,
         local_pd=local.D * (q_ref - q) + local.D_B * (v_ref - v),
         coupled=terms.coupled,
-        eased=np.zeros(12),
+        filtered=np.zeros(12),
     )
 
 

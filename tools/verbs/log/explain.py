@@ -135,7 +135,7 @@ def run(flags: ExplainFlags) -> int:
     found = torque_breakdown(
         robot, q, v, q_ref, v_ref, tick.status.assist_n, tick.status.slope, tick.status.stance
     )
-    found = found._replace(eased=_joined(tick.commands, "tau_coupled") - found.coupled)
+    found = found._replace(filtered=_joined(tick.commands, "tau_coupled") - found.coupled)
     show(robot, found, console)
     sent = _joined(tick.commands, "tau_ff")
     console.print(
@@ -363,9 +363,9 @@ def _gains(found: TorqueBreakdown) -> Table:
 def _torques(found: TorqueBreakdown) -> Table:
     table = _table(
         "Torques by origin, N m",
-        ("gravity", "assist", "local PD", "coupled", "low-pass", "total"),
+        ("gravity", "assist", "local PD", "coupled", "low-pass, push, lead", "total"),
     )
-    rows = (found.gravity, found.assist, found.local_pd, found.coupled, found.eased, found.total)
+    rows = (found.gravity, found.assist, found.local_pd, found.coupled, found.filtered, found.total)
     for joint, torques in zip(JOINTS, np.array(rows).T, strict=True):
         table.add_row(joint, *_numbers(torques, 2))
     return table
