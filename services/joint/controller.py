@@ -53,6 +53,8 @@ class ControllerState(msgspec.Struct, kw_only=True):
     """Torque of a drive that was found armed, N m: it is taken over without a step."""
     takeover_offset: Pair = (0.0, 0.0)
     """Torque of the drive beyond the law's when the service resumed after a gap, N m."""
+    astray: Pair = (0.0, 0.0)
+    """How far the tracked reference has gone another way than its rate says, rad."""
     resumed_ns: int = 0
     last_cycle_ns: int = 0
     cause: int = 0
@@ -306,6 +308,7 @@ class JointController:
         """Let the age rule and the envelope decide about a command."""
         s = self._state
         tracked = s.failsafe.command if s.failsafe.mode is _TRACK else None
+        astray = self._envelope.astray(command, tracked, s.astray)
         outside = self._envelope.judge(
             command,
             tracked,
@@ -313,8 +316,11 @@ class JointController:
             s.estimate.v,
             age_s=self._law.age_s(command, now_ns),
             settled=tracked is not None and self._law.is_settled(now_ns),
+            astray=astray,
         )
         s.failsafe.offer(command, now_ns, self.timing, outside)
+        if s.failsafe.command is command:
+            s.astray = astray
 
     def _tripped(self, now_ns: int) -> Event:
         """Return the trip of this cycle; only a module in TRACK trips."""

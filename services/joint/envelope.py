@@ -10,12 +10,17 @@ The coupled torque answers to what the body's pose lacks, so in each module it p
 local spring pulls. One that drives the joint away from its reference is wrong however small it is:
 ramped up together inside their bounds, those of knees and hips made the robot fall.
 
+A reference comes with its rate, so an ankle's goes the way its rate says, whatever is asked for: to
+0.3 mrad while a person leads, 20 mrad while the height follows a reference of its own. One that
+goes another way is wrong however slowly: drifting by 0.3 rad/s it took the robot over.
+
 A command with `hold` is obeyed anyway, but a module that refused its numbers is not ready to track
 (`Failsafe.ready`), so no planner leads with such numbers.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 from services.joint import pd_law
@@ -30,6 +35,11 @@ ROUNDING = 0.02
 GAP_TICKS = 4
 """The step that is allowed grows with the time between commands no longer than so: a wrong torque
 that is refused again and again would be within it in the end."""
+UNSETTLED: Final = 0.5
+"""Share of a spring's torque that counts until TRACK has blended in: a robot that was held off
+centre still moves to the reference."""
+ASTRAY_S: Final = 0.5
+"""s; a way that the rate does not explain is forgotten with this time constant."""
 _INSIDE: Final = Outside.NOTHING  # returned in each cycle: docs/contributing.md
 
 
@@ -47,6 +57,7 @@ class Envelope:
             self._v_ref = [min(own.v_ref, most) for most in bounds.v_ref]
         self._room = own.tau_ff_margin
         self._distance, self._spring = own.q_ref_distance, own.spring_torque
+        self._astray = own.q_ref_astray if kind_of(module) == "ankle" else math.inf
         self._coupled, self._dtau_ff = own.tau_coupled, own.dtau_ff
         self._work = -own.coupled_work
         self._step, self._rate = own.torque_step, own.torque_rate
@@ -63,6 +74,7 @@ class Envelope:
         *,
         age_s: float = 0.0,
         settled: bool = True,
+        astray: Pair = pd_law.ZERO,
     ) -> Outside:
         """Return the first part of a command that lies outside.
 
@@ -74,8 +86,8 @@ class Envelope:
             q: joint angles, rad.
             v: joint rates, rad/s.
             age_s: time by which the reference is extrapolated, s.
-            settled: True if TRACK has blended in; before, a robot that was held off centre still
-                moves to the reference.
+            settled: True if TRACK has blended in.
+            astray: `astray` of this command, rad.
         """
         bounds, c = self._bounds, command
         if bounds is None:
@@ -100,9 +112,11 @@ class Envelope:
             deflection = c.q_ref[axis] + age_s * c.v_ref[axis] - q[axis]
             work += c.tau_coupled[axis] * deflection
             distance = abs(deflection)
-            spring = c.k_p[axis] * distance if settled else 0.0
+            spring = c.k_p[axis] * distance * (1.0 if settled else UNSETTLED)
             if not (distance <= self._distance and spring <= self._spring):
                 return Outside.Q_REF
+            if not abs(astray[axis]) <= self._astray:
+                return Outside.Q_REF_ASTRAY
         if not work >= self._work:
             return Outside.COUPLED_WORK
         if last is None or last.hold or last.session != c.session:
@@ -112,6 +126,26 @@ class Envelope:
         if not (abs(phi - last_phi) <= most and abs(theta - last_theta) <= most):
             return Outside.TORQUE_STEP
         return _INSIDE
+
+    @staticmethod
+    def astray(command: JointCommand, last: JointCommand | None, before: Pair) -> Pair:
+        """Return how far the reference has gone another way than its rate says, rad.
+
+        Args:
+            command: the received command.
+            last: the command that the module tracks; None if it does not track.
+            before: the same of the last command.
+        """
+        if last is None or last.hold or command.hold or last.session != command.session:
+            return pd_law.ZERO
+        dt = 1e-9 * (command.t_ns - last.t_ns)
+        kept = max(0.0, 1.0 - dt / ASTRAY_S)
+        (phi, theta), (last_phi, last_theta) = command.q_ref, last.q_ref
+        (rate_phi, rate_theta), (last_rate_phi, last_rate_theta) = command.v_ref, last.v_ref
+        return (
+            kept * before[0] + phi - last_phi - 0.5 * dt * (rate_phi + last_rate_phi),
+            kept * before[1] + theta - last_theta - 0.5 * dt * (rate_theta + last_rate_theta),
+        )
 
     @staticmethod
     def _tau_ff_at(bounds: ModuleBounds, theta: float) -> Bounds:

@@ -31,7 +31,7 @@ class Action(NamedTuple):
     q_ref: Array
     """rad"""
     v_ref: Array
-    """rad/s"""
+    """rad/s; the rate of q_ref. A joint service refuses a q_ref that goes another way."""
     tau_ff: Array
     """N m; what holds the body up without anybody's reaction."""
     dtau_ff: Array

@@ -119,6 +119,8 @@ class Outside(IntEnum):
     """The margin is below the least that the planner may publish."""
     COUPLED_WORK = 10
     """The coupled torque drives the joint away from its reference."""
+    Q_REF_ASTRAY = 11
+    """The reference goes another way than its rate says."""
 
 
 class Refusal(IntEnum):
@@ -340,8 +342,8 @@ class JointCommand(Message, frozen=True):
     dtau_ff: Pair
     """Rate of the feedforward torque, N m/s."""
     tau_coupled: Pair
-    """Coupled torque, N m: stiffness and damping of the body beyond the local gains and what bears a
-    lasting push, low-passed, plus the eased lead; dropped in HOLD."""
+    """Coupled torque, N m: stiffness and damping of the body beyond the local gains, and what bears
+    a lasting push, low-passed, plus the eased lead; dropped in HOLD."""
     k_p: Pair
     """Local stiffness D, N m/rad."""
     k_d: Pair

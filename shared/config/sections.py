@@ -257,6 +257,10 @@ class EnvelopeConfig(Section, frozen=True):
     """Feedforward beyond the bounds of straight stands: leans, slopes and other stances."""
     q_ref_distance: Annotated[float, Range(0.01, 2.0, "rad")] = 0.2
     """Largest distance of the reference from the joint."""
+    q_ref_astray: Annotated[float, Range(0.001, 2.0, "rad")] = 0.04
+    """Farthest an ankle's reference may go another way than its rate says, within half a second.
+    The law's goes 0.3 mrad while a person leads, and 20 while the height has a reference of its
+    own."""
     spring_torque: Annotated[float, Range(1.0, 1e3, "N m")] = 40.0
     """Largest k_p times that distance."""
     hold_torque: Annotated[float, Range(1.0, 1e4, "N m")] = 300.0

@@ -10,8 +10,9 @@ import msgspec
 import numpy as np
 import pytest
 
+from services.joint import pd_law
 from services.joint.controller import JointController
-from services.joint.envelope import ROUNDING, Envelope
+from services.joint.envelope import ASTRAY_S, ROUNDING, Envelope
 from services.joint.failsafe import Event, Failsafe, timing_of
 from shared.bus.messages import JointCommand, Mode, Outside, Pair, Refusal
 from shared.config import files as config_file
@@ -249,12 +250,76 @@ def test_the_reference_is_judged_where_it_is_used(robot: RobotConfig) -> None:
     assert envelope.judge(told, None, ran_ahead, V, age_s=0.041) is Outside.NOTHING
 
 
-def test_while_track_blends_in_the_reference_may_be_farther(robot: RobotConfig) -> None:
+def test_while_track_blends_in_the_reference_may_be_twice_as_far(robot: RobotConfig) -> None:
     k_p = bounds_of(robot, "ankle_left").k_p[1]
-    told = middle(robot, "ankle_left", k_p=k_p, q_ref=(Q[0], Q[1] + 0.06))
-    envelope = Envelope(robot, "ankle_left")
-    assert envelope.judge(told, None, Q, V) is Outside.Q_REF
-    assert envelope.judge(told, None, Q, V, settled=False) is Outside.NOTHING
+    envelope, farthest = Envelope(robot, "ankle_left"), robot.envelope.spring_torque / k_p[1]
+    for share, settled, blending in (
+        (0.99, Outside.NOTHING, Outside.NOTHING),
+        (1.01, Outside.Q_REF, Outside.NOTHING),
+        (1.99, Outside.Q_REF, Outside.NOTHING),
+        (2.01, Outside.Q_REF, Outside.Q_REF),
+    ):
+        told = middle(robot, "ankle_left", k_p=k_p, q_ref=(Q[0], Q[1] + share * farthest))
+        assert envelope.judge(told, None, Q, V) is settled
+        assert envelope.judge(told, None, Q, V, settled=False) is blending
+
+
+def going(tick: int, told: Pair, goes: Pair) -> JointCommand:
+    """Return a command of a course that says one rate, rad/s, and goes at another."""
+    at = tuple(q + rate * 4e-3 * tick for q, rate in zip(Q, goes, strict=True))
+    return command(t_ns=T0 + tick * 4_000_000, seq=tick, q_ref=at, v_ref=told)
+
+
+def astray_after(ticks: int, told: Pair, goes: Pair, every: int = 1) -> Pair:
+    astray, last = pd_law.ZERO, going(0, told, goes)
+    for tick in range(every, ticks + 1, every):
+        after = going(tick, told, goes)
+        astray, last = Envelope.astray(after, last, astray), after
+    return astray
+
+
+@pytest.mark.parametrize("every", [1, 10])
+def test_a_reference_that_goes_as_it_says_is_not_astray_however_far_and_seldom(every: int) -> None:
+    assert astray_after(1000, (-2.0, 0.7), (-2.0, 0.7), every) == pytest.approx((0.0, 0.0))
+
+
+@pytest.mark.parametrize(("told", "goes"), [((0.0, 0.0), (0.3, -0.3)), ((1.0, 0.3), (1.3, 0.0))])
+def test_one_that_goes_another_way_is_found_within_a_fifth_of_a_second(
+    robot: RobotConfig, told: Pair, goes: Pair
+) -> None:
+    astray = astray_after(50, told, goes)
+    assert min(map(abs, astray)) > robot.envelope.q_ref_astray
+    assert np.sign(astray).tolist() == [1.0, -1.0]
+    settled = astray_after(2000, told, goes)
+    assert np.abs(settled) == pytest.approx([0.3 * ASTRAY_S] * 2, rel=0.02), "it is forgotten"
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_an_ankles_reference_is_believed_up_to_its_bound_astray(
+    robot: RobotConfig, axis: int, sign: float
+) -> None:
+    """A knee's and a hip's go astray while the height follows a reference of its own."""
+    most = robot.envelope.q_ref_astray
+    for far, outside in (
+        (0.999 * most, Outside.NOTHING),
+        (1.001 * most, Outside.Q_REF_ASTRAY),
+        (math.nan, Outside.Q_REF_ASTRAY),
+    ):
+        astray = (sign * far, 0.0) if axis == 0 else (0.0, sign * far)
+        told = middle(robot, "ankle_left")
+        judged = Envelope(robot, "ankle_left").judge(told, None, Q, V, astray=astray)
+        assert judged is outside
+    told = middle(robot)
+    assert Envelope(robot, MODULE).judge(told, None, Q, V, astray=(0.2, 0.2)) is Outside.NOTHING
+
+
+def test_where_nothing_of_this_planner_is_tracked_nothing_is_astray() -> None:
+    after = command(q_ref=(9.0, 9.0), seq=2)
+    for last in (None, command(hold=True), command(session=SESSION + 1)):
+        assert Envelope.astray(after, last, (0.5, 0.5)) == pd_law.ZERO
+    held = msgspec.structs.replace(after, hold=True)
+    assert Envelope.astray(held, command(), (0.5, 0.5)) == pd_law.ZERO
 
 
 def test_without_bounds_everything_is_believed(robot: RobotConfig) -> None:

@@ -113,6 +113,16 @@ def test_it_holds_and_reports_what_it_does_not_believe(
     assert ended.modes == {Mode.HOLD}
 
 
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize("module", ["ankle_left", "ankle_right"])
+@pytest.mark.parametrize("moment", range(len(MOMENTS)))
+def test_it_stands_though_a_planner_whose_reference_drifts_leads_again_and_again(
+    robot: RobotConfig, begins: list[Begin], module: str, moment: int
+) -> None:
+    """Before references had to go as their rates say, it fell in the squat and in the stand."""
+    assert not end(robot, begins[moment], f"q_ref of {module} theta drifts", 3.0).fell
+
+
 def test_without_the_envelope_it_falls(robot: RobotConfig, begins: list[Begin]) -> None:
     """A robot that stands here would prove nothing above."""
     name = "q_ref of all negative"
