@@ -98,6 +98,8 @@ class Trip(IntEnum):
     """The robot drifts and nobody holds it."""
     EDGE = 10
     """A sole is loaded near its edge: the robot is leaned on from the side."""
+    TIPPING = 11
+    """A sole is loaded at its edge: the robot is shoved from the side."""
 
 
 class Outside(IntEnum):

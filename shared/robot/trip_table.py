@@ -83,6 +83,10 @@ PLANNER_TRIPS: Final[dict[Trip, TripRow]] = {
         "edge", "a sole is loaded near its edge, sideways", "of its half width",
         "do not lean on it from the side: it leads again a second later",
     ),
+    Trip.TIPPING: TripRow(
+        "tipping", "a sole is loaded at its edge, sideways", "of its half width",
+        "do not shove it from the side: it leads again a second later",
+    ),
 }  # fmt: skip
 """By the planner, while it leads. It leads again once all is within its limits for a second."""
 

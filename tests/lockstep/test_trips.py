@@ -210,7 +210,7 @@ def test_leaned_on_from_the_side_it_holds_and_is_led_again(
         delay_ms=delay_ms, record=said,
     )  # fmt: skip
     assert outcome.stood
-    assert {Trip(status.trip) for status in said} == {Trip.NONE, Trip.EDGE}
+    assert {Trip(status.trip) for status in said} - {Trip.NONE} in ({Trip.EDGE}, {Trip.TIPPING})
     assert outcome.status.mode == PlannerMode.LEADING
 
 

@@ -24,7 +24,7 @@ T0 = 5_000_000_000
 TICK_NS = 4 * NS_PER_MS
 
 
-CALM = (0.0, 0.0, 0.0, 200.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+CALM = tuple(200.0 if trip is Trip.UNLOADED else 0.0 for trip in PLANNER_TRIPS)
 
 
 TRIPS = list(PLANNER_TRIPS)
@@ -262,7 +262,7 @@ def test_each_value_is_the_tables(joint: int, sign: float) -> None:
     expected = {
         Trip.LEGS: 0.03, Trip.REACH: 0.004, Trip.TRACKING: 0.2, Trip.UNLOADED: 80.0,
         Trip.SINKING: 0.3, Trip.TURNING: 0.5, Trip.HARNESS: math.nan, Trip.SAGGING: math.nan,
-        Trip.UNATTENDED: 0.07, Trip.EDGE: 0.6,
+        Trip.UNATTENDED: 0.07, Trip.EDGE: 0.6, Trip.TIPPING: 0.6,
     }  # fmt: skip
     assert values == pytest.approx([expected[trip] for trip in TRIPS], nan_ok=True)
 
@@ -273,7 +273,7 @@ def test_a_watch_restored_from_before_there_was_a_trip_counts_it_from_now_on(
     trips, old = PlannerTrips(robot), led(robot).state
     old.since_ns = old.since_ns[:-1]
     trips.restore(old)
-    assert go_on(trips, beyond(robot, Trip.EDGE), range(1000)).tripped is Trip.EDGE
+    assert go_on(trips, beyond(robot, Trip.TIPPING), range(1000)).tripped is Trip.TIPPING
 
 
 # ---- how far out its soles bear it

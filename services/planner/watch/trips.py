@@ -14,6 +14,8 @@ robot file):
                assist and lead, while it sinks
     unattended the robot drifts with nobody's hand on it (`services.planner.watch.unattended`)
     edge       a sole's centre of pressure is near its edge (`services.planner.watch.soles`)
+    tipping    it is at its edge: a shove of 110 N for 0.3 s, on the way into the crawl, had tipped
+               the sole before `edge` counted
 
 The trips are checked while the planner is engaged. `unloaded` counts only once both legs have
 carried the torso, because on the hoist neither does. `sagging` counts only after the person has
@@ -174,6 +176,7 @@ def values_of(
         _assist_error(lifted, output.assist, leads=leads),
         0.0 if moves else _pressing_power(lifted, output.assist, harness_rate, leads=leads),
         0.0 if moves else drift,
+        edge,
         edge,
     )
 

@@ -107,6 +107,17 @@ def test_with_every_error_drawn_it_is_led_pushed_killed_and_stands(
     assert outcome.operator_peak_n < 80.0
 
 
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize("number", [49, 61, 142, 160, 175])
+def test_shoved_from_the_side_on_its_way_into_the_crawl_it_stands(
+    robot: RobotConfig, pushes: PushRange, number: int
+) -> None:
+    """By 106 to 111 N: it fell while it was led on until its sole had tipped."""
+    trial = draw(pushes, 1, number)
+    assert trial.kind == "crawl"
+    assert run_trial(trial, robot).ending is Ending.STOOD
+
+
 def test_errors_are_reported_as_one_number_each() -> None:
     errors = plants.errors_of(plants.draw("one"))
     assert set(errors) == {row.key for row in plants.shipped().error}
