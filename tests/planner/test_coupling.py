@@ -113,7 +113,7 @@ def test_it_forgets_on_reset(robot: RobotConfig) -> None:
         filtered.advance(np.full(12, float(step)), 0.004)
         filtered.integral.advance(0.01 * Y, STILL, 0.004)
     filtered.reset()
-    np.testing.assert_array_equal(filtered.integral.force, 0.0)
+    assert filtered.integral.force == [0.0, 0.0]
     np.testing.assert_array_equal(filtered.advance(np.zeros(12), 0.004), 0.0)
 
 

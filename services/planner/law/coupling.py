@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.law.small_matrices import positive_part
+from shared.clamp import clamp
 from shared.config.sections import LawConfig
 from shared.joints import N_JOINTS
 
@@ -100,6 +101,8 @@ class CoupledState(msgspec.Struct, frozen=True):
 class BodyIntegral:
     """F_I: force along x and y that grows against a lasting push, until the error is gone.
 
+    It uses plain floats: for two values, NumPy's calls cost more than the arithmetic.
+
     A push that lasts is then borne by the coupled torque, whose load sharing asks little of a
     sole, and no longer by the local springs, which bend the feet's shares until a sole tips:
 
@@ -118,9 +121,10 @@ class BodyIntegral:
         """Start at rest."""
         certified = law.split == "certified"  # the paper's has none
         self.rows = [row for row in (0, 1) if certified and not law.S[row]]
-        self.gains: Array = np.array([law.K_p[row] / law.push_integral_s[row] for row in self.rows])
-        self._most: Array = np.array([law.push_integral_max[row] for row in self.rows])
-        self.force: Array = np.zeros(len(self.rows))
+        self.gains = [law.K_p[row] / law.push_integral_s[row] for row in self.rows]
+        self._most = [law.push_integral_max[row] for row in self.rows]
+        self.force = [0.0] * len(self.rows)
+        self._F: Array = np.zeros(6)
 
     def advance(self, e_p: Array, e_pdot: Array, dt: float) -> None:
         """Integrate for dt seconds, within the limits.
@@ -130,13 +134,15 @@ class BodyIntegral:
             e_pdot: its rate (6,).
             dt: time since the last tick, s.
         """
-        slow = np.maximum(0.0, 1.0 - np.abs(e_pdot[self.rows]) / FAST)
-        force = self.force + dt * slow * self.gains * e_p[self.rows]
-        self.force[:] = np.clip(force, -self._most, self._most)
+        for at, row in enumerate(self.rows):
+            slow = max(0.0, 1.0 - abs(float(e_pdot[row])) / FAST)
+            force = self.force[at] + dt * slow * self.gains[at] * float(e_p[row])
+            self.force[at] = clamp(force, -self._most[at], self._most[at])
 
     def torque(self, J: Array) -> Array:
         """Return J^T F_I (12,), N m; J is (6, 12)."""
-        torque: Array = self.force @ J[self.rows]
+        self._F[self.rows] = self.force
+        torque: Array = self._F @ J
         return torque
 
 
@@ -169,14 +175,14 @@ class CoupledTorque:
     def reset(self) -> None:
         """Reset filter and integral to zero."""
         self._first[:] = self._second[:] = 0.0
-        self.integral.force[:] = 0.0
+        self.integral.force = [0.0] * len(self.integral.rows)
 
     def snapshot(self) -> CoupledState:
         """Return the state between two ticks."""
         first, second = tuple(self._first.tolist()), tuple(self._second.tolist())
-        return CoupledState(first, second, tuple(self.integral.force.tolist()))
+        return CoupledState(first, second, tuple(self.integral.force))
 
     def restore(self, state: CoupledState) -> None:
         """Continue from a state that `snapshot` returned."""
         self._first[:], self._second[:] = state.first, state.second
-        self.integral.force[:] = state.force or 0.0
+        self.integral.force = list(state.force) or [0.0] * len(self.integral.rows)

@@ -227,7 +227,7 @@ class DynamicCertificate:
             self._config.law.lead_easing,
             self._config.harness.low_pass_hz,
             J[self._integral.rows],
-            self._integral.gains,
+            np.array(self._integral.gains),
         )
 
     def held(self, node: StiffnessNode, design: Design, *, onboard: bool) -> Feedback:
