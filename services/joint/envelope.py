@@ -10,9 +10,10 @@ The coupled torque answers to what the body's pose lacks, so in each module it p
 local spring pulls. One that drives the joint away from its reference is wrong however small it is:
 ramped up together inside their bounds, those of knees and hips made the robot fall.
 
-A reference comes with its rate, so an ankle's goes the way its rate says, whatever is asked for: to
-0.3 mrad while a person leads, 20 mrad while the height follows a reference of its own. One that
-goes another way is wrong however slowly: drifting by 0.3 rad/s it took the robot over.
+A reference comes with its rate, so an ankle's goes the way its rate says: to 0.3 mrad while a
+person leads, 20 mrad while the height follows a reference of its own or is probed. One that goes
+another way by more than `q_ref_astray` / `ASTRAY_S` is wrong: drifting by 0.3 rad/s it took the
+robot over.
 
 A command with `hold` is obeyed anyway, but a module that refused its numbers is not ready to track
 (`Failsafe.ready`), so no planner leads with such numbers.
@@ -36,8 +37,8 @@ GAP_TICKS = 4
 """The step that is allowed grows with the time between commands no longer than so: a wrong torque
 that is refused again and again would be within it in the end."""
 UNSETTLED: Final = 0.5
-"""Share of a spring's torque that counts until TRACK has blended in: a robot that was held off
-centre still moves to the reference."""
+"""Share of a spring's torque that counts in HOLD, and until TRACK has blended in: a robot that was
+held off centre still moves to the reference."""
 ASTRAY_S: Final = 0.5
 """s; a way that the rate does not explain is forgotten with this time constant."""
 _INSIDE: Final = Outside.NOTHING  # returned in each cycle: docs/contributing.md
@@ -127,8 +128,7 @@ class Envelope:
             return Outside.TORQUE_STEP
         return _INSIDE
 
-    @staticmethod
-    def astray(command: JointCommand, last: JointCommand | None, before: Pair) -> Pair:
+    def astray(self, command: JointCommand, last: JointCommand | None, before: Pair) -> Pair:
         """Return how far the reference has gone another way than its rate says, rad.
 
         Args:
@@ -136,7 +136,9 @@ class Envelope:
             last: the command that the module tracks; None if it does not track.
             before: the same of the last command.
         """
-        if last is None or last.hold or command.hold or last.session != command.session:
+        if self._astray == math.inf or last is None or last.hold or command.hold:
+            return pd_law.ZERO
+        if last.session != command.session:
             return pd_law.ZERO
         dt = 1e-9 * (command.t_ns - last.t_ns)
         kept = max(0.0, 1.0 - dt / ASTRAY_S)

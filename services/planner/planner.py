@@ -129,6 +129,9 @@ class Planner:
             controller: in the place of the shipped law; its own state is in no snapshot.
         """
         self.session = session
+        if controller is not None:  # an integral of the law would wind up against it
+            law = msgspec.structs.replace(config.law, push_integral_max=0.0)
+            config = msgspec.structs.replace(config, law=law)
         self._law = Hocca(config)
         self._guard: ControllerGuard | None = None
         if controller is not None:

@@ -102,10 +102,6 @@ ProbeAngle = Annotated[float, Range(0.0, 0.1, "rad")]
 Probe6 = tuple[ProbeLength, ProbeLength, ProbeLength, ProbeAngle, ProbeAngle, ProbeAngle]
 
 
-IntegralTime = Annotated[float, Range(0.1, 100.0, "s")]
-IntegralForce = Annotated[float, Range(0.0, 200.0, "N")]
-
-
 class LawConfig(Section, frozen=True):
     """Gains and choices of the law (docs/law.md)."""
 
@@ -121,10 +117,10 @@ class LawConfig(Section, frozen=True):
     load_sharing_moment_arms: tuple[Share, Share, Annotated[float, Range(0.001, 0.5, "m")]]
     recentre_s: Seconds
     lead_easing: Annotated[float, Range(0.0, 0.95, "1")]
-    push_integral_s: tuple[IntegralTime, IntegralTime] = (2.0, 1.0)
-    """Along x and y."""
-    push_integral_max: tuple[IntegralForce, IntegralForce] = (0.0, 0.0)
-    """0: none along that axis."""
+    push_integral_s: Annotated[float, Range(0.1, 100.0, "s")] = 1.0
+    """Time in which a force of K_p times the error grows against a push from the side."""
+    push_integral_max: Annotated[float, Range(0.0, 200.0, "N")] = 0.0
+    """Most of that force; HOLD drops it, and must stand the step."""
     shift_max: tuple[ShiftLength, ShiftLength, ShiftAngle, ShiftAngle] = (0.0, 0.0, 0.0, 0.0)
     probe_max: Probe6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     stance_max: Stance6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)

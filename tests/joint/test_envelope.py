@@ -30,6 +30,7 @@ V: Pair = (0.01, -0.2)
 
 
 MODULE = "knee_right"
+ANKLE = "ankle_left"
 
 
 PAIRS = ("q_ref", "v_ref", "tau_ff", "dtau_ff", "tau_coupled", "k_p", "k_d")
@@ -270,27 +271,31 @@ def going(tick: int, told: Pair, goes: Pair) -> JointCommand:
     return command(t_ns=T0 + tick * 4_000_000, seq=tick, q_ref=at, v_ref=told)
 
 
-def astray_after(ticks: int, told: Pair, goes: Pair, every: int = 1) -> Pair:
-    astray, last = pd_law.ZERO, going(0, told, goes)
+def astray_after(
+    robot: RobotConfig, ticks: int, told: Pair, goes: Pair, every: int = 1, module: str = ANKLE
+) -> Pair:
+    envelope, astray, last = Envelope(robot, module), pd_law.ZERO, going(0, told, goes)
     for tick in range(every, ticks + 1, every):
         after = going(tick, told, goes)
-        astray, last = Envelope.astray(after, last, astray), after
+        astray, last = envelope.astray(after, last, astray), after
     return astray
 
 
 @pytest.mark.parametrize("every", [1, 10])
-def test_a_reference_that_goes_as_it_says_is_not_astray_however_far_and_seldom(every: int) -> None:
-    assert astray_after(1000, (-2.0, 0.7), (-2.0, 0.7), every) == pytest.approx((0.0, 0.0))
+def test_a_reference_that_goes_as_it_says_is_not_astray_however_far_and_seldom(
+    robot: RobotConfig, every: int
+) -> None:
+    assert astray_after(robot, 1000, (-2.0, 0.7), (-2.0, 0.7), every) == pytest.approx((0.0, 0.0))
 
 
 @pytest.mark.parametrize(("told", "goes"), [((0.0, 0.0), (0.3, -0.3)), ((1.0, 0.3), (1.3, 0.0))])
 def test_one_that_goes_another_way_is_found_within_a_fifth_of_a_second(
     robot: RobotConfig, told: Pair, goes: Pair
 ) -> None:
-    astray = astray_after(50, told, goes)
+    astray = astray_after(robot, 50, told, goes)
     assert min(map(abs, astray)) > robot.envelope.q_ref_astray
     assert np.sign(astray).tolist() == [1.0, -1.0]
-    settled = astray_after(2000, told, goes)
+    settled = astray_after(robot, 2000, told, goes)
     assert np.abs(settled) == pytest.approx([0.3 * ASTRAY_S] * 2, rel=0.02), "it is forgotten"
 
 
@@ -310,16 +315,15 @@ def test_an_ankles_reference_is_believed_up_to_its_bound_astray(
         told = middle(robot, "ankle_left")
         judged = Envelope(robot, "ankle_left").judge(told, None, Q, V, astray=astray)
         assert judged is outside
-    told = middle(robot)
-    assert Envelope(robot, MODULE).judge(told, None, Q, V, astray=(0.2, 0.2)) is Outside.NOTHING
+    assert astray_after(robot, 50, (0.0, 0.0), (0.3, 0.3), module=MODULE) == pd_law.ZERO
 
 
-def test_where_nothing_of_this_planner_is_tracked_nothing_is_astray() -> None:
+def test_where_nothing_of_this_planner_is_tracked_nothing_is_astray(robot: RobotConfig) -> None:
     after = command(q_ref=(9.0, 9.0), seq=2)
     for last in (None, command(hold=True), command(session=SESSION + 1)):
-        assert Envelope.astray(after, last, (0.5, 0.5)) == pd_law.ZERO
+        assert Envelope(robot, ANKLE).astray(after, last, (0.5, 0.5)) == pd_law.ZERO
     held = msgspec.structs.replace(after, hold=True)
-    assert Envelope.astray(held, command(), (0.5, 0.5)) == pd_law.ZERO
+    assert Envelope(robot, ANKLE).astray(held, command(), (0.5, 0.5)) == pd_law.ZERO
 
 
 def test_without_bounds_everything_is_believed(robot: RobotConfig) -> None:

@@ -53,7 +53,7 @@ class Judged:
 
         def watching(own: PlannerTrips, *rest: Any, **more: Any) -> None:
             advance(own, *rest, **more)
-            if own.tripped and own.tripped is not Trip.EDGE:
+            if own.tripped and own.tripped not in (Trip.EDGE, Trip.TIPPING):
                 self.tripped.append(own.why)
 
         def hearing(own: Failsafe, *rest: Any, **more: Any) -> Cause | None:

@@ -82,7 +82,7 @@ def test_open_directions_are_free(
 def test_coupled_torques_come_slowly_and_ease_at_once(
     robot: RobotConfig, ik: InverseKinematics, q: Array
 ) -> None:
-    law = Hocca(with_law(robot, push_integral_max=(0.0, 0.0)))
+    law = Hocca(with_law(robot, push_integral_max=0.0))
     law.tick(q, STILL, 0.0, DT, align=True)
     q_moved = moved(robot, ik, q, 1, 0.01)
     first = law.tick(q_moved, STILL, 0.0, DT)

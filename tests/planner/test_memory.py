@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from services.planner.intents import OperatorRequest
-from services.planner.law.coupling import BodyIntegral, CoupledTorque
+from services.planner.law.coupling import CoupledTorque, PushIntegral
 from services.planner.law.levelling import Levelling, up_of
 from services.planner.law.load import Load
 from services.planner.law.probe import ReferenceProbe
@@ -52,9 +52,8 @@ def weigh(load: Load, tick: int, kg: float) -> Any:
 
 
 def couple(coupled: CoupledTorque, tick: int) -> Any:
-    coupled.integral.advance(1e-5 * tick * np.ones(6), np.zeros(6), DT)
-    body = coupled.integral.torque(np.ones((6, 12)))
-    return tuple(coupled.advance(body + tick, DT))
+    coupled.integral.advance(1e-5 * tick, 0.0, DT)
+    return tuple(coupled.advance(np.full(12, coupled.integral.force + tick), DT))
 
 
 def shift(follower: ShiftReference, tick: int) -> Any:
@@ -99,7 +98,7 @@ def loaded(kg: float) -> Part:
 
 MOST = (0.01,) * 6
 PARTS = {
-    "coupling": Part(lambda robot: CoupledTorque(3.0, BodyIntegral(robot.law)), couple),
+    "coupling": Part(lambda robot: CoupledTorque(3.0, PushIntegral(robot.law)), couple),
     "levelling": Part(lambda _: Levelling(1.0), level),
     "a load of 9 kg": loaded(9.0),
     "3 kg less": loaded(-3.0),

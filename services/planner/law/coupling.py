@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import math
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,6 +30,8 @@ from shared.joints import N_JOINTS
 Array = NDArray[np.float64]
 
 
+Y = 1
+"""Row of p."""
 FAST = 0.04
 """m/s; the integral takes no error that changes so fast: a shove, and the sway after it. With all
 of the error, a robot shoved to one side swung to the other twice as far as without an integral."""
@@ -88,62 +89,40 @@ def pole_gain(bandwidth_hz: float, dt: float) -> float:
     return 1.0 - math.exp(-2.0 * math.pi * bandwidth_hz * dt)
 
 
-class CoupledState(msgspec.Struct, frozen=True):
-    """State of `CoupledTorque`."""
+class PushIntegral:
+    """F_I: force along y that grows against a lasting push, until the error is gone.
 
-    first: tuple[float, ...] = (0.0,) * N_JOINTS
-    """N m"""
-    second: tuple[float, ...] = (0.0,) * N_JOINTS
-    force: tuple[float, ...] = ()
-    """F_I, N; () is at rest."""
-
-
-class BodyIntegral:
-    """F_I: force along x and y that grows against a lasting push, until the error is gone.
-
-    It uses plain floats: for two values, NumPy's calls cost more than the arithmetic.
-
-    A push that lasts is then borne by the coupled torque, whose load sharing asks little of a
+    A push from the side is then borne by the coupled torque, whose load sharing asks little of a
     sole, and no longer by the local springs, which bend the feet's shares until a sole tips:
 
-        F_I' = (1 - |e_p'| / FAST)+ K_p e_p / push_integral_s,    |F_I| <= push_integral_max
+        F_I' = (1 - |e_y'| / FAST)+ K_p e_y / push_integral_s,    |F_I| <= push_integral_max
 
-    HOLD drops it with the coupled torque: `push_integral_max` is a push that HOLD stands.
+    HOLD drops it with the coupled torque: `push_integral_max` is a push that HOLD stands. Along x
+    there is none: there HOLD has no such room.
 
     Attributes:
-        rows: of p that are closed and integrated, also those with a limit of 0: the dynamic
-            certificate holds for any limit.
-        gains: rate of the force per error, N/(m s).
-        force: along these rows, N.
+        gain: rate of the force per error, N/(m s); 0: the direction is led, or the split the
+            paper's. The dynamic certificate holds for any limit.
+        force: F_I, N.
     """
 
     def __init__(self, law: LawConfig) -> None:
         """Start at rest."""
-        certified = law.split == "certified"  # the paper's has none
-        self.rows = [row for row in (0, 1) if certified and not law.S[row]]
-        self.gains = [law.K_p[row] / law.push_integral_s[row] for row in self.rows]
-        self._most = [law.push_integral_max[row] for row in self.rows]
-        self.force = [0.0] * len(self.rows)
-        self._F: Array = np.zeros(6)
+        closed = law.split == "certified" and not law.S[Y]
+        self.gain = law.K_p[Y] / law.push_integral_s if closed else 0.0
+        self.most = law.push_integral_max if closed else 0.0
+        self.force = 0.0
 
-    def advance(self, e_p: Array, e_pdot: Array, dt: float) -> None:
-        """Integrate for dt seconds, within the limits.
+    def advance(self, error: float, rate: float, dt: float) -> None:
+        """Integrate for dt seconds, within the limit.
 
         Args:
-            e_p: p_ref - p (6,), m and rad.
-            e_pdot: its rate (6,).
+            error: of y, m.
+            rate: of the error, m/s.
             dt: time since the last tick, s.
         """
-        for at, row in enumerate(self.rows):
-            slow = max(0.0, 1.0 - abs(float(e_pdot[row])) / FAST)
-            force = self.force[at] + dt * slow * self.gains[at] * float(e_p[row])
-            self.force[at] = clamp(force, -self._most[at], self._most[at])
-
-    def torque(self, J: Array) -> Array:
-        """Return J^T F_I (12,), N m; J is (6, 12)."""
-        self._F[self.rows] = self.force
-        torque: Array = self._F @ J
-        return torque
+        slow = max(0.0, 1.0 - abs(rate) / FAST)
+        self.force = clamp(self.force + dt * slow * self.gain * error, -self.most, self.most)
 
 
 class CoupledTorque:
@@ -153,7 +132,7 @@ class CoupledTorque:
         integral: F_I.
     """
 
-    def __init__(self, bandwidth_hz: float, integral: BodyIntegral) -> None:
+    def __init__(self, bandwidth_hz: float, integral: PushIntegral) -> None:
         """Start at rest."""
         self.integral = integral
         self._bandwidth_hz = bandwidth_hz
@@ -174,15 +153,13 @@ class CoupledTorque:
 
     def reset(self) -> None:
         """Reset filter and integral to zero."""
-        self._first[:] = self._second[:] = 0.0
-        self.integral.force = [0.0] * len(self.integral.rows)
+        self._first[:] = self._second[:] = self.integral.force = 0.0
 
-    def snapshot(self) -> CoupledState:
-        """Return the state between two ticks."""
-        first, second = tuple(self._first.tolist()), tuple(self._second.tolist())
-        return CoupledState(first, second, tuple(self.integral.force))
+    def snapshot(self) -> tuple[float, ...]:
+        """Return both poles' states (24,), N m, and F_I, N."""
+        return (*self._first.tolist(), *self._second.tolist(), self.integral.force)
 
-    def restore(self, state: CoupledState) -> None:
-        """Continue from a state that `snapshot` returned."""
-        self._first[:], self._second[:] = state.first, state.second
-        self.integral.force = list(state.force) or [0.0] * len(self.integral.rows)
+    def restore(self, state: tuple[float, ...]) -> None:
+        """Continue from a state that `snapshot` returned; an old log knows no F_I."""
+        self._first[:], self._second[:] = state[:N_JOINTS], state[N_JOINTS : 2 * N_JOINTS]
+        self.integral.force = sum(state[2 * N_JOINTS :])

@@ -34,7 +34,7 @@ from services.planner.law.assist import (
     is_still,
     wrench_in_world,
 )
-from services.planner.law.coupling import BodyIntegral, CoupledState, CoupledTorque
+from services.planner.law.coupling import CoupledTorque, PushIntegral, Y
 from services.planner.law.gains import GainLaw
 from services.planner.law.height import HeightReference, HeightState, Toward
 from services.planner.law.kinematics import Measured
@@ -105,7 +105,8 @@ class LawState(msgspec.Struct):
     assist: AssistState = msgspec.field(default_factory=AssistState)
     easing: EasingState = msgspec.field(default_factory=EasingState)
     has_led: bool = False
-    coupling: CoupledState = CoupledState()
+    coupling: tuple[float, ...] = (0.0,) * (2 * N_JOINTS + 1)
+    """State of `CoupledTorque`, N m and N."""
     levelling: tuple[bool, float, float] = (False, 0.0, 0.0)
     """State of `Levelling`: True if a slope is known, and the slope, rad."""
     shift: ShiftState = msgspec.field(default_factory=ShiftState)
@@ -127,7 +128,7 @@ class Hocca:
         self._split = GainSplit(config)
         self._S = gains.S
         self._terms = LawAtReference(gains, self._split)
-        self._coupling = CoupledTorque(self._split.coupling.bandwidth_hz, BodyIntegral(config.law))
+        self._coupling = CoupledTorque(self._split.coupling.bandwidth_hz, PushIntegral(config.law))
         self._S_perp = 1.0 - self._S
         self._levelling = Levelling(config.imu.levelling_s)
         self._shift = ShiftReference(config.law.shift_max)
@@ -197,7 +198,7 @@ class Hocca:
         wrench: Wrench | None = None,
         up_torso: Vector3 | None = None,
     ) -> LawOutput:
-        """Run the law once: docs/law.md (6) and (12).
+        """Run the law once: docs/law.md (6), (12) and (17).
 
         Args:
             q: measured joint angles (12,), rad.
@@ -277,9 +278,9 @@ class Hocca:
         e_p, e_pdot = p_ref - measured.p, pdot_ref - pdot
         terms = self._terms.evaluate(reference, e_p, e_pdot)
         integral = self._coupling.integral
-        if probe[0] == NO_ROW:  # it measures the body's answer to an error
-            integral.advance(e_p, e_pdot, dt)
-        tau_unfiltered = terms.coupled + integral.torque(reference.J)
+        if self._probe.state.row != Y:  # it measures the body's answer to an error
+            integral.advance(float(e_p[Y]), float(e_pdot[Y]), dt)
+        tau_unfiltered = terms.coupled + integral.force * reference.J[Y]
         tau_coupled = self._coupling.advance(tau_unfiltered, dt)
         # the eased lead goes into tau_coupled, which HOLD drops; in tau_ff it would outlive the
         # hand. It is a force fed forward, not fed-back joint rates, so the harness filter is enough

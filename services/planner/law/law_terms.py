@@ -39,7 +39,7 @@ class LawAtReference:
         self._uncoupled = UncoupledGains(gains.K_p, gains.B_p, gains.S, split.coupling.damping)
 
     def evaluate(self, reference: Reference, e_p: Array, e_pdot: Array) -> LawTerms:
-        """Return the terms: docs/law.md (9) and (17).
+        """Return the terms: docs/law.md (9).
 
         Args:
             reference: evaluated at the reference pose.

@@ -5,7 +5,7 @@ that no motion of `tools.lab.design.sampled_loop` grows. It covers every pose of
 every drivetrain (`robustness.stiffness`), hand and delay of the robot file:
 
 - with every feedback torque, and with tau_coupled alone, scaled by `gain_margin`;
-- with the delay scaled by `delay_margin`;
+- with the delay scaled by `delay_margin`, also while F_I is at its limit;
 - in HOLD with the services, and with the drives alone.
 
 While an encoder is blind, which its drive says only after `BLIND_S`, a motion may grow, by
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.law.certificate import motor_mean
-from services.planner.law.coupling import BodyIntegral, UncoupledGains
+from services.planner.law.coupling import PushIntegral, UncoupledGains, Y
 from services.planner.law.model import BodyInertia
 from services.planner.law.split import CouplingGains
 from shared.config.robot_config import RobotConfig
@@ -109,6 +109,8 @@ class Condition(NamedTuple):
     delay_s: float
     hand: HandModel
     gains: Gains
+    integral: bool = True
+    """False: F_I is at its limit, and stays there."""
 
     def words(self) -> str:
         """Return a description of the case."""
@@ -119,6 +121,8 @@ class Condition(NamedTuple):
         ]
         if self.hand != NO_HAND:
             parts.append(f"hand {self.hand.k_z:g} N/m")
+        if not self.integral:
+            parts.append("F_I at its limit")
         if self.gains.coupling != 1.0:
             parts.append(f"tau_coupled x{self.gains.coupling:g}")
         if self.gains.torque != 1.0:
@@ -205,7 +209,7 @@ class DynamicCertificate:
         S = np.array(law.S, float)
         self._K_p, self._B_p = (np.array(gain) * (1.0 - S) for gain in (law.K_p, law.B_p))
         self._S = S
-        self._integral = BodyIntegral(law)
+        self._integral_gain = PushIntegral(law).gain
         self._hands = [HandModel(*hand) for hand in wanted.hands]
         self._halves = (*halves(), whole())
         self._hold = _hold_gains(config)
@@ -226,8 +230,8 @@ class DynamicCertificate:
             design.coupling.bandwidth_hz,
             self._config.law.lead_easing,
             self._config.harness.low_pass_hz,
-            J[self._integral.rows],
-            np.array(self._integral.gains),
+            J[Y],
+            self._integral_gain,
         )
 
     def held(self, node: StiffnessNode, design: Design, *, onboard: bool) -> Feedback:
@@ -245,6 +249,8 @@ class DynamicCertificate:
         stand, half = c.node.stand, self._halves[c.half]
         if c.mode == "TRACK":
             feedback = self.feedback(c.node, design)
+            if not c.integral:
+                feedback = feedback._replace(integral_gain=0.0)
         else:
             feedback = self.held(c.node, design, onboard=c.mode == "drives alone")
             stand = stand._replace(S=np.zeros(6))
@@ -353,6 +359,8 @@ class DynamicCertificate:
             yield case._replace(delay_s=delay)
             if margins:
                 yield case._replace(delay_s=wanted.delay_margin * delay)
+                if half == 1:
+                    yield case._replace(delay_s=wanted.delay_margin * delay, integral=False)
                 yield case._replace(delay_s=delay, gains=Gains(coupling=wanted.gain_margin))
                 yield case._replace(gains=Gains(torque=wanted.gain_margin))
                 yield case._replace(delay_s=delay, gains=Gains(torque=wanted.gain_margin))

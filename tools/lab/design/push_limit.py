@@ -8,7 +8,7 @@ module adds them, for a constant horizontal push F u at the torso's origin:
 
        (K_fail + K_c) dp = F pi,   pi = (dr_torso/dp)^T u,   dtau = -D T dp - J^T K_c dp
 
-   Led, a push that grew slowly leaves no error along x and y up to `law.push_integral_max`.
+   Led, a push that grew slowly leaves no error along y up to `law.push_integral_max`.
 
 2. Limit of the body, whatever the control does, at fixed joint angles. A linear program chooses how
    the two legs share weight and push. No gains hold a harder push at that pose.
@@ -28,7 +28,7 @@ import scipy.optimize
 from numpy.typing import NDArray
 
 from services.planner.law.certificate import motor_mean
-from services.planner.law.coupling import UncoupledGains
+from services.planner.law.coupling import PushIntegral, UncoupledGains, Y
 from services.planner.law.kinematics import Kinematics
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.joints import MODULES, N_JOINTS, N_LEG, SIDES
@@ -182,7 +182,7 @@ class LoadedStand:
         D: Array,
         direction: tuple[float, float],
         K_c: Array,
-        integral_max: tuple[float, float],
+        integral_max: float,
     ) -> PushLimit:
         """Return the hardest push that gains and integral hold, which grew slowly.
 
@@ -190,15 +190,14 @@ class LoadedStand:
             D: local stiffnesses (12,), N m/rad.
             direction: world x and y, a unit vector.
             K_c: stiffness that the planner adds along p (6, 6).
-            integral_max: of F_I along x and y, N; 0: none (`services.planner.law.coupling`).
+            integral_max: of F_I, N; 0: there is none (`services.planner.law.coupling`).
         """
-        rows = [row for row in (0, 1) if direction[row] and integral_max[row] > 0.0]
         rigid = np.zeros((6, 6))
-        rigid[rows, rows] = RIGID
+        rigid[Y, Y] = RIGID
         response = self.response(D, direction, K_c + rigid)
-        if not rows or response is None:
+        if not (direction[Y] and integral_max) or response is None:
             return self.limit_held(D, direction, K_c)
-        until_n = min(integral_max[row] / abs(RIGID * response.dp[row]) for row in rows)
+        until_n = integral_max / abs(RIGID * response.dp[Y])
         hardest = self._hardest(response, np.zeros(2 * N_JOINTS))
         if hardest.force_n <= until_n:
             return hardest
@@ -284,7 +283,7 @@ def limits_along(
     K_c, _ = uncoupled.at(stand.stiffness(D), stand.along_p(D_B))
     D_hold = np.maximum(D, np.ravel([config.hold_gains(module)[0] for module in MODULES]))
     return PushLimits(
-        stand.limit_led(D, direction, K_c, law.push_integral_max),
+        stand.limit_led(D, direction, K_c, PushIntegral(law).most),
         stand.limit_held(D_hold, direction),
         stand.limit_held(motor_mean(D_hold), direction),
         stand.limit_of_body(direction),

@@ -13,7 +13,7 @@ The controllers run on it, each at its own rate:
     drive          u = W - D_m q^ - D_Bm v^                     D_m: the module's mean
     joint service  W = tau + D_m q^ + D_Bm v^, tau the law of `services.joint.pd_law` on q^, v^
     planner        r = S J q^, q_ref = T r, tau_coupled filtered, sent d later than sampled;
-                   F_I' = K_p e_p / integral_s along x and y is part of tau_coupled
+                   F_I' = K_p e_y / push_integral_s is part of tau_coupled
 
 One planner period is a linear map. The loop is stable if the map's spectral radius is below 1.
 
@@ -66,7 +66,7 @@ class HandModel(NamedTuple):
 
 
 MOVES_MIN: Final = 1e-9
-"""Largest entry of a row of J that a half of the loop does not move."""
+"""Largest gain of an integral that is none."""
 NO_HAND: Final = HandModel(0.0, 0.0, 0.0, 0.0)
 
 
@@ -99,9 +99,10 @@ class Feedback(NamedTuple):
     lead_easing: float = 0.0
     easing_bandwidth_hz: float = 40.0
     """Bandwidth of the pole on the hand's measured wrench."""
-    integral: Array = np.zeros((0, N_JOINTS))
-    """(n, 12): rows of J whose errors are integrated, with their gains, N/(m s)."""
-    integral_gains: Array = np.zeros(0)
+    integral: Array = np.zeros(N_JOINTS)
+    """(12,): row of J whose error is integrated; 0: none."""
+    integral_gain: float = 0.0
+    """N/(m s)"""
     seen: Array = np.eye(N_JOINTS)
     """(12, 12): the local loops see `seen` q; the identity, but while an encoder is blind."""
 
@@ -186,8 +187,7 @@ class _Laws(NamedTuple):
     ease_v: Array
     """Torques that ease the hand's force, per p and p'."""
     integral: Array
-    """(n, n_q): rows of J that are integrated in this half."""
-    integral_gains: Array
+    """(1, n): the row of J that is integrated; (0, n) where there is none."""
 
 
 class _State(NamedTuple):
@@ -353,7 +353,7 @@ class SampledLoop:
         q, v = x[at.q], x[at.v]
         r, rate = laws.J_open @ q, laws.J_open @ v
         e_q, e_v = laws.T_open @ r - q, laws.T_open @ rate - v
-        F_I = F_I + period * laws.integral_gains[:, np.newaxis] * (laws.integral @ e_q)
+        F_I = F_I + period * self.feedback.integral_gain * (laws.integral @ e_q)
         raw = laws.C_q @ e_q + laws.C_v @ e_v + laws.integral.T @ F_I
         gain = pole_gain(self.feedback.bandwidth_hz, period)
         f_1 = f_1 + gain * (raw - f_1)
@@ -384,9 +384,9 @@ def _laws(
     D, D_B, D_m, D_Bm = (V.T @ (gain[:, np.newaxis] * feedback.seen) @ V for gain in gains)
     easing = np.outer(V.T @ stand.J_harness[2], n_z), np.outer(V.T @ stand.J[4], n_pitch)
     alpha = feedback.lead_easing
-    integral = feedback.integral @ V
-    # the integral of a row that this half does not move would stay as it is
-    moves = np.abs(integral).max(axis=1, initial=0.0) > MOVES_MIN
+    integral = (feedback.integral @ V)[np.newaxis]
+    if np.abs(integral).max() * feedback.integral_gain < MOVES_MIN:
+        integral = integral[:0]  # it would stay as it is: a motion that does not decay
     return _Laws(
         D=D,
         D_B=D_B,
@@ -399,6 +399,5 @@ def _laws(
         T_open=(V.T @ stand.T @ P)[:, opened],
         ease_p=-alpha * (hand.k_z * easing[0] + hand.k_pitch * easing[1]),
         ease_v=-alpha * (hand.b_z * easing[0] + hand.b_pitch * easing[1]),
-        integral=integral[moves],
-        integral_gains=feedback.integral_gains[moves],
+        integral=integral,
     )

@@ -14,7 +14,7 @@ planner period, just before the sample of that period. Its rows are, in this ord
     q_hat 12, v_hat 12            the drives' estimates of theta and omega
     W 12                          target in use by the drives
     f1 12, f2 12, e 12            the planner's filters
-    I m                           the planner's integrals, each a force, N
+    F_I 1                         the planner's integral, a force, N
     r n, rdot n, c 12             each command still needed, oldest first; n = sum(S)
     W 12                          each target written but not yet in use, oldest first
 
@@ -66,8 +66,8 @@ class Loop:
     bandwidth_hz: float  # corner of each of the two coupling filters
     lead_easing: float  # share of the hand's force that is eased
     easing_bandwidth_hz: float
-    integral: Array  # (m, 12) body rate per joint rates, of what the planner integrates
-    integral_gains: Array  # (m,) growth of its force per error, N/(m s)
+    integral: Array  # (12,) body rate per joint rates, of what the planner integrates
+    integral_gain: float  # growth of its force per error, N/(m s)
     k: float  # drivetrain stiffness
     b: float  # drivetrain damping
     I: float  # noqa: E741  (the paper's letter) motor inertia, joint side
@@ -162,9 +162,9 @@ class _Plant:
 class _Planner:
     """The planner: makes one command from each sample, and keeps its filters."""
 
-    def __init__(self, loop: Loop, f1: Array, f2: Array, e: Array, forces: Array) -> None:
+    def __init__(self, loop: Loop, f1: Array, f2: Array, e: Array, force: Array) -> None:
         self.loop = loop
-        self.f1, self.f2, self.e, self.forces = f1, f2, e, forces
+        self.f1, self.f2, self.e, self.force = f1, f2, e, force
         self.open = np.asarray(loop.S).astype(bool)
         self.a = _filter_gain(loop.bandwidth_hz, loop.planner_period)
         self.a_e = _filter_gain(loop.easing_bandwidth_hz, loop.planner_period)
@@ -178,10 +178,8 @@ class _Planner:
         r, rdot = J_open @ q_hat, J_open @ v_hat
         error = T_open @ r - q_hat
         raw = loop.C_q @ error + loop.C_v @ (T_open @ rdot - v_hat)
-        self.forces = self.forces.copy()
-        for i, (row, gain) in enumerate(zip(loop.integral, loop.integral_gains, strict=True)):
-            self.forces[i] += loop.planner_period * gain * (row @ error)
-            raw = raw + np.outer(row, self.forces[i])
+        self.force = self.force + loop.planner_period * loop.integral_gain * (loop.integral @ error)
+        raw = raw + np.outer(loop.integral, self.force)
         self.f1 = self.f1 + self.a * (raw - self.f1)
         self.f2 = self.f2 + self.a * (self.f1 - self.f2)
         self.e = self.e + self.a_e * (self._felt(p, p_dot) - self.e)
@@ -225,8 +223,7 @@ def state_size(loop: Loop) -> int:
     commands, writes = _under_way(loop)
     n_open = int(np.count_nonzero(loop.S))
     command_size = 2 * n_open + N_JOINTS
-    own = 4 * N_JOINTS + len(loop.integral)
-    return _Plant.SIZE + own + commands * command_size + writes * N_JOINTS
+    return _Plant.SIZE + 4 * N_JOINTS + 1 + commands * command_size + writes * N_JOINTS
 
 
 def _times(loop: Loop) -> list[tuple[float, bool, bool]]:
@@ -294,7 +291,7 @@ def advance(
     x = take(_Plant.SIZE)
     target = take(N_JOINTS)
     filters = take(N_JOINTS), take(N_JOINTS), take(N_JOINTS)
-    planner = _Planner(loop, *filters, take(len(loop.integral)))
+    planner = _Planner(loop, *filters, take(1))
     commands: deque[_Command] = deque()
     for i in range(n_commands):
         sampled = -(n_commands - i) * loop.planner_period
@@ -326,7 +323,7 @@ def advance(
     while len(commands) > n_commands:
         commands.popleft()
 
-    parts = [x, target, planner.f1, planner.f2, planner.e, planner.forces]
+    parts = [x, target, planner.f1, planner.f2, planner.e, planner.force]
     for command in commands:
         parts += [command.r, command.rdot, command.c]
     parts += [write.target for write in writes]
