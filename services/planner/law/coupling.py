@@ -103,6 +103,7 @@ class PushIntegral:
     Attributes:
         gain: rate of the force per error, N/(m s); 0: the direction is led, or the split the
             paper's. The dynamic certificate holds for any limit.
+        most: the limit, N.
         force: F_I, N.
     """
 
