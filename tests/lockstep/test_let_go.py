@@ -110,7 +110,7 @@ def test_half_a_payload_too_much_or_too_little_or_too_far_back_is_not_led(
 
 
 def test_a_hand_that_comes_back_leads_again(robot: RobotConfig) -> None:
-    """Let go of for 2.5 s, with a payload that pulls it down."""
+    """Nobody holds it for 2.5 s, and its payload pulls it down."""
     modes: list[tuple[float, int]] = []
 
     def look(fleet: Lockstep, row: SimTruth) -> None:

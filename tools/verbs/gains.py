@@ -137,7 +137,7 @@ def _show(robot: RobotConfig, schedule: GainSchedule, console: Console) -> None:
 
 def _show_pushes(robot: RobotConfig, schedule: GainSchedule, console: Console) -> None:
     """Print how hard a constant push each tier holds, upright."""
-    table = Table(title="Hardest constant push, N: led / planner dead / drives alone / body")
+    table = Table(title="Hardest constant push, N: led, if it grows / planner dead / drives / body")
     table.add_column("COM m", justify="right")
     for name in DIRECTIONS:
         table.add_column(name, justify="right", no_wrap=True)
