@@ -43,6 +43,9 @@ class Keyframe(Section, frozen=True):
     """Weight that the operator rests on the harness and asks the robot to carry, N."""
     shift: tuple[ShiftLength, ShiftLength, ShiftAngle, ShiftAngle] = (0.0, 0.0, 0.0, 0.0)
     """Where the operator asks COM x and y, m, and the torso's roll and yaw, rad, to be."""
+    side: ShiftLength | None = None
+    """Where the person holds the harness point sideways, m, world y: between two keyframes that say
+    so; else they leave it free."""
 
 
 class Push(Section, frozen=True):
@@ -181,6 +184,9 @@ class Lead(NamedTuple):
     """N"""
     shift: Shift = (0.0, 0.0, 0.0, 0.0)
     """x, y, m; roll, yaw, rad."""
+    side: float | None = None
+    """m, world y of the harness point; None: free sideways."""
+    side_rate: float = 0.0
 
 
 def lead(scenario: Scenario, t: float) -> Lead:
@@ -199,9 +205,10 @@ def lead(scenario: Scenario, t: float) -> Lead:
                 (b.pitch - a.pitch) * s_rate,
                 a.assist + (b.assist - a.assist) * s,
                 _eased(a.shift, b.shift, s),
+                *_across(a.side, b.side, s, s_rate),
             )
     rest = frames[0] if t <= frames[0].at else frames[-1]
-    return Lead(rest.height, 0.0, rest.pitch, 0.0, rest.assist, rest.shift)
+    return Lead(rest.height, 0.0, rest.pitch, 0.0, rest.assist, rest.shift, rest.side)
 
 
 def _eased(a: Shift, b: Shift, s: float) -> Shift:
@@ -209,6 +216,15 @@ def _eased(a: Shift, b: Shift, s: float) -> Shift:
         return a
     x, y, roll, yaw = (start + (end - start) * s for start, end in zip(a, b, strict=True))
     return x, y, roll, yaw
+
+
+def _across(
+    a: float | None, b: float | None, s: float, s_rate: float
+) -> tuple[float | None, float]:
+    """Return where the harness point is held sideways, and its rate."""
+    if a is None or b is None:
+        return None, 0.0
+    return a + (b - a) * s, (b - a) * s_rate
 
 
 def push_at(scenario: Scenario, t: float) -> tuple[float, float, float]:
@@ -284,7 +300,7 @@ def _fault_problems(where: str, fault: Fault) -> Iterator[tuple[str, str, str]]:
 def to_toml(scenario: Scenario) -> str:
     """Return the scenario as TOML that `load` reads back."""
     table = msgspec.to_builtins(scenario)
-    for row in (*table["fault"], *table["inject"]):
+    for row in (*table["keyframe"], *table["fault"], *table["inject"]):
         for key in [key for key, value in row.items() if value is None]:
             del row[key]  # TOML has no null
     return tomli_w.dumps(table)

@@ -493,6 +493,9 @@ class OperatorConfig(Section, frozen=True):
     k_pitch: Annotated[float, Range(0.0, 1e5, "N m/rad")]
     b_pitch: Annotated[float, Range(0.0, 1e4, "N m s/rad")]
     moment_max: Annotated[float, Range(0.0, 1e4, "N m")]
+    k_y: Annotated[float, Range(0.0, 1e5, "N/m")] = 1500.0
+    """Sideways, where a scenario holds the harness point there."""
+    b_y: Annotated[float, Range(0.0, 1e4, "N s/m")] = 150.0
 
 
 class SimulationConfig(Section, frozen=True):

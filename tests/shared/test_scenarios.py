@@ -183,6 +183,17 @@ def test_lead_waits_at_the_first_keyframe_and_stays_at_the_last() -> None:
     assert {lead(stand, t).height for t in (-1.0, 0.0, 1.5, 2.0)} == {1.1}
 
 
+def test_sideways_it_is_held_between_keyframes_that_say_where_and_else_left_free() -> None:
+    sides = (None, 0.02, -0.04, None)
+    frames = tuple(Keyframe(at=float(at), height=1.1, side=side) for at, side in enumerate(sides))
+    leaned = Scenario(name="leaned", about="", duration=10.0, keyframe=frames)
+    assert {lead(leaned, t)[6:] for t in (-1.0, 0.5, 0.999, 2.001, 9.0)} == {(None, 0.0)}
+    assert [lead(leaned, t).side for t in (1.0, 1.5)] == pytest.approx([0.02, -0.01])
+    dt = 1e-6
+    sides_there = [lead(leaned, 1.3 + t).side or 0.0 for t in (-dt, dt)]
+    assert lead(leaned, 1.3).side_rate == pytest.approx(np.diff(sides_there)[0] / (2 * dt))
+
+
 def test_a_push_acts_from_its_start_up_to_its_end() -> None:
     squat = scenarios.load(SQUAT)
     before, start = push_at(squat, math.nextafter(12.0, 0.0)), push_at(squat, 12.0)

@@ -55,6 +55,16 @@ def test_the_hand_is_a_spring_and_a_damper(robot: RobotConfig, operator: Operato
     assert turning.moment_pitch == pytest.approx(-0.1 * hand.b_pitch)
 
 
+def test_held_sideways_it_is_a_spring_and_a_damper_there_too_and_no_stronger(
+    robot: RobotConfig, operator: Operator
+) -> None:
+    hand, held = robot.simulation.operator, LEVEL._replace(side=0.03, side_rate=0.1)
+    assert operator.force_side(held, 0.01, 0.1) == pytest.approx(0.02 * hand.k_y)
+    assert operator.force_side(held, 0.03, 0.0) == pytest.approx(0.1 * hand.b_y)
+    assert operator.force_side(held, -1.0, 0.0) == hand.force_max
+    assert operator.force_side(LEVEL, 0.5, 1.0) == 0.0, "nothing holds it"
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("far", [0.2, 10.0])
 def test_the_hand_is_no_stronger_than_a_person(

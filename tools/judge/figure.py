@@ -75,11 +75,12 @@ def draw(log: RunLog, name: str, summary: Summary, path: Path) -> None:
     _lines(axes[1], t, height[:, None], ("torso height",), "height in m")
     angles = np.array([row.angles for row in rows])
     _lines(axes[2], t, angles, ("roll", "pitch", "yaw"), "torso in rad")
-    force = np.array([row.operator_force[2] for row in rows])
-    _lines(axes[3], t, force[:, None], ("operator's\nhand, z",), "force in N")
+    force = np.array([row.operator_force[:0:-1] for row in rows])  # z, y
+    force = force if force[:, 1].any() else force[:, :1]
+    _lines(axes[3], t, force, ("operator's\nhand, z", "hand, y"), "force in N")
     if any(row.load_n for row in rows):
         load = [row.load_n for row in rows]
-        axes[3].plot(t, load, color=LINES[1], lw=1.1, label="weight on\nthe harness")
+        axes[3].plot(t, load, color=LINES[2], lw=1.1, label="weight on\nthe harness")
         _legend(axes[3])
     _ages(axes[-2], log, zero_ns)
     _modes(axes[-1], log, zero_ns, end_s)

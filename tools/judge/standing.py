@@ -38,6 +38,7 @@ LIMITS: Final = (
     VerdictLimit("shaking_nm", 15.0, "N m", "torque above 8 Hz, root mean square"),
     VerdictLimit("sinking_m_s", 0.8, "m/s", "torso's fastest way down"),
     VerdictLimit("operator_peak_n", 40.0, "N", "operator's force, led"),
+    VerdictLimit("operator_side_peak_n", 60.0, "N", "operator's force sideways, led"),
     VerdictLimit("assist_error_n", 10.0, "N", "assist force against what was asked"),
     VerdictLimit("hold_com_x_max_mm", 80.0, "mm", "COM x, held"),
     VerdictLimit("hold_com_y_max_mm", 100.0, "mm", "COM y, held"),

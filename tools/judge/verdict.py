@@ -128,9 +128,10 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
     summary["sole_tilt_max_rad"] = _max(tilt)
     summary |= sound
     summary["alive_sole_tilt_max_rad"] = _max(tilt[led])
-    force = np.array([abs(row.operator_force[2]) for row in truth])
+    _, side, force = np.abs([row.operator_force for row in truth]).T
     summary["operator_peak_n"] = _max(force[led])
     summary["hold_operator_peak_n"] = _max(force[held])
+    summary["operator_side_peak_n"] = _max(side[led]) if side.any() else None
     judged = (t < kill_s) & ~apart
     summary["assist_error_n"] = _assist_error(list(compress(truth, judged)))
     summary |= _handover(log, kills)

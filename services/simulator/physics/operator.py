@@ -1,7 +1,8 @@
 """The simulated operator: a hand that leads, and weight rested on the harness.
 
 The hand is a clipped spring-damper between a path and the harness point, in height and
-pitch (docs/simulator.md#reference-scenario). Behind it is a person with a mass. Pure.
+pitch (docs/simulator.md#reference-scenario), and sideways where a scenario says so. Behind it is a
+person with a mass. Pure.
 """
 
 from __future__ import annotations
@@ -103,3 +104,14 @@ class Operator:
             clamp(force, -hand.force_max, hand.force_max),
             clamp(moment, -hand.moment_max, hand.moment_max),
         )
+
+    def force_side(self, wanted: Lead, side: float, rate: float) -> float:
+        """Return the hand's force along world y, N, with the harness point there, m, at a rate.
+
+        0 where nothing holds it sideways.
+        """
+        if wanted.side is None:
+            return 0.0
+        hand = self._hand
+        force = hand.k_y * (wanted.side - side) + hand.b_y * (wanted.side_rate - rate)
+        return clamp(force, -hand.force_max, hand.force_max)

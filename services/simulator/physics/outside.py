@@ -88,6 +88,7 @@ class OutsideForces:
         led_hand: the hand that somebody leads in place of the scenario.
         holds: the operator's hand is on the harness.
         hand: the hand's force now.
+        hand_side: the hand's force along world y, N.
         push: the push now, N, world.
         harness_force: the operator's force on the torso at the harness point, N, torso axes.
         harness_moment: N m, torso axes.
@@ -105,6 +106,7 @@ class OutsideForces:
         self.led_hand: LedHand | None = None
         self.holds = scenario.hand
         self.hand = HandForce(0.0, 0.0)
+        self.hand_side = 0.0
         self.push: Vector3 = (0.0, 0.0, 0.0)
         self.harness_force: Vector3 = (0.0, 0.0, 0.0)
         self.harness_moment: Vector3 = (0.0, 0.0, 0.0)
@@ -114,7 +116,9 @@ class OutsideForces:
         wanted = lead(self.scenario, scenario_s)
         if self.led_hand is not None:
             wanted = self.led_hand.over(wanted)
-        return wanted if self.asked is None else Lead(*wanted[:4], *self.asked)
+        if self.asked is not None:
+            wanted = wanted._replace(assist=self.asked[0], shift=self.asked[1])
+        return wanted
 
     def apply(self, scenario_s: float, dt: float) -> None:
         """Advance by dt, s, and set the wrench on the torso.
@@ -130,14 +134,16 @@ class OutsideForces:
         x, y, z = self._harness_point
         arm_x = r[0] * x + r[1] * y + r[2] * z
         arm_y = r[3] * x + r[4] * y + r[5] * z
+        arm_z = r[6] * x + r[7] * y + r[8] * z
         # MuJoCo applies outside forces at the body's centre of mass, which a plant may move
         com_x, com_y, com_z = torso.com
         off_x = r[0] * com_x + r[1] * com_y + r[2] * com_z
         off_y = r[3] * com_x + r[4] * com_y + r[5] * com_z
-        self.hand = HandForce(0.0, 0.0)
+        off_z = r[6] * com_x + r[7] * com_y + r[8] * com_z
+        self.hand, side = HandForce(0.0, 0.0), 0.0
         if self.holds and self.hoist.share == 0.0:
-            height = float(torso.position[2]) + r[6] * x + r[7] * y + r[8] * z
-            _, _, v_z, w_x, w_y, w_z = torso.rates.tolist()  # omega in torso axes
+            height = float(torso.position[2]) + arm_z
+            _, v_y, v_z, w_x, w_y, w_z = torso.rates.tolist()  # omega in torso axes
             omega_x = r[0] * w_x + r[1] * w_y + r[2] * w_z
             omega_y = r[3] * w_x + r[4] * w_y + r[5] * w_z
             rate = v_z + omega_x * arm_y - omega_y * arm_x
@@ -145,21 +151,31 @@ class OutsideForces:
             above, rising = self.wearer.motion()
             height, rate = height - above, rate - rising
             self.hand = self.operator.force(wanted, height, rate, math.atan2(-r[6], r[8]), w_y)
+            if wanted.side is not None:
+                omega_z = r[6] * w_x + r[7] * w_y + r[8] * w_z
+                across = v_y + omega_z * arm_x - omega_x * arm_z
+                at = float(torso.position[1]) + arm_y
+                side = self.operator.force_side(wanted, at, across)
         self.wearer.step(dt, self.hand.force_z, wanted.assist)
         self.push = push_at(self.scenario, scenario_s) if scenario_s >= 0.0 else (0.0, 0.0, 0.0)
         if led_hand is not None:
             self.push = led_hand.push or self.push
         f, m = self.hand.force_z - self.wearer.load_n, self.hand.moment_pitch
-        # in torso axes, as the harness sensor feels it: f along world z, m about torso y
-        self.harness_force = (r[6] * f, r[7] * f, r[8] * f)
+        self.hand_side = side
+        # in torso axes, as the sensor feels it: side along world y, f along z, m about torso y
+        self.harness_force = (
+            r[3] * side + r[6] * f,
+            r[4] * side + r[7] * f,
+            r[5] * side + r[8] * f,
+        )
         self.harness_moment = (0.0, m, 0.0)
         torso.wrench[:] = (
             self.push[0],
-            self.push[1],
+            self.push[1] + side,
             self.push[2] + f,
-            r[1] * m + (arm_y - off_y) * f,
+            r[1] * m + (arm_y - off_y) * f - (arm_z - off_z) * side,
             r[4] * m - (arm_x - off_x) * f,
-            r[7] * m,
+            r[7] * m + (arm_x - off_x) * side,
         )
         if self.hoist.share > 0.0:
             torso.wrench[:] += self.hoist.advance(torso, dt)

@@ -228,7 +228,7 @@ class World:
             com=posture.com,
             torso=posture.torso,
             angles=posture.angles,
-            operator_force=(0.0, 0.0, outside.hand.force_z),
+            operator_force=(0.0, outside.hand_side, outside.hand.force_z),
             operator_moment=as_vector(moment),
             load_n=outside.wearer.load_n,
             harness_force_z=outside.wearer.load_n - outside.hand.force_z,

@@ -40,6 +40,7 @@ WORLD: Final = (
     ("right sole's tilt", "foot_right_tilt", 0, 1.0, "alive_sole_tilt_max_rad", ""),
     ("left sole's tilt", "foot_left_tilt", 0, 1.0, "alive_sole_tilt_max_rad", ""),
     ("operator's force", "operator_force", 2, 1.0, "operator_peak_n", ""),
+    ("operator's force sideways", "operator_force", 1, 1.0, "operator_side_peak_n", ""),
 )
 """(name, field of `SimTruth`, index in the field, scale, key of the verdict's limit while the
 planner leads, key while it does not lead); an empty key: no limit."""

@@ -146,6 +146,8 @@ def hand(run: RunData) -> Iterator[Panel]:
     t, t_p = run.times(topics.SIM_TRUTH), run.times(topics.PLANNER_STATUS)
     requested, assist = run.columns(topics.PLANNER_STATUS, "", "assist_requested_n", "assist_n")
     lines = [Line("hand, z", t, force[:, 2], 0)]
+    if force[:, 1].any():
+        lines.append(Line("hand, y", t, force[:, 1], 8))
     if load.any():
         lines += [Line("weight on the harness", t, load, 1), Line("carried", t, carried, 2)]
     if requested.any() or assist.any():

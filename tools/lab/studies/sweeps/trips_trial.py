@@ -169,9 +169,17 @@ TROUBLES: Final[Mapping[str, Trouble]] = {
         "50 N from the side for 3 s", Trip.EDGE,
         _led(7.0, push=(Push(at=2.5, duration=3.0, force=(0.0, 50.0, 0.0)),)),
     ),
+    "is shoved": Trouble(
+        "100 N from the side for 0.3 s on its way into the crawl", Trip.TIPPING,
+        _led(
+            6.0, _at(3.5, 0.79, pitch=1.2, assist=100.0),
+            push=(Push(at=2.2, duration=0.3, force=(0.0, 100.0, 0.0)),),
+        ),
+    ),
     "squats": Trouble("as shipped: pushed, planner killed", None, _shipped("squat")),
     "crawls": Trouble("as shipped", None, _shipped("crawl")),
     "shifts": Trouble("as shipped", None, _shipped("shift")),
+    "leans": Trouble("as shipped: held and leaned on sideways", None, _shipped("lean")),
 }  # fmt: skip
 
 
