@@ -273,6 +273,16 @@ def test_for_a_limp_ankle_the_knees_alone_brace(robot: RobotConfig) -> None:
     assert abs(outcome.com_mm[:, 0]).max() < 120.0, "within the sole that is left"
 
 
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize("led", [True, False])
+@pytest.mark.parametrize("x", [25.0, -25.0])
+def test_pushed_beside_a_limp_ankle_it_stands(robot: RobotConfig, x: float, led: bool) -> None:
+    """One sole is left: it bears 47 N under any control, 23 with HOLD's gains."""
+    limp = fault("disarmed", "ankle_left", 0.7)
+    told = still(4.5, fault=limp, push=(push(1.7, x, 0.0, 0.0),), kill=() if led else kill(0.5))
+    assert run(robot, told).stood
+
+
 @pytest.mark.parametrize(("height", "pitch"), [(1.1, 0.5), (0.95, 0.9)])
 def test_a_turned_torso_stays_turned(robot: RobotConfig, height: float, pitch: float) -> None:
     """Six such robots without a planner: pulled upright against the hand, two fell."""

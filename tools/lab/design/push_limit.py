@@ -21,6 +21,7 @@ is linear in tau and in the soles' wrenches, so the first limit reached sets the
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -219,9 +220,15 @@ class LoadedStand:
                 hardest = min(hardest, PushLimit(force, part))
         return hardest
 
-    def limit_of_body(self, direction: tuple[float, float]) -> PushLimit:
-        """Return the hardest push that soles and motors bear at this pose under any control."""
-        total, unit = self._W[0] + self._W[1], _horizontal(direction)
+    def limit_of_body(self, direction: Sequence[float], limp: str = "") -> PushLimit:
+        """Return the hardest push that soles and motors bear at this pose under any control.
+
+        Args:
+            direction: world x and y, a unit vector; or a wrench on the torso (6,), N and N m: the
+                limit is then in times of it.
+            limp: a module whose motors have no torque.
+        """
+        total, unit = self._W[0] + self._W[1], np.pad(direction, (0, 6 - len(direction)))
 
         def loads(x: Array) -> Array:
             """Return (tau, soles); the right leg carries x[:6], the push is x[6] in N."""
@@ -231,7 +238,8 @@ class LoadedStand:
         unpushed = loads(np.zeros(7))
         slopes = np.array([loads(e) - unpushed for e in np.eye(7)]).T
         rows = np.array([limit.row for limit in self._limits])
-        bounds = np.array([limit.bound for limit in self._limits]) - rows @ unpushed
+        most = [limit.bound * (limit.part != f"torque of {limp}") for limit in self._limits]
+        bounds = np.array(most) - rows @ unpushed
         solution = scipy.optimize.linprog(
             -np.eye(7)[6],
             A_ub=rows @ slopes,

@@ -19,6 +19,7 @@ from shared.config.scenarios import Keyframe, Push, Scenario
 from shared.joints import N_JOINTS, N_LEG
 from tools.lab.design.poses import Poses
 from tools.lab.design.push_limit import DIRECTIONS, RIGID, LoadedStand, equivalent_slope
+from tools.lab.studies.sweeps.push_range import com_height
 
 Array = NDArray[np.float64]
 
@@ -30,6 +31,8 @@ PUSH_N = 15.0
 FLOOR_S = 0.004
 """Contact time of a floor that hardly gives: the soles' own roll is not in the formula."""
 SETTLE_S = 4.0
+HAND_PITCH, HAND_DOWN = (0.0, 0.0, 0.0, 0.0, 60.0, 0.0), (0.0, 0.0, -150.0, 0.0, 0.0, 0.0)
+"""The most that the simulated person's hand does, N and N m."""
 
 
 class Posed(NamedTuple):
@@ -102,6 +105,26 @@ def test_no_local_gains_hold_more_than_soles_and_motors_bear(
     stand, direction = poses[z].stand, DIRECTIONS[name]
     D = np.tile(10.0 ** np.array(logs), 2)
     assert stand.limit_held(D, direction).force_n <= stand.limit_of_body(direction).force_n + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("limp", "wrench", "bears"),
+    [
+        ("", HAND_PITCH, 1.55),
+        ("ankle_left", HAND_PITCH, 0.93),
+        ("", HAND_DOWN, 3.25),
+        ("knee_left", HAND_DOWN, 0.327),
+    ],
+)
+def test_beside_a_limp_ankle_or_knee_no_control_bears_a_hand_that_leads_on_into_the_crawl(
+    robot: RobotConfig, limp: str, wrench: tuple[float, ...], bears: float
+) -> None:
+    """Two seconds on its way there the torso is at 1.05 m, turned by 0.41 rad."""
+    at = Poses(robot)
+    node = at.node(com_height(at, 1.05, 0.41), 0.41)
+    assert node is not None
+    stand = LoadedStand(robot, at.kinematics, node.T, node.hessians[0])
+    assert stand.limit_of_body(wrench, limp).force_n == pytest.approx(bears, rel=0.02)
 
 
 def test_left_and_right_are_alike(poses: dict[float, Posed]) -> None:
