@@ -104,4 +104,4 @@ def test_a_group_that_is_none_is_an_error_that_names_those_there(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     assert mutants.main(["--group", "nobody", "--out", str(tmp_path)]) == 2
-    assert "there are joint, planner" in capsys.readouterr().out
+    assert "there are holding, joint, planner" in capsys.readouterr().out

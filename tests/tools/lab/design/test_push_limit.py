@@ -11,12 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from services.planner.law.split import ScheduledGains
 from services.simulator.physics.body import body_of
 from services.simulator.physics.plant import NAMED, changed
 from services.simulator.physics.world import World
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.config.scenarios import Keyframe, Push, Scenario
-from shared.joints import N_JOINTS, N_LEG
+from shared.joints import MODULES, N_JOINTS, N_LEG
 from tools.lab.design.poses import Poses
 from tools.lab.design.push_limit import DIRECTIONS, RIGID, LoadedStand, equivalent_slope
 from tools.lab.studies.sweeps.push_range import com_height
@@ -105,6 +106,20 @@ def test_no_local_gains_hold_more_than_soles_and_motors_bear(
     stand, direction = poses[z].stand, DIRECTIONS[name]
     D = np.tile(10.0 ** np.array(logs), 2)
     assert stand.limit_held(D, direction).force_n <= stand.limit_of_body(direction).force_n + 1e-6
+
+
+def test_no_stiffness_along_y_bears_100_newtons_that_come_at_once(
+    robot: RobotConfig, poses: dict[float, Posed]
+) -> None:
+    """They overshoot by a third. Nor do HOLD's gains; soles and motors would."""
+    assert robot.gain_schedule is not None
+    gains, K_c = ScheduledGains(robot.gain_schedule), np.diag([0.0, RIGID, 0.0, 800.0, 0.0, 400.0])
+    hold = np.ravel([robot.hold_gains(module)[0] for module in MODULES])
+    for z, (stand, *_) in poses.items():
+        D, side = gains.at(z, 0.0), DIRECTIONS["sideways"]
+        assert stand.limit_held(D, side, K_c).force_n < 133.0
+        assert stand.limit_held(np.maximum(D, hold), side).force_n < 133.0
+        assert stand.limit_of_body(side).force_n > 133.0
 
 
 @pytest.mark.parametrize(

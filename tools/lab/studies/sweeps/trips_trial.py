@@ -178,8 +178,8 @@ TROUBLES: Final[Mapping[str, Trouble]] = {
     ),
     "squats": Trouble("as shipped: pushed, planner killed", None, _shipped("squat")),
     "crawls": Trouble("as shipped", None, _shipped("crawl")),
-    "shifts": Trouble("as shipped", None, _shipped("shift")),
     "leans": Trouble("as shipped: held and leaned on sideways", None, _shipped("lean")),
+    "shifts": Trouble("as shipped", None, _shipped("shift")),
 }  # fmt: skip
 
 
