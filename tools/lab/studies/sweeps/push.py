@@ -33,7 +33,7 @@ SHORT: Final = {"led": "leads", "dead": "dead"}
 CURVES: Final = (
     ("led", "stood_n", "#1f5f8b", "-o", "planner leads"),
     ("dead", "stood_n", FALL_COLOUR, "-o", "planner dead"),
-    ("dead", "held_limit_n", FALL_COLOUR, "--", "its gains, push lasting"),
+    ("dead", "held_limit_n", FALL_COLOUR, "--", "gains of HOLD, push lasting"),
     ("dead", "body_limit_n", "black", "--", "soles and motors, push lasting"),
 )
 """Mode, column, colour, line, in words."""

@@ -63,7 +63,7 @@ class PushResult(msgspec.Struct, frozen=True, kw_only=True):
     fell_n: float | None
     """The lightest that it fell at, within `STEP_N` of it; None: it stood them all."""
     held_limit_n: float
-    """What this mode's gains hold if the push lasts (`tools.lab.design.push_limit`)."""
+    """What HOLD's gains bear if the push lasts (`tools.lab.design.push_limit`): led, it trips."""
     held_part: str
     """What gives way then."""
     body_limit_n: float
@@ -107,12 +107,11 @@ def run_trial(trial: PushTrial, robot: RobotConfig, plant: PlantConfig) -> PushR
         else:
             fell = force
     limits = limits_of(trial, robot)
-    held = limits.led if trial.mode == "led" else limits.held
     return PushResult(
         stood_n=stood,
         fell_n=fell if fell <= FORCE_MAX_N else None,
-        held_limit_n=held.force_n,
-        held_part=held.part,
+        held_limit_n=limits.held.force_n,
+        held_part=limits.held.part,
         body_limit_n=limits.body.force_n,
     )
 
