@@ -45,7 +45,8 @@ class Keyframe(Section, frozen=True):
     """Where the operator asks COM x and y, m, and the torso's roll and yaw, rad, to be."""
     side: ShiftLength | None = None
     """Where the person holds the harness point sideways, m, world y: between two keyframes that say
-    so; else they leave it free."""
+    so, before the first and after the last if that says so; else they leave it free. It begins near
+    0, where the robot stands: nothing eases the grip."""
 
 
 class Push(Section, frozen=True):

@@ -494,7 +494,7 @@ class OperatorConfig(Section, frozen=True):
     b_pitch: Annotated[float, Range(0.0, 1e4, "N m s/rad")]
     moment_max: Annotated[float, Range(0.0, 1e4, "N m")]
     k_y: Annotated[float, Range(0.0, 1e5, "N/m")] = 1500.0
-    """Sideways, where a scenario holds the harness point there."""
+    """Sideways, where a scenario holds the harness point (`side`)."""
     b_y: Annotated[float, Range(0.0, 1e4, "N s/m")] = 150.0
 
 

@@ -245,8 +245,8 @@ def pause(at: float, until: float) -> dict[str, Any]:
     [
         pytest.param({"fault": limp("ankle_left", 3.7)}, {}, 0.1, None, id="an ankle limp"),
         pytest.param({"fault": limp("hip_right", 3.7)}, {}, 0.1, None, id="a hip limp"),
-        pytest.param(pause(4.5, 4.55), {}, 0.1, True, id="a knee pauses: both sink"),
         pytest.param(pause(4.5, 4.8), {}, 0.1, False, id="a knee pauses long: both hold"),
+        pytest.param(pause(4.5, 4.55), {}, 0.1, True, id="a knee pauses: both sink"),
         pytest.param(
             {"kill": kill(4.5, "knee_left"), "restart": restart(5.2, "knee_left")},
             {}, 0.1, None, id="a knee crashes and is started again",

@@ -92,6 +92,17 @@ def test_the_same_seed_gives_the_same_log(tmp_path: Path) -> None:
         assert other.messages(*key) != first.messages(*key)
 
 
+def test_what_a_hand_that_leans_feels_sideways_is_in_the_verdict(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert sim(tmp_path, "--scenario", "lean", "--duration", "1.5") == 0
+    peak = summary_of(tmp_path)["operator_side_peak_n"]
+    assert 10.0 < peak < 40.0
+    assert f"operator's force sideways, led {peak:.1f} N" in " ".join(
+        capsys.readouterr().out.split()
+    )
+
+
 def test_a_lean_that_was_asked_for_is_no_excursion_and_comes_out_again(tmp_path: Path) -> None:
     """`xrl log resim` hears what was asked from the record."""
     assert sim(tmp_path, "--scenario", "shift", "--duration", "2.5", "--kill", "planner@2.4") == 0

@@ -54,6 +54,7 @@ REFUSALS: list[tuple[Change, str, str, str]] = [
     (row("keyframe", height=0.2), "keyframe[1].height", "0.2", "0.3 to 2 m"),
     (row("keyframe", height=math.nan), "keyframe[1].height", "nan", "0.3 to 2 m"),
     (row("keyframe", pitch=1.6), "keyframe[1].pitch", "1.6", "rad"),
+    (row("keyframe", side=0.2), "keyframe[1].side", "0.2", "0.1 m"),
     (row("keyframe", assist=-1.0), "keyframe[1].assist", "-1.0", "500 N"),
     (row("keyframe", at=1.0), "keyframe[1].at", "1 s does not follow 1 s", "rise"),
     (row("keyframe", at=0.5), "keyframe[1].at", "0.5 s", "rise"),
@@ -97,7 +98,10 @@ def test_a_refusal_names_file_key_value_and_what_would_be_right(
 PLAIN_FAULT = {"module": "hip_left", "kind": "watchdog", "at": 1}
 
 
-@pytest.mark.parametrize("about", [{"hand": False}, {"fault": [PLAIN_FAULT]}])
+HELD = {"at": 1.0, "height": 1.1, "side": 0.02}
+
+
+@pytest.mark.parametrize("about", [{"hand": False}, {"fault": [PLAIN_FAULT]}, {"keyframe": [HELD]}])
 def test_a_scenario_is_taken_and_comes_back_from_its_own_toml(tmp_path: Path, about: Table) -> None:
     path = changed_file(tmp_path / "scenario.toml", RAW, lambda raw: raw.update(about))
     first = scenarios.load(path)

@@ -2,7 +2,7 @@
 
 The hand is a clipped spring-damper between a path and the harness point, in height and
 pitch (docs/simulator.md#reference-scenario), and sideways where a scenario says so. Behind it is a
-person with a mass. Pure.
+person with a mass, which yields in height. Pure.
 """
 
 from __future__ import annotations
@@ -106,9 +106,9 @@ class Operator:
         )
 
     def force_side(self, wanted: Lead, side: float, rate: float) -> float:
-        """Return the hand's force along world y, N, with the harness point there, m, at a rate.
+        """Return the hand's force along world y, N; 0 where nothing holds it sideways.
 
-        0 where nothing holds it sideways.
+        The harness point is at `side`, m, and moves at `rate`, m/s.
         """
         if wanted.side is None:
             return 0.0

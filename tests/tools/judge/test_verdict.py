@@ -90,6 +90,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Summary:
 
 def test_a_run_in_virtual_time_has_no_stalls_and_says_nothing_of_them(sound: Summary) -> None:
     assert (sound["stalls"], sound["across_stalls"], sound["drop_outs"]) == ([], [], [])
+    assert sound["operator_side_peak_n"] is None, "nobody holds it sideways"
     assert verdict_table.stalls(sound) == []
 
 

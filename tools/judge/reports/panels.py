@@ -146,8 +146,10 @@ def hand(run: RunData) -> Iterator[Panel]:
     t, t_p = run.times(topics.SIM_TRUTH), run.times(topics.PLANNER_STATUS)
     requested, assist = run.columns(topics.PLANNER_STATUS, "", "assist_requested_n", "assist_n")
     lines = [Line("hand, z", t, force[:, 2], 0)]
+    limits = _leading_limits("operator_peak_n", "hand z, planner leading")
     if force[:, 1].any():
-        lines.append(Line("hand, y", t, force[:, 1], 8))
+        limits += _leading_limits("operator_side_peak_n", "hand y, planner leading")
+        lines.append(Line("hand, y", t, force[:, 1], 7))
     if load.any():
         lines += [Line("weight on the harness", t, load, 1), Line("carried", t, carried, 2)]
     if requested.any() or assist.any():
@@ -163,7 +165,7 @@ def hand(run: RunData) -> Iterator[Panel]:
     yield Plot(
         "Operator's force", "N", "World axes, on the torso.", NO_WORLD,
         lines=lines if len(t) else [],
-        limits=_leading_limits("operator_peak_n", "hand, planner leading"),
+        limits=limits,
     )  # fmt: skip
 
 

@@ -227,7 +227,12 @@ class LoadedStand:
             direction: world x and y, a unit vector; or a wrench on the torso (6,), N and N m: the
                 limit is then in times of it.
             limp: a module whose motors have no torque.
+
+        Raises:
+            ValueError: no module is called so.
         """
+        if limp and limp not in MODULES:
+            raise ValueError(f"no module is called {limp!r}: {', '.join(MODULES)}")
         total, unit = self._W[0] + self._W[1], np.pad(direction, (0, 6 - len(direction)))
 
         def loads(x: Array) -> Array:
@@ -238,8 +243,8 @@ class LoadedStand:
         unpushed = loads(np.zeros(7))
         slopes = np.array([loads(e) - unpushed for e in np.eye(7)]).T
         rows = np.array([limit.row for limit in self._limits])
-        most = [limit.bound * (limit.part != f"torque of {limp}") for limit in self._limits]
-        bounds = np.array(most) - rows @ unpushed
+        limp_rows = np.array([limit.part == f"torque of {limp}" for limit in self._limits])
+        bounds = np.where(limp_rows, 0.0, [limit.bound for limit in self._limits]) - rows @ unpushed
         solution = scipy.optimize.linprog(
             -np.eye(7)[6],
             A_ub=rows @ slopes,
@@ -248,7 +253,8 @@ class LoadedStand:
         )
         if not solution.success:
             return PushLimit(0.0, "the pose itself")
-        tightest = int(np.argmin(bounds - rows @ slopes @ solution.x))
+        left = np.where(limp_rows, np.inf, bounds - rows @ slopes @ solution.x)
+        tightest = int(np.argmin(left))
         return PushLimit(float(solution.x[6]), self._limits[tightest].part)
 
     def _joint_torques(self, W: list[Array]) -> Array:

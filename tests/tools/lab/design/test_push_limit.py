@@ -32,8 +32,8 @@ PUSH_N = 15.0
 FLOOR_S = 0.004
 """Contact time of a floor that hardly gives: the soles' own roll is not in the formula."""
 SETTLE_S = 4.0
-HAND_PITCH, HAND_DOWN = (0.0, 0.0, 0.0, 0.0, 60.0, 0.0), (0.0, 0.0, -150.0, 0.0, 0.0, 0.0)
-"""The most that the simulated person's hand does, N and N m."""
+HAND_PITCH, HAND_DOWN = 60.0, 150.0
+"""The most that the simulated person's hand does, N m and N."""
 
 
 class Posed(NamedTuple):
@@ -111,35 +111,38 @@ def test_no_local_gains_hold_more_than_soles_and_motors_bear(
 def test_no_stiffness_along_y_bears_100_newtons_that_come_at_once(
     robot: RobotConfig, poses: dict[float, Posed]
 ) -> None:
-    """They overshoot by a third. Nor do HOLD's gains; soles and motors would."""
+    """They overshoot by 1.22 at least, upright. Nor do HOLD's gains; soles and motors would."""
     assert robot.gain_schedule is not None
     gains, K_c = ScheduledGains(robot.gain_schedule), np.diag([0.0, RIGID, 0.0, 800.0, 0.0, 400.0])
     hold = np.ravel([robot.hold_gains(module)[0] for module in MODULES])
     for z, (stand, *_) in poses.items():
         D, side = gains.at(z, 0.0), DIRECTIONS["sideways"]
-        assert stand.limit_held(D, side, K_c).force_n < 133.0
-        assert stand.limit_held(np.maximum(D, hold), side).force_n < 133.0
-        assert stand.limit_of_body(side).force_n > 133.0
+        assert stand.limit_held(D, side, K_c).force_n < 122.0
+        assert stand.limit_held(np.maximum(D, hold), side).force_n < 122.0
+        assert stand.limit_of_body(side).force_n > 122.0
 
 
 @pytest.mark.parametrize(
-    ("limp", "wrench", "bears"),
+    ("limp", "down", "moment", "bears"),
     [
-        ("", HAND_PITCH, 1.55),
-        ("ankle_left", HAND_PITCH, 0.93),
-        ("", HAND_DOWN, 3.25),
-        ("knee_left", HAND_DOWN, 0.327),
+        ("", 0.0, HAND_PITCH, 1.549),
+        ("ankle_left", 0.0, HAND_PITCH, 0.914),
+        ("", HAND_DOWN, 0.0, 4.50),
+        ("knee_left", HAND_DOWN, 0.0, 0.453),
     ],
 )
-def test_beside_a_limp_ankle_or_knee_no_control_bears_a_hand_that_leads_on_into_the_crawl(
-    robot: RobotConfig, limp: str, wrench: tuple[float, ...], bears: float
+def test_beside_a_limp_ankle_or_knee_no_control_bears_the_hands_most_on_the_way_into_the_crawl(
+    robot: RobotConfig, limp: str, down: float, moment: float, bears: float
 ) -> None:
     """Two seconds on its way there the torso is at 1.05 m, turned by 0.41 rad."""
-    at = Poses(robot)
-    node = at.node(com_height(at, 1.05, 0.41), 0.41)
+    at, pitch = Poses(robot), 0.41
+    node = at.node(com_height(at, 1.05, pitch), pitch)
     assert node is not None
     stand = LoadedStand(robot, at.kinematics, node.T, node.hessians[0])
-    assert stand.limit_of_body(wrench, limp).force_n == pytest.approx(bears, rel=0.02)
+    x, _, z = robot.geometry.harness_point
+    arm = x * math.cos(pitch) + z * math.sin(pitch)
+    wrench = (0.0, 0.0, -down, 0.0, moment + arm * down, 0.0)
+    assert stand.limit_of_body(wrench, limp).force_n == pytest.approx(bears, rel=0.01)
 
 
 def test_left_and_right_are_alike(poses: dict[float, Posed]) -> None:

@@ -63,7 +63,8 @@ class PushResult(msgspec.Struct, frozen=True, kw_only=True):
     fell_n: float | None
     """The lightest that it fell at, within `STEP_N` of it; None: it stood them all."""
     held_limit_n: float
-    """What HOLD's gains bear if the push lasts (`tools.lab.design.push_limit`): led, it trips."""
+    """What its gains bear if the push lasts (`tools.lab.design.push_limit`): HOLD's, into which a
+    led robot trips but for a push straight forwards or back."""
     held_part: str
     """What gives way then."""
     body_limit_n: float
@@ -107,11 +108,13 @@ def run_trial(trial: PushTrial, robot: RobotConfig, plant: PlantConfig) -> PushR
         else:
             fell = force
     limits = limits_of(trial, robot)
+    trips = trial.angle_deg % 180 != 0
+    held = limits.led if trial.mode == "led" and not trips else limits.held
     return PushResult(
         stood_n=stood,
         fell_n=fell if fell <= FORCE_MAX_N else None,
-        held_limit_n=limits.held.force_n,
-        held_part=limits.held.part,
+        held_limit_n=held.force_n,
+        held_part=held.part,
         body_limit_n=limits.body.force_n,
     )
 
