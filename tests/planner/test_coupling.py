@@ -123,6 +123,16 @@ def test_in_its_time_the_integral_grows_to_what_the_body_s_stiffness_gives(
     assert integral.force == pytest.approx(robot.law.K_p[1] * 0.01)
 
 
+@pytest.mark.parametrize(
+    "law", [{"split": "diagonal"}, {"S": (0.0, 1.0, 1.0, 0.0, 1.0, 0.0)}], ids=["paper", "y led"]
+)
+def test_the_papers_split_and_a_y_that_is_led_have_no_integral(
+    robot: RobotConfig, law: dict[str, object]
+) -> None:
+    integral = integral_of(robot, **law)
+    assert (integral.gain, integral.most) == (0.0, 0.0)
+
+
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_at_its_limit_the_integral_stays_and_comes_back_at_once(
     robot: RobotConfig, sign: float
