@@ -239,7 +239,6 @@ def pause(at: float, until: float) -> dict[str, Any]:
     return {"kill": suspended, "restart": restart(until, "knee_left")}
 
 
-@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("happens", "plant", "turned", "sinks"),
     [

@@ -225,7 +225,6 @@ LASTING = 2.6
 1.2 to 1.3 s."""
 
 
-@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("name", "module", "kind", "at", "force", "led"),
     [

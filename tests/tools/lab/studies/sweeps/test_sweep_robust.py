@@ -107,7 +107,6 @@ def test_with_every_error_drawn_it_is_led_pushed_killed_and_stands(
     assert outcome.operator_peak_n < 80.0
 
 
-@pytest.mark.sampled(1)
 @pytest.mark.parametrize("number", [142, 160, 175])
 def test_shoved_from_the_side_on_its_way_into_the_crawl_it_stands(
     robot: RobotConfig, pushes: PushRange, number: int

@@ -36,7 +36,6 @@ TRIPS = [name for name, trouble in TROUBLES.items() if isinstance(trouble.trip, 
 """Without the gains that shake: these are in `tests/lockstep/test_trips.py`, on every plant."""
 
 
-@pytest.mark.sampled(2)
 @pytest.mark.parametrize("trouble", TRIPS)
 def test_on_a_plant_of_many_errors_what_is_to_trip_trips_and_stands(
     trouble: str, robot: RobotConfig
@@ -48,7 +47,6 @@ def test_on_a_plant_of_many_errors_what_is_to_trip_trips_and_stands(
     assert outcome.speed_max < outcome.untripped_speed_max
 
 
-@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     "trouble", [name for name, trouble in TROUBLES.items() if trouble.trip is None]
 )
