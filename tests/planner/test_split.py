@@ -10,19 +10,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.planner.law.certificate import Certificate, Margins
+from services.planner.law.certificate import Margins
 from services.planner.law.gains import JointGains
-from services.planner.law.inverse_kinematics import InverseKinematics
-from services.planner.law.kinematics import Kinematics
 from services.planner.law.split import GainSplit, ScheduledGains
 from shared.bus.messages import SplitSource
 from shared.config.gain_table import GainSchedule
-from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.config.sections import CertificateConfig
 from shared.exceptions import ConfigError
-from shared.robot.robot_model import stand_pose
 from tests.planner.conftest import Closed
-from tests.planner.oracle import Array
 from tests.planner.stands import Stand
 from tests.planner.states import requiring, with_law
 
@@ -90,38 +86,6 @@ def test_gains_do_not_step_from_node_to_node(schedule: GainSchedule) -> None:
         path = zip(np.linspace(0.95, 0.63, 1600), np.linspace(0.0, pitch_end, 1600), strict=True)
         table = np.array([scheduled.at(z, pitch) for z, pitch in path])
         assert np.abs(np.diff(table, axis=0)).max() < 10.0
-
-
-def halved(nodes: tuple[float, ...]) -> Array:
-    return np.sort(np.concatenate([nodes, 0.5 * (np.array(nodes[1:]) + np.array(nodes[:-1]))]))
-
-
-def test_the_schedule_is_certified_throughout(robot: RobotConfig, schedule: GainSchedule) -> None:
-    """Both margins, without and with the full assist, wherever the robot can stand."""
-    kinematics, certificate = Kinematics(robot), Certificate(robot)
-    ik = InverseKinematics(kinematics, np.array(robot.joint_limits()))
-    scheduled = ScheduledGains(schedule)
-    F_O = np.array([0.0, 0.0, robot.total_mass * GRAVITY, 0.0, 0.0, 0.0])
-    seen, failing = 0, []
-    for pitch in halved(schedule.pitch):
-        ik.q[:] = stand_pose(robot, 1.0)
-        for z in halved(schedule.z):
-            before = ik.q.copy()
-            if not ik.solve(np.array([0.0, 0.0, z, 0.0, pitch, 0.0]), iterations_max=60).converged:
-                ik.q[:] = before
-                continue
-            kinematics.update(ik.q)
-            A = np.vstack([kinematics.J, kinematics.C])
-            T = np.asarray(np.linalg.solve(A, np.eye(12)[:, :6]), float)
-            for assist in (0.0, 100.0, robot.assist.force_max):
-                force = np.array([0.0, 0.0, assist])
-                certificate.at(T, kinematics.hessian_times(F_O, force))
-                margins = certificate.margins(scheduled.at(z, pitch))
-                seen += 1
-                if margins.service < MARGIN or margins.onboard < MARGIN_ONBOARD:
-                    failing.append((round(z, 4), pitch, assist, margins))
-    assert seen > 3 * 400
-    assert failing == []
 
 
 def test_in_the_squat_and_the_crawl_the_schedule_is_enough(
