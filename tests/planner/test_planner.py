@@ -224,15 +224,6 @@ def test_a_robot_that_nothing_holds_is_never_lead(robot: RobotConfig, q: Array) 
     assert status.margin < robot.certificate.margin_min
 
 
-def test_staleness_counts_before_gains(robot: RobotConfig, planner: Planner, q: Array) -> None:
-    now = lead(planner, q)
-    planner._law._split._margins_min = Margins(1e9, 1e9)
-    for silence_ms in (4, 200):
-        now += silence_ms * NS_PER_MS
-        planner.tick(now)
-    assert planner.status(now, 0.0).mode == PlannerMode.WAITING
-
-
 def test_a_status_before_any_state_is_finite(planner: Planner) -> None:
     status = planner.status(START_NS, 0.0)
     assert (status.mode, status.hold, status.wrench_seq) == (PlannerMode.WAITING, True, -1)
