@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from services.planner.law.hocca import LawOutput
-from services.planner.law.kinematics import Kinematics, Measured
+from services.planner.law.kinematics import Measured
 from services.planner.watch.soles import Soles
 from services.planner.watch.trips import CALM_NS, PlannerTrips, values_of
 from services.planner.watch.unattended import ARM, HAND_LOST_NS, HAND_MIN, Unattended
@@ -16,6 +16,7 @@ from shared.bus.messages import Pair, Trip
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.robot.trip_table import JOINT_TRIPS, PLANNER_TRIPS
+from tests.planner import oracle
 from tests.planner.conftest import Closed
 
 T0 = 5_000_000_000
@@ -111,32 +112,16 @@ def test_it_ends_after_a_calm_second(robot: RobotConfig, trip: Trip, known: bool
     assert trips.why == ""
 
 
-def test_a_legs_load_is_the_force_that_its_torques_hold(
-    robot: RobotConfig, kinematics: Kinematics, closed: Closed
-) -> None:
-    """J_leg is differenced from the leg's own estimate of the torso, not taken from C."""
-    q = closed(height=0.948)
-    wrench = np.array((5.0, -7.0, 230.0, 3.0, 9.0, -2.0))
-    tau = np.zeros(12)
-    h = 1e-6
-    for joint in range(12):
-        nearby = [np.array(q), np.array(q)]
-        nearby[0][joint] -= h
-        nearby[1][joint] += h
-        low, high = (_closure(kinematics, each) for each in nearby)
-        sign = -1.0 if joint < 6 else 1.0
-        tau[joint] = sign * (high - low) @ wrench / (2.0 * h)
+def test_a_legs_load_is_the_force_that_its_torques_hold(robot: RobotConfig, closed: Closed) -> None:
+    """By the oracle: closure is what the left leg says less what the right one does."""
+    q, wrench = closed(height=0.948), np.array((5.0, -7.0, 230.0, 3.0, 9.0, -2.0))
+    tau = oracle.derivative(lambda near: oracle.closure(robot, near), q).T @ wrench
+    tau[:6] *= -1.0
     measured = Measured(robot)
     measured.update(q, np.zeros(12))
-    right, left = measured.leg_loads(tau)
-    assert (right, left) == pytest.approx((230.0, 230.0), abs=0.1)
+    assert measured.leg_loads(tau) == pytest.approx((230.0, 230.0), abs=0.1)
     tau[6:] = 0.0
     assert measured.leg_loads(tau) == pytest.approx((230.0, 0.0), abs=0.1)
-
-
-def _closure(kinematics: Kinematics, q: np.ndarray) -> np.ndarray:
-    kinematics.update(q)
-    return kinematics.closure.copy()
 
 
 def test_a_straight_leg_measures_nothing(robot: RobotConfig, closed: Closed) -> None:
@@ -154,13 +139,14 @@ def output_of(assist: float) -> LawOutput:
     return LawOutput(**(zeros | {"assist": assist, "ik_residual": 0.0}))  # type: ignore[arg-type]
 
 
-HARNESS = TRIPS.index(Trip.HARNESS)
-
-
-UNLOADED = TRIPS.index(Trip.UNLOADED)
-
-
-SAGGING = TRIPS.index(Trip.SAGGING)
+def value_of(
+    trip: Trip, assist: float = 0.0, lifted: float | None = None, rate: float = 0.0,
+    *, leads: bool, soles: Pair = (200.0, 200.0),
+) -> float:  # fmt: skip
+    """Return what is measured for a trip, of a law at rest."""
+    output, zeros = output_of(assist), np.zeros(12)
+    values = values_of(output, zeros, soles, 0.0, lifted, rate, 0.0, leads=leads)
+    return values[TRIPS.index(trip)]
 
 
 @pytest.mark.parametrize(
@@ -178,10 +164,7 @@ def test_in_hold_only_a_load_beyond_what_was_asked_or_a_pull_upwards_counts(
     lifted: float, assist: float, leads: bool, found: float
 ) -> None:
     """A request of 200 N with nobody there tripped for ever."""
-    values = values_of(
-        output_of(assist), np.zeros(12), (200.0, 200.0), 0.0, lifted, 0.0, 0.0, leads=leads
-    )
-    assert values[HARNESS] == pytest.approx(found)
+    assert value_of(Trip.HARNESS, assist, lifted, leads=leads) == pytest.approx(found)
 
 
 @pytest.mark.parametrize(
@@ -199,10 +182,7 @@ def test_sagging_is_the_power_of_a_load_beyond_assist_and_lead_as_it_sinks(
     lifted: float, rate: float, leads: bool, watts: float
 ) -> None:
     """The assist is 100 N, a lead 40 N. In HOLD nothing sinks, and the load itself is judged."""
-    values = values_of(
-        output_of(100.0), np.zeros(12), (200.0, 200.0), 0.0, lifted, rate, 0.0, leads=leads
-    )
-    assert values[SAGGING] == pytest.approx(watts)
+    assert value_of(Trip.SAGGING, 100.0, lifted, rate, leads=leads) == pytest.approx(watts)
 
 
 def test_a_hand_that_was_held_up_may_catch_up(robot: RobotConfig) -> None:
@@ -215,9 +195,8 @@ def test_a_hand_that_was_held_up_may_catch_up(robot: RobotConfig) -> None:
 
 
 @pytest.mark.parametrize("loads", [(math.nan, 5.0), (5.0, math.nan)])
-def test_with_one_leg_unknown_none_is_unloaded(loads: tuple[float, float]) -> None:
-    values = values_of(output_of(0.0), np.zeros(12), loads, 0.0, None, 0.0, 0.0, leads=True)
-    assert math.isnan(values[UNLOADED])
+def test_with_one_leg_unknown_none_is_unloaded(loads: Pair) -> None:
+    assert math.isnan(value_of(Trip.UNLOADED, leads=True, soles=loads))
 
 
 def test_one_that_was_put_back_on_the_hoist_misses_no_leg(robot: RobotConfig) -> None:
@@ -237,7 +216,7 @@ def test_both_legs_have_borne_it_once_each_bears_three_times_the_least(robot: Ro
     least = robot.trips.unloaded.limit
     for borne, tripped in ((3.0 * least, Trip.NONE), (3.0 * least + 0.1, Trip.UNLOADED)):
         values = list(CALM)
-        values[UNLOADED] = borne
+        values[TRIPS.index(Trip.UNLOADED)] = borne
         trips = go_on(PlannerTrips(robot), tuple(values), range(1))
         assert go_on(trips, beyond(robot, Trip.UNLOADED), range(1, 500)).tripped is tripped
 
