@@ -14,7 +14,7 @@ from tests.planner import oracle
 from tests.planner.conftest import Closed
 from tests.planner.oracle import LEFT, RIGHT, Array
 from tools.lab.design.poses import Poses
-from tools.lab.design.push_limit import LoadedStand
+from tools.lab.design.push_limit import stand_at
 
 STANCES = (
     (0.1, 0.0, 0.0, 0.0, 0.0, 0.0),
@@ -160,11 +160,10 @@ def test_a_foot_ahead_lets_it_bear_a_harder_push_forwards(robot: RobotConfig) ->
     """The foremost toe is farther from the COM; without the stance both read 72 N."""
 
     def limit(ahead: float) -> float:
-        at = Poses(robot)
-        at.kinematics.stance[0] = ahead
-        node = at.node(0.9, 0.0)
-        assert node is not None
-        stand = LoadedStand(robot, at.kinematics, node.T, node.hessians[0])
+        poses = Poses(robot)
+        poses.kinematics.stance[0] = ahead
+        stand = stand_at(robot, poses, 0.9, 0.0)
+        assert stand is not None
         return stand.limit_of_body((1.0, 0.0)).force_n
 
     together, apart = limit(0.0), limit(0.1)

@@ -28,7 +28,7 @@ from services.planner.law.model import BodyInertia
 from services.planner.law.split import CouplingGains
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES, N_JOINTS, N_LEG
-from tools.lab.design.poses import Poses
+from tools.lab.design.poses import PoseNode, Poses, geometric_stiffness
 from tools.lab.design.sampled_loop import (
     NO_HAND,
     NOMINAL,
@@ -175,26 +175,30 @@ def nodes_of(
         pitches: of the torso, rad.
     """
     poses, inertia = Poses(config), BodyInertia(config)
-    S = np.array(config.law.S, float)
     nodes = []
     for z, pitch in itertools.product(heights.tolist(), pitches.tolist()):
         node = poses.node(z, pitch)
         if node is None:
             continue
-        M, kinematics = inertia.at(poses.q, node.T), poses.kinematics
-        for hessian in node.hessians:
-            K_geo = node.T.T @ hessian @ node.T
-            stand = Stand(
-                M=M,
-                K_geo=0.5 * (K_geo + K_geo.T),
-                T=node.T,
-                J=kinematics.J.copy(),
-                J_harness=kinematics.J_harness.copy(),
-                H=hessian,
-                S=S,
-            )
-            nodes.append(StiffnessNode(z, pitch, stand, D_at(z, pitch)))
+        M, D = inertia.at(poses.q, node.T), D_at(z, pitch)
+        nodes += [StiffnessNode(z, pitch, stand, D) for stand in stands_of(config, poses, node, M)]
     return nodes
+
+
+def stands_of(config: RobotConfig, poses: Poses, node: PoseNode, M: Array) -> list[Stand]:
+    """Return the last of the poses linearised, without and with the full assist.
+
+    Args:
+        config: the robot.
+        poses: the last of which is the node.
+        node: that pose.
+        M: inertia along p (6, 6) there (`services.planner.law.model.BodyInertia`).
+    """
+    J, J_harness = poses.kinematics.J.copy(), poses.kinematics.J_harness.copy()
+    S = np.array(config.law.S, float)
+    return [
+        Stand(M, geometric_stiffness(node.T, H), node.T, J, J_harness, H, S) for H in node.hessians
+    ]
 
 
 class DynamicCertificate:
@@ -212,7 +216,9 @@ class DynamicCertificate:
         self._integral_gain = PushIntegral(law).gain
         self._hands = [HandModel(*hand) for hand in wanted.hands]
         self._halves = (*halves(), whole())
-        self._hold = _hold_gains(config)
+        hold = np.array([config.hold_gains(module) for module in MODULES])
+        self._hold = hold[:, 0].ravel(), hold[:, 1].ravel()
+        """Minimum (k_p, k_d) of the joints in HOLD, (12,) each."""
 
     def feedback(self, node: StiffnessNode, design: Design) -> Feedback:
         """Return the feedback of services and planner in TRACK at a pose."""
@@ -398,12 +404,3 @@ def _seen(mode: int) -> Array:
     seen, first = np.eye(N_JOINTS), 2 * (mode // len(SEEN))
     seen[first : first + 2, first : first + 2] = SEEN[mode % len(SEEN)]
     return seen
-
-
-def _hold_gains(config: RobotConfig) -> tuple[Array, Array]:
-    """Return the minimum (k_p, k_d) (12,) of every module in HOLD."""
-    pairs = [config.hold_gains(module) for module in MODULES]
-    return (
-        np.array([k_p for k_p, _ in pairs]).ravel(),
-        np.array([k_d for _, k_d in pairs]).ravel(),
-    )

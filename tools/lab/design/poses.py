@@ -46,6 +46,12 @@ class PoseNode(NamedTuple):
     """(6,) N m/rad"""
 
 
+def geometric_stiffness(T: Array, H: Array) -> Array:
+    """Return K_geo (6, 6) of T (12, 6) and H (12, 12), as in `services.planner.law.certificate`."""
+    K_geo = T.T @ H @ T
+    return np.asarray(0.5 * (K_geo + K_geo.T), float)
+
+
 class Poses:
     """Upright and pitched stands of a robot, COM over the ankles."""
 
@@ -56,9 +62,11 @@ class Poses:
         """Updated at the last pose."""
         self._ik = InverseKinematics(self.kinematics, np.array(config.joint_limits()))
         self._gains = GainLaw(config)
-        self._F_O: Array = np.zeros(6)
-        self._F_O[2] = config.total_mass * GRAVITY
-        self._no_assist, self._assist = np.zeros(3), np.array([0.0, 0.0, config.assist.force_max])
+        self.F_O: Array = np.zeros(6)
+        """The weight (6,), N and N m."""
+        self.F_O[2] = config.total_mass * GRAVITY
+        self.F_assist: Array = np.array([0.0, 0.0, config.assist.force_max])
+        """The full assist (3,), N."""
         reach = config.geometry.l1 + config.geometry.l2
         self._ik.q[:] = stand_pose(config, MID_HEIGHT_FRACTION * reach)
         self.kinematics.update(self._ik.q)
@@ -101,15 +109,17 @@ class Poses:
 
     def node(self, z: float, pitch: float) -> PoseNode | None:
         """Return the node, or None if the pose cannot be reached."""
-        if not self._solve_stand(z, pitch):
-            return None
+        return self.node_at(self._ik.q) if self._solve_stand(z, pitch) else None
+
+    def node_at(self, q: Array) -> PoseNode:
+        """Return the node of joint angles (12,), rad, at which the legs agree."""
         kinematics = self.kinematics
-        kinematics.update(self._ik.q)
+        kinematics.update(q)
         A = np.vstack((kinematics.J, kinematics.C))
         T = np.asarray(np.linalg.solve(A, np.eye(N_JOINTS)[:, :6]), float)
         hessians = [
-            kinematics.hessian_times(self._F_O, force).copy()
-            for force in (self._no_assist, self._assist)
+            kinematics.hessian_times(self.F_O, force).copy()
+            for force in (np.zeros(3), self.F_assist)
         ]
         diagonals = [np.diagonal(self._gains.gains(kinematics, h).K_q) for h in hessians]
         K_q: Array = np.max(diagonals, axis=0)
@@ -123,9 +133,6 @@ class BoundsOverPoses:
 
     def __init__(self, config: RobotConfig) -> None:
         """Start with the stand gains only."""
-        self._F_O: Array = np.zeros(6)
-        self._F_O[2] = config.total_mass * GRAVITY
-        self._assist: Array = np.array([0.0, 0.0, config.assist.force_max])
         right = MODULES[: N_LEG // 2]
         self._stand_k_p = np.ravel([config.stand_gains(module).k_p for module in right])
         self._k_p: list[Array] = []
@@ -134,12 +141,13 @@ class BoundsOverPoses:
         self._tau_ff: list[Array] = []
         self._v_ref: list[Array] = []
 
-    def add(self, q: Array, kinematics: Kinematics, node: PoseNode, D: Array) -> None:
-        """Add a pose: joint angles (12,), rad, and local stiffness (6,), N m/rad."""
+    def add(self, poses: Poses, node: PoseNode, D: Array) -> None:
+        """Add the last of the poses, a node, with its local stiffness (6,), N m/rad."""
+        q, kinematics = poses.q, poses.kinematics
         self._k_p.append(D)
         self._k_p_max.append(node.D_max)
-        weight = self._F_O @ kinematics.J
-        for tau in (weight, weight + self._assist @ kinematics.J_harness):
+        weight = poses.F_O @ kinematics.J
+        for tau in (weight, weight + poses.F_assist @ kinematics.J_harness):
             self._tau_ff += [tau[:N_LEG].copy(), tau[N_LEG:].copy()]
             self._q += [q[:N_LEG], q[N_LEG:]]
         rates = np.abs(node.T) @ np.array(BODY_RATES)

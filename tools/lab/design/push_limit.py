@@ -27,6 +27,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import scipy.optimize
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from services.planner.law.certificate import motor_mean
 from services.planner.law.coupling import PushIntegral, UncoupledGains, Y
@@ -34,6 +35,7 @@ from services.planner.law.kinematics import Kinematics
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.joints import MODULES, N_JOINTS, N_LEG, SIDES
 from shared.robot.robot_model import ankle_positions
+from tools.lab.design.poses import Poses
 
 Array = NDArray[np.float64]
 
@@ -112,7 +114,8 @@ class LoadedStand:
         """Torso twist per joint rate of each leg (6, 6), linear before angular."""
         D_left = kinematics.D_left
         weight = config.torso_mass * GRAVITY
-        arm_x, arm_y = _torso_com(config, kinematics.p[3:])[:2]
+        rotation_world_torso = Rotation.from_euler("ZXY", kinematics.p[[5, 3, 4]])
+        arm_x, arm_y, _ = rotation_world_torso.apply(config.torso_com)
         torso = np.array([0.0, 0.0, weight, weight * arm_y, -weight * arm_x, 0.0])
         self._W = [shares @ torso for shares in (np.eye(6) - D_left, D_left)]
         """Torso wrench on each leg (6,), N and N m at the torso's origin."""
@@ -154,8 +157,8 @@ class LoadedStand:
         K = self.stiffness(D) + (0.0 if K_c is None else K_c)
         if np.linalg.eigvalsh(K)[0] <= 0.0:
             return None
-        torso_per_p = self._J[0] @ T[:N_LEG]
-        dp: Array = np.asarray(np.linalg.solve(K, torso_per_p.T @ _horizontal(direction)), float)
+        torso_per_p = self._J[0][:2] @ T[:N_LEG]
+        dp: Array = np.asarray(np.linalg.solve(K, torso_per_p.T @ np.array(direction)), float)
         dq = T @ dp
         dtau: Array = np.asarray(-D * dq, float)
         if K_c is not None:
@@ -270,14 +273,18 @@ class LoadedStand:
         return np.concatenate(wrenches)
 
 
-def limits_at(
-    config: RobotConfig, kinematics: Kinematics, T: Array, H: Array, D: Array, D_B: Array
-) -> dict[str, PushLimits]:
-    """Return the limits of a pose along each of `DIRECTIONS`.
+def stand_at(config: RobotConfig, poses: Poses, z: float, pitch: float) -> LoadedStand | None:
+    """Return the stand at a COM height, m, and a pitch, rad; None if it cannot be reached."""
+    node = poses.node(z, pitch)
+    if node is None:
+        return None
+    return LoadedStand(config, poses.kinematics, node.T, node.hessians[0])
 
-    Args as for `LoadedStand` and `limits_along`.
-    """
-    stand = LoadedStand(config, kinematics, T, H)
+
+def limits_at(
+    stand: LoadedStand, config: RobotConfig, D: Array, D_B: Array
+) -> dict[str, PushLimits]:
+    """Return the limits along each of `DIRECTIONS`; arguments as for `limits_along`."""
     return {
         name: limits_along(stand, config, D, D_B, direction)
         for name, direction in DIRECTIONS.items()
@@ -311,22 +318,6 @@ def equivalent_slope(config: RobotConfig, force_n: float) -> float:
     a push at the torso. The real load is somewhat smaller, because a third of the mass hangs lower.
     """
     return math.asin(min(1.0, force_n / (config.total_mass * GRAVITY)))
-
-
-def _horizontal(direction: tuple[float, float]) -> Array:
-    return np.array([*direction, 0.0, 0.0, 0.0, 0.0])
-
-
-def _torso_com(config: RobotConfig, angles: Array) -> Array:
-    """Return the torso's centre of mass from its origin (3,), m, world.
-
-    R = Rz(yaw) Rx(roll) Ry(pitch) of its angles (3,), rad.
-    """
-    (s_x, s_y, s_z), (c_x, c_y, c_z) = np.sin(angles), np.cos(angles)
-    R_z = np.array([[c_z, -s_z, 0.0], [s_z, c_z, 0.0], [0.0, 0.0, 1.0]])
-    R_x = np.array([[1.0, 0.0, 0.0], [0.0, c_x, -s_x], [0.0, s_x, c_x]])
-    R_y = np.array([[c_y, 0.0, s_y], [0.0, 1.0, 0.0], [-s_y, 0.0, c_y]])
-    return np.asarray(R_z @ R_x @ R_y @ np.array(config.torso_com), float)
 
 
 def _limits(config: RobotConfig) -> list[_Limit]:

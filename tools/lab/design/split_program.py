@@ -33,8 +33,8 @@ from shared.joints import N_LEG
 from tools.lab.design import design_program
 from tools.lab.design.dynamic_certificate import Design, nodes_of
 from tools.lab.design.dynamic_certificate import StiffnessNode as DynamicNode
-from tools.lab.design.poses import BoundsOverPoses, PoseNode, Poses
-from tools.lab.design.push_limit import PushLimits, limits_at
+from tools.lab.design.poses import BoundsOverPoses, PoseNode, Poses, geometric_stiffness
+from tools.lab.design.push_limit import PushLimits, limits_at, stand_at
 
 if TYPE_CHECKING:
     import cvxpy as cp
@@ -85,7 +85,7 @@ def solve(
             node = poses.node(z, pitch)
             if node is not None:
                 found[i, j] = _program(config, node, z, pitch)
-                bounds.add(poses.q, poses.kinematics, node, found[i, j])
+                bounds.add(poses, node, found[i, j])
         done += len(PITCHES)
         progress(done, total)
     rows = [
@@ -154,11 +154,10 @@ def push_limits(config: RobotConfig, heights: int) -> Iterator[tuple[float, dict
     assert schedule is not None  # noqa: S101 - the caller has just computed it
     poses, scheduled = Poses(config), ScheduledGains(schedule)
     for z in np.linspace(schedule.z[0], schedule.z[-1], heights):
-        node = poses.node(float(z), 0.0)
-        if node is not None:
+        stand = stand_at(config, poses, float(z), 0.0)
+        if stand is not None:
             D = scheduled.at(float(z), 0.0)
-            kinematics, (H, _) = poses.kinematics, node.hessians
-            yield float(z), limits_at(config, kinematics, node.T, H, D, scheduled.D_B)
+            yield float(z), limits_at(stand, config, D, scheduled.D_B)
 
 
 def _with_midpoints(nodes: Array) -> Array:
@@ -176,8 +175,7 @@ def _program(config: RobotConfig, node: PoseNode, z: float, pitch: float) -> Arr
     K_onboard = _weighted_sum(per_joint, FULL_SCALE * (mean @ D))
     constraints = [node.D_max / FULL_SCALE >= D]
     for hessian in node.hessians:
-        K_geo = T.T @ hessian @ T
-        K_geo = 0.5 * (K_geo + K_geo.T)
+        K_geo = geometric_stiffness(T, hessian)
         constraints += [
             K_loc + K_geo >> np.eye(6),
             K_onboard + K_geo >> config.certificate.onboard_fraction * np.eye(6),

@@ -22,7 +22,7 @@ from shared.bus.messages import AS_CONFIGURED, Pair, Vector6
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.exceptions import RunError
 from shared.joints import N_LEG, SIDES
-from tools.lab.design.push_limit import PushLimits, limits_at
+from tools.lab.design.push_limit import LoadedStand, PushLimits, limits_at
 
 Array = NDArray[np.float64]
 
@@ -115,6 +115,7 @@ def torque_breakdown(
     e_p, e_pdot = reference.p - measured.p, reference.J @ v_ref - measured.pdot
     terms = LawAtReference(law, split).evaluate(reference, e_p, e_pdot)
     body, local, certificate = terms.body_gains(), terms.local, split.certificate
+    stand = LoadedStand(config, at_ref, reference.T, hessian_weight)
     return TorqueBreakdown(
         p=measured.p,
         pdot=measured.pdot,
@@ -126,7 +127,7 @@ def torque_breakdown(
         local=local,
         weakest=certificate.weakest(local.D),
         weakest_onboard=certificate.weakest(motor_mean(local.D)),
-        pushes=limits_at(config, at_ref, reference.T, hessian_weight, local.D, local.D_B),
+        pushes=limits_at(stand, config, local.D, local.D_B),
         gravity=reference.gravity,
         assist=reference.assist,
         local_pd=local.D * (q_ref - q) + local.D_B * (v_ref - v),

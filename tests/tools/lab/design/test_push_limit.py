@@ -19,7 +19,7 @@ from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.config.scenarios import Keyframe, Push, Scenario
 from shared.joints import MODULES, N_JOINTS, N_LEG
 from tools.lab.design.poses import Poses
-from tools.lab.design.push_limit import DIRECTIONS, RIGID, LoadedStand, equivalent_slope
+from tools.lab.design.push_limit import DIRECTIONS, RIGID, LoadedStand, equivalent_slope, stand_at
 from tools.lab.studies.sweeps.push_range import com_height
 
 Array = NDArray[np.float64]
@@ -46,13 +46,10 @@ class Posed(NamedTuple):
 @pytest.fixture(scope="module")
 def poses(robot: RobotConfig) -> dict[float, Posed]:
     at, found = Poses(robot), {}
-    weight = np.zeros(6)
-    weight[2] = robot.total_mass * 9.81
     for z in HEIGHTS:
-        node = at.node(z, 0.0)
-        assert node is not None
-        stand = LoadedStand(robot, at.kinematics, node.T, node.hessians[0])
-        found[z] = Posed(stand, at.q, weight @ at.kinematics.J)
+        stand = stand_at(robot, at, z, 0.0)
+        assert stand is not None
+        found[z] = Posed(stand, at.q, at.F_O @ at.kinematics.J)
     return found
 
 
@@ -136,9 +133,8 @@ def test_beside_a_limp_ankle_or_knee_no_control_bears_the_hands_most_on_the_way_
 ) -> None:
     """Two seconds on its way there the torso is at 1.05 m, turned by 0.41 rad."""
     at, pitch = Poses(robot), 0.41
-    node = at.node(com_height(at, 1.05, pitch), pitch)
-    assert node is not None
-    stand = LoadedStand(robot, at.kinematics, node.T, node.hessians[0])
+    stand = stand_at(robot, at, com_height(at, 1.05, pitch), pitch)
+    assert stand is not None
     x, _, z = robot.geometry.harness_point
     arm = x * math.cos(pitch) + z * math.sin(pitch)
     wrench = (0.0, 0.0, -down, 0.0, moment + arm * down, 0.0)

@@ -24,7 +24,9 @@ from tools.lab.design.dynamic_certificate import (
     DynamicCertificate,
     StiffnessNode,
     nodes_of,
+    stands_of,
 )
+from tools.lab.design.poses import Poses
 from tools.lab.design.sampled_loop import (
     NO_HAND,
     DrivetrainModel,
@@ -131,7 +133,7 @@ def test_the_plant_has_the_simulated_world_s_modes(robot: RobotConfig) -> None:
         fleet.advance()
     world = fleet.world
     simulated = modes(simulated_transition(world, fleet._torque.copy()), world.model.opt.timestep)
-    stand = stand_at(robot, world.actuation.flexible.theta)
+    stand = linearised(robot, world.actuation.flexible.theta)
     nothing = np.zeros((12, 12))
     drivetrain = DrivetrainModel(5000.0, 10.0, 0.15)
     loop = SampledLoop(
@@ -147,21 +149,11 @@ def test_the_plant_has_the_simulated_world_s_modes(robot: RobotConfig) -> None:
     np.testing.assert_allclose(simulated[:, 1], modelled[:, 1], atol=0.03)
 
 
-def stand_at(robot: RobotConfig, q: np.ndarray) -> Stand:
-    from tools.lab.design.poses import Poses  # noqa: PLC0415 - only its constants are wanted
-
+def linearised(robot: RobotConfig, q: np.ndarray) -> Stand:
+    """Return the stand at joint angles (12,), rad, without assist."""
     poses = Poses(robot)
-    kinematics = poses.kinematics
-    kinematics.update(q)
-    T = np.linalg.solve(np.vstack((kinematics.J, kinematics.C)), np.eye(12)[:, :6])
-    F_O = np.zeros(6)
-    F_O[2] = robot.total_mass * 9.81
-    H = kinematics.hessian_times(F_O, np.zeros(3)).copy()
-    K_geo = T.T @ H @ T
-    return Stand(
-        BodyInertia(robot).at(q, T), 0.5 * (K_geo + K_geo.T), T, kinematics.J.copy(),
-        kinematics.J_harness.copy(), H, np.array(robot.law.S, float),
-    )  # fmt: skip
+    node = poses.node_at(q)
+    return stands_of(robot, poses, node, BodyInertia(robot).at(q, node.T))[0]
 
 
 def simulated_transition(world: World, torque: np.ndarray) -> np.ndarray:
@@ -204,7 +196,7 @@ def test_inertia_along_p_is_that_of_the_simulated_body(robot: RobotConfig) -> No
     """Kinetic energy of a motion with both feet still, by MuJoCo's own mass matrix."""
     world = World(body_of(robot, changed(IDEAL, {"drivetrain.rotor_inertia": 0.01})), still(1.0))
     q = world.data.qpos[world.joints.q_index].copy()
-    stand = stand_at(robot, q)
+    stand = linearised(robot, q)
     M = np.zeros((18, 18))
     mujoco.mj_fullM(world.model, world.data, M)
     M[world.joints.v_index, world.joints.v_index] -= 0.01  # the rotors

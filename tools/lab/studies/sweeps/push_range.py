@@ -12,7 +12,7 @@ from shared.exceptions import RunError
 from shared.toml_file import Range
 from tools.flags import Arg, Flags
 from tools.lab.design.poses import Poses
-from tools.lab.design.push_limit import LoadedStand
+from tools.lab.design.push_limit import stand_at
 
 DIGITS: Final = 3
 REACHED_M: Final = 1e-4
@@ -34,11 +34,11 @@ class PushRange:
         poses = Poses(robot)
         height = robot.simulation.stand_height
         z = com_height(poses, height, 0.0)
-        node = poses.node(z, 0.0)
-        if node is None:
+        stand = stand_at(robot, poses, z, 0.0)
+        if stand is None:
             raise RunError(f"a stand with the torso at {height:g} m: this robot does not reach it")
         self._most = most
-        self._stand = LoadedStand(robot, poses.kinematics, node.T, node.hessians[0])
+        self._stand = stand
 
     def limit_n(self, angle: float) -> float:
         """Return the limit, N, along an angle, rad from x (forwards) to y (left)."""

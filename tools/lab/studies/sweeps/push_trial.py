@@ -17,7 +17,7 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Kill, Push, Scenario
 from shared.exceptions import RunError
 from tools.lab.design.poses import Poses
-from tools.lab.design.push_limit import LoadedStand, PushLimits, limits_along
+from tools.lab.design.push_limit import PushLimits, limits_along, stand_at
 from tools.lab.studies.sweeps.figures import NOBODY, Ending, ending_of
 from tools.lab.studies.sweeps.push_range import com_height
 from tools.sim.lockstep import FleetMoment, Lockstep
@@ -127,14 +127,12 @@ def limits_of(trial: PushTrial, robot: RobotConfig) -> PushLimits:
     height, pitch = POSES[trial.pose]
     poses, scheduled = Poses(robot), ScheduledGains(schedule)
     z = com_height(poses, height, pitch)
-    node = poses.node(z, pitch)
-    if node is None:
+    stand = stand_at(robot, poses, z, pitch)
+    if stand is None:
         raise RunError(f"{trial.pose}: this robot does not reach it")
-    D, (H, _) = scheduled.at(z, pitch), node.hessians
-    stand = LoadedStand(robot, poses.kinematics, node.T, H)
     angle = math.radians(trial.angle_deg)
     direction = (math.cos(angle), math.sin(angle))
-    return limits_along(stand, robot, D, scheduled.D_B, direction)
+    return limits_along(stand, robot, scheduled.at(z, pitch), scheduled.D_B, direction)
 
 
 def _start_of(trial: PushTrial, robot: RobotConfig, plant: PlantConfig) -> FleetMoment:
