@@ -28,11 +28,12 @@ from services.simulator.drives import axis_control
 from services.simulator.physics.actuation import step_graph
 from services.simulator.physics.body import body_of
 from services.simulator.physics.plant import PlantConfig
+from shared.arrays import Array
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, RunError
 from shared.extras import is_installed
-from shared.robot.compiled_graph import FLAGS, FOLDER, Array, library_of
+from shared.robot.compiled_graph import FLAGS, FOLDER, library_of
 from tools.flags import ConfigFlags, add_flags, read_flags
 
 SAMPLES: Final = 200

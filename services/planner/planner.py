@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from services.planner.controller import Controller, Observation
 from services.planner.intents import OperatorRequest
@@ -30,6 +29,7 @@ from services.planner.watch.soles import Soles
 from services.planner.watch.supply import SupplyState, SupplyWatch
 from services.planner.watch.trips import PlannerTrips, TripsState, values_of
 from services.planner.watch.unattended import Unattended, UnattendedState
+from shared.arrays import Array
 from shared.bus.messages import (
     Attitude,
     JointCommand,
@@ -47,8 +47,6 @@ from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES, N_JOINTS, N_MODULES
 from shared.robot.hold_rules import Support
 from shared.state import copied
-
-Array = NDArray[np.float64]
 
 EARLY_FRACTION = 0.5
 """Fraction of a period; states that arrive sooner after a tick still belong to that tick."""

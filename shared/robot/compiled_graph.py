@@ -16,9 +16,8 @@ from typing import Final
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from shared.arrays import Array
 
 FOLDER: Final = Path(sys.prefix) / "xrl-graphs"
 """Libraries of this environment, one for each graph."""

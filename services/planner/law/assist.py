@@ -11,14 +11,12 @@ from typing import Final
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from shared.arrays import Array
 from shared.bus.messages import Pair, Vector3, Wrench
 from shared.clamp import clamp
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import HarnessConfig
-
-Array = NDArray[np.float64]
 
 ERROR_MIN: Final = 5.0
 """N; force that dry friction in the joints hides (0.3 N m a joint: 5 to 6 N at the harness). Within

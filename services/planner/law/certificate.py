@@ -20,14 +20,12 @@ from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from services.planner.law.small_matrices import eigenvalue_min
+from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
 from shared.joints import N_JOINTS
 from shared.robot.compiled_graph import CompiledGraph
-
-Array = NDArray[np.float64]
 
 DIRECTIONS = ("lean forward", "lean sideways", "sink", "roll", "pitch", "yaw")
 """Name of the motion along each part of p."""

@@ -20,15 +20,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from services.planner.law.small_matrices import positive_part
+from shared.arrays import Array
 from shared.clamp import clamp
 from shared.config.sections import LawConfig
 from shared.joints import N_JOINTS
-
-Array = NDArray[np.float64]
-
 
 Y = 1
 """Row of p."""

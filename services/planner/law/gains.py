@@ -8,13 +8,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from services.planner.law.kinematics import Kinematics
+from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
 from shared.joints import N_JOINTS
-
-Array = NDArray[np.float64]
 
 
 class JointGains(NamedTuple):

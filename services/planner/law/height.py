@@ -22,12 +22,10 @@ from typing import Final
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from shared.arrays import Array
 from shared.bus.messages import Pair
 from shared.clamp import clamp
-
-Array = NDArray[np.float64]
 
 
 class Toward(IntEnum):

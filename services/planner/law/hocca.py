@@ -23,7 +23,6 @@ from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from services.planner.law.assist import (
     AssistLaw,
@@ -46,13 +45,11 @@ from services.planner.law.reference import Reference
 from services.planner.law.shift import ShiftReference, ShiftState
 from services.planner.law.split import GainSplit, LocalGains
 from services.planner.law.stance import FOLLOW_S, Stance
+from shared.arrays import Array
 from shared.bus.messages import AS_CONFIGURED, STRAIGHT, Pair, Vector3, Vector4, Vector6, Wrench
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.joints import MODULE_INDEX, N_JOINTS, SIDES
 from shared.state import copied
-
-Array = NDArray[np.float64]
-
 
 RECENTRED = np.array([True, True, False, True, False, True])
 """Rows of p whose closed-loop reference returns to zero: no roll or yaw, and the COM above the

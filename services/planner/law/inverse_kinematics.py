@@ -18,14 +18,12 @@ from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from services.planner.law.kinematics import Kinematics
 from services.planner.law.small_matrices import LuDecomposition
 from services.planner.law.symbolic import DAMPING
+from shared.arrays import Array
 from shared.joints import JOINTS, N_JOINTS, N_LEG
-
-Array = NDArray[np.float64]
 
 TOLERANCE = 1e-6
 """Largest residual of a solution, m or rad."""

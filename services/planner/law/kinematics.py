@@ -12,17 +12,14 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from services.planner.law import symbolic
 from services.planner.law.model import leg_geometry
+from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import GeometryConfig, LawConfig, MassConfig
 from shared.joints import N_LEG
 from shared.robot.compiled_graph import CompiledGraph
-
-Array = NDArray[np.float64]
-
 
 _GRAPHS: Final[dict[tuple[MassConfig, GeometryConfig, LawConfig], symbolic.Graphs]] = {}
 """Graphs per robot. A process builds each once, because that takes a tenth of a second."""

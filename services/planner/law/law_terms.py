@@ -8,15 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from services.planner.law.coupling import UncoupledGains
 from services.planner.law.gains import GainLaw, JointGains
 from services.planner.law.reference import Reference
 from services.planner.law.split import GainSplit, LocalGains
-
-Array = NDArray[np.float64]
+from shared.arrays import Array
 
 
 class LawTerms(NamedTuple):

@@ -25,12 +25,10 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shared.arrays import Array
 from shared.bus.messages import Pair, Vector3
 from shared.clamp import clamp
-
-Array = NDArray[np.float64]
 
 SLOPE_MAX: Final = 0.12
 """rad each way, 7 degrees. This robot stands on no steeper floor, so a larger value means an IMU

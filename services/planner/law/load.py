@@ -27,13 +27,10 @@ import math
 from typing import Final
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
+from shared.arrays import Array
 from shared.bus.messages import Pair
 from shared.config.robot_config import GRAVITY
-
-Array = NDArray[np.float64]
 
 LEADING_S: Final = 2.0
 HOLDING_S: Final = 0.25

@@ -14,13 +14,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
 from shared.joints import SIDES
 from shared.robot.robot_model import ankle_positions, mjcf
-
-Array = NDArray[np.float64]
 
 _TREE_OF_LEG: Final = np.array([[5, 4, 3, 2, 1, 0], [11, 10, 9, 8, 7, 6]])
 """Index in Pinocchio's tree (hip theta, hip phi, ... from the torso down) of each leg joint, (2,

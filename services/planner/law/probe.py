@@ -19,12 +19,9 @@ from collections.abc import Sequence
 from typing import Final
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
+from shared.arrays import Array
 from shared.clamp import clamp
-
-Array = NDArray[np.float64]
 
 NO_ROW: Final = -1
 PROBE_S: Final = 0.04

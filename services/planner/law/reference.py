@@ -13,7 +13,6 @@ from typing import Final
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from services.planner.law.inverse_kinematics import (
     STEP_MAX,
@@ -22,10 +21,9 @@ from services.planner.law.inverse_kinematics import (
     InverseKinematics,
 )
 from services.planner.law.kinematics import Kinematics, graphs_of
+from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
 from shared.robot.compiled_graph import CompiledGraph
-
-Array = NDArray[np.float64]
 
 STEPS_MAX: Final = 3
 """Steps by the graph; near a solution each squares the error. What needs more is not near."""

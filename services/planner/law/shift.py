@@ -14,13 +14,10 @@ from collections.abc import Sequence
 from typing import Final
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
+from shared.arrays import Array
 from shared.bus.messages import Vector4
 from shared.clamp import clamp
-
-Array = NDArray[np.float64]
 
 ROWS: Final = (0, 1, 3, 5)
 """Rows of p that the shift moves: x, y, roll, yaw."""

@@ -8,10 +8,9 @@ NumPy's time.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-Array = NDArray[np.float64]
+from shared.arrays import Array
 
 
 class LuDecomposition:

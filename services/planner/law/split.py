@@ -13,10 +13,10 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from services.planner.law.certificate import Certificate, Margins
 from services.planner.law.gains import JointGains
+from shared.arrays import Array
 from shared.bus.messages import SplitSource
 from shared.clamp import clamp
 from shared.config import gain_schedule
@@ -24,8 +24,6 @@ from shared.config.gain_table import GainSchedule
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
 from shared.joints import MODULES, N_JOINTS
-
-Array = NDArray[np.float64]
 
 STIFFEN_FRACTIONS: Final = (0.25, 0.5, 0.75, 1.0)
 """Fractions of the way from the wanted D to the stiff one, tried in turn."""

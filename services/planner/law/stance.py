@@ -23,11 +23,9 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shared.arrays import Array
 from shared.bus.messages import Vector6
-
-Array = NDArray[np.float64]
 
 _ROWS: Final = (
     ("ahead of", "behind", "mm"),

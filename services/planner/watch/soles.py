@@ -9,14 +9,10 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
+from shared.arrays import Array
 from shared.bus.messages import Pair
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.joints import MODULE_INDEX, SIDES
-
-Array = NDArray[np.float64]
 
 ANKLES = tuple(2 * MODULE_INDEX[f"ankle_{side}"] for side in SIDES)
 """Indices of the ankles' phi among the joints."""

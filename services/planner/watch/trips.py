@@ -32,16 +32,13 @@ import math
 from typing import Final
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
 from services.planner.law.hocca import LawOutput
+from shared.arrays import Array
 from shared.bus.messages import Trip
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.robot.trip_table import PLANNER_TRIPS, limits_of
-
-Array = NDArray[np.float64]
 
 CALM_NS: Final = NS_PER_S
 """A body that still swings passes through its limits several times a second."""

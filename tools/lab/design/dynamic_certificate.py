@@ -20,12 +20,12 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from services.planner.law.certificate import motor_mean
 from services.planner.law.coupling import PushIntegral, UncoupledGains, Y
 from services.planner.law.model import BodyInertia
 from services.planner.law.split import CouplingGains
+from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES, N_JOINTS, N_LEG
 from tools.lab.design.poses import PoseNode, Poses, geometric_stiffness
@@ -43,8 +43,6 @@ from tools.lab.design.sampled_loop import (
     halves,
     whole,
 )
-
-Array = NDArray[np.float64]
 
 DELAY_MIN_S: Final = 2e-3
 """s, from a sample to the first use of its command, over a bus without delay."""

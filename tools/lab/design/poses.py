@@ -9,17 +9,15 @@ from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from services.planner.law.gains import GainLaw
 from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.kinematics import Kinematics
+from shared.arrays import Array
 from shared.config.gain_table import Bounds, ModuleBounds
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.joints import MODULES, N_JOINTS, N_LEG, kind_of
 from shared.robot.robot_model import stand_pose
-
-Array = NDArray[np.float64]
 
 REACH_STEP: Final = 0.005
 """m; resolution of the ends of the height range."""

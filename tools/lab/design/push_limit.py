@@ -26,18 +26,16 @@ from typing import Final, NamedTuple
 
 import numpy as np
 import scipy.optimize
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from services.planner.law.certificate import motor_mean
 from services.planner.law.coupling import PushIntegral, UncoupledGains, Y
 from services.planner.law.kinematics import Kinematics
+from shared.arrays import Array
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.joints import MODULES, N_JOINTS, N_LEG, SIDES
 from shared.robot.robot_model import ankle_positions
 from tools.lab.design.poses import Poses
-
-Array = NDArray[np.float64]
 
 FRICTION: Final = 0.5
 """Friction coefficient of the soles on a slippery floor."""

@@ -33,9 +33,8 @@ from numpy.typing import NDArray
 
 from services.planner.law.certificate import motor_mean
 from services.planner.law.coupling import pole_gain
+from shared.arrays import Array
 from shared.joints import N_JOINTS, N_LEG
-
-Array = NDArray[np.float64]
 
 
 class DrivetrainModel(NamedTuple):

@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from services.planner.law.certificate import Certificate, Margins
 from services.planner.law.split import CouplingGains, ScheduledGains
+from shared.arrays import Array
 from shared.config.gain_schedule import VERSION, digest_of, inputs_of
 from shared.config.gain_table import GainSchedule, LegGains
 from shared.config.robot_config import RobotConfig
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 else:
     cp = late("cvxpy")
 
-Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 """Called with the number of nodes done and their total."""
 

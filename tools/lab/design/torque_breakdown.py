@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from services.planner.law.certificate import Weakest, motor_mean
 from services.planner.law.gains import GainLaw
@@ -18,14 +17,12 @@ from services.planner.law.law_terms import LawAtReference
 from services.planner.law.levelling import up_of
 from services.planner.law.reference import Reference
 from services.planner.law.split import GainSplit, LocalGains
+from shared.arrays import Array
 from shared.bus.messages import AS_CONFIGURED, Pair, Vector6
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.exceptions import RunError
 from shared.joints import N_LEG, SIDES
 from tools.lab.design.push_limit import LoadedStand, PushLimits, limits_at
-
-Array = NDArray[np.float64]
-
 
 SINGULAR: Final = 1e-3
 """Smallest singular value of a leg's Jacobian, m and rad mixed, with which there are gains: a knee
