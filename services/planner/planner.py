@@ -258,7 +258,7 @@ class Planner:
         if self._guard is not None:
             self._output = self._controlled(self._guard, self._output, now_ns, dt)
         self._state.source = self._output.local.source
-        loads = self._law.leg_loads(self._tau)
+        loads = self._law.measured.leg_loads(self._tau)
         lifted, leads = self._lifted(now_ns), not engagement.hold
         self._heat.state.lifted = lifted
         all_carry = all(state.mode in _CARRIES for state in states)
@@ -267,7 +267,7 @@ class Planner:
         if known:
             self._law.weigh(self._tau, self._v, self._usable_wrench(now_ns), dt, led=leads)
         else:
-            self._law.pause_load_estimate()
+            self._law.load.pause()
         soles = self._soles.loads(loads)
         edge = self._soles.edge(self._tau, soles)
         rate = self._law.harness_rate(self._v)
@@ -383,8 +383,8 @@ class Planner:
             tau=self._tau.copy(),
             p=law.p,
             pdot=law.pdot,
-            J=self._law.J.copy(),
-            T=self._law.T.copy(),
+            J=self._law.measured.J.copy(),
+            T=self._law.reference.T.copy(),
             wrench=self._usable_wrench(now_ns),
             request=self._state.request,
             law=law,
@@ -437,9 +437,9 @@ class Planner:
             return PlannerMode.YIELDING
         if self._overload.hold:
             return PlannerMode.OVERLOADED
-        if self._law.stance_refused:
+        if self._law.stance.refused:
             return PlannerMode.MISPLACED
-        if self._law.load_refused:
+        if self._law.load.refused:
             return PlannerMode.MISLOADED
         if self._state.source is _UNCERTIFIED:
             return PlannerMode.UNCERTIFIED
@@ -458,8 +458,8 @@ class Planner:
         """Return what the person must know: of the supply, of heat, and why it does not lead."""
         refusal = (
             self._state.rival.describe()
-            or self._law.stance_refusal()
-            or self._law.load_refusal()
+            or self._law.stance.refusal()
+            or self._law.load.refusal()
             or self._trips.why
             or self._heat.describe()
             or (self._guard.why if self._guard is not None else "")
@@ -468,7 +468,7 @@ class Planner:
 
     def status(self, now_ns: int, tick_us: float) -> PlannerStatus:
         """Return the inputs and decisions of the last tick."""
-        s, output = self._state, self._output
+        s, output, load = self._state, self._output, self._law.load.state
         seqs = [state.seq if state is not None else -1 for state in s.states]
         ages = [
             now_ns - arrived if state is not None else -1
@@ -504,7 +504,7 @@ class Planner:
             attitude_seq=s.attitude_seq,
             slope=output.slope if output is not None else (0.0, 0.0),
             shift_requested=s.request.shift,
-            load=self._law.load,
+            load=(load.kg, load.a, load.b),
             requested_by=s.request.source,
             probe_row=s.request.probe_row,
             probe=s.request.probe,

@@ -314,7 +314,7 @@ def test_pushed_by_the_operator_the_feet_carry_the_push_too(
     for _ in range(2):  # the second tick's feedforward is that of the moved reference
         output = law.tick(pushed, STILL, assist, 0.0)
     T = oracle.feasible(robot, pushed)
-    K_fail = law._split.certificate.failsafe_stiffness(output.local.D)
+    K_fail = law.split.certificate.failsafe_stiffness(output.local.D)
     K_c, _ = law._terms._uncoupled.at(K_fail, (T.T * output.local.D_B) @ T)
     along_p = (K_fail + K_c) @ moved
     torso_per_p = oracle.leg_jacobian(robot, RIGHT, pushed) @ T[oracle.LEG[RIGHT]]
@@ -382,7 +382,7 @@ def test_it_feels_like_k_p_where_it_balances_or_free(robot: RobotConfig, posed: 
     at_ref = law.tick(posed, STILL, 0.0, 0.0)
     T, D = oracle.feasible(robot, posed), at_ref.local.D
     # T_ref has them at the law's own damping of its inverse
-    K_fail = law._split.certificate.failsafe_stiffness(D)
+    K_fail = law.split.certificate.failsafe_stiffness(D)
     K_c, _ = law._terms._uncoupled.at(K_fail, (T.T * at_ref.local.D_B) @ T)
     wanted = (K_fail + K_c) @ S_perp
     np.testing.assert_allclose(-slope, wanted, rtol=2e-3, atol=3.0)
@@ -400,6 +400,6 @@ def test_motion_is_damped_where_it_balances_or_free(robot: RobotConfig, posed: A
     S_perp = np.diag(1.0 - np.array(robot.law.S))
     local = law.tick(posed, STILL, 0.0, 0.0).local
     B_local = (T.T * local.D_B) @ T
-    _, B_c = law._terms._uncoupled.at(law._split.certificate.failsafe_stiffness(local.D), B_local)
+    _, B_c = law._terms._uncoupled.at(law.split.certificate.failsafe_stiffness(local.D), B_local)
     wanted = (B_local + B_c) @ S_perp
     np.testing.assert_allclose(-slope, wanted, rtol=2e-3, atol=0.5)

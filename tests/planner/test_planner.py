@@ -187,7 +187,7 @@ def test_both_margins_are_told(robot: RobotConfig, planner: Planner, q: Array) -
 def test_gains_that_fall_hold_at_once(robot: RobotConfig, planner: Planner, q: Array) -> None:
     """The mode follows a tick later; when the gains stand again it waits as after a drop-out."""
     now = lead(planner, q)
-    split = planner._law._split
+    split = planner._law.split
     least = split._margins_min
     seen = []
     wait_ns = WAITS_NS[1]

@@ -115,24 +115,32 @@ class LawState(msgspec.Struct):
 
 
 class Hocca:
-    """The law and its state, such as the closed-loop reference p_C and the assist."""
+    """The law and its state, such as the closed-loop reference p_C and the assist.
+
+    Attributes:
+        measured: at the measured joints of the last tick.
+        reference: at the last tick's reference pose.
+        split: of the gains, with their certificate.
+        stance: of the feet.
+        load: beyond the robot file.
+    """
 
     def __init__(self, config: RobotConfig) -> None:
         """Build the law; the first tick starts from the measured pose."""
-        self._measured = Measured(config)
-        self._reference = Reference(config)
+        self.measured = Measured(config)
+        self.reference = Reference(config)
         gains = GainLaw(config)
-        self._split = GainSplit(config)
+        self.split = GainSplit(config)
         self._S = gains.S
-        self._terms = LawAtReference(gains, self._split)
-        self._coupling = CoupledTorque(self._split.coupling.bandwidth_hz, PushIntegral(config.law))
+        self._terms = LawAtReference(gains, self.split)
+        self._coupling = CoupledTorque(self.split.coupling.bandwidth_hz, PushIntegral(config.law))
         self._S_perp = 1.0 - self._S
         self._levelling = Levelling(config.imu.levelling_s)
         self._shift = ShiftReference(config.law.shift_max)
         self._probe = ReferenceProbe(config.law.probe_max, config.law.S)
         low, high = config.joint_service.damp_knee_stop, config.limits.knee.theta[1]
         self._height = HeightReference((low, high))
-        self._stance = Stance(config.law.stance_max)
+        self.stance = Stance(config.law.stance_max)
         self._weight = config.total_mass * GRAVITY
         self._F_O: Array = np.zeros(6)
         size = config.geometry.torso_size
@@ -140,7 +148,7 @@ class Hocca:
         # the paper's split serves for comparison only: no load correction is added to it
         certified = config.law.split == "certified"
         correction_max = config.law.load_correction if certified else (0.0, 0.0)
-        self._load = Load(correction_max, self._weight, config.torso_mass, inertia)
+        self.load = Load(correction_max, self._weight, config.torso_mass, inertia)
         assist = config.assist
         self._assist = AssistLaw(
             assist.force_max, assist.rate_max, assist.integral_max, assist.integral_s
@@ -152,34 +160,10 @@ class Hocca:
             assist=self._assist.state,
             easing=self._easing.state,
             shift=self._shift.state,
-            load=self._load.state,
+            load=self.load.state,
             probe=self._probe.state,
             height=self._height.state,
         )
-
-    @property
-    def stance_refused(self) -> bool:
-        """True while the planner must hold because of the feet's stance."""
-        return self._stance.refused
-
-    def stance_refusal(self) -> str:
-        """Return why the stance is refused, as text; "" if it is accepted."""
-        return self._stance.refusal() if self._stance.refused else ""
-
-    @property
-    def load(self) -> Vector3:
-        """Load beyond the robot file: kg, and moments a and b, N m."""
-        load = self._load.state
-        return load.kg, load.a, load.b
-
-    @property
-    def load_refused(self) -> bool:
-        """True while the load differs from the robot file by more than the law accepts."""
-        return self._load.refused
-
-    def load_refusal(self) -> str:
-        """Return why the load is refused, as text; "" if it is accepted."""
-        return self._load.refusal()
 
     def tick(
         self,
@@ -217,16 +201,16 @@ class Hocca:
             wrench: of the operator on the torso, if it is fresh and valid.
             up_torso: unit vector against gravity, torso axes, if the IMU knows it now.
         """
-        measured, reference = self._measured, self._reference
+        measured, reference = self.measured, self.reference
         if align or not self._state.aligned:
             fraction = min(1.0, dt / FOLLOW_S) if self._state.has_led else 1.0
-            self._stance.take(measured.stance_at(q), fraction)
+            self.stance.take(measured.stance_at(q), fraction)
             self._apply_stance()
         measured.update(q, v)
         self._levelling.advance(up_torso, measured.p[3:], dt, jump=align or not self._state.aligned)
         up = self._levelling.up
         self._F_O[:3] = self._weight * up
-        self._F_O[4] = self._load.moment(float(measured.p[4]))
+        self._F_O[4] = self.load.moment(float(measured.p[4]))
         if align or not self._state.aligned:
             self._align(q)
             self._shift.rest()
@@ -267,7 +251,7 @@ class Hocca:
         reference.load(
             pdot_ref,
             F_O,
-            (assist + self._load.force()) * up,
+            (assist + self.load.force()) * up,
             assist_rate * up,
             measured.D_left,
         )
@@ -297,20 +281,10 @@ class Hocca:
             closure=measured.closure.copy(),
             assist=assist + height.state.force,
             slope=self._levelling.slope,
-            stance=self._stance.taken,
+            stance=self.stance.taken,
             ik_iterations=result.iterations,
             ik_residual=result.residual,
         )
-
-    @property
-    def J(self) -> Array:  # noqa: N802 - the paper's letter
-        """dp/dq (6, 12) at the measured joints; overwritten by the next tick."""
-        return self._measured.J
-
-    @property
-    def T(self) -> Array:  # noqa: N802 - the paper's letter
-        """Joint rates per unit of p along the closed chain (12, 6), at the reference pose."""
-        return self._reference.T
 
     def rest_from_here(self, D: Array, torque: Array) -> Array:
         """Return how far p (6,) goes until local gains alone balance a torque, m and rad.
@@ -319,22 +293,8 @@ class Hocca:
             D: local stiffness (12,), N m/rad, certified at this tick.
             torque: beyond what balances the body here (12,), N m.
         """
-        K_fail = self._split.certificate.failsafe_stiffness(D)
-        return np.asarray(np.linalg.solve(K_fail, self._reference.T.T @ torque), float)
-
-    def certify(self, D: Array) -> LocalGains:
-        """Return somebody's own local stiffness (12,), N m/rad, with its margins at this tick."""
-        return self._split.certify(D)
-
-    def leg_loads(self, tau: Array) -> tuple[float, float]:
-        """Return the upward force of right and left leg on the torso at the last tick, N.
-
-        NaN for a leg that is straight or folded.
-
-        Args:
-            tau: joint torques (12,), N m.
-        """
-        return self._measured.leg_loads(tau)
+        K_fail = self.split.certificate.failsafe_stiffness(D)
+        return np.asarray(np.linalg.solve(K_fail, self.reference.T.T @ torque), float)
 
     def weigh(self, tau: Array, v: Array, wrench: Wrench | None, dt: float, *, led: bool) -> None:
         """Update the estimate of the load beyond the robot file, at the last tick's pose.
@@ -346,21 +306,17 @@ class Hocca:
             dt: time since the last tick, s.
             led: the planner is engaged.
         """
-        if not self._load.enabled:
+        if not self.load.enabled:
             return
         if wrench is None:
-            F_z = float(tau @ self._reference.T[:, 2])
-            self._load.advance_without_harness(F_z, dt, led=led)
+            F_z = float(tau @ self.reference.T[:, 2])
+            self.load.advance_without_harness(F_z, dt, led=led)
             return
-        at_ref, p = self._reference, self._measured.p
+        at_ref, p = self.reference, self.measured.p
         force, moment = wrench_in_world(wrench, float(p[3]), float(p[4]))
         tau_held = tau + force @ at_ref.J_harness + moment * at_ref.J[4]
-        T, rates = at_ref.T, (self.harness_rate(v), float(self._measured.pdot[4]))
-        self._load.advance(tau_held @ T, at_ref.J_harness[2] @ T, float(p[4]), rates, dt, led=led)
-
-    def pause_load_estimate(self) -> None:
-        """Pause the load estimate: a state is stale, or a straight or folded leg hides the load."""
-        self._load.pause()
+        T, rates = at_ref.T, (self.harness_rate(v), float(self.measured.pdot[4]))
+        self.load.advance(tau_held @ T, at_ref.J_harness[2] @ T, float(p[4]), rates, dt, led=led)
 
     def harness_rate(self, v: Array) -> float:
         """Return the vertical rate of the harness point at the last tick's pose, m/s, world.
@@ -368,17 +324,17 @@ class Hocca:
         Args:
             v: joint rates (12,), rad/s.
         """
-        return float(self._measured.J_harness[2] @ v)
+        return float(self.measured.J_harness[2] @ v)
 
     def snapshot(self) -> LawState:
         """Return a copy of the state; `restore` continues from it."""
         state = msgspec.structs.replace(
             self._state,
             p_C0=tuple(self._p_C0.tolist()),
-            q=tuple(self._reference.start.tolist()),
+            q=tuple(self.reference.start.tolist()),
             coupling=self._coupling.snapshot(),
             levelling=self._levelling.snapshot(),
-            stance=self._stance.snapshot(),
+            stance=self.stance.snapshot(),
         )
         return copied(state)
 
@@ -390,27 +346,27 @@ class Hocca:
             own.easing,
             own.shift,
         )
-        self._load.state, self._probe.state, self._height.state = own.load, own.probe, own.height
+        self.load.state, self._probe.state, self._height.state = own.load, own.probe, own.height
         self._p_C0 = np.array(own.p_C0)
-        self._reference.start[:] = own.q
+        self.reference.start[:] = own.q
         self._coupling.restore(own.coupling)
         self._levelling.restore(own.levelling)
-        self._stance.restore(own.stance)
+        self.stance.restore(own.stance)
         self._apply_stance()
 
     def _apply_stance(self) -> None:
-        for stance in (self._measured.stance, self._reference.inputs.stance):
-            stance[:] = self._stance.taken
+        for stance in (self.measured.stance, self.reference.inputs.stance):
+            stance[:] = self.stance.taken
 
     def _align(self, q: Array) -> None:
         self._state.aligned = True
         self._coupling.reset()
         kept_rows = np.where(RECENTRED & self._state.has_led, 0.0, self._S_perp)
-        p = self._measured.p.copy()
+        p = self.measured.p.copy()
         p[:2] -= self._levelling.up[:2] / self._levelling.up[2] * p[2]
         self._p_C0 = p * kept_rows
         self._state.since_align_s = 0.0
-        self._reference.start[:] = q
+        self.reference.start[:] = q
 
     def _closed_loop_reference(self, dt: float) -> tuple[Array, Array]:
         """Return p_C and its rate: a minimum-jerk path from the pose found by `align` to zero.

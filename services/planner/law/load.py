@@ -167,9 +167,8 @@ class Load:
             s.weighing_s = WEIGHING_S if s.refused else max(0.0, s.weighing_s - dt)
 
     def pause(self) -> None:
-        """Pause the estimate, because nothing can be measured now; its value stays."""
-        s = self.state
-        s.rates = None
+        """Pause the estimate: a state is stale, or a straight or folded leg hides the load."""
+        self.state.rates = None
 
     def advance_without_harness(self, F_z: float, dt: float, *, led: bool) -> None:
         """Update with the joints' force along z, N, without a harness; check only if it hangs.

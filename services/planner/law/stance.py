@@ -85,7 +85,9 @@ class Stance:
         self.refused = beyond or bool((np.abs(wanted - self.taken) > FOLLOW_TOLERANCE).any())
 
     def refusal(self) -> str:
-        """Return why the stance measured last is refused, as text."""
+        """Return why the stance measured last is refused, as text; "" if it is accepted."""
+        if not self.refused:
+            return ""
         if not np.isfinite(self._measured).all():
             return "the joint angles give no stance: check the encoders"
         rows = zip(self._measured.tolist(), self._stance_max.tolist(), _ROWS, strict=True)

@@ -100,7 +100,7 @@ class ControllerGuard:
         if fault:
             state.why, state.failed = f"the controller {fault}"[:WORDS], True
             return _uncertified(law)
-        local = self._law.certify(action.D)
+        local = self._law.split.certify(action.D)
         state.why = self._objection(seen, action, local)
         if state.why:
             state.wait_s = clamp(2.0 * state.wait_s, REST_S, WAIT_MAX_S)

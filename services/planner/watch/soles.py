@@ -34,7 +34,7 @@ class Soles:
         NaN for a leg whose force is not known.
 
         Args:
-            leg_loads: of the right and the left leg, N (`Hocca.leg_loads`).
+            leg_loads: of the right and the left leg, N (`Measured.leg_loads`).
         """
         right, left = leg_loads
         return right + self._leg_weight, left + self._leg_weight
