@@ -22,6 +22,11 @@ from tests.planner.oracle import Array
 SESSION = 4711
 START_NS = 10**12
 TICK_NS = 4 * NS_PER_MS
+DT = 0.004
+"""s; the same."""
+STILL: Array = np.zeros(12)
+WEIGHT: Array = np.array([0.0, 0.0, 731.6, 0.0, 0.0, 0.0])
+"""The shipped robot's along p, N and N m."""
 
 
 def with_law(robot: RobotConfig, **changes: object) -> RobotConfig:

@@ -26,10 +26,7 @@ from services.planner.law.assist import (
 from shared.bus.messages import Wrench
 from shared.clock import NS_PER_MS
 from tests.planner import oracle
-from tests.planner.states import wrench
-
-DT = 0.004
-
+from tests.planner.states import DT, wrench
 
 FORCE_MAX, RATE_MAX, INTEGRAL_MAX, INTEGRAL_S = 200.0, 100.0, 50.0, 3.0
 

@@ -20,7 +20,7 @@ from shared.robot.robot_model import stand_pose
 from tests.planner.conftest import Closed, at_pose, p_at
 from tests.planner.oracle import Array
 from tests.planner.stands import Stand
-from tests.planner.states import with_law
+from tests.planner.states import WEIGHT, with_law
 
 POSES = (
     {"height": 1.188},
@@ -226,9 +226,6 @@ def test_a_stiffness_that_was_returned_stays_when_another_is_asked_for(robot: Ro
 
 
 # ---- K_q = N K_0 + J^T K_p J - sum_i H_i F_i, B_q = N B_0 + J^T B_p J
-
-WEIGHT = np.array([0.0, 0.0, 731.6, 0.0, 0.0, 0.0])
-
 
 OPEN = (2, 4)
 """z and pitch, where the person leads."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from services.planner.law.height import (
     ACCELERATION,
@@ -19,9 +18,10 @@ from services.planner.law.height import (
     HeightReference,
     Toward,
 )
+from tests.planner.oracle import Array
+from tests.planner.states import DT
 
 DOWN, UP, PERSON = Toward.DOWN, Toward.UP, Toward.PERSON
-DT = 0.004
 T_Z = np.full(12, 4.0)
 KNEES = (-2.5, -0.2)
 SLOPE = 0.1
@@ -41,7 +41,7 @@ class Body:
     def knee(self) -> float:
         return float(self.p[2] - 1.0) / SLOPE
 
-    def step(self, toward: Toward) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def step(self, toward: Toward) -> tuple[Array, Array]:
         knees = self.knee, self.knee + 0.02
         self.force = self.law.advance(toward, self.p, self.pdot, T_Z, knees, DT)
         p_ref, pdot_ref = self.p.copy(), self.pdot.copy()  # open: the person leads

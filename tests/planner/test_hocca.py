@@ -16,13 +16,7 @@ from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
 from tests.planner.conftest import Closed, at_pose
 from tests.planner.oracle import LEFT, RIGHT, Array
-from tests.planner.states import with_law
-
-DT = 0.004
-
-
-STILL = np.zeros(12)
-
+from tests.planner.states import DT, STILL, with_law
 
 OPEN = {"z": 2, "pitch": 4}
 

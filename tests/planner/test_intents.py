@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from services.planner.intents import Intents, OperatorRequest
 from services.planner.law.probe import NO_ROW, PROBE_S, ReferenceProbe
@@ -28,12 +27,13 @@ from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Scenario
+from tests.planner.oracle import Array
+from tests.planner.states import DT
 from tools.bringup.tune.excitation import Excitation, SinePart
 from tools.bringup.tune.pose_probe import DIRECTIONS, ProbedLockstep, course_of
 from tools.sim.standing_start import begin_standing
 
 T0 = 5_000_000_000
-DT = 0.004
 
 
 def intent(assist_n: float = 0.0, shift: Vector4 = STRAIGHT, **probe: Any) -> OperatorIntent:
@@ -150,9 +150,6 @@ def test_it_rests_where_it_is_while_it_is_not_led() -> None:
     shift, rate = now(follower)
     np.testing.assert_array_equal(shift, there)
     assert not rate.any()
-
-
-Array = NDArray[np.float64]
 
 
 # ---- a row of the reference that is probed

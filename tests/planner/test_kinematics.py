@@ -17,6 +17,7 @@ from tests.planner import oracle
 from tests.planner.conftest import SQUAT, Closed
 from tests.planner.oracle import LEFT, RIGHT, Array
 from tests.planner.stands import Stand
+from tests.planner.states import WEIGHT
 from tools.lab.design.push_limit import LoadedStand
 
 POSES = (
@@ -143,9 +144,6 @@ def test_load_sharing_asks_each_foot_for_less_than_its_edge_gives_and_average_fo
                 capacity.append(lifted[2] * robot.geometry.w_foot / 2)
     assert max(asked) == pytest.approx(127, abs=1.0)  # docs/law.md#load-sharing
     assert min(capacity) == pytest.approx(23, abs=0.5)
-
-
-WEIGHT = np.array([0.0, 0.0, 731.6, 0.0, 0.0, 0.0])
 
 
 NO_FORCE = np.zeros(3)

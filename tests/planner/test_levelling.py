@@ -17,12 +17,10 @@ from shared.config.robot_config import GRAVITY, RobotConfig
 from tests.imu.robots import with_imu
 from tests.planner import oracle
 from tests.planner.conftest import Closed
+from tests.planner.states import DT
 from tools.lab.design.torque_breakdown import torque_breakdown
 
 LEVEL = np.zeros(3)
-
-
-DT = 0.004
 
 
 slopes = st.tuples(*[st.floats(-0.14, 0.14)] * 2)

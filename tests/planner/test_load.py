@@ -14,7 +14,7 @@ from services.planner.law.load import FRICTION_BAND, RESUME_FRACTION, WEIGHING_S
 from shared.bus.messages import Pair
 from shared.config.robot_config import GRAVITY, RobotConfig
 from tests.planner.conftest import Closed
-from tests.planner.states import wrench
+from tests.planner.states import DT, wrench
 
 LARGEST = (8.0, 20.0)
 
@@ -23,9 +23,6 @@ WEIGHT, MASS, INERTIA = 700.0, 40.0, 0.5
 
 
 STRAIGHT_UP = np.array((0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
-
-
-DT = 0.004
 
 
 Push = Callable[[float], float]

@@ -26,9 +26,8 @@ from shared.joints import N_MODULES
 from shared.robot.trip_table import PLANNER_TRIPS
 from tests.planner.conftest import Closed
 from tests.planner.oracle import Array
-from tests.planner.states import SESSION, START_NS, TICK_NS, receive_all, state
+from tests.planner.states import DT, SESSION, START_NS, TICK_NS, receive_all, state
 
-DT = 0.004
 UP = np.array((0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
 P, REST = np.array([0.0, 0.0, 0.9, 0.0, 0.1, 0.0]), np.zeros(6)
 APART = tuple({Trip.LEGS: 0.2, Trip.UNLOADED: 200.0}.get(trip, 0.0) for trip in PLANNER_TRIPS)

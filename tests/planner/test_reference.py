@@ -12,8 +12,8 @@ from services.planner.law.reference import Reference
 from shared.config.robot_config import RobotConfig
 from tests.planner.conftest import Closed
 from tests.planner.oracle import Array
+from tests.planner.states import DT
 
-DT = 0.004
 NOWHERE = np.tile([-4.0, 4.0], (12, 1))
 """Joint limits that stop nothing."""
 

@@ -13,6 +13,7 @@ from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
 from tests.planner.conftest import Closed
 from tests.planner.oracle import LEFT, RIGHT, Array
+from tests.planner.states import DT, STILL
 from tools.lab.design.poses import Poses
 from tools.lab.design.push_limit import stand_at
 
@@ -26,12 +27,6 @@ STANCES = (
 
 
 LARGEST = (0.12, 0.14, 0.04, 0.06, 0.06, 0.33)
-
-
-DT = 0.004
-
-
-STILL = np.zeros(12)
 
 
 class Standing:

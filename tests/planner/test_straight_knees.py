@@ -22,15 +22,12 @@ from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
 from tests.planner.conftest import Closed
 from tests.planner.oracle import Array
-from tests.planner.states import with_law
+from tests.planner.states import WEIGHT, with_law
 
 KNEES = [3, 9]
 
 
 OTHERS = [joint for joint in range(12) if joint not in KNEES]
-
-
-WEIGHT = np.array([0.0, 0.0, 731.6, 0.0, 0.0, 0.0])
 
 
 ASSIST = np.array([0.0, 0.0, 200.0])

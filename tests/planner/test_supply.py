@@ -7,9 +7,9 @@ import pytest
 from services.planner.watch.supply import POLE_S, RECOVERED_V, SupplyWatch
 from shared.config.sections import SupplyConfig
 from tests.messages import all_states
+from tests.planner.states import DT
 
 LEVELS = SupplyConfig(low_v=44.0, sit_v=42.0)
-DT = 0.004
 
 
 def watched(watch: SupplyWatch, volts: float, seconds: float) -> SupplyWatch:

@@ -18,11 +18,9 @@ from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.robot.trip_table import JOINT_TRIPS, PLANNER_TRIPS
 from tests.planner import oracle
 from tests.planner.conftest import Closed
+from tests.planner.states import TICK_NS
 
 T0 = 5_000_000_000
-
-
-TICK_NS = 4 * NS_PER_MS
 
 
 CALM = tuple(200.0 if trip is Trip.UNLOADED else 0.0 for trip in PLANNER_TRIPS)

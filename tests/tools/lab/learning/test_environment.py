@@ -10,13 +10,13 @@ from gymnasium.error import InvalidAction, ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
 from services.planner.law.certificate import Certificate
-from services.planner.law.kinematics import Kinematics
 from shared.bus import topics
 from shared.bus.messages import JointCommand, JointState, Message
 from shared.bus.topics import Topic
-from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
 from tests.lockstep.runs import still
+from tools.lab.design.poses import Poses
 from tools.lab.learning.environment import FALLEN, BalanceEnv, standing_reward
 from tools.lab.learning.policy import ACTIONS, OBSERVED, PolicyController
 from tools.sim.lockstep import Lockstep
@@ -111,17 +111,6 @@ def test_an_action_that_is_none_raises_and_the_episode_goes_on(
     env.step(np.zeros(ACTIONS))
 
 
-def margin(robot: RobotConfig, certificate: Certificate, q: np.ndarray, D: np.ndarray) -> float:
-    """Return the failsafe margin of gains at measured joints, from the model itself."""
-    kinematics = Kinematics(robot)
-    kinematics.update(q)
-    T = np.linalg.solve(np.vstack([kinematics.J, kinematics.C]), np.eye(12, 6))
-    F = np.array([0.0, 0.0, robot.total_mass * GRAVITY, 0.0, 0.0, 0.0])
-    K = T.T @ (D[:, None] * T) + T.T @ kinematics.hessian_times(F, np.zeros(3)) @ T
-    scale = 1.0 / np.sqrt(certificate.K_required)
-    return float(np.linalg.eigvalsh(scale[:, None] * 0.5 * (K + K.T) * scale)[0])
-
-
 @pytest.mark.sampled(10)
 @pytest.mark.parametrize("number", range(100))
 def test_no_random_policy_gets_an_uncertified_gain_to_a_drive_and_the_robot_stands(
@@ -154,11 +143,13 @@ def test_no_random_policy_gets_an_uncertified_gain_to_a_drive_and_the_robot_stan
             if all(command is not None for command in held):
                 D = np.array([gain for c in held if c is not None for gain in c.k_p])
                 used.append((np.array([a for name in MODULES for a in states[name].q]), D))
-    certificate = Certificate(robot)
-    least = robot.certificate.margin_min
-    margins = [margin(robot, certificate, q, D) for q, D in used]
-    assert margins
-    assert min(margins) > 0.93 * least, "the pose of the certificate is the reference, not q"
+    poses, certificate, margins = Poses(robot), Certificate(robot), list[float]()
+    for q, D in used:
+        node = poses.node_at(q)
+        certificate.at(node.T, node.hessians[0])
+        margins.append(certificate.margins(D).service)
+    least = 0.93 * robot.certificate.margin_min
+    assert min(margins) > least, "the pose of the certificate is the reference, not q"
 
 
 def test_a_fall_is_worth_less_than_any_stand(robot: RobotConfig) -> None:
