@@ -14,13 +14,13 @@ from services.joint.differential import motor_from_joint
 from services.planner.law.certificate import DIRECTIONS, UNITS, Certificate, motor_mean
 from services.planner.law.gains import GainLaw
 from services.planner.law.inverse_kinematics import InverseKinematics
-from services.planner.law.kinematics import Kinematics
+from services.planner.law.split import GainSplit
 from shared.config.robot_config import RobotConfig
 from shared.robot.robot_model import stand_pose
 from tests.planner.conftest import Closed, at_pose, p_at
 from tests.planner.oracle import Array
 from tests.planner.stands import Stand
-from tests.planner.states import WEIGHT, with_law
+from tests.planner.states import with_law
 
 POSES = (
     {"height": 1.188},
@@ -50,15 +50,6 @@ def random_stiffness(seed: int) -> Array:
     return np.asarray(np.random.default_rng(seed).uniform(0.0, 2000.0, 12), float)
 
 
-def scheduled(robot: RobotConfig, stand: Stand) -> Array:
-    """Return D (12,) of the schedule's node nearest to a stand."""
-    schedule = robot.gain_schedule
-    assert schedule is not None
-    i = int(np.abs(np.array(schedule.z) - stand.p[2]).argmin())
-    j = int(np.abs(np.array(schedule.pitch) - stand.p[4]).argmin())
-    return np.tile(schedule.D[i][j], 2)
-
-
 def smallest(robot: RobotConfig, K: Array) -> tuple[float, Array]:
     """Return the smallest mu with K p = mu diag(K_required) p, and p (6,)."""
     values, vectors = np.linalg.eig(K / np.array(robot.certificate.K_required)[:, np.newaxis])
@@ -76,7 +67,7 @@ def test_failsafe_stiffness_is_the_curvature_of_the_energy(stand: Stand) -> None
 
 def test_of_the_scheduled_gains_it_is_exact_to_1_n_per_m(robot: RobotConfig, stand: Stand) -> None:
     """Where the numbers are small and the verdict hangs on them: the smallest eigenvalue."""
-    D = scheduled(robot, stand)
+    D = stand.split(GainSplit(robot)).D
     felt = stand.stiffness_felt(D)
     np.testing.assert_allclose(stand.certificate.failsafe_stiffness(D), felt, rtol=1e-3, atol=1.0)
     margins = stand.certificate.margins(D)
@@ -110,18 +101,6 @@ def test_onboard_margin_is_of_motors_alone(robot: RobotConfig, stand: Stand) -> 
     np.testing.assert_allclose(motor_mean(D), D_onboard, rtol=1e-12)
     onboard, _ = smallest(robot, stand.stiffness_felt(D_onboard))
     assert stand.certificate.margins(D).onboard == pytest.approx(onboard, rel=1e-3, abs=1e-3)
-
-
-def test_all_of_k_q_gives_k_p_in_the_closed_directions(stand: Stand) -> None:
-    """T^T K_q T + K_geo = S_perp K_p + K_0 T^T N T: the paper's law holds with its own gains."""
-    robot, T = stand.robot, stand.T
-    K_q = GainLaw(robot).gains(stand.kinematics, stand.hessian_O).K_q
-    K_geo = stand.certificate.failsafe_stiffness(np.zeros(12))
-    law = robot.law
-    N = damped_null_space(stand.kinematics.J, law.damping_lambda)
-    K_p = np.diag(np.array(law.K_p) * (1.0 - np.array(law.S)))
-    assert np.abs(K_geo).max() > 500.0
-    np.testing.assert_allclose(T.T @ K_q @ T + K_geo, K_p + law.K_0 * T.T @ N @ T, atol=1e-5)
 
 
 def test_where_the_chain_has_no_rates_nothing_is_certified(robot: RobotConfig) -> None:
@@ -172,7 +151,7 @@ def test_all_a_certificate_requires_is_a_margin_of_one(robot: RobotConfig, stand
 
 def test_weakest_is_an_independent_decompositions(robot: RobotConfig, stand: Stand) -> None:
     required = np.array(robot.certificate.K_required)
-    for D in (scheduled(robot, stand), *(random_stiffness(seed) for seed in range(6, 12))):
+    for D in (stand.split(GainSplit(robot)).D, *(random_stiffness(seed) for seed in range(6, 12))):
         weakest = stand.certificate.weakest(D)
         K = stand.certificate.failsafe_stiffness(D)
         margin, p = smallest(robot, K)
@@ -229,14 +208,6 @@ def test_a_stiffness_that_was_returned_stays_when_another_is_asked_for(robot: Ro
 
 OPEN = (2, 4)
 """z and pitch, where the person leads."""
-LEVEL_POSES = ((1.25, 0.0), (1.188, 0.0), (0.948, 0.0), (0.85, 0.6), (0.80, 1.2))
-
-
-@pytest.fixture(params=LEVEL_POSES, ids=lambda p: f"{p[0]:g}m-{p[1]:g}rad")
-def at(request: pytest.FixtureRequest, kinematics: Kinematics, closed: Closed) -> Kinematics:
-    height, pitch = request.param
-    kinematics.update(closed(height, pitch=pitch))
-    return kinematics
 
 
 def damped_null_space(J: Array, damping: float) -> Array:
@@ -246,16 +217,20 @@ def damped_null_space(J: Array, damping: float) -> Array:
 
 @pytest.mark.parametrize("open_K_p", [0.0, 2000.0])
 def test_gains_are_symmetric_and_the_papers_sum_without_the_open_directions(
-    robot: RobotConfig, at: Kinematics, open_K_p: float
+    robot: RobotConfig, stand: Stand, open_K_p: float
 ) -> None:
+    """So T^T K_q T + K_geo = S_perp K_p + K_0 T^T N T: the paper's law holds with its own gains."""
     K_p = tuple(open_K_p if i in OPEN else k for i, k in enumerate(robot.law.K_p))
-    law, J = with_law(robot, K_p=K_p).law, at.J.copy()
-    hessian = at.hessian_times(WEIGHT, np.array([0.0, 0.0, 200.0])).copy()
-    gains = GainLaw(with_law(robot, K_p=K_p)).gains(at, hessian)
+    changed, J, T = with_law(robot, K_p=K_p), stand.kinematics.J, stand.T
+    law, gains = changed.law, GainLaw(changed).gains(stand.kinematics, stand.hessian_O)
     closed = 1.0 - np.array(law.S)
     N = damped_null_space(J, law.damping_lambda)
-    K_q = law.K_0 * N + J.T @ np.diag(law.K_p * closed) @ J - hessian
+    K_q = law.K_0 * N + J.T @ np.diag(law.K_p * closed) @ J - stand.hessian_O
     B_q = law.B_0 * N + J.T @ np.diag(law.B_p * closed) @ J
     for found, wanted in ((gains.K_q, K_q), (gains.B_q, B_q)):
         np.testing.assert_allclose(found, wanted, atol=1e-9)
         np.testing.assert_array_equal(found, found.T)
+    K_geo = stand.certificate.failsafe_stiffness(np.zeros(12))
+    assert np.abs(K_geo).max() > 500.0
+    along_p = np.diag(law.K_p * closed) + law.K_0 * T.T @ N @ T
+    np.testing.assert_allclose(T.T @ gains.K_q @ T + K_geo, along_p, atol=1e-5)
