@@ -102,16 +102,6 @@ class _Ages(NamedTuple):
     attitude: int
     command: int
 
-    @classmethod
-    def of(cls, config: RobotConfig) -> _Ages:
-        rows = (
-            config.planner.state_stale_ms,
-            config.harness.stale_ms,
-            config.imu.stale_ms,
-            config.joint_service.max_command_age_ms,
-        )
-        return cls(*(round(row * NS_PER_MS) for row in rows))
-
 
 class Planner:
     """Whole-body law behind its engagement rule."""
@@ -144,7 +134,12 @@ class Planner:
         service = config.joint_service
         self._phases = StatePhases(service.rate_hz, service.state_rate_hz)
         self._period_s = 1.0 / config.planner.rate_hz
-        self._ages = _Ages.of(config)
+        self._ages = _Ages(
+            state=round(config.planner.state_stale_ms * NS_PER_MS),
+            wrench=round(config.harness.stale_ms * NS_PER_MS),
+            attitude=round(config.imu.stale_ms * NS_PER_MS),
+            command=round(service.max_command_age_ms * NS_PER_MS),
+        )
         self._state = PlannerState(
             overload=self._overload.state,
             trips=self._trips.state,

@@ -23,6 +23,7 @@ import numpy as np
 
 from services.planner.law.certificate import motor_mean
 from services.planner.law.coupling import PushIntegral, UncoupledGains, Y
+from services.planner.law.gains import GainLaw
 from services.planner.law.model import BodyInertia
 from services.planner.law.split import CouplingGains
 from shared.arrays import Array
@@ -206,13 +207,10 @@ class DynamicCertificate:
         """Set the robot and its poses."""
         self._config = config
         self._nodes = nodes
-        law, wanted = config.law, config.robustness
-        self._wanted = wanted
-        S = np.array(law.S, float)
-        self._K_p, self._B_p = (np.array(gain) * (1.0 - S) for gain in (law.K_p, law.B_p))
-        self._S = S
-        self._integral_gain = PushIntegral(law).gain
-        self._hands = [HandModel(*hand) for hand in wanted.hands]
+        self._wanted = config.robustness
+        self._body = GainLaw(config)
+        self._integral_gain = PushIntegral(config.law).gain
+        self._hands = [HandModel(*hand) for hand in config.robustness.hands]
         self._halves = (*halves(), whole())
         hold = np.array([config.hold_gains(module) for module in MODULES])
         self._hold = hold[:, 0].ravel(), hold[:, 1].ravel()
@@ -221,8 +219,8 @@ class DynamicCertificate:
     def feedback(self, node: StiffnessNode, design: Design) -> Feedback:
         """Return the feedback of services and planner in TRACK at a pose."""
         T, J = node.stand.T, node.stand.J
-        D_B = np.tile(design.D_B, 2)
-        uncoupled = UncoupledGains(self._K_p, self._B_p, self._S, design.coupling.damping)
+        D_B, body = np.tile(design.D_B, 2), self._body
+        uncoupled = UncoupledGains(body.K_p, body.B_p, body.S, design.coupling.damping)
         K_fail = T.T @ (node.D[:, np.newaxis] * T) + node.stand.K_geo
         K_c, B_c = uncoupled.at(K_fail, (T.T * D_B) @ T)
         # tau_coupled = C_q e_q + C_v e_v, with J e_q = p_ref - p in the closed rows
@@ -281,12 +279,11 @@ class DynamicCertificate:
         design: Design,
         modes: Sequence[str] = TRACK + HELD + BLIND,
         *,
-        margins: bool = True,
         stop_above: float = np.inf,
     ) -> DynamicVerdict:
         """Return the condition with the slowest decay, or the first excess above so much, 1/s."""
         worst: DynamicVerdict | None = None
-        for condition in self.conditions(modes, margins=margins):
+        for condition in self.conditions(modes):
             verdict = self.judge(condition, design)
             if worst is None or verdict.excess > worst.excess:
                 worst = verdict

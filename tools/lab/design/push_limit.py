@@ -30,6 +30,7 @@ from scipy.spatial.transform import Rotation
 
 from services.planner.law.certificate import motor_mean
 from services.planner.law.coupling import PushIntegral, UncoupledGains, Y
+from services.planner.law.gains import GainLaw
 from services.planner.law.kinematics import Kinematics
 from shared.arrays import Array
 from shared.config.robot_config import GRAVITY, RobotConfig
@@ -296,13 +297,13 @@ def limits_along(
 
     D, N m/rad, and D_B, N m s/rad, (12,) are the local gains in TRACK.
     """
-    law, schedule = config.law, config.gain_schedule
+    body, schedule = GainLaw(config), config.gain_schedule
     damping = 0.0 if schedule is None else schedule.coupling_damping
-    uncoupled = UncoupledGains(np.array(law.K_p), np.array(law.B_p), np.array(law.S), damping)
+    uncoupled = UncoupledGains(body.K_p, body.B_p, body.S, damping)
     K_c, _ = uncoupled.at(stand.stiffness(D), stand.along_p(D_B))
     D_hold = np.maximum(D, np.ravel([config.hold_gains(module)[0] for module in MODULES]))
     return PushLimits(
-        stand.limit_led(D, direction, K_c, PushIntegral(law).most),
+        stand.limit_led(D, direction, K_c, PushIntegral(config.law).most),
         stand.limit_held(D_hold, direction),
         stand.limit_held(motor_mean(D_hold), direction),
         stand.limit_of_body(direction),
