@@ -55,9 +55,9 @@ def path_of(robot: RobotConfig) -> Path:
     q = np.tile([0.0, 0.1, 0.0, 0.0, 0.0, 0.4], 2)
     for index in range(-100, 21):
         q[KNEES] = index * STEP
-        for _ in range(8):
-            A = oracle.derivative(rows, q)[:, OTHERS]
-            q[OTHERS] -= np.linalg.lstsq(A, rows(q), rcond=1e-6)[0]
+        inverse = np.linalg.pinv(oracle.derivative(rows, q)[:, OTHERS], rcond=1e-6)
+        for _ in range(40):  # Newton, its slope held
+            q[OTHERS] -= inverse @ rows(q)
             if np.abs(rows(q)).max() < 1e-11:
                 break
         assert np.abs(rows(q)).max() < 1e-9

@@ -129,7 +129,7 @@ def test_the_plant_has_the_simulated_world_s_modes(robot: RobotConfig) -> None:
     )  # fmt: skip
     fleet = Lockstep(robot, still(3.0, hand=False), plant=plant)
     fleet.planner = None
-    for _ in range(5000):
+    for _ in range(2000):
         fleet.advance()
     world = fleet.world
     simulated = modes(simulated_transition(world, fleet._torque.copy()), world.model.opt.timestep)
