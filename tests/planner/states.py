@@ -9,7 +9,7 @@ import numpy as np
 
 from services.planner.law.kinematics import Kinematics
 from services.planner.planner import Planner
-from shared.bus.messages import DriveStatus, JointState, Mode, PlannerMode, Wrench
+from shared.bus.messages import JointState, PlannerMode, Wrench
 from shared.clock import NS_PER_MS
 from shared.config import files as config_file
 from shared.config.gain_schedule import digest_of, inputs_of
@@ -62,15 +62,12 @@ def standing_torque(q: tuple[float, ...]) -> Array:
 def state(module: int, q: Array, seq: int = 1, **changes: object) -> JointState:
     """Return the state of a module of a robot that stands on its feet."""
     tau = standing_torque(tuple(q.tolist())) if np.isfinite(q).all() else np.zeros(12)
+    own = slice(2 * module, 2 * module + 2)
     fields: dict[str, object] = {
-        "t_ns": 1000 * (module + 1) + seq, "seq": seq,
-        "q": (float(q[2 * module]), float(q[2 * module + 1])), "v": (0.0, 0.0),
-        "tau": (float(tau[2 * module]), float(tau[2 * module + 1])),
-        "mode": int(Mode.TRACK), "cause": 0, "ready": True, "age_ns": 4_000_000,
-        "session": SESSION, "command_seq": -1, "cycle": 0, "late": 0, "dropouts": 0,
-        "refused": 0, "drive": DriveStatus.ARMED, "drive_error": 0,
+        "t_ns": 1000 * (module + 1) + seq, "seq": seq, "session": SESSION, "cause": 0,
+        "q": tuple(q[own].tolist()), "v": (0.0, 0.0), "tau": tuple(tau[own].tolist()),
     }  # fmt: skip
-    return JointState(**(fields | changes))  # type: ignore[arg-type]
+    return messages.joint_state(**(fields | changes))
 
 
 def receive_all(planner: Planner, q: Array, now_ns: int, seq: int = 1, **changes: object) -> None:

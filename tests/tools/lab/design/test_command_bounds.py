@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
 from services.joint.envelope import Envelope
-from services.planner.law.hocca import Hocca
-from shared.bus.messages import JointCommand, Outside
+from services.planner.intents import OperatorRequest
+from services.planner.planner import Planner
+from shared.bus.messages import Outside
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
 from tests.planner.conftest import Closed
+from tests.planner.states import SESSION, START_NS, receive_all
 
 
 @pytest.mark.parametrize("height", [0.8, 0.95, 1.05, 1.188])
@@ -19,18 +20,13 @@ from tests.planner.conftest import Closed
 def test_what_the_law_sends_in_a_stand_is_believed(
     robot: RobotConfig, closed: Closed, height: float, pitch: float, share: float
 ) -> None:
-    q = closed(height, pitch=pitch)
-    output = Hocca(robot).tick(q, np.zeros(12), share * robot.assist.force_max, 0.004, align=True)
-    for index, module in enumerate(MODULES):
-        two = slice(2 * index, 2 * index + 2)
-        rows = (output.q_ref, output.v_ref, output.tau_ff, output.dtau_ff, output.tau_coupled)
-        pairs = [tuple(row[two].tolist()) for row in (*rows, output.local.D, output.local.D_B)]
-        command = JointCommand(
-            t_ns=1, seq=1, session=1, echo_t_ns=1, hold=False, q_ref=pairs[0], v_ref=pairs[1],
-            tau_ff=pairs[2], dtau_ff=pairs[3], tau_coupled=pairs[4], k_p=pairs[5], k_d=pairs[6],
-            margin=output.local.margins.service, margin_onboard=output.local.margins.onboard,
-        )  # fmt: skip
-        judged = Envelope(robot, module).judge(command, None, pairs[0], (0.0, 0.0))
+    planner, q = Planner(robot, SESSION), closed(height, pitch=pitch)
+    planner.receive_request(OperatorRequest(share * robot.assist.force_max))
+    receive_all(planner, q, START_NS)
+    commands = planner.tick(START_NS)
+    assert planner.status(START_NS, 0.0).assist_n == share * robot.assist.force_max
+    for module, command in zip(MODULES, commands, strict=True):
+        judged = Envelope(robot, module).judge(command, None, command.q_ref, (0.0, 0.0))
         assert judged is Outside.NOTHING, module
 
 
