@@ -430,7 +430,7 @@ class Planner:
         """Return why the planner may not engage, from the last tick's results; None if it may."""
         if self._state.rival.yields:
             return PlannerMode.YIELDING
-        if self._overload.hold:
+        if self._overload.state.hold:
             return PlannerMode.OVERLOADED
         if self._law.stance.refused:
             return PlannerMode.MISPLACED
@@ -438,7 +438,7 @@ class Planner:
             return PlannerMode.MISLOADED
         if self._state.source is _UNCERTIFIED:
             return PlannerMode.UNCERTIFIED
-        if self._trips.tripped:
+        if self._trips.state.tripped:
             return PlannerMode.TRIPPED
         return None
 
@@ -455,9 +455,9 @@ class Planner:
             self._state.rival.describe()
             or self._law.stance.refusal()
             or self._law.load.refusal()
-            or self._trips.why
+            or self._trips.state.why
             or self._heat.describe()
-            or (self._guard.why if self._guard is not None else "")
+            or (self._guard.state.why if self._guard is not None else "")
         )
         return "; ".join(filter(None, (self._supply.describe(), refusal)))
 
@@ -505,7 +505,7 @@ class Planner:
             probe=s.request.probe,
             stance=stance,
             why=self._why(),
-            trip=int(self._trips.tripped),
+            trip=int(self._trips.state.tripped),
             refused=self._plausible.refused,
             sit=s.request.sit,
             heat=int(self._heat.state.action),

@@ -235,23 +235,23 @@ def test_hold_is_asked_for_beyond_a_limit_in_time(kind: str, share: float, for_n
     overload = make_overload()
     for t_ns in sorted({0, for_ns // 3, for_ns}):
         overload.receive(at(share, kind), T0 + t_ns)
-    assert overload.hold is (share > 1.0 and for_ns >= AFTER)
+    assert overload.state.hold is (share > 1.0 and for_ns >= AFTER)
 
 
 def test_a_moment_below_the_limit_begins_the_time_anew() -> None:
     overload = make_overload()
     for t_ns, share in ((0, 1.1), (60, 1.1), (64, 0.99), (68, 1.1), (167, 1.1)):
         overload.receive(at(share, "force"), T0 + t_ns * NS_PER_MS)
-        assert not overload.hold
+        assert not overload.state.hold
     overload.receive(at(1.1, "force"), T0 + 168 * NS_PER_MS)
-    assert overload.hold
+    assert overload.state.hold
 
 
 @pytest.mark.parametrize("valid", [True, False])
 def test_a_saturated_cell_asks_for_hold_at_once(valid: bool) -> None:
     overload = make_overload()
     overload.receive(wrench(valid=valid, saturated=True), T0)
-    assert overload.hold
+    assert overload.state.hold
 
 
 @pytest.mark.parametrize("kind", ["force", "moment"])
@@ -261,7 +261,7 @@ def test_hold_ends_below_the_lower_limit_for_its_time(kind: str, share: float, f
     overload = make_overload(holds=True)
     for now_ns in (T0, T0 + for_ns):
         overload.receive(at(share, kind), now_ns)
-    assert overload.hold is not (share < RELEASE_FRACTION and for_ns >= RELEASE)
+    assert overload.state.hold is not (share < RELEASE_FRACTION and for_ns >= RELEASE)
 
 
 def test_an_invalid_reading_now_and_then_does_not_hold_an_overload_off() -> None:
@@ -269,7 +269,7 @@ def test_an_invalid_reading_now_and_then_does_not_hold_an_overload_off() -> None
     for t in range(0, 104, 4):
         reading = wrench(valid=False) if t % 40 == 20 else at(1.1, "force")
         overload.receive(reading, T0 + t * NS_PER_MS)
-    assert overload.hold
+    assert overload.state.hold
 
 
 def test_an_invalid_reading_begins_the_end_of_an_overload_anew() -> None:
@@ -281,7 +281,7 @@ def test_an_invalid_reading_begins_the_end_of_an_overload_anew() -> None:
         (wrench(), 2 * RELEASE, False),
     ):
         overload.receive(reading, T0 + at_ns)
-        assert overload.hold is hold
+        assert overload.state.hold is hold
 
 
 def test_numbers_that_are_not_valid_neither_begin_nor_end_it() -> None:
@@ -290,7 +290,7 @@ def test_numbers_that_are_not_valid_neither_begin_nor_end_it() -> None:
         (make_overload(), old),
         (make_overload(holds=True), wrench(valid=False)),
     ):
-        before = overload.hold
+        before = overload.state.hold
         for t_ns in (0, AFTER, RELEASE, 10 * RELEASE):
             overload.receive(reading, T0 + t_ns)
-            assert overload.hold is before
+            assert overload.state.hold is before

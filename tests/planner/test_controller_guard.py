@@ -209,7 +209,7 @@ def test_what_is_no_action_holds_all(hocca: Hocca, seen: Observation, name: str)
         assert found.local.source is SplitSource.UNCERTIFIED
         for part, shipped in zip(Action.of(found), Action.of(seen.law), strict=True):
             assert np.array_equal(part, shipped), "nothing of it is sent"
-        assert guard.why.startswith("the controller r")
+        assert guard.state.why.startswith("the controller r")
     assert mine.steps == 1
 
 
@@ -220,10 +220,10 @@ def test_gains_that_fall_are_never_sent(hocca: Hocca, seen: Observation, scale: 
     found = guard.act(seen, leads=True)
     assert found.local.source is SplitSource.UNCERTIFIED
     assert np.array_equal(found.local.D, seen.law.local.D)
-    assert "do not stand alone" in guard.why
+    assert "do not stand alone" in guard.state.why
     held = [guard.act(seen, leads=False).local.source for _ in range(300)]
     assert held.index(SplitSource.SCHEDULE) == pytest.approx(250, abs=2), "for a second"
-    assert guard.why == ""
+    assert guard.state.why == ""
     guard.act(seen, leads=True)
     assert soft.steps == 2, "it is asked again: the next pose may be another"
 
@@ -260,7 +260,7 @@ def test_near_the_edge_of_the_soles_it_is_not_followed(
         guard = ControllerGuard(Scripted(changed()), hocca, GEOMETRY)
         found = guard.act(seen._replace(p=p, pdot=pdot), leads=True)
         assert (found.local.source is SplitSource.CONTROLLER) is followed, fraction
-        assert ("near the edge" in guard.why) is not followed
+        assert ("near the edge" in guard.state.why) is not followed
 
 
 def test_on_a_slope_the_capture_point_is_against_gravity() -> None:
@@ -278,7 +278,7 @@ def test_what_it_sees_cannot_be_written(hocca: Hocca, seen: Observation) -> None
         guard = ControllerGuard(Scripted(write), hocca, GEOMETRY)
         before = getattr(seen, part).copy()
         assert guard.act(seen, leads=True).local.source is SplitSource.UNCERTIFIED
-        assert "read-only" in guard.why
+        assert "read-only" in guard.state.why
         assert np.array_equal(getattr(seen, part), before)
 
 
@@ -302,7 +302,7 @@ def test_its_state_goes_on_from_a_snapshot(hocca: Hocca, seen: Observation) -> N
     again = ControllerGuard(mine, hocca, GEOMETRY)
     again.state = copied(failed.state)
     assert again.act(seen, leads=True).local.source is SplitSource.UNCERTIFIED
-    assert again.why == failed.why
+    assert again.state.why == failed.state.why
     assert mine.steps == 0
 
 
@@ -325,4 +325,4 @@ def test_references_off_the_soles_are_not_sent(hocca: Hocca, seen: Observation) 
     )
     guard = ControllerGuard(lean, hocca, GEOMETRY)
     assert guard.act(seen, leads=True).local.source is SplitSource.UNCERTIFIED
-    assert guard.why.startswith("the rest in HOLD is at ")
+    assert guard.state.why.startswith("the rest in HOLD is at ")

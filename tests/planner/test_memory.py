@@ -75,7 +75,7 @@ def level(levelling: Levelling, tick: int) -> Any:
 
 def trip(trips: PlannerTrips, tick: int) -> Any:
     trips.advance(START_NS + tick * TICK_NS, APART, leads=True)
-    return trips.tripped, trips.why
+    return trips.state.tripped, trips.state.why
 
 
 def drift(watch: Unattended, tick: int) -> Any:

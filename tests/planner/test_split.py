@@ -52,23 +52,18 @@ def with_table(robot: RobotConfig, scale: float) -> RobotConfig:
     return msgspec.structs.replace(robot, gain_schedule=msgspec.structs.replace(schedule, D=D))
 
 
-def made_of(function: object, z: list[float], pitch: list[float]) -> GainSchedule:
-    assert callable(function)
-    D = tuple(tuple(tuple(function(a, b)) for b in pitch) for a in z)
-    return GainSchedule(
-        version=1, digest="", inputs={}, z=tuple(z), pitch=tuple(pitch), D=D,
-        D_B=(1.0,) * 6, coupling_bandwidth_hz=1.0, coupling_damping=1.0, lead_easing=0.6,
-    )  # fmt: skip
-
-
 @given(st.floats(0.5, 1.1), st.floats(-0.5, 1.7))
-def test_between_nodes_each_gain_is_linear_in_height_and_in_pitch(z: float, pitch: float) -> None:
+def test_between_nodes_each_gain_is_linear_in_height_and_in_pitch(
+    schedule: GainSchedule, z: float, pitch: float
+) -> None:
     """A table made of a + b z + c pitch + d z pitch comes back exactly; beyond it is held."""
 
     def bilinear(z: float, pitch: float) -> list[float]:
         return [100.0 * n + 300.0 * z - 20.0 * n * pitch + 70.0 * z * pitch for n in range(1, 7)]
 
-    scheduled = ScheduledGains(made_of(bilinear, [0.6, 0.65, 0.8, 1.0], [-0.4, 0.0, 1.0, 1.5]))
+    nodes = {"z": (0.6, 0.65, 0.8, 1.0), "pitch": (-0.4, 0.0, 1.0, 1.5)}
+    D = [[bilinear(a, b) for b in nodes["pitch"]] for a in nodes["z"]]
+    scheduled = ScheduledGains(msgspec.structs.replace(schedule, D=D, **nodes))
     inside = bilinear(float(np.clip(z, 0.6, 1.0)), float(np.clip(pitch, -0.4, 1.5)))
     np.testing.assert_allclose(scheduled.at(z, pitch), np.tile(inside, 2), rtol=1e-12)
 

@@ -50,7 +50,7 @@ def go_on(
 ) -> PlannerTrips:
     """Go on with these values; one that has tripped leads no more."""
     for tick in ticks:
-        trips.advance(T0 + tick * TICK_NS, values, leads=leads and trips.tripped is Trip.NONE)
+        trips.advance(T0 + tick * TICK_NS, values, leads=leads and trips.state.tripped is Trip.NONE)
     return trips
 
 
@@ -66,9 +66,9 @@ def test_each_trips_once_it_has_lasted(robot: RobotConfig, trip: Trip) -> None:
     lasted_ns = round(getattr(robot.trips, PLANNER_TRIPS[trip].key).after_ms * NS_PER_MS)
     for at_ns, tripped in ((0, Trip.NONE), (lasted_ns - 1, Trip.NONE), (lasted_ns, trip)):
         trips.advance(T0 + at_ns, values, leads=True)
-        assert trips.tripped is tripped
-    assert PLANNER_TRIPS[trip].measured in trips.why
-    assert PLANNER_TRIPS[trip].unit in trips.why
+        assert trips.state.tripped is tripped
+    assert PLANNER_TRIPS[trip].measured in trips.state.why
+    assert PLANNER_TRIPS[trip].unit in trips.state.why
 
 
 @pytest.mark.parametrize("trip", TRIPS)
@@ -76,23 +76,23 @@ def test_what_comes_back_in_between_does_not(robot: RobotConfig, trip: Trip) -> 
     trips = led(robot)
     for tick in range(1000):
         go_on(trips, CALM if tick % 3 == 2 else beyond(robot, trip), range(tick, tick + 1))
-    assert trips.tripped is Trip.NONE
+    assert trips.state.tripped is Trip.NONE
 
 
 @pytest.mark.parametrize("trip", TRIPS)
 def test_at_its_limit_nothing_trips_yet(robot: RobotConfig, trip: Trip) -> None:
-    assert go_on(led(robot), beyond(robot, trip, by=1.0), range(1000)).tripped is Trip.NONE
+    assert go_on(led(robot), beyond(robot, trip, by=1.0), range(1000)).state.tripped is Trip.NONE
 
 
 @pytest.mark.parametrize("trip", TRIPS)
 def test_a_planner_that_does_not_lead_trips_on_nothing(robot: RobotConfig, trip: Trip) -> None:
     trips = go_on(PlannerTrips(robot), beyond(robot, trip), range(1000), leads=False)
-    assert go_on(trips, beyond(robot, trip), range(1000, 1001)).tripped is Trip.NONE
+    assert go_on(trips, beyond(robot, trip), range(1000, 1001)).state.tripped is Trip.NONE
 
 
 def test_what_is_not_known_is_no_reason_nor_a_leg_on_the_hoist(robot: RobotConfig) -> None:
     for values in ((math.nan,) * len(CALM), beyond(robot, Trip.UNLOADED)):
-        assert go_on(PlannerTrips(robot), values, range(1000)).tripped is Trip.NONE
+        assert go_on(PlannerTrips(robot), values, range(1000)).state.tripped is Trip.NONE
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["it lasts", "it is not known"])
@@ -106,8 +106,8 @@ def test_it_ends_after_a_calm_second(robot: RobotConfig, trip: Trip, known: bool
     calm_from = T0 + 3000 * TICK_NS
     for at_ns, tripped in ((0, trip), (CALM_NS - 1, trip), (CALM_NS, Trip.NONE)):
         trips.advance(calm_from + at_ns, CALM, leads=False)
-        assert trips.tripped is tripped
-    assert trips.why == ""
+        assert trips.state.tripped is tripped
+    assert trips.state.why == ""
 
 
 def test_a_legs_load_is_the_force_that_its_torques_hold(robot: RobotConfig, closed: Closed) -> None:
@@ -187,9 +187,9 @@ def test_a_hand_that_was_held_up_may_catch_up(robot: RobotConfig) -> None:
     """It presses from the first tick on; once it has not, the same load is a person who sags."""
     sagging = beyond(robot, Trip.SAGGING)
     trips = go_on(PlannerTrips(robot), sagging, range(100))
-    assert trips.tripped is Trip.NONE
+    assert trips.state.tripped is Trip.NONE
     go_on(trips, CALM, range(100, 101))
-    assert go_on(trips, sagging, range(101, 200)).tripped is Trip.SAGGING
+    assert go_on(trips, sagging, range(101, 200)).state.tripped is Trip.SAGGING
 
 
 @pytest.mark.parametrize("loads", [(math.nan, 5.0), (5.0, math.nan)])
@@ -200,14 +200,14 @@ def test_with_one_leg_unknown_none_is_unloaded(loads: Pair) -> None:
 def test_one_that_was_put_back_on_the_hoist_misses_no_leg(robot: RobotConfig) -> None:
     trips, hanging = led(robot), beyond(robot, Trip.UNLOADED)
     trips.advance(T0, hanging, leads=False)
-    assert go_on(trips, hanging, range(1, 1000)).tripped is Trip.NONE
+    assert go_on(trips, hanging, range(1, 1000)).state.tripped is Trip.NONE
 
 
 @pytest.mark.parametrize("trip", TRIPS)
 def test_one_that_stood_as_it_tripped_is_not_led_on_one_leg(robot: RobotConfig, trip: Trip) -> None:
     trips = go_on(led(robot), beyond(robot, trip), range(500))
     go_on(trips, beyond(robot, Trip.UNLOADED), range(500, 1500), leads=False)
-    assert trips.tripped is trip
+    assert trips.state.tripped is trip
 
 
 def test_both_legs_have_borne_it_once_each_bears_three_times_the_least(robot: RobotConfig) -> None:
@@ -216,14 +216,14 @@ def test_both_legs_have_borne_it_once_each_bears_three_times_the_least(robot: Ro
         values = list(CALM)
         values[TRIPS.index(Trip.UNLOADED)] = borne
         trips = go_on(PlannerTrips(robot), tuple(values), range(1))
-        assert go_on(trips, beyond(robot, Trip.UNLOADED), range(1, 500)).tripped is tripped
+        assert go_on(trips, beyond(robot, Trip.UNLOADED), range(1, 500)).state.tripped is tripped
 
 
 def test_the_first_trip_is_reported(robot: RobotConfig) -> None:
     trips = go_on(led(robot), beyond(robot, Trip.LEGS), range(100))
     go_on(trips, beyond(robot, Trip.REACH), range(100, 200))
-    assert trips.tripped is Trip.LEGS
-    assert PLANNER_TRIPS[Trip.LEGS].measured in trips.why
+    assert trips.state.tripped is Trip.LEGS
+    assert PLANNER_TRIPS[Trip.LEGS].measured in trips.state.why
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
@@ -250,7 +250,7 @@ def test_a_watch_restored_from_before_there_was_a_trip_counts_it_from_now_on(
     trips, old = PlannerTrips(robot), led(robot).state
     old.since_ns = old.since_ns[:-1]
     trips.restore(old)
-    assert go_on(trips, beyond(robot, Trip.TIPPING), range(1000)).tripped is Trip.TIPPING
+    assert go_on(trips, beyond(robot, Trip.TIPPING), range(1000)).state.tripped is Trip.TIPPING
 
 
 # ---- how far out its soles bear it

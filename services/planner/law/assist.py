@@ -225,11 +225,6 @@ class Overload:
         self._release_ns = release_ns
         self.state = OverloadState()
 
-    @property
-    def hold(self) -> bool:
-        """True during an overload."""
-        return self.state.hold
-
     @classmethod
     def of(cls, harness: HarnessConfig) -> Overload:
         """Return a detector with the limits of a robot file."""

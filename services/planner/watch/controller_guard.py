@@ -45,7 +45,7 @@ class GuardState(msgspec.Struct):
     failed: bool = False
     """It is not asked again."""
     why: str = ""
-    """Why its last action was not used."""
+    """Why its action was not used at the last tick; "": it was."""
     rest_s: float = 0.0
     """Time for which all still hold."""
     wait_s: float = 0.0
@@ -68,11 +68,6 @@ class ControllerGuard:
         self._controller, self._law = controller, law
         self.state = GuardState()
         self._begun = False
-
-    @property
-    def why(self) -> str:
-        """Why the controller's action was not used at the last tick; "": it was."""
-        return self.state.why
 
     def act(self, seen: Observation, *, leads: bool) -> LawOutput:
         """Return the tick's output.

@@ -64,7 +64,9 @@ class TripsState(msgspec.Struct):
     calm_ns: int = 0
     """Time since which no value is beyond its limit."""
     tripped: Trip = Trip.NONE
+    """Active trip, which prevents the planner from engaging."""
     why: str = ""
+    """The same as text: value and limit at the time of the trip."""
     stands: bool = False
     """Both legs have carried the torso since the planner engaged."""
     light: bool = False
@@ -81,16 +83,6 @@ class PlannerTrips:
         self._after_ns = [round(row.after_ms * NS_PER_MS) for row in rows]
         self._least = [PLANNER_TRIPS[trip].least for trip in _TRIPS]
         self.state = TripsState()
-
-    @property
-    def tripped(self) -> Trip:
-        """Active trip, which prevents the planner from engaging."""
-        return self.state.tripped
-
-    @property
-    def why(self) -> str:
-        """Active trip as text: value and limit at the time of the trip."""
-        return self.state.why
 
     def restore(self, state: TripsState) -> None:
         """Continue from a state, which is the watch's from now on; an old log knows fewer trips."""
