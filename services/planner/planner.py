@@ -125,7 +125,7 @@ class Planner:
         if controller is not None:
             self._guard = ControllerGuard(controller, self._law, config.geometry)
         self._plausible = Plausible(config)
-        self._overload = Overload.of(config.harness)
+        self._overload = Overload(config.harness)
         self._trips = PlannerTrips(config)
         self._soles = Soles(config)
         self._unattended = Unattended()

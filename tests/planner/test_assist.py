@@ -25,15 +25,19 @@ from services.planner.law.assist import (
 )
 from shared.bus.messages import Wrench
 from shared.clock import NS_PER_MS
+from shared.config.sections import AssistConfig
 from tests.planner import oracle
-from tests.planner.states import DT, wrench
+from tests.planner.states import DT, shipped, wrench
 
 FORCE_MAX, RATE_MAX, INTEGRAL_MAX, INTEGRAL_S = 200.0, 100.0, 50.0, 3.0
+ASSIST = AssistConfig(
+    force_max=FORCE_MAX, rate_max=RATE_MAX, integral_max=INTEGRAL_MAX, integral_s=INTEGRAL_S
+)
 
 
 def make_law(wanted: float = 100.0) -> AssistLaw:
     """Return a law that has carried `wanted` for long enough to integrate."""
-    law = AssistLaw(FORCE_MAX, RATE_MAX, INTEGRAL_MAX, INTEGRAL_S)
+    law = AssistLaw(ASSIST)
     run(law, SETTLE_S + 2 * DT, wanted, wanted)
     assert (law.assist, law.state.integral) == (wanted, 0.0)
     return law
@@ -47,7 +51,7 @@ def run(
 
 
 def test_the_first_tick_takes_over_what_hold_carries() -> None:
-    law = AssistLaw(FORCE_MAX, RATE_MAX, INTEGRAL_MAX, INTEGRAL_S)
+    law = AssistLaw(ASSIST)
     assert law.advance(150.0, None, DT, still=False) == 0.0
     assert law.assist == 150.0
 
@@ -207,6 +211,10 @@ def test_the_easing_fades_out_when_the_wrench_is_lost_and_in_when_it_is_back() -
 
 
 AFTER, RELEASE = 100 * NS_PER_MS, 1000 * NS_PER_MS
+LIMITS = {
+    "overload_force": 500.0, "overload_moment": 100.0,
+    "overload_after_ms": AFTER / NS_PER_MS, "overload_release_s": 1e-3 * RELEASE / NS_PER_MS,
+}  # fmt: skip
 
 
 T0 = 10**12
@@ -222,7 +230,8 @@ def at(share: float, kind: str) -> Wrench:
 
 def make_overload(*, holds: bool = False) -> Overload:
     """Return an overload that holds, by a cell that was saturated, or not."""
-    overload = Overload(500.0, 100.0, AFTER, RELEASE)
+    robot, _ = shipped()
+    overload = Overload(msgspec.structs.replace(robot.harness, **LIMITS))
     if holds:
         overload.receive(wrench(valid=False, saturated=True), T0)
     return overload

@@ -70,12 +70,6 @@ def test_the_first_attitude_is_taken_as_it_is_while_the_robot_is_not_led() -> No
     assert levelling.up == pytest.approx(up_of(levelling.slope))
 
 
-def test_an_imu_that_joins_while_the_robot_is_led_is_followed_slowly() -> None:
-    levelling = Levelling(1.0)
-    levelling.advance(told((0.05, 0.0)), LEVEL, DT)
-    assert 0.0 < levelling.slope[0] < 0.05 * 1.1 * DT
-
-
 FLOORS = [(0.0873, 0.0), (-0.0873, 0.0), (0.0, 0.0873), (0.05, -0.05)]
 
 

@@ -212,7 +212,3 @@ def test_arrivals_in_all_phases_move_nothing_and_are_not_remembered(phases: Stat
         phases.advance(states, arrived, min(arrived) - 1)
     assert phases.state.phases == [0] * N_MODULES
     assert phases.state.sums == [(0.0, 0.0)] * N_MODULES
-
-
-def test_before_there_are_six_modules_nothing_is_compared(phases: StatePhases) -> None:
-    assert not phases.compares

@@ -16,7 +16,7 @@ from shared.arrays import Array
 from shared.bus.messages import Pair, Vector3, Wrench
 from shared.clamp import clamp
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config.sections import HarnessConfig
+from shared.config.sections import AssistConfig, HarnessConfig
 
 ERROR_MIN: Final = 5.0
 """N; force that dry friction in the joints hides (0.3 N m a joint: 5 to 6 N at the harness). Within
@@ -85,7 +85,8 @@ class AssistLaw:
 
         d integral / dt = e / integral_s,  |integral| <= integral_max
 
-    with e = wanted - measured beyond `ERROR_MIN`.
+    with e = wanted - measured beyond `ERROR_MIN`. The ramp goes up to `force_max` (N), by at most
+    `rate_max` (N/s); an `integral_max` of 0 disables the integral.
 
     The integral is frozen without a reading (stale, invalid or saturated), in HOLD, while the
     request changes, and while the operator leads. The force of a leading hand is no error of the
@@ -96,21 +97,10 @@ class AssistLaw:
     Stability: `integral_s_min`.
     """
 
-    def __init__(
-        self, force_max: float, rate_max: float, integral_max: float, integral_s: float
-    ) -> None:
-        """Start without assist; the first `advance` adopts the request at once.
-
-        Args:
-            force_max: of the ramp, N.
-            rate_max: of the ramp, N/s.
-            integral_max: N either way; 0 disables the integral.
-            integral_s: time constant, s.
-        """
-        self._force_max = force_max
-        self._rate_max = rate_max
-        self._integral_max = integral_max
-        self._integral_s = integral_s
+    def __init__(self, config: AssistConfig) -> None:
+        """Start without assist; the first `advance` adopts the request at once."""
+        self._force_max, self._rate_max = config.force_max, config.rate_max
+        self._integral_max, self._integral_s = config.integral_max, config.integral_s
         self.state = AssistState()
 
     @property
@@ -217,20 +207,12 @@ class Overload:
     would otherwise be held off for ever by one in ten. It does interrupt an ending.
     """
 
-    def __init__(self, force_max: float, moment_max: float, after_ns: int, release_ns: int) -> None:
+    def __init__(self, config: HarnessConfig) -> None:
         """Set the limits: N, N m, ns, ns."""
-        self._force_max = force_max
-        self._moment_max = moment_max
-        self._after_ns = after_ns
-        self._release_ns = release_ns
+        self._force_max, self._moment_max = config.overload_force, config.overload_moment
+        self._after_ns = round(config.overload_after_ms * NS_PER_MS)
+        self._release_ns = round(config.overload_release_s * NS_PER_S)
         self.state = OverloadState()
-
-    @classmethod
-    def of(cls, harness: HarnessConfig) -> Overload:
-        """Return a detector with the limits of a robot file."""
-        after_ns = round(harness.overload_after_ms * NS_PER_MS)
-        release_ns = round(harness.overload_release_s * NS_PER_S)
-        return cls(harness.overload_force, harness.overload_moment, after_ns, release_ns)
 
     def receive(self, wrench: Wrench, now_ns: int) -> None:
         """Update with a wrench that arrived now."""

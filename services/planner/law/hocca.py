@@ -149,10 +149,7 @@ class Hocca:
         certified = config.law.split == "certified"
         correction_max = config.law.load_correction if certified else (0.0, 0.0)
         self.load = Load(correction_max, self._weight, config.torso_mass, inertia)
-        assist = config.assist
-        self._assist = AssistLaw(
-            assist.force_max, assist.rate_max, assist.integral_max, assist.integral_s
-        )
+        self._assist = AssistLaw(config.assist)
         self._easing = LeadEasing(config.law.lead_easing)
         self._recentre_s = config.law.recentre_s
         self._p_C0: Array = np.zeros(6)

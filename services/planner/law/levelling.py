@@ -40,6 +40,7 @@ class Levelling:
 
     Attributes:
         slope: rise of the floor along x and along y, rad, as in the plant's `floor.slope`.
+        up: unit vector against gravity (3,), floor axes.
     """
 
     def __init__(self, levelling_s: float) -> None:
@@ -51,12 +52,7 @@ class Levelling:
         self.slope: Pair = (0.0, 0.0)
         self._levelling_s = levelling_s
         self._known = False
-        self._up: Array = np.array((0.0, 0.0, 1.0))
-
-    @property
-    def up(self) -> Array:
-        """Unit vector against gravity (3,), floor axes."""
-        return self._up
+        self.up: Array = np.array((0.0, 0.0, 1.0))
 
     def advance(
         self, up_torso: Vector3 | None, angles: Array, dt: float, *, jump: bool = False
@@ -91,7 +87,7 @@ class Levelling:
 
     def _set_slope(self, slope: Pair) -> None:
         self.slope = slope
-        self._up[:] = up_of(slope)
+        self.up[:] = up_of(slope)
 
 
 def up_of(slope: Pair) -> Vector3:
