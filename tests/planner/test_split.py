@@ -27,7 +27,6 @@ POSES = ((1.188, 0.0), (0.948, 0.0), (0.85, 0.6), (0.80, 1.2))
 
 MARGIN, MARGIN_ONBOARD = 0.9, 0.45
 """Fractions of the required margins; the nodes are designed for 1 and 0.5."""
-RowsOfGains = tuple[tuple[tuple[float, float, float, float, float, float], ...], ...]
 
 
 def is_enough(margins: Margins, least: CertificateConfig) -> bool:
@@ -48,7 +47,7 @@ def with_table(robot: RobotConfig, scale: float) -> RobotConfig:
     """Return the robot with its schedule's D scaled; what it was made from is kept."""
     schedule = robot.gain_schedule
     assert schedule is not None
-    D = msgspec.convert((scale * np.array(schedule.D)).tolist(), type=RowsOfGains)
+    D = (scale * np.array(schedule.D)).tolist()
     return msgspec.structs.replace(robot, gain_schedule=msgspec.structs.replace(schedule, D=D))
 
 
