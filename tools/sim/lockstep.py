@@ -37,7 +37,7 @@ from shared.exceptions import RunError
 from shared.joints import MODULE_INDEX, MODULES
 from tools.logs.hand_path import HandRow
 from tools.sim.network import BASE, VirtualNetwork
-from tools.sim.virtual_bus import VirtualBus
+from tools.sim.virtual_drive import VirtualBus
 from tools.sim.virtual_services import (
     SharedMemory,
     VirtualHarness,
@@ -209,12 +209,7 @@ class Lockstep:
             for index, name in enumerate(MODULES)
         ]  # fmt: skip
         self._periods = _Periods.of(config, traced=traced)
-        happens: list[Kill | Restart | Push | HandRow] = [
-            *scenario.kill,
-            *scenario.restart,
-            *scenario.push,
-            *hand,
-        ]
+        happens: list[Happening] = [*scenario.kill, *scenario.restart, *scenario.push, *hand]
         self._progress = _Progress(sorted(happens, key=lambda row: row.at))
 
     @property

@@ -34,8 +34,7 @@ from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
 from tools.sim.network import VirtualNetwork
-from tools.sim.virtual_bus import VirtualBus
-from tools.sim.virtual_drive import VirtualDrive
+from tools.sim.virtual_drive import VirtualBus, VirtualDrive
 from tools.sim.virtual_time import HostClock, LinkInbox, Record, RecordOutbox, VirtualTime
 
 S = TypeVar("S")

@@ -154,12 +154,8 @@ class AxisBank:
         control.turn(vel_turns)
         beyond, least, most = control.control()
         if beyond:
-            for axis in control.overspeed():
-                self._fail(axis, FAULTS["OVERSPEED"])
-            for axis in control.broken():
-                self._fail(axis, FAULTS["MODULATION_IS_NAN"])
-            for axis in control.over_current():
-                self._fail(axis, FAULTS["CURRENT_LIMIT"])
+            for axis, name in control.failing():
+                self._fail(axis, FAULTS[name])
             _, least, most = control.control()
         control.integrate()
         for axis in self.calibration.running:

@@ -159,8 +159,7 @@ class AxisControl:
 
         Returns:
             How many axes are beyond their OVERSPEED or current limit or have no torque that is a
-            number (which: `overspeed`, `over_current` and `broken`), and the least and the most
-            power of an axis, W.
+            number (which: `failing`), and the least and the most power of an axis, W.
         """
         if self._dt_s != self._encoders.dt_s:
             self._dt_s = self._encoders.dt_s
@@ -174,21 +173,22 @@ class AxisControl:
         self.integrator[:] = self.results.integrator
         self._loops[:] = self.results.loops
 
-    def overspeed(self) -> list[int]:
-        """Return the axes beyond their OVERSPEED limit; in IDLE it is checked all the same."""
-        return np.flatnonzero(self.results.too_fast).tolist()
+    def failing(self) -> list[tuple[int, str]]:
+        """Return the axes that the last `control` disarms, each with its fault's name.
 
-    def broken(self) -> list[int]:
-        """Return the armed axes whose torque is no number."""
-        return np.flatnonzero(self.results.broken).tolist()
+        OVERSPEED is checked in IDLE all the same, the others on armed axes only.
+        """
+        law = self.results
+        checks = {
+            "OVERSPEED": law.too_fast,
+            "MODULATION_IS_NAN": law.broken,
+            "CURRENT_LIMIT": law.over_current,
+        }
+        return [(int(n), name) for name, axes in checks.items() for n in np.flatnonzero(axes)]
 
     def asked_power(self, axis: int) -> float:
         """Return the filtered power of the torque that an axis's controller asks for, W."""
         return float(self._loops[_POWER + axis])
-
-    def over_current(self) -> list[int]:
-        """Return the armed axes whose current is beyond its limit and margin."""
-        return np.flatnonzero(self.results.over_current).tolist()
 
 
 @functools.cache
