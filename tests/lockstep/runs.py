@@ -129,10 +129,21 @@ def push(at: float, *force: float) -> Push:
     return Push(at=at, duration=0.3, force=(x, y, z))
 
 
+def led_to(*poses: tuple[Any, ...], duration: float, **changes: object) -> Scenario:
+    """Return a scenario in which the hand leads from a stand to poses, and stays in the last.
+
+    A pose has the fields of a `Keyframe` in their order: s, m, rad, N, shift.
+    """
+    frames = tuple(
+        Keyframe(**dict(zip(Keyframe.__struct_fields__, pose, strict=False)))
+        for pose in ((0.0, 1.188), *poses)
+    )
+    return variant("stand", duration=duration, keyframe=frames, **changes)
+
+
 def still(duration: float, height: float = 1.188, **changes: object) -> Scenario:
     """Return a scenario in which the hand goes to a height and stays there."""
-    frames = (Keyframe(at=0.0, height=1.188), Keyframe(at=2.0, height=height))
-    return variant("stand", duration=duration, keyframe=frames, **changes)
+    return led_to((2.0, height), duration=duration, **changes)
 
 
 def at_rest(rows: Sequence[SimTruth], seconds: float = 1.5) -> bool:
@@ -143,14 +154,6 @@ def at_rest(rows: Sequence[SimTruth], seconds: float = 1.5) -> bool:
     last = rows[-count::10]
     moved = np.ptp([(*row.torso, *row.angles) for row in last], axis=0)
     return bool(moved.max() < 1e-3)
-
-
-def led_to(*poses: tuple[float, float], duration: float, **changes: object) -> Scenario:
-    """Return a scenario in which the hand leads from 1.188 m to heights, m, at times, s."""
-    frames = tuple(Keyframe(at=at, height=height) for at, height in ((0.0, 1.188), *poses))
-    return variant(
-        "stand", **{"duration": duration, "keyframe": frames, "kill": (), "push": ()} | changes
-    )
 
 
 def run(

@@ -12,8 +12,8 @@ from services.simulator.physics.plant import IDEAL, changed
 from shared.bus.messages import Cause, Message, Mode, PlannerStatus, Tare, TareRequest, Wrench
 from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
-from shared.config.scenarios import Keyframe, Scenario
-from tests.lockstep.runs import Heard, modes_of, run, standing_as, still, variant
+from shared.config.scenarios import Scenario
+from tests.lockstep.runs import Heard, led_to, modes_of, run, standing_as, still, variant
 from tools.sim.lockstep import Lockstep
 
 M = TypeVar("M", bound=Message)
@@ -29,7 +29,7 @@ def with_keys(robot: RobotConfig, section: str, **changes: object) -> RobotConfi
 
 @pytest.mark.parametrize(
     ("weighed", "integrates", "duration", "comes_true"),
-    [(False, True, 9.0, True), (True, False, 5.5, True), (False, False, 9.0, False)],
+    [(False, True, 9.0, True), (True, False, 5.5, True), (False, False, 5.5, False)],
     ids=["by its integral", "by the load found", "by neither"],
 )
 def test_the_assist_comes_true_with_a_payload_the_planner_does_not_know(
@@ -40,8 +40,7 @@ def test_the_assist_comes_true_with_a_payload_the_planner_does_not_know(
         robot = with_keys(robot, "law", load_correction=(0.0, 0.0))
     if not integrates:
         robot = with_keys(robot, "assist", integral_max=0.0)
-    frames = (Keyframe(at=0.0, height=1.188), Keyframe(at=4.0, height=1.0, assist=200.0))
-    resting = variant("stand", duration=duration, keyframe=frames)
+    resting = led_to((4.0, 1.0, 0.0, 200.0), duration=duration)
     outcome = run(robot, resting, plant=LIGHT, start=start)
     error = abs(np.mean([row.harness_force_z for row in outcome.rows[-100:]]) - 200.0)
     assert error < 10.0 if comes_true else error > 12.0
@@ -61,10 +60,6 @@ def test_the_eased_lead_is_lighter_and_as_steady(robot: RobotConfig, delay_ms: f
 
 
 def test_an_overloaded_harness_makes_all_hold_and_lead_again(robot: RobotConfig) -> None:
-    frames = tuple(
-        Keyframe(at=t, height=1.188, assist=a)
-        for t, a in ((0.0, 0.0), (2.0, 190.0), (3.0, 190.0), (5.0, 0.0))
-    )
     held = []
 
     def look(fleet: Lockstep, truth: SimTruth) -> None:
@@ -72,7 +67,8 @@ def test_an_overloaded_harness_makes_all_hold_and_lead_again(robot: RobotConfig)
             held.append(set(modes_of(fleet)))
 
     tight = with_keys(robot, "harness", overload_force=170.0)
-    overloading = variant("stand", duration=8.0, keyframe=frames)
+    rests = ((2.0, 1.188, 0.0, 190.0), (3.0, 1.188, 0.0, 190.0), (5.0, 1.188))
+    overloading = led_to(*rests, duration=8.0)
     outcome = run(tight, overloading, start=standing_as(robot), each=look)
     assert outcome.stood
     assert held
@@ -104,8 +100,7 @@ TARED_S = 3.3
 @pytest.fixture(scope="module")
 def leaned(robot: RobotConfig) -> list[Message]:
     """The torso pitches while a load comes to rest on it; at `TARED_S` a new zero is asked for."""
-    end = Keyframe(at=2.0, height=1.1, pitch=0.4, assist=150.0)
-    leaning = variant("stand", duration=4.1, keyframe=(Keyframe(at=0.0, height=1.188), end))
+    leaning = led_to((2.0, 1.1, 0.4, 150.0), duration=4.1)
     asked: list[int] = []
 
     def tare(fleet: Lockstep, truth: SimTruth) -> None:

@@ -11,7 +11,7 @@ import pytest
 from services.simulator.physics.plant import PlantConfig, changed
 from shared.bus.messages import PlannerMode
 from shared.config.robot_config import RobotConfig
-from shared.config.scenarios import Inject, Keyframe
+from shared.config.scenarios import Inject
 from tests.imu.robots import with_imu
 from tests.lockstep.runs import (
     Run,
@@ -62,7 +62,7 @@ def test_every_error_drawn_it_squats_in_its_stance_and_stands_pushed_without_a_p
 
 def test_a_planner_that_comes_back_leads_on_in_the_same_stance(robot: RobotConfig) -> None:
     plant = with_foot(PlantConfig(), (0.1, 0.0, 0.2))
-    there = variant("stand", duration=3.8, kill=kill(0.3), restart=restart(0.6), push=())
+    there = variant("stand", duration=3.8, kill=kill(0.3), restart=restart(0.6))
     outcome = run(robot, there, plant=plant, stands=False)
     assert outcome.stood
     assert outcome.status.mode == PlannerMode.LEADING
@@ -116,9 +116,8 @@ def test_with_an_imu_it_squats_on_five_degrees_and_stands_without_a_planner(
 
 def test_when_the_imu_falls_silent_the_last_slope_stands(robot: RobotConfig) -> None:
     cut = (Inject(link="imu->planner", at=0.5, partition=True),)
-    leans = (Keyframe(at=0.5, height=1.188), Keyframe(at=2.5, height=1.0, pitch=0.4))
-    pushed = (push(2.8, 0.0, 30.0, 0.0),)
-    scenario = variant("stand", duration=4.0, keyframe=leans, inject=cut, push=pushed)
+    happens = {"inject": cut, "push": (push(2.8, 0.0, 30.0, 0.0),)}
+    scenario = led_to((0.5, 1.188), (2.5, 1.0, 0.4), duration=4.0, **happens)
     outcome = run(with_imu(robot), scenario, plant=sloping(5.0, 0.0))
     assert outcome.stood
     assert over_mm(outcome) < 30.0
@@ -144,8 +143,7 @@ LEANING = {"kill": kill(3.0), "push": (push(3.3, 30.0, 0.0, 0.0), push(4.3, 0.0,
 def test_it_stands_in_the_farthest_corner(robot: RobotConfig, signs: tuple[int, ...]) -> None:
     x, y, roll, yaw = corner(robot, signs)
     beyond = (x, y, 2.0 * roll, yaw)  # it comes to the limit
-    frames = (Keyframe(at=0.0, height=1.188), Keyframe(at=2.0, height=1.0, shift=beyond))
-    outcome = run(robot, variant("stand", duration=5.6, keyframe=frames, **LEANING))
+    outcome = run(robot, led_to((2.0, 1.0, 0.0, 0.0, beyond), duration=5.6, **LEANING))
     there = int(np.searchsorted(outcome.t, 2.9))
     np.testing.assert_allclose(outcome.com_mm[there, :2], [1e3 * x, 1e3 * y], atol=6.0)
     assert outcome.angles[there, 0] == pytest.approx(roll, abs=0.01)
@@ -157,10 +155,8 @@ def test_it_stands_in_the_farthest_corner(robot: RobotConfig, signs: tuple[int, 
 
 
 def test_a_planner_that_comes_back_leads_to_the_same_lean(robot: RobotConfig) -> None:
-    asked = Keyframe(at=1.5, height=1.1, shift=(0.02, 0.03, 0.0, 0.08))
-    frames = (Keyframe(at=0.0, height=1.188), asked)
-    there_and_back = {"kill": kill(2.0), "restart": restart(2.4), "push": ()}
-    outcome = run(robot, variant("stand", duration=6.5, keyframe=frames, **there_and_back))
+    asked = (1.5, 1.1, 0.0, 0.0, (0.02, 0.03, 0.0, 0.08))
+    outcome = run(robot, led_to(asked, duration=6.5, kill=kill(2.0), restart=restart(2.4)))
     assert outcome.stood
     np.testing.assert_allclose(outcome.com_mm[-1, :2], [20.0, 30.0], atol=6.0)
     assert outcome.angles[-1, 2] == pytest.approx(0.08, abs=0.01)
@@ -176,12 +172,9 @@ def test_it_stands_at_the_corner_on_plants_with_every_error_drawn(
     robot: RobotConfig, drawn: str, signs: tuple[int, ...]
 ) -> None:
     """The two of 36 that went farthest: 69 and 73 mm."""
-    frames = (
-        Keyframe(at=0.0, height=1.188),
-        Keyframe(at=2.0, height=1.188, shift=corner(robot, signs)),
-    )
+    pose = (2.0, 1.188, 0.0, 0.0, corner(robot, signs))
     pushes = (push(4.2, 30.0, 0.0, 0.0), push(5.2, -30.0, 0.0, 0.0))
-    leaned = variant("stand", duration=6.5, keyframe=frames, kill=kill(3.8), push=pushes)
+    leaned = led_to(pose, duration=6.5, kill=kill(3.8), push=pushes)
     outcome = run(robot, leaned, plant=plants.draw(drawn))
     assert outcome.stood
     assert np.hypot(*outcome.com_mm[-1, :2]) > 20.0, "it leans to the end"

@@ -23,6 +23,7 @@ from tests.lockstep.runs import (
     Heard,
     Run,
     kill,
+    led_to,
     modes_of,
     push,
     run,
@@ -155,20 +156,13 @@ def test_a_person_who_sags_and_holds_on_is_let_down_slowly(robot: RobotConfig) -
 
 def _sags(height: float) -> Scenario:
     """Return a stand at a height, m, and 100 N asked for within 0.2 s: 200 are rested."""
-    frames = (
-        Keyframe(at=0.0, height=1.188),
-        Keyframe(at=2.0, height=height),
-        Keyframe(at=2.5, height=height),
-        Keyframe(at=2.7, height=height, assist=100.0),
-    )
-    return variant("stand", duration=6.0, keyframe=frames, kill=(), push=())
+    return led_to((2.0, height), (2.5, height), (2.7, height, 0.0, 100.0), duration=6.0)
 
 
 def test_a_torso_that_is_thrown_about_is_held(robot: RobotConfig) -> None:
     """1.2 rad of pitch in 0.6 s; a person takes 2 s."""
     frames = tuple(Keyframe(at=at, height=1.1, pitch=1.2 * (at > 1.5)) for at in (0.0, 1.0, 1.6))
-    thrown = variant("stand", duration=3.0, keyframe=frames, kill=(), push=())
-    outcome, _ = trip_run(robot, thrown)
+    outcome, _ = trip_run(robot, variant("stand", duration=3.0, keyframe=frames))
     assert Cause.HOLD_ALL in causes(outcome)
     assert not causes(outcome) & set(JOINT_TRIPS)
 
@@ -181,15 +175,13 @@ def test_a_fast_lead_and_one_beyond_what_legs_reach_are_followed(
     robot: RobotConfig, height: float, pitch: float, ways_s: float
 ) -> None:
     """0.34 m in 1.5 s; to straight legs; the crawl in 2 s; below the knees' stop."""
-    end = Keyframe(at=0.5 + ways_s, height=height, pitch=pitch)
-    frames = (Keyframe(at=0.5, height=1.188), end)
-    scenario = variant("stand", duration=ways_s + 1.0, keyframe=frames, kill=(), push=())
-    outcome, _ = trip_run(robot, scenario)
+    way = ((0.5, 1.188), (0.5 + ways_s, height, pitch))
+    outcome, _ = trip_run(robot, led_to(*way, duration=ways_s + 1.0))
     assert not outcome.lockstep.events, "all six track on"
 
 
-def lean(newtons: float) -> Push:
-    return Push(at=2.8, duration=3.0, force=(0.0, newtons, 0.0))
+def lean(newtons: float, at: float = 2.8) -> Push:
+    return Push(at=at, duration=3.0, force=(0.0, newtons, 0.0))
 
 
 @pytest.mark.sampled(2)
@@ -202,13 +194,9 @@ def test_leaned_on_from_the_side_it_holds_and_is_led_again(
     robot: RobotConfig, height: float, pitch: float, newtons: float, delay_ms: float
 ) -> None:
     """Led on, it fell from 50 N on (squat 55, crawl 70)."""
-    pose = (Keyframe(at=0.0, height=1.188), Keyframe(at=2.5, height=height, pitch=pitch))
-    happens: dict[str, Any] = {"kill": (), "restart": (), "push": (lean(newtons),)}
     said = Heard(PlannerStatus)
-    outcome = run(
-        robot, variant("stand", duration=9.0, keyframe=pose, **happens),
-        delay_ms=delay_ms, record=said,
-    )  # fmt: skip
+    leant = led_to((2.5, height, pitch), duration=9.0, push=(lean(newtons),))
+    outcome = run(robot, leant, delay_ms=delay_ms, record=said)
     assert outcome.stood
     assert {Trip(status.trip) for status in said} - {Trip.NONE} in ({Trip.EDGE}, {Trip.TIPPING})
     assert outcome.status.mode == PlannerMode.LEADING
@@ -239,7 +227,6 @@ def test_leaned_on_slowly_it_is_led_on_and_comes_back_and_killed_then_it_stands(
 
 
 def test_leaned_on_by_30_newtons_it_is_led_on(robot: RobotConfig) -> None:
-    happens: dict[str, Any] = {"kill": (), "restart": (), "push": (lean(30.0),)}
-    outcome = run(robot, variant("stand", duration=6.5, **happens))
+    outcome = run(robot, variant("stand", duration=4.0, push=(lean(30.0, at=0.3),)))
     assert outcome.stood
     assert Cause.HOLD_ALL not in causes(outcome)
