@@ -5,41 +5,65 @@ Each of the four kinds has 63 subsets, at 1.2 s of CPU each: all 252 take five m
     XRL_ALL_SUBSETS=1 ./deploy/test tests/lockstep/test_partial.py
 
 and by default 32 of them: of links cut and services frozen each module alone, each leg, four
-drawn by a fixed seed and all six at once; of either direction alone two drawn and all six. The
-push is to the front left, so a subset is not its own mirror image, and no symmetry is counted on.
+drawn by a fixed seed and all six at once; of either direction alone two drawn and all six. Every
+case goes on from one moment of one run, so that none has to stand up first. The push is to the
+front left, so a subset is not its own mirror image, and no symmetry is counted on.
 """
 
 from __future__ import annotations
 
 import os
 import random
+from itertools import chain, combinations
+from typing import Any, Final, NamedTuple
 
 import pytest
 
+from services.joint.differential import joint_torque
 from services.planner.watch.engagement_fsm import GRACE_NS, WAITS_NS
+from shared.bus.messages import Mode, Pair, PlannerStatus
 from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
-from shared.joints import MODULES, SIDES
-from shared.links import ATTITUDES, DIRECTIONS, WRENCHES, directions_of
-from tests.lockstep import partial
-from tests.lockstep.partial import KINDS, SUBSETS, PartialCase, run_case
+from shared.config.scenarios import Inject, Kill, Scenario
+from shared.joints import MODULE_INDEX, MODULES, SIDES
+from shared.links import Pair as Link
+from tests.lockstep.runs import Heard, led_to, modes_of, moment_of, push, restart, run
 from tests.shared.mcap_log.runs import sample as sample_of
-from tools.lab.studies.sweeps.figures import Ending, ending_of
-from tools.sim.lockstep import FleetMoment
+from tools.lab.studies.sweeps.figures import Ending, com_max_mm, ending_of, operator_peak_n, step_nm
+from tools.sim.lockstep import FleetMoment, Lockstep
 
-LEGS = [tuple(module for module in MODULES if module.endswith(side)) for side in SIDES]
-ALWAYS = {"links": [*((module,) for module in MODULES), *LEGS]}
-ALWAYS["frozen"] = ALWAYS["links"]
-DRAWN = {"links": 4, "frozen": 4, "commands": 2, "states": 2}
+BEGIN_S, CUT_S, HEAL_S, END_S = 0.9, 1.0, 2.0, 3.4
+"""Scenario times: all cases go on from the first, in the first half of the way down."""
+PUSH: Final = push(1.2, 28.0, 28.0, 0.0)
+"""40 N to the front left, while what failed is out: no leg mirrors the other."""
+LAST_S: Final = 0.3
+
+KINDS: Final = {"links": 4, "commands": 2, "states": 2, "frozen": 4}
+"""What fails of each module of a subset, and how many subsets are drawn.
+
+links: both directions between planner and module cut, as if the cable were out. commands: they are
+cut, states still come, the module holds by its own age rule. states: they are cut, commands still
+come, but echo a stamp that grows old. frozen: the service stopped (SIGSTOP): unheard, its drive
+holds by its own loop. A joint service that refuses without a cause there is none: refusing is what
+`commands` makes it do.
+"""
+SUBSETS: Final = [*chain.from_iterable(combinations(MODULES, size) for size in range(1, 7))]
+LEGS: Final = [tuple(module for module in MODULES if module.endswith(side)) for side in SIDES]
 
 
-def sample(kind: partial.FailureKind) -> list[PartialCase]:
+class PartialCase(NamedTuple):
+    kind: str
+    modules: tuple[str, ...]
+
+
+def sample(kind: str) -> list[PartialCase]:
     if os.environ.get("XRL_ALL_SUBSETS"):
-        return [PartialCase(kind, modules) for modules in SUBSETS[1:]]
-    always = [*ALWAYS.get(kind, []), SUBSETS[-1]]
-    others = [modules for modules in SUBSETS[1:] if modules not in always]
-    drawn = random.Random(f"partial {kind}").sample(others, DRAWN[kind])
+        return [PartialCase(kind, modules) for modules in SUBSETS]
+    always = [*((module,) for module in MODULES), *LEGS] if kind in ("links", "frozen") else []
+    always.append(SUBSETS[-1])
+    others = [modules for modules in SUBSETS if modules not in always]
+    drawn = random.Random(f"partial {kind}").sample(others, KINDS[kind])
     return [PartialCase(kind, modules) for modules in (*always, *drawn)]
 
 
@@ -47,9 +71,108 @@ def words(case: PartialCase) -> str:
     return f"{case.kind}-{'+'.join(case.modules)}"
 
 
+def scenario_of(case: PartialCase) -> Scenario:
+    """Return the case as a scenario, from its beginning: `xrl sim` would run it too."""
+    pairs = [Link("planner", name) for name in case.modules]
+    cut = [pair.there for pair in pairs if case.kind in ("links", "commands")]
+    cut += [pair.back for pair in pairs if case.kind in ("links", "states")]
+    lasts = {"at": CUT_S, "duration": HEAL_S - CUT_S, "partition": True}
+    happens: dict[str, Any] = {"inject": tuple(Inject(link=link, **lasts) for link in cut)}
+    if case.kind == "frozen":
+        stops = tuple(Kill(service=name, at=CUT_S, signal="STOP") for name in case.modules)
+        happens = {"kill": stops, "restart": restart(HEAL_S, *case.modules)}
+    return led_to((2.5, 0.948), (5.0, 1.188), duration=END_S, push=(PUSH,), **happens)
+
+
+class PartialFleet(Lockstep):
+    """Compares the drives' torques around each change of mode.
+
+    A service that was frozen does not know its drive's torque: the torque before the change is the
+    drive's, not the last one that the service sent.
+    """
+
+    torque_step_nm = 0.0
+    """Largest change of a joint's torque in the millisecond after a change of mode."""
+    _changed: dict[int, Pair] = {}  # noqa: RUF012 - replaced, never changed
+
+    def advance(self) -> None:
+        told, changed = len(self.events), self._changed
+        super().advance()
+        for index, before in changed.items():
+            step = step_nm(before, self._torque_of(index))
+            self.torque_step_nm = max(self.torque_step_nm, step)
+        names = {name for name, _ in self.events[told:]}
+        self._changed = {MODULE_INDEX[name]: self._torque_of(MODULE_INDEX[name]) for name in names}
+
+    def _torque_of(self, index: int) -> Pair:
+        """Return a module's joint torques, N m, as its drive gives them."""
+        a, b = self.bank.torque[2 * index : 2 * index + 2].tolist()
+        a_sign, b_sign = self.config.module_named(MODULES[index]).motor_signs
+        return joint_torque((a * a_sign, b * b_sign), self.config.joint.gear_ratio)
+
+
+class Outcome(NamedTuple):
+    """The figures of a case; None where there was nothing of the kind."""
+
+    stood: bool
+    """Neither fallen nor, at the end, tipping."""
+    hold_shown_ms: float | None
+    """From the cut to the first planner status that says `hold`."""
+    track_left_ms: float | None
+    """From the cut to when the last module left TRACK; None: one never did before the heal."""
+    led_again_s: float | None
+    """From the heal until all six track under a planner that leads; None: not by the end."""
+    torque_step_nm: float
+    """Largest step of a joint's torque at a change of mode, as the drives give it."""
+    com_max_mm: float
+    """Largest horizontal distance of the COM from between the ankles."""
+    operator_end_n: float
+    """Most of the hand, vertical, in the run's last `LAST_S`, with all six back in TRACK.
+
+    While they HOLD it leads on against them and comes to its limit, whatever failed.
+    """
+
+
+def run_case(case: PartialCase, robot: RobotConfig, start: FleetMoment) -> Outcome:
+    """Go on from the common moment, with the case's failure, to its end or to the fall."""
+    statuses = Heard(PlannerStatus)
+    led_s: list[float] = []
+
+    def look(fleet: Lockstep, row: SimTruth) -> None:
+        leads = {*modes_of(fleet)} == {Mode.TRACK} and not statuses[-1].hold
+        if not leads:
+            led_s.clear()
+        elif row.scenario_s > HEAL_S:
+            led_s.append(row.scenario_s - HEAL_S)
+
+    scenario, how = scenario_of(case), {"fleet_type": PartialFleet, "record": statuses}
+    fleet, rows = run(robot, scenario, start=start, each=look, **how)
+    begin_ns = rows[0].t_ns - round(rows[0].scenario_s * NS_PER_S)
+    cut_ns, heal_ns = (begin_ns + round(at * NS_PER_S) for at in (CUT_S, HEAL_S))
+    held = [status.t_ns for status in statuses if status.hold and status.t_ns >= cut_ns]
+    left = {
+        name: event.t_ns
+        for name, event in fleet.events
+        if event.mode_before == Mode.TRACK and cut_ns <= event.t_ns < heal_ns
+    }
+    # a frozen service changes no mode: its drive keeps the last target
+    awake = set(MODULES) - set(case.modules if case.kind == "frozen" else ())
+    all_left = bool(left) and awake <= set(left)
+    last = [row for row in rows if row.scenario_s > rows[-1].scenario_s - LAST_S]
+    return Outcome(
+        stood=ending_of(rows[-1], END_S, robot) is Ending.STOOD,
+        hold_shown_ms=(held[0] - cut_ns) / NS_PER_MS if held else None,
+        track_left_ms=(max(left.values()) - cut_ns) / NS_PER_MS if all_left else None,
+        led_again_s=led_s[0] if led_s else None,
+        torque_step_nm=fleet.torque_step_nm,
+        com_max_mm=com_max_mm(rows),
+        operator_end_n=operator_peak_n(last),
+    )
+
+
 @pytest.fixture(scope="module")
 def start(robot: RobotConfig) -> FleetMoment:
-    return partial.start_of(robot)
+    return moment_of(robot, scenario_of(PartialCase("links", ())), BEGIN_S)
 
 
 @pytest.mark.sampled(2)
@@ -89,31 +212,13 @@ def test_with_nothing_failed_no_module_holds(robot: RobotConfig, start: FleetMom
         ({"fallen": True}, Ending.FELL),
         ({"foot_left_tilt": 0.06}, Ending.TIPPING),
         ({"com": (0.13, 0.0, 1.0)}, Ending.TIPPING),
-        ({"scenario_s": partial.END_S - 0.5}, Ending.FELL),
+        ({"scenario_s": END_S - 0.5}, Ending.FELL),
     ],
 )
 def test_who_tips_at_the_end_or_does_not_come_so_far_has_not_stood(
     changes: dict[str, object], ending: Ending, robot: RobotConfig
 ) -> None:
-    good = {"scenario_s": partial.END_S, "com": (0.0, 0.0, 1.0), "fallen": False}
+    good = {"scenario_s": END_S, "com": (0.0, 0.0, 1.0), "fallen": False}
     flat = {"foot_left_tilt": 0.0, "foot_right_tilt": 0.0, "lean": (0.0, 0.0)}
     row = sample_of(SimTruth, **(good | flat | changes))
-    assert ending_of(row, partial.END_S, robot) is ending
-
-
-def test_there_are_64_subsets_and_each_kind_fails_as_named() -> None:
-    assert len(SUBSETS) == len(set(SUBSETS)) == 64
-    cut = {
-        kind: {
-            direction
-            for row in partial.scenario_of(PartialCase(kind, MODULES)).inject
-            for direction in directions_of(row.link)
-        }
-        for kind in KINDS
-    }
-    assert cut["links"] == cut["commands"] | cut["states"]
-    assert cut["links"] == set(DIRECTIONS) - {WRENCHES, ATTITUDES}
-    assert not cut["commands"] & cut["states"]
-    frozen = partial.scenario_of(PartialCase("frozen", MODULES))
-    assert {row.service for row in frozen.kill if row.signal == "STOP"} == set(MODULES)
-    assert not cut["frozen"]
+    assert ending_of(row, END_S, robot) is ending
