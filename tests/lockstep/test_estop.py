@@ -15,8 +15,9 @@ from services.simulator.physics.plant import PlantConfig, changed
 from shared.bus.messages import Mode
 from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
-from shared.config.scenarios import Fault, Keyframe, Kill, Scenario
+from shared.config.scenarios import Fault, Kill, Scenario
 from shared.joints import MODULES
+from tests.lockstep import runs
 from tests.lockstep.runs import at_rest, kill, moment_of, restart, run, standing_as, variant
 from tools.lab.studies.sweeps import plants
 from tools.sim.lockstep import FleetMoment, Lockstep
@@ -64,8 +65,7 @@ class Stopped(NamedTuple):
 
 def led(height: float, pitch: float, **happens: Any) -> Scenario:
     """Return a scenario in which the hand leads to a pose in 3 s."""
-    frames = (Keyframe(at=0.0, height=1.188), Keyframe(at=3.0, height=height, pitch=pitch))
-    return variant("stand", duration=14.0, keyframe=frames, push=(), **happens)
+    return runs.led_to((3.0, height, pitch), duration=14.0, **happens)
 
 
 @pytest.fixture(scope="module")
@@ -197,7 +197,9 @@ def test_it_comes_down_on_its_feet_without_a_planner(
     heavy: RobotConfig, led_to: Callable[[float], FleetMoment]
 ) -> None:
     found = stop(heavy, start=led_to(1.0), kill=kill(3.6))
+    assert found.modes == {Mode.DAMP}
     assert found.turned < 0.1
+    assert found.speed < 0.25
     assert found.sank > 0.1
 
 
