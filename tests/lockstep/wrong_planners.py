@@ -79,8 +79,8 @@ def _all() -> Iterator[tuple[str, Fault]]:
         for bit in BITS:
             yield f"bit {bit} of {name} flips", _flipped(name, bit)
     for name in ("q_ref", "k_p", "tau_ff"):
-        yield f"{name} negative in one tick of 25", _now_and_then(_scaled(name, -1.0, range(6)))
-        yield f"{name} zero in every other tick", _every_other(_scaled(name, 0.0, range(6)))
+        yield f"{name} negative in one tick of 25", _every(25, _scaled(name, -1.0, range(6)))
+        yield f"{name} zero in every other tick", _every(2, _scaled(name, 0.0, range(6)))
     for name, size in (("q_ref", 0.02), ("tau_ff", 20.0), ("tau_coupled", 40.0), ("v_ref", 3.0)):
         yield f"{name} noisy", _noisy(name, size)
     for signs in CONSPIRACIES:
@@ -207,12 +207,8 @@ def _both(first: Fault, second: Fault) -> Fault:
     return lambda commands, tick: second(first(commands, tick), tick)
 
 
-def _now_and_then(inner: Fault) -> Fault:
-    return lambda commands, tick: commands if tick % 25 else inner(commands, tick)
-
-
-def _every_other(inner: Fault) -> Fault:
-    return lambda commands, tick: commands if tick % 2 else inner(commands, tick)
+def _every(ticks: int, inner: Fault) -> Fault:
+    return lambda commands, tick: commands if tick % ticks else inner(commands, tick)
 
 
 def _noisy(name: str, size: float) -> Fault:
