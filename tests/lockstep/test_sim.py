@@ -67,13 +67,6 @@ def test_a_run_is_recorded_judged_and_drawn(recorded: Path) -> None:
     assert lacking == set(), "publish it in tools/sim/virtual_*.py as the service does live"
 
 
-def test_a_record_in_which_nobody_led_the_hand_is_refused_in_words(
-    recorded: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.main(["sim", "--hand", str(recorded / "run.mcap")]) == 2
-    assert "nobody led the hand there" in capsys.readouterr().err
-
-
 def test_a_frozen_planner_goes_on_in_its_session(tmp_path: Path) -> None:
     flags = ("--duration", "2.4", "--kill", "planner@0.5:STOP", "--restart", "planner@1.1")
     assert sim(tmp_path, *flags) == 0
@@ -81,15 +74,14 @@ def test_a_frozen_planner_goes_on_in_its_session(tmp_path: Path) -> None:
     assert summary_of(tmp_path)["reengage_s"] < 1.5
 
 
-def test_the_same_seed_gives_the_same_log(tmp_path: Path) -> None:
-    flags = ("--duration", "0.3", "--jitter", "3", "--delay", "3", "--loss", "0.2", "--kill",
-             "planner@0.2", "--seed")  # fmt: skip
-    for name, seed in (("a", "5"), ("b", "5"), ("c", "6")):
-        assert sim(tmp_path / name, *flags, seed) == 0
-    first, same, other = (read_run(tmp_path / name / "run.mcap") for name in "abc")
+def test_another_seed_gives_another_log(recorded: Path, tmp_path: Path) -> None:
+    """The same seed gives the same one: below, and in `test_hand.py`."""
+    assert sim(tmp_path, "--duration", "0.2", "--seed", "6") == 0
+    first, other = (read_run(folder / "run.mcap") for folder in (recorded, tmp_path))
     for key in ((topics.JOINT_STATE, "knee_left"), (topics.WRENCH,)):
-        assert same.messages(*key) == first.messages(*key)
-        assert other.messages(*key) != first.messages(*key)
+        count = len(other.messages(*key))
+        assert count > 100
+        assert other.messages(*key) != first.messages(*key)[:count]
 
 
 def test_what_a_hand_that_leans_feels_sideways_is_in_the_verdict(
@@ -112,21 +104,6 @@ def test_a_lean_that_was_asked_for_is_no_excursion_and_comes_out_again(tmp_path:
     asked = max(status.shift_requested[1] for status in statuses_of(tmp_path))
     assert asked == pytest.approx(0.04, abs=1e-4)
     assert cli.main(["log", "resim", str(tmp_path), "--service", "planner"]) == 0
-
-
-@pytest.mark.parametrize(
-    ("flags", "words"),
-    [
-        (("--loss", "1.5"), "from 0 to 1"),
-        (("--delay", "-1"), "of at least 0 ms"),
-        (("--kill", "harness@1"), "only the planner"),
-    ],
-)
-def test_bad_input_is_one_clear_line(
-    tmp_path: Path, flags: tuple[str, ...], words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert sim(tmp_path / "out", *flags) == 2
-    assert words in capsys.readouterr().err
 
 
 def test_a_stance_that_is_not_led_is_reported_in_words(

@@ -34,6 +34,8 @@ REFUSALS: Final = {
     "demo --kill recorder@3": "without the recorder there is nothing to judge the run by",
     "demo --push 1:2": "write START:DURATION:FX,FY,FZ",
     "sim --loss 1.5": "a number from 0 to 1",
+    "sim --delay -1": "of at least 0 ms",
+    "sim --hand LOG": "nobody led the hand there",
     "sim --controller x.py --control centralised": "both choose what computes the torques",
     "up --config nowhere.toml": "nowhere.toml",
     "up --scenario moonwalk": "no scenario 'moonwalk'; one of bad_network, crawl, ",
