@@ -369,7 +369,6 @@ class AxisBank:
         return self._shaft
 
     def _become(self, axis: int, outcome: AxisState | AxisErrors) -> None:
-        """Take the state that a calibration is at, or the fault that it ended with."""
         if isinstance(outcome, AxisErrors):
             self._fail(axis, outcome)
         else:

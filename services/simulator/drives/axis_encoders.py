@@ -192,7 +192,6 @@ class AxisEncoders:
         counts /= self._cpr
 
     def _derive(self) -> None:
-        """Compute what follows from the settings."""
         self._seen = self._settings.version
         self._cpr = self._settings.axis("encoder.config.cpr").copy()
         self._bandwidth = self._settings.axis("encoder.config.bandwidth").copy()

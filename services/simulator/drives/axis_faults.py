@@ -205,7 +205,6 @@ class Conditions:
         return failing + [(axis, FAULTS[names[motor]]) for axis, motor in sorted(hot)]
 
     def _update_silent(self) -> None:
-        """Work out who is silent."""
         self.silent.clear()
         for axis in range(N_JOINTS):
             if axis >> 1 in self.down or not self._linked[axis >> 1]:

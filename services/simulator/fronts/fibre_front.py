@@ -220,7 +220,6 @@ def _input(name: str, i: int) -> Property:
 
 
 def _setting(name: str, default: Value) -> Property:
-    """Return a setting's endpoint."""
     below = name.partition(".")[2] if name.startswith("axis") else name
     if isinstance(default, bool):
         kind = "bool"

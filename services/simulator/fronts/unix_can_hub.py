@@ -173,7 +173,6 @@ class UnixCanHub:
             pass
 
     def _part(self, client: socket.socket) -> None:
-        """Close a client's side."""
         if self._clients.pop(client.fileno(), None) is not None:
             self._epoll.unregister(client)
             client.close()

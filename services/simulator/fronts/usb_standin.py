@@ -94,7 +94,6 @@ def clear(run_dir: Path) -> None:
 
 
 def _compile(library: Path) -> None:
-    """Compile the stand-in to this file."""
     command = [_COMPILER, "-shared", "-fPIC", "-O2", "-Wall", f"-Wl,-soname,{SONAME}"]
     command += ["-o", str(library), str(SOURCE), "-lpthread"]
     try:
