@@ -29,16 +29,13 @@ def held(rotors: FlexibleDrivetrain, tau: float, seconds: float, dt: float = DT)
         rotors.step(np.full(12, tau), zero, zero)
 
 
-def test_a_clamped_joint_stretches_the_spring_by_tau_over_k(robot: RobotConfig) -> None:
-    rotors = drivetrain(robot, stiffness=5000.0)
-    held(rotors, 20.0, 2.0)
-    np.testing.assert_allclose(rotors.theta, 20.0 / 5000.0, rtol=1e-6)
-
-
-def test_play_comes_on_top_of_the_stretch(robot: RobotConfig) -> None:
-    rotors = drivetrain(robot, stiffness=5000.0, play=0.01)
-    held(rotors, 20.0, 3.0)
-    np.testing.assert_allclose(rotors.theta, 20.0 / 5000.0 + 0.005, rtol=1e-4)
+@pytest.mark.parametrize(("play", "seconds", "rtol"), [(0.0, 2.0, 1e-6), (0.01, 3.0, 1e-4)])
+def test_a_clamped_joint_stretches_the_spring_by_tau_over_k_and_half_its_play(
+    robot: RobotConfig, play: float, seconds: float, rtol: float
+) -> None:
+    rotors = drivetrain(robot, stiffness=5000.0, play=play)
+    held(rotors, 20.0, seconds)
+    np.testing.assert_allclose(rotors.theta, 20.0 / 5000.0 + 0.5 * play, rtol=rtol)
 
 
 def test_within_the_play_no_torque_reaches_the_joint(robot: RobotConfig) -> None:
