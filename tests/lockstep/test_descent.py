@@ -18,6 +18,7 @@ from shared.config.scenarios import Scenario
 from shared.exceptions import FleetError
 from shared.joints import MODULE_INDEX, MODULES
 from tests.lockstep.runs import kill, led_to, modes_of, push, run, still
+from tests.planner.states import with_law
 from tools.fleet.descent import LIGHT_FRACTION, Ask, Descent, Phase
 from tools.lab.studies.sweeps import plants
 from tools.sim.lockstep import Lockstep
@@ -189,9 +190,8 @@ def test_idled_in_a_stand_it_meets_the_floor_as_hard(robot: RobotConfig) -> None
 
 
 def test_a_robot_without_its_payload_is_not_taken_for_a_hanging_one(robot: RobotConfig) -> None:
-    law = msgspec.structs.replace(robot.law, load_correction=(0.0, 0.0))  # led whatever it carries
+    led = with_law(robot, load_correction=(0.0, 0.0))  # whatever it carries
     light = changed(PlantConfig(), {"body.payload_scale": 0.0})
-    led = msgspec.structs.replace(robot, law=law)
     found = go_down(led, alone(kill=kill(0.1)), light, fleet_type=Impatient)
     assert "still holds: the legs bear" in found.fleet.error
     assert found.fleet.asks == [Ask.NOTHING, Ask.STOP, Ask.NOTHING]

@@ -19,6 +19,7 @@ from shared.config.scenarios import Fault, Kill, Scenario
 from shared.joints import MODULES
 from tests.lockstep import runs
 from tests.lockstep.runs import at_rest, kill, moment_of, restart, run, standing_as, variant
+from tests.planner.states import with_law
 from tools.lab.studies.sweeps import plants
 from tools.sim.lockstep import FleetMoment, Lockstep
 from tools.sim.standing_start import begin_standing
@@ -71,8 +72,7 @@ def led(height: float, pitch: float, **happens: Any) -> Scenario:
 @pytest.fixture(scope="module")
 def heavy(robot: RobotConfig) -> RobotConfig:
     """A robot that is led whatever it carries."""
-    law = msgspec.structs.replace(robot.law, load_correction=(0.0, 0.0))
-    return msgspec.structs.replace(robot, law=law)
+    return with_law(robot, load_correction=(0.0, 0.0))
 
 
 @pytest.fixture(scope="module")

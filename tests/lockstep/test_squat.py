@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import msgspec
 import numpy as np
 import pytest
 
 from shared.bus.messages import Cause, Mode
 from shared.config.robot_config import RobotConfig
 from tests.lockstep.runs import Run, kill, push, run, still, variant
+from tests.planner.states import with_law
 from tools.sim.lockstep import Lockstep
 
 DIES_S = 8.0
@@ -86,8 +86,8 @@ def test_the_robot_stands_whenever_the_planner_dies(robot: RobotConfig, at: floa
 
 
 def test_a_plain_average_of_the_legs_tips_the_soles(robot: RobotConfig) -> None:
-    law = msgspec.structs.replace(robot.law, jacobian="average", split="diagonal")
-    world = Lockstep(msgspec.structs.replace(robot, law=law), still(5.0))
+    averaging = with_law(robot, jacobian="average", split="diagonal")
+    world = Lockstep(averaging, still(5.0))
     tilt = 0.0
     for _ in range(1200):
         world.advance()
