@@ -11,7 +11,7 @@ from services.simulator.physics.plant import PlantConfig, changed
 from shared.bus.messages import Mode
 from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
-from shared.config.scenarios import Push
+from shared.config.scenarios import Kill, Push
 from shared.exceptions import RunError
 from shared.joints import MODULE_INDEX, MODULES
 from tests.lockstep.runs import kill, modes_of, push, restart, run, still, variant
@@ -59,6 +59,16 @@ def test_which_way_a_motor_counts_is_not_seen_at_the_joint(robot: RobotConfig) -
     assert signed.stood
     # an encoder's counts are rounded down, whichever way it counts: 0.8 mm of play and friction
     np.testing.assert_allclose(signed.com_mm, plain.com_mm, atol=1.5)
+
+
+def test_a_frozen_planner_goes_on_in_its_session(robot: RobotConfig) -> None:
+    """All hold meanwhile. A dead one's successor has another: `test_sim.py`."""
+    stops = (Kill(service="planner", at=0.5, signal="STOP"),)
+    result = run(robot, still(2.4, kill=stops, restart=restart(1.1)))
+    held = {name for name, event in result.lockstep.events if event.mode_after == Mode.HOLD}
+    assert held == set(MODULES)
+    assert set(result.modes) == {Mode.TRACK}
+    assert result.status.session == 1
 
 
 # ---- no joint service: the drives' own loops hold

@@ -67,13 +67,6 @@ def test_a_run_is_recorded_judged_and_drawn(recorded: Path) -> None:
     assert lacking == set(), "publish it in tools/sim/virtual_*.py as the service does live"
 
 
-def test_a_frozen_planner_goes_on_in_its_session(tmp_path: Path) -> None:
-    flags = ("--duration", "2.4", "--kill", "planner@0.5:STOP", "--restart", "planner@1.1")
-    assert sim(tmp_path, *flags) == 0
-    assert len({status.session for status in statuses_of(tmp_path)}) == 1
-    assert summary_of(tmp_path)["reengage_s"] < 1.5
-
-
 def test_another_seed_gives_another_log(recorded: Path, tmp_path: Path) -> None:
     """The same seed gives the same one: below, and in `test_hand.py`."""
     assert sim(tmp_path, "--duration", "0.2", "--seed", "6") == 0
