@@ -114,7 +114,8 @@ def _led(fleet: Lockstep) -> list[tuple[Any, Any]]:
 
 
 def test_what_keeps_shaking_is_led_ever_more_rarely(robot: RobotConfig) -> None:
-    outcome, _ = trip_run(unfiltered(robot), still(12.0), PLANTS["k 5000"], stands=False)
+    shaky = unfiltered(robot)
+    outcome, _ = trip_run(shaky, still(12.0), PLANTS["k 5000"], stands=False, until_s=11.0)
     tracked = [
         (enters.t_ns, (leaves.t_ns - enters.t_ns) / 1e9)
         for enters, leaves in _led(outcome.lockstep)
@@ -123,8 +124,8 @@ def test_what_keeps_shaking_is_led_ever_more_rarely(robot: RobotConfig) -> None:
     waits = [later - earlier for earlier, later in pairwise(starts)]
     assert len(waits) >= 3
     assert all(later > 1.5 * earlier for earlier, later in pairwise(waits)), waits
-    # 1.52 on one processor, under 1.5 on another: shaking amplifies a product's last bit
-    assert sum(led_s for _, led_s in tracked) / 6 < 2.0, "seconds led, of 18"
+    # 1.2 here, and another on other processors: shaking amplifies a product's last bit
+    assert sum(led_s for _, led_s in tracked) / 6 < 1.5, "seconds led, of 10"
     assert outcome.status.wait_s > 2.0
 
 
