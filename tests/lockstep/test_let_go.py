@@ -20,8 +20,8 @@ from tools.sim.lockstep import Lockstep
 LET_GO_S = 3.0
 
 
-REFUSED_ROWS = 450
-"""Rows of the simulated world, which come at 100 Hz: 4.5 s, the last 3 without the hoist."""
+REFUSED_ROWS = 300
+"""Rows of the simulated world, which come at 100 Hz: 3 s, the last 1.5 without the hoist."""
 
 
 def let_go(
