@@ -240,10 +240,6 @@ def _set_input_pos(bank: AxisBank, axis: int, data: bytes) -> None:
     bank.input_torque[axis] = torque
 
 
-def _set_input_torque(bank: AxisBank, axis: int, data: bytes) -> None:
-    bank.input_torque[axis] = _FLOAT(data)[0]
-
-
 _TWO: Final = cansimple.unpack_two_floats
 _SETTERS: Final[dict[int, Setter]] = {
     Command.ESTOP: lambda bank, axis, _: bank.estop(axis),
@@ -253,7 +249,7 @@ _SETTERS: Final[dict[int, Setter]] = {
     ),
     Command.SET_INPUT_POS: _set_input_pos,
     Command.SET_INPUT_VEL: _writer(("input_vel", "input_torque"), _TWO),
-    Command.SET_INPUT_TORQUE: _set_input_torque,
+    Command.SET_INPUT_TORQUE: _writer(("input_torque",), _FLOAT),
     Command.SET_LIMITS: _writer(("vel_limit", "current_lim"), _TWO),
     Command.REBOOT: lambda bank, axis, _: bank.reboot(axis),
     Command.SET_LINEAR_COUNT: lambda bank, axis, data: bank.set_count(
