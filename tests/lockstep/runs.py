@@ -42,6 +42,16 @@ class Run(NamedTuple):
         return 1e3 * np.array([row.com for row in self.rows])
 
     @property
+    def height(self) -> NDArray[np.float64]:
+        """Of the torso, m."""
+        return np.array([row.torso[2] for row in self.rows])
+
+    @property
+    def sinking(self) -> float:
+        """Fastest way down of the torso, m/s."""
+        return float(-np.gradient(self.height, 0.01).min())  # it is seen at 100 Hz
+
+    @property
     def angles(self) -> NDArray[np.float64]:
         return np.array([row.angles for row in self.rows])
 

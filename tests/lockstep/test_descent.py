@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -17,7 +17,7 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Scenario
 from shared.exceptions import FleetError
 from shared.joints import MODULE_INDEX, MODULES
-from tests.lockstep.runs import kill, led_to, modes_of, push, run, still
+from tests.lockstep.runs import Run, kill, led_to, modes_of, push, run, still
 from tests.planner.states import with_law
 from tools.fleet.descent import LIGHT_FRACTION, Ask, Descent, Phase
 from tools.lab.studies.sweeps import plants
@@ -83,22 +83,6 @@ class Impatient(Descending):
     wait_s = 1.0
 
 
-class Descended(NamedTuple):
-    """What came of it."""
-
-    fleet: Descending
-    rows: list[SimTruth]
-
-    @property
-    def speed(self) -> float:
-        """Fastest way down of the torso, m/s."""
-        return float((-np.gradient([row.torso[2] for row in self.rows], 0.01)).max())
-
-    @property
-    def height(self) -> float:
-        return self.rows[-1].torso[2]
-
-
 def go_down(
     robot: RobotConfig,
     scenario: Scenario,
@@ -106,7 +90,7 @@ def go_down(
     each: Any = lambda _fleet, _row: None,
     interrupt_s: float = np.inf,
     fleet_type: type[Descending] = Descending,
-) -> Descended:
+) -> Run:
     """Type `xrl down` at `AT_S`; go on for half a second after its end."""
     ended: list[float] = []
 
@@ -123,7 +107,7 @@ def go_down(
     assert not outcome.rows[-1].fallen
     on_feet = [row for row in outcome.rows if row.hoist == 0.0]
     assert max(max(row.foot_left_tilt, row.foot_right_tilt) for row in on_feet) < 0.05
-    return Descended(outcome.lockstep, outcome.rows)
+    return outcome
 
 
 def alone(duration: float = 40.0, **changes: Any) -> Scenario:
@@ -163,23 +147,22 @@ def hang(fleet: Descending, row: SimTruth) -> None:
 @pytest.mark.parametrize("number", range(20))
 def test_it_goes_down_and_holds_until_a_hoist_bears_it(robot: RobotConfig, number: int) -> None:
     found = go_down(robot, alone(), plants.draw(f"down {number}"), hang)
-    assert found.fleet.asks[-1] is Ask.IDLE
+    assert found.lockstep.asks[-1] is Ask.IDLE
     assert found.rows[-1].hoist == 1.0, "not before"
-    assert found.speed < 0.2
-    lowest = min(row.torso[2] for row in found.rows)
-    assert lowest < 0.85, "the lowest pose"
+    assert found.sinking < 0.2
+    assert found.height.min() < 0.85, "the lowest pose"
 
 
 def test_with_nothing_to_bear_it_it_holds_and_says_what_helps(robot: RobotConfig) -> None:
     """Idled there it tips: the torso meets the floor at 2.8 m/s, as from a stand."""
     found = go_down(robot, alone(), fleet_type=Impatient)
-    assert found.speed < 0.2
-    assert "still holds: the legs bear 9" in found.fleet.error
-    assert "stand under its torso" in found.fleet.error
-    assert Ask.IDLE not in found.fleet.asks
-    assert found.height < 0.85
-    assert {*modes_of(found.fleet)} == {Mode.DAMP}
-    assert 2.3 < floor_speed(found.fleet) < 3.5
+    assert found.sinking < 0.2
+    assert "still holds: the legs bear 9" in found.lockstep.error
+    assert "stand under its torso" in found.lockstep.error
+    assert Ask.IDLE not in found.lockstep.asks
+    assert found.height[-1] < 0.85
+    assert {*modes_of(found.lockstep)} == {Mode.DAMP}
+    assert 2.3 < floor_speed(found.lockstep) < 3.5
 
 
 def test_idled_in_a_stand_it_meets_the_floor_as_hard(robot: RobotConfig) -> None:
@@ -193,16 +176,16 @@ def test_a_robot_without_its_payload_is_not_taken_for_a_hanging_one(robot: Robot
     led = with_law(robot, load_correction=(0.0, 0.0))  # whatever it carries
     light = changed(PlantConfig(), {"body.payload_scale": 0.0})
     found = go_down(led, alone(kill=kill(0.1)), light, fleet_type=Impatient)
-    assert "still holds: the legs bear" in found.fleet.error
-    assert found.fleet.asks == [Ask.NOTHING, Ask.STOP, Ask.NOTHING]
+    assert "still holds: the legs bear" in found.lockstep.error
+    assert found.lockstep.asks == [Ask.NOTHING, Ask.STOP, Ask.NOTHING]
     assert LIGHT_FRACTION < 0.5, "what it still bears"
 
 
 def test_a_planner_that_dies_on_the_way_does_not_keep_it_up(robot: RobotConfig) -> None:
     found = go_down(robot, alone(kill=kill(2.8)), each=hang)
-    assert Ask.SIT in found.fleet.asks
-    assert found.fleet.asks[-3:] == [Ask.STOP, Ask.NOTHING, Ask.IDLE], "it sinks in DAMP"
-    assert found.speed < 0.2
+    assert Ask.SIT in found.lockstep.asks
+    assert found.lockstep.asks[-3:] == [Ask.STOP, Ask.NOTHING, Ask.IDLE], "it sinks in DAMP"
+    assert found.sinking < 0.2
 
 
 @pytest.mark.sampled(2)
@@ -216,22 +199,22 @@ def test_interrupted_it_stands_where_it_is(robot: RobotConfig, at: float) -> Non
             heights.append(row.torso[2])
 
     found = go_down(robot, alone(), each=stop, interrupt_s=at)
-    assert heights[0] - found.height < 0.05
-    assert found.height > 0.9
-    assert not {*modes_of(found.fleet)} - {Mode.TRACK, Mode.HOLD}
+    assert heights[0] - found.height[-1] < 0.05
+    assert found.height[-1] > 0.9
+    assert not {*modes_of(found.lockstep)} - {Mode.TRACK, Mode.HOLD}
 
 
 def test_a_hand_that_holds_it_up_is_not_pressed_down(robot: RobotConfig) -> None:
     found = go_down(robot, still(40.0))
-    assert "held up" in found.fleet.error
+    assert "held up" in found.lockstep.error
     assert max(abs(row.operator_force[2]) for row in found.rows) < 95.0
-    assert found.height > 1.05
+    assert found.height[-1] > 1.05
 
 
 def test_a_person_who_goes_along_takes_it_down(robot: RobotConfig) -> None:
     scenario = led_to((AT_S, 1.188), (AT_S + 6.0, 0.83), duration=40.0)
     found = go_down(robot, scenario, each=hang)
-    assert found.fleet.asks[-1] is Ask.IDLE
+    assert found.lockstep.asks[-1] is Ask.IDLE
 
 
 @pytest.mark.sampled(8)
@@ -239,4 +222,4 @@ def test_a_person_who_goes_along_takes_it_down(robot: RobotConfig) -> None:
 def test_pushed_on_its_way_it_does_not_tip(robot: RobotConfig, number: int) -> None:
     pushes = (push(2.3, 30.0, 0.0, 0.0), push(3.3, 0.0, 30.0, 0.0), push(4.8, -30.0, 0.0, 0.0))
     found = go_down(robot, alone(push=pushes), plants.draw(f"pushed {number}"), hang)
-    assert found.fleet.asks[-1] is Ask.IDLE
+    assert found.lockstep.asks[-1] is Ask.IDLE

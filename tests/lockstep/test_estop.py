@@ -111,10 +111,10 @@ def stop(
     scenario = led(height, pitch, **happens)
     outcome = run(heavy, scenario, plant=plant, start=start, each=let_go_and_stop)
     assert not outcome.rows[-1].fallen
-    pitches, heights = ([row.angles[1] for row in rows], [row.torso[2] for row in rows])
-    turned = np.abs(np.array(pitches) - pitches[0]).max()
-    speed = float((-np.gradient(heights, 0.01)).max())  # of heights seen at 100 Hz
-    return Stopped(turned, heights[0] - heights[-1], speed, set(outcome.modes))
+    since = outcome._replace(rows=rows)
+    pitch, height = since.angles[:, 1], since.height
+    turned = np.abs(pitch - pitch[0]).max()
+    return Stopped(turned, height[0] - height[-1], since.sinking, set(outcome.modes))
 
 
 @pytest.mark.sampled(2)

@@ -21,18 +21,15 @@ from shared.bus.messages import Cause, Mode, Outside, PlannerMode, Trip
 from shared.bus.traces import SimTruth
 from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
-from shared.config.scenarios import Inject, Keyframe, Push, Scenario
+from shared.config.scenarios import Inject, Push, Scenario
 from shared.robot.trip_table import JOINT_TRIPS
-from tests.lockstep.runs import Run, kill, push, restart, run, variant
+from tests.lockstep.runs import Run, kill, led_to, push, restart, run, variant
 from tools.lab.studies.sweeps import plants
 from tools.lab.studies.sweeps.push_range import PushRange
 from tools.sim.lockstep import Lockstep
 from tools.sim.network import BASE
 
-DOWN = {
-    "duration": 4.0,
-    "keyframe": (Keyframe(at=0.0, height=1.188), Keyframe(at=1.5, height=0.95)),
-}
+LOW = (1.5, 0.95)
 
 
 class Judged:
@@ -112,12 +109,12 @@ def test_a_killed_planners_successor_takes_over_without_a_step(
     ids=lambda network: f"{network.delay_ms:g}-{network.jitter_ms:g}-{network.loss:g}",
 )
 def test_over_a_bad_network(robot: RobotConfig, judged: Judged, network: Impairment) -> None:
-    happens = {"duration": 40.0, "push": (push(1.0, 0.0, 40.0, 0.0),)}
+    scenario = led_to(LOW, duration=40.0, push=(push(1.0, 0.0, 40.0, 0.0),))
 
     def enough(_fleet: Lockstep, row: SimTruth) -> bool:
         return row.scenario_s > 4.0 and judged.leading > 600
 
-    led(judged, robot, variant("stand", **(DOWN | happens)), network, each=enough)
+    led(judged, robot, scenario, network, each=enough)
 
 
 @pytest.mark.sampled(3)
@@ -125,7 +122,7 @@ def test_over_a_bad_network(robot: RobotConfig, judged: Judged, network: Impairm
 def test_on_drawn_plants_pushed_hard(robot: RobotConfig, judged: Judged, number: int) -> None:
     angle = (0.0, math.pi, math.pi / 2, -2.0)[number]
     hard = (PushRange(robot).push(2.0, 0.3, 0.75, angle),)
-    scenario = variant("stand", **(DOWN | {"duration": 4.5, "push": hard}))
+    scenario = led_to(LOW, duration=4.5, push=hard)
     led(judged, robot, scenario, Impairment(delay_ms=5.0), plants.draw(f"right planner {number}"))
 
 

@@ -43,9 +43,8 @@ def test_the_robot_balances_while_the_operator_leads_two_squats(squat: Run) -> N
 
 def test_the_operator_leads_the_height_by_hand(squat: Run) -> None:
     alive = squat.t < 10.0
-    height = np.array([row.torso[2] for row in squat.rows])[alive]
-    assert height.min() < 0.97
-    assert height.max() > 1.17
+    assert squat.height[alive].min() < 0.97
+    assert squat.height[alive].max() > 1.17
     assert np.abs(squat.operator_n[alive]).max() <= 22.0
 
 
@@ -111,9 +110,9 @@ def test_the_robot_stands_at_any_delay_of_the_bus(robot: RobotConfig, delay_ms: 
 
 def test_the_robot_goes_down_to_crawling_and_back(crawl: Run) -> None:
     assert crawl.stood
-    assert min(row.torso[2] for row in crawl.rows) < 0.82
+    assert crawl.height.min() < 0.82
     assert crawl.angles[:, 1].max() > 1.15
-    assert crawl.rows[-1].torso[2] > 1.15
+    assert crawl.height[-1] > 1.15
     assert crawl.believed
 
 

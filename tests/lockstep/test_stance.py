@@ -14,7 +14,6 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject
 from tests.imu.robots import with_imu
 from tests.lockstep.runs import (
-    Run,
     corner,
     kill,
     led_to,
@@ -26,6 +25,7 @@ from tests.lockstep.runs import (
     variant,
 )
 from tools.lab.studies.sweeps import plants
+from tools.lab.studies.sweeps.figures import com_max_mm
 from tools.sim.lockstep import Lockstep
 
 Foot = tuple[float, float, float]
@@ -95,11 +95,6 @@ def sloping(x_deg: float, y_deg: float) -> PlantConfig:
     return changed(PlantConfig(), {"floor.slope": slope, "imu.tilt": wrong})
 
 
-def over_mm(outcome: Run) -> float:
-    """Return how far from over the ankles the COM was by gravity, at most."""
-    return 1e3 * max(math.hypot(*row.over) for row in outcome.rows)
-
-
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("slope", [(5.0, 0.0), (-5.0, 0.0), (0.0, 5.0), (-3.5, -3.5)])
 def test_with_an_imu_it_squats_on_five_degrees_and_stands_without_a_planner(
@@ -109,7 +104,7 @@ def test_with_an_imu_it_squats_on_five_degrees_and_stands_without_a_planner(
     scenario = variant("squat", duration=6.0, kill=kill(4.0), push=pushes)
     outcome = run(with_imu(robot), scenario, plant=sloping(*slope))
     assert outcome.stood
-    assert over_mm(outcome) < 50.0
+    assert com_max_mm(outcome.rows) < 50.0
     assert np.abs(outcome.operator_n[outcome.t < 4.0]).max() < 30.0
     assert outcome.tilt < 0.03
 
@@ -120,7 +115,7 @@ def test_when_the_imu_falls_silent_the_last_slope_stands(robot: RobotConfig) -> 
     scenario = led_to((0.5, 1.188), (2.5, 1.0, 0.4), duration=4.0, **happens)
     outcome = run(with_imu(robot), scenario, plant=sloping(5.0, 0.0))
     assert outcome.stood
-    assert over_mm(outcome) < 30.0
+    assert com_max_mm(outcome.rows) < 30.0
     leaned = pytest.approx((5.0 * DEG, 0.0), abs=1.0 * DEG)
     assert outcome.status.slope == leaned, "not 23 degrees: it leans"
 
@@ -131,7 +126,7 @@ def test_on_a_level_floor_an_imu_changes_little_that_the_hand_feels(robot: Robot
     outcome = run(with_imu(robot), scenario, plant=plant, start=start)
     assert outcome.stood
     assert np.abs(outcome.operator_n).max() < 26.0, "23 N measured, 19 without an IMU"
-    assert over_mm(outcome) < 20.0
+    assert com_max_mm(outcome.rows) < 20.0
 
 
 # ---- leans that are asked for
