@@ -20,7 +20,7 @@ from shared.bus.topics import Topic
 from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
 from tests.imu.robots import with_imu
-from tests.lockstep.runs import Run, kill, modes_of, push, run, still
+from tests.lockstep.runs import Run, kill, modes_of, push, run, standing_as, still
 from tests.planner.states import with_law
 from tools.lab.studies.sweeps import plants
 from tools.sim.lockstep import Lockstep
@@ -96,8 +96,11 @@ def test_whatever_it_does_the_robot_stands(robot: RobotConfig, name: str) -> Non
 
 
 def test_one_that_changes_nothing_is_the_shipped_law_to_the_last_bit(robot: RobotConfig) -> None:
+    start = standing_as(robot)
     robot = with_law(robot, push_integral_max=0.0)  # the integral would wind up against another law
-    mine, shipped = (fleet_of(robot, 0.8, change) for change in (lambda _, action: action, None))
+    mine, shipped = (
+        fleet_of(robot, 0.8, change, start=start) for change in (lambda _, action: action, None)
+    )
     assert mine.com_mm.tolist() == shipped.com_mm.tolist()
 
 
