@@ -26,14 +26,10 @@ from tests.joint.helpers import ModuleBench, command
 from tests.lockstep import runs
 from tests.lockstep.runs import push, variant
 from tests.planner.states import state
-from tests.test_architecture import IMPORTS
 from tools import cli
 from tools.sim.centralised.control import CentralPlanner, PassThrough
 from tools.sim.centralised.fleet import CONTROLS, SHIPPED, torques_only
 from tools.sim.lockstep import Lockstep
-
-ROOT = Path(__file__).resolve().parents[2]
-
 
 TAU: Pair = (3.0, -41.0)
 
@@ -186,26 +182,10 @@ def test_once_it_leads_the_planner_leads_whatever_it_receives(robot: RobotConfig
     assert modes == [PlannerMode.WAITING, PlannerMode.LEADING]
 
 
-def test_nothing_but_two_tools_knows_it_and_no_file_names_it() -> None:
-    users = {
-        file
-        for file, imports in IMPORTS.items()
-        if any(f"{one.full}.".startswith("tools.sim.centralised.") for one in imports)
-    }
-    assert users == {
-        "tools/sim/recorded_lockstep.py",
-        "tools/verbs/sim.py",
-        "tools/lab/studies/sweeps/latency_trial.py",
-        "tools/sim/centralised/fleet.py",
-    }
-    for file in (*(ROOT / "deploy").glob("*.toml"), *(ROOT / "deploy" / "scenarios").glob("*")):
-        assert "centralised" not in file.read_text(encoding="utf-8")
-    assert CONTROLS[SHIPPED] is Lockstep
-
-
 def test_a_run_of_it_is_marked_and_cannot_be_mistaken_for_the_services_own(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    assert CONTROLS[SHIPPED] is Lockstep
     flags = ("--duration", "0.2", "--kill", "planner@0.1", "--control", "centralised")
     flags += ("--plant", "ideal")
     assert cli.main(["sim", *flags, "--out", str(tmp_path)]) == 0
