@@ -280,9 +280,9 @@ class VirtualPlanner:
             self.planner = None
             return
         self._session, state = start
-        planner = self._make(self._session)
-        planner.restore(state)
-        self.planner = planner
+        if self.planner is None or self.planner.session != self._session:
+            self.planner = self._make(self._session)
+        self.planner.restore(state)
 
 
 class VirtualCan(Generic[S]):
