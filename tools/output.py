@@ -6,7 +6,7 @@ import contextlib
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from rich.progress import Progress
 
@@ -17,6 +17,9 @@ from tools.terminal import Console
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+Picture: TypeAlias = "Figure"
+"""One of Matplotlib's."""
 
 
 @contextlib.contextmanager
@@ -60,7 +63,7 @@ def write_atomically(out: Path, content: bytes, *, private: bool = False) -> Non
         raise RunError(f"{out}: cannot be written: {error.strerror}; give another -o") from None
 
 
-def new_figure(width: float, height: float, dpi: int = 110) -> Figure:
+def new_figure(width: float, height: float, dpi: int = 110) -> Picture:
     """Return an empty picture of Matplotlib, laid out by itself."""
     require("plot")
     from matplotlib.figure import Figure  # noqa: PLC0415 - takes a second, and needs the extra
@@ -68,7 +71,7 @@ def new_figure(width: float, height: float, dpi: int = 110) -> Figure:
     return Figure(figsize=(width, height), dpi=dpi, layout="constrained")
 
 
-def save_figure(figure: Figure, path: Path) -> None:
+def save_figure(figure: Picture, path: Path) -> None:
     """Write a picture of Matplotlib whole or not at all; the suffix names its format."""
     with atomic_file(path) as file:
         figure.savefig(file, format=path.suffix.removeprefix("."))

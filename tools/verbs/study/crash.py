@@ -22,12 +22,19 @@ from tools.lab.studies.crash import report
 from tools.lab.studies.crash.cases import CASES, CrashCase, CrashVerdict
 from tools.lab.studies.crash.report import JUNIT, RESULTS, Result
 from tools.lab.studies.crash.runner import run_case
+from tools.lab.studies.sweeps.figures import worst
 from tools.live import experiment
 from tools.live.scenario_runner import LiveSnapshot
 from tools.terminal import Console, marked
 
 CASE_S: Final = 14.0
 """First estimate of a case's duration, s, until some have run."""
+EXIT_CODES: Final = {
+    CrashVerdict.STOOD: 0,
+    CrashVerdict.SANK: FAULT_EXIT_CODE,
+    CrashVerdict.FELL: FELL_EXIT_CODE,
+    CrashVerdict.UNJUDGED: RunError.exit_code,
+}
 UNJUDGED_MAX: Final = 3
 """After this many cases in a row that cannot be judged, the machine is at fault, not the robot."""
 
@@ -111,13 +118,8 @@ def select(cases: Sequence[CrashCase], *, quick: bool, only: Sequence[str]) -> l
 
 
 def exit_code(results: Sequence[Result]) -> int:
-    """Return the exit code of what came out worse than it has to, a fall before all else."""
-    bad = {result.outcome.verdict for result in results if not result.good}
-    if CrashVerdict.FELL in bad:
-        return FELL_EXIT_CODE
-    if CrashVerdict.SANK in bad:
-        return FAULT_EXIT_CODE
-    return RunError.exit_code if bad else 0
+    """Return the exit code of what came out worse than it has to."""
+    return worst(EXIT_CODES[result.outcome.verdict] for result in results if not result.good)
 
 
 def _run_all(

@@ -22,8 +22,8 @@ from tools.lab.studies.sweeps.certificate_trial import (
 )
 from tools.lab.studies.sweeps.report import draw_predictions
 from tools.lab.studies.sweeps.study import Finished, Study, StudyFlags
+from tools.output import Picture
 
-PICTURE: Final = "certificate.png"
 LABELS: Final = (
     "the certificate's margin, in shares of what is required",
     "COM, farthest from the posture in mm",
@@ -59,7 +59,7 @@ class Confusion(NamedTuple):
 
 
 def report(finished: Finished) -> None:
-    """Draw and print what came of the study."""
+    """Print what came of the study."""
     rows, console = finished.rows, finished.console
     predicted = [(row["margin"], row["stood"]) for row in rows]
     found = confusion(predicted)
@@ -75,12 +75,17 @@ def report(finished: Finished) -> None:
                 f"{row['com_mm']:.6g} mm away",
                 style="dim",
             )
+
+
+def draw(finished: Finished) -> Picture:
+    """Draw how far each case came over its margin."""
+    rows = finished.rows
     points = {
         name: [(row["margin"], row["com_mm"]) for row in rows if row["stood"] == stood]
         for name, stood in (("stood", True), ("fell", False))
     }
     title = f"{len(rows)} random postures and gains, seed {finished.flags.seed}"
-    draw_predictions(points, LABELS, title, finished.out / PICTURE)
+    return draw_predictions(points, LABELS, title)
 
 
 def confusion(said: Sequence[tuple[float, bool]]) -> Confusion:
@@ -107,8 +112,7 @@ def threshold(said: Sequence[tuple[float, bool]]) -> float:
 STUDY: Final = Study[CertificateCase](
     name="certificate",
     table="certificate.csv",
-    pictures=(PICTURE,),
-    code=("tools.lab.studies.sweeps.certificate_trial",),
+    pictures={"certificate.png": draw},
     load=lambda flags: config_file.load(flags.config),
     cases=lambda flags, robot: partial(CertificateCases(robot).draw, flags.seed),
     decided_by=("seed", "rigid", "friction"),
@@ -122,9 +126,7 @@ STUDY: Final = Study[CertificateCase](
     },
     fell=lambda row: not row["stood"],
     report=report,
-    exit_code=lambda rows: (
-        FELL_EXIT_CODE if any(row["margin"] > 0.0 and not row["stood"] for row in rows) else 0
-    ),
+    exit_code=lambda row: FELL_EXIT_CODE if row["margin"] > 0.0 and not row["stood"] else 0,
 )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from functools import partial
 from typing import Final
 
@@ -14,8 +13,8 @@ from tools.lab.studies.sweeps.dynamics_trial import DynamicsResult, DynamicsTria
 from tools.lab.studies.sweeps.report import draw_predictions
 from tools.lab.studies.sweeps.study import AloneFlags, Finished, Study
 from tools.lab.studies.sweeps.table import Row
+from tools.output import Picture
 
-PICTURE: Final = "dynamics.png"
 LABELS: Final = (
     "rate of the slowest motion by the certificate, 1/s: below 0 it fades",
     "joints' rates 2 s after a tap, over those at once after it",
@@ -37,9 +36,8 @@ class DynamicsStudyFlags(AloneFlags):
 
 
 def report(finished: Finished) -> None:
-    """Draw and print what came of the study."""
-    rows, console = finished.rows, finished.console
-    tried = [row for row in rows if row["ended"] != "unready"]
+    """Print what came of the study."""
+    rows, console, tried = finished.rows, finished.console, tried_in(finished)
     counts = Counter((row["said_stable"], row["grew"]) for row in tried)
     console.print(
         f"said to fade: {counts[True, False]} faded, {counts[True, True]} grew\n"
@@ -55,16 +53,25 @@ def report(finished: Finished) -> None:
             highlight=False,
             soft_wrap=True,
         )
+
+
+def tried_in(finished: Finished) -> list[Row]:
+    """Return the cases in which the drawn gains took over."""
+    return [row for row in finished.rows if row["ended"] != "unready"]
+
+
+def draw(finished: Finished) -> Picture:
+    """Draw how the motion changed over the rate that the certificate gives it."""
     points = {
         name: [
             (row["rate"], row["late_rad_s"] / max(row["early_rad_s"], 1e-4))
-            for row in tried
+            for row in tried_in(finished)
             if row["grew"] == grew
         ]
         for name, grew in (("faded", False), ("grew", True))
     }
-    title = f"{len(rows)} random gains, poses and drivetrains, seed {finished.flags.seed}"
-    draw_predictions(points, LABELS, title, finished.out / PICTURE)
+    title = f"{len(finished.rows)} random gains, poses and drivetrains, seed {finished.flags.seed}"
+    return draw_predictions(points, LABELS, title)
 
 
 def grew_against_it(row: Row) -> bool:
@@ -72,19 +79,17 @@ def grew_against_it(row: Row) -> bool:
     return bool(row["said_stable"] and row["grew"])
 
 
-def exit_code(rows: Sequence[Row]) -> int:
-    """Return the exit code of cases: motion that grew against the certificate may also fall."""
-    ended = {row["ended"] for row in rows if grew_against_it(row)}
-    if "fell" in ended:
-        return FELL_EXIT_CODE
-    return FAULT_EXIT_CODE if ended else 0
+def exit_code(row: Row) -> int:
+    """Return the exit code of a case: motion that grew against the certificate may also fall."""
+    if not grew_against_it(row):
+        return 0
+    return FELL_EXIT_CODE if row["ended"] == "fell" else FAULT_EXIT_CODE
 
 
 STUDY: Final = Study[DynamicsTrial](
     name="dynamics",
     table="dynamics.csv",
-    pictures=(PICTURE,),
-    code=("tools.lab.studies.sweeps.dynamics_trial",),
+    pictures={"dynamics.png": draw},
     cases=lambda flags, _robot: partial(dynamics_trial.draw, flags.seed),
     decided_by=("seed",),
     row=dynamics_trial.row_of,

@@ -75,12 +75,18 @@ class Ended(msgspec.Struct, frozen=True, kw_only=True):
         return self.ending == Ending.STOOD
 
 
-def exit_code(endings: Iterable[str]) -> int:
-    """Return the exit code of cases that ended so: a robot that tips has as good as fallen."""
-    not_stood = set(endings) - {Ending.STOOD}
-    if not_stood - {Ending.UNREADY}:
-        return FELL_EXIT_CODE
-    return FAULT_EXIT_CODE if not_stood else 0
+EXIT_CODES: Final = {
+    Ending.STOOD: 0,
+    Ending.FELL: FELL_EXIT_CODE,
+    Ending.TIPPING: FELL_EXIT_CODE,
+    Ending.UNREADY: FAULT_EXIT_CODE,
+}
+"""A robot that tips has as good as fallen."""
+
+
+def worst(codes: Iterable[int]) -> int:
+    """Return the exit code of many cases by their own: a fall before all else, then a fault."""
+    return max(codes, key=lambda code: (code == FELL_EXIT_CODE, code), default=0)
 
 
 def ending_of(last: SimTruth, end_s: float, robot: RobotConfig) -> Ending:

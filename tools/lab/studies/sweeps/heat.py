@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from statistics import median
 from typing import Any, Final, NamedTuple
 
 import msgspec
@@ -20,12 +21,12 @@ from shared.bus.messages import LEFT_MAX_S, HeatAction
 from shared.bus.traces import SimTruth
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.config.scenarios import Keyframe, Scenario
-from shared.exceptions import FAULT_EXIT_CODE, RunError
+from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE, RunError
 from shared.joints import MODULES, kind_of
 from shared.robot.robot_model import stand_pose
 from tools.flags import Count
 from tools.lab.studies.sweeps import heat_trial, plants, study
-from tools.lab.studies.sweeps.figures import Ending, exit_code, with_payload
+from tools.lab.studies.sweeps.figures import Ending, with_payload
 from tools.lab.studies.sweeps.heat_trial import (
     AHEAD_S,
     HELD_S,
@@ -34,7 +35,7 @@ from tools.lab.studies.sweeps.heat_trial import (
     HeatResult,
     HeatTrial,
 )
-from tools.lab.studies.sweeps.report import parted, show_falls, show_share
+from tools.lab.studies.sweeps.report import parted, show_falls, show_figures, show_share
 from tools.lab.studies.sweeps.study import AloneFlags, CaseLog, Finished, Study
 from tools.lab.studies.sweeps.table import Row
 from tools.live import experiment
@@ -57,6 +58,17 @@ POSES: Final = (
     ("crawl, 200 N", 0.79, 1.2, 200.0),
 )  # fmt: skip
 """Name, torso's height, m, pitch, rad, and assist, N."""
+FIGURES: Final = (
+    ("held_s", "held until it stood up by itself", "s"),
+    ("told_s", "told before that", "s"),
+    ("rose_s", "until it was straight", "s"),
+    ("winding_max", "warmest winding, true", "C"),
+    ("stage_max", "warmest output stage, true", "C"),
+    ("derating_min", "of a current limit left", "1"),
+    ("error", "estimate less truth as it acts", "K"),
+    ("operator_peak_n", "hand's force from then on", "N"),
+    ("com_mm", "COM from then on", "mm"),
+)
 PICTURE: Final = "held.png"
 DAYS: Final = (("20 C", 20.0, 1.0), ("45 C", 45.0, 1.0), ("45 C, payload +20 %", 45.0, 1.2))
 """Heading, air, C, and the payload's scale."""
@@ -176,42 +188,31 @@ def wrong_with(row: Row) -> str:
     return ""
 
 
-def trial_exit_code(rows: Sequence[Row]) -> int:
-    """Return the exit code of a table: a fall before all else.
+def fell(row: Row) -> bool:
+    """Return True for a fall.
 
     A plant whose load is beyond `law.load_correction` is not led: it holds no squat.
     """
-    code = exit_code(row["ending"] for row in rows if row["ending"] is not Ending.UNREADY)
-    return code or (FAULT_EXIT_CODE if any(map(wrong_with, rows)) else 0)
+    return row["ending"] not in (Ending.STOOD, Ending.UNREADY)
+
+
+def exit_code(row: Row) -> int:
+    """Return the exit code of a trial."""
+    if fell(row):
+        return FELL_EXIT_CODE
+    return FAULT_EXIT_CODE if wrong_with(row) else 0
 
 
 def report(finished: Finished) -> None:
     """Print what came of the study."""
     rows, console = finished.rows, finished.console
     standing, others = parted(rows)
-    fallen = [row for row in others if row["ending"] is not Ending.UNREADY]
+    fallen = list(filter(fell, others))
     show_poses(finished.robot, console)
     show_falls(
         fallen, finished.command, lambda row: f"{row['person']}: trial {row['number']}", console
     )
-    printed = Printed("what", "least", "median", "largest", "")
-    printed.title, printed.title_justify = "Standing trials", "left"
-    for key, words, unit in (
-        ("held_s", "held until it stood up by itself", "s"),
-        ("told_s", "told before that", "s"),
-        ("rose_s", "until it was straight", "s"),
-        ("winding_max", "warmest winding, true", "C"),
-        ("stage_max", "warmest output stage, true", "C"),
-        ("derating_min", "of a current limit left", "1"),
-        ("error", "estimate less truth as it acts", "K"),
-        ("operator_peak_n", "hand's force from then on", "N"),
-        ("com_mm", "COM from then on", "mm"),
-    ):
-        values = [row[key] for row in standing if row[key] is not None]
-        if values:
-            cells = (min(values), float(np.median(values)), max(values))
-            printed.add_row(words, *(f"{value:.3g}" for value in cells), unit)
-    console.print(printed)
+    show_figures(standing, FIGURES, {"least": min, "median": median, "largest": max}, console)
     lasting = sum(row["held_s"] is None for row in standing)
     why = "light enough, or relieved in time"
     console.print(f"{lasting} of {len(rows)} stood up for no heat: {why}")
@@ -328,7 +329,6 @@ STUDY: Final = Study[HeatTrial](
     name="heat",
     case="trial",
     table="trials.csv",
-    code=("tools.lab.studies.sweeps.heat_trial",),
     load=load,
     cases=lambda flags, _robot: partial(heat_trial.draw, flags.seed),
     decided_by=("seed",),
@@ -341,9 +341,9 @@ STUDY: Final = Study[HeatTrial](
         heat_trial.plant_of,
         lambda _trial, command: {"lockstep": command},
     ),
-    fell=lambda row: row["ending"] not in (Ending.STOOD, Ending.UNREADY),
+    fell=fell,
     report=report,
-    exit_code=trial_exit_code,
+    exit_code=exit_code,
 )
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rich.table import Table
@@ -28,7 +27,7 @@ from tools.lab.studies.sweeps.study import AloneFlags, CaseLog, Finished, Study,
 from tools.lab.studies.sweeps.table import Row
 from tools.live import experiment
 from tools.live.experiment import LawFlags
-from tools.output import new_figure, save_figure
+from tools.output import Picture, new_figure
 from tools.terminal import Console
 
 if TYPE_CHECKING:
@@ -41,7 +40,6 @@ else:
     lines = late("matplotlib.lines")
     patches = late("matplotlib.patches")
 
-PICTURE: Final = "cases.png"
 WORST: Final = (
     ("com_x_max_mm", "COM forward", 1.0, "mm"),
     ("com_x_min_mm", "COM backward", -1.0, "mm"),
@@ -94,12 +92,9 @@ def _metadata(case: KillCase, command: str) -> dict[str, str]:
 
 
 def report(finished: Finished) -> None:
-    """Draw and print what came of the study."""
+    """Print what came of the study."""
     rows, console, command = finished.rows, finished.console, finished.command
     standing, fallen = parted(rows)
-    title = f"Planner killed, {len(rows)} random cases, seed {finished.flags.seed}, "
-    title += f"{push_range.describe(finished.flags)}: {len(fallen)} fell"
-    draw(rows, finished.robot, title, finished.out / PICTURE)
     show_falls(fallen, command, describe, console)
     if standing:
         table = Table(title="Worst of those that stood", title_justify="left")
@@ -141,8 +136,9 @@ def describe(row: Row) -> str:
     return ", ".join(words)
 
 
-def draw(rows: Sequence[Row], robot: RobotConfig, title: str, path: Path) -> None:
-    """Draw the study into a PNG file."""
+def draw(finished: Finished) -> Picture:
+    """Draw the study."""
+    flags, rows, robot = finished.flags, finished.rows, finished.robot
     figure = new_figure(13, 11)
     norm = _norm(payloads(robot))
     _draw_pushes(figure.add_subplot(2, 2, 1, projection="polar"), rows, norm)
@@ -160,8 +156,10 @@ def draw(rows: Sequence[Row], robot: RobotConfig, title: str, path: Path) -> Non
         cm.ScalarMappable(norm, _colours()), ax=figure.axes, shrink=0.5, ticks=payloads(robot)
     )
     bar.set_label("payload in kg")
+    title = f"Planner killed, {len(rows)} random cases, seed {flags.seed}, "
+    title += f"{push_range.describe(flags)}: {len(parted(rows)[1])} fell"
     figure.suptitle(title, fontsize=13, x=0.01, ha="left")
-    save_figure(figure, path)
+    return figure
 
 
 Point = tuple[float, float, Row]
@@ -276,8 +274,7 @@ def _draw_excursions(
 STUDY: Final = Study[KillCase](
     name="kill",
     table="cases.csv",
-    pictures=(PICTURE,),
-    code=("tools.lab.studies.sweeps.kill_trial",),
+    pictures={"cases.png": draw},
     load=experiment.make_robot,
     cases=lambda flags, robot: partial(KillCases(robot, flags.push).draw, flags.seed),
     decided_by=("seed", "push"),

@@ -22,7 +22,7 @@ from tools.lab.studies.sweeps.latency_trial import (
     Network,
     robot_of,
 )
-from tools.lab.studies.sweeps.study import AloneFlags, CaseLog, Finished, Study
+from tools.lab.studies.sweeps.study import AloneFlags, CaseLog, Study
 from tools.lab.studies.sweeps.table import DECIMALS
 from tools.live import experiment
 from tools.terminal import Console
@@ -150,19 +150,14 @@ def _robots(
     return [by_control[trial.control] for trial in trials]
 
 
-def _report(finished: Finished) -> None:
-    force_max = finished.robot.simulation.operator.force_max
-    seed = f"seed {finished.flags.seed}"
-    latency_report.draw(finished.rows, force_max, seed, finished.out)
-    latency_report.show(finished.rows, finished.command, finished.console)
-
-
 STUDY: Final = Study[LatencyTrial](
     name="latency",
     case="trial",
     table="latency.csv",
-    pictures=(latency_report.FALLS, latency_report.EFFORT),
-    code=("tools.lab.studies.sweeps.latency_trial",),
+    pictures={
+        "latency-falls.png": latency_report.draw_falls,
+        "latency-effort.png": latency_report.draw_effort,
+    },
     load=load,
     total=lambda flags: flags.trials * len(grid_of(flags)),
     cases=lambda flags, _robot: partial(trial_of, grid_of(flags), flags.seed),
@@ -177,7 +172,7 @@ STUDY: Final = Study[LatencyTrial](
         latency_trial.plant_of,
         lambda trial, command: {"lockstep": command, "control": trial.control},
     ),
-    report=_report,
+    report=latency_report.show,
     counts=lambda row: row["control"] == "distributed",
 )
 

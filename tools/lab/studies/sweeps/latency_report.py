@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -15,9 +14,10 @@ from shared.extras import late
 from tools.lab.studies.sweeps.latency_trial import CONTROLS, DURATION_S, PUSHES
 from tools.lab.studies.sweeps.push_range import SHARE
 from tools.lab.studies.sweeps.report import parted, wilson
+from tools.lab.studies.sweeps.study import Finished
 from tools.lab.studies.sweeps.table import Row
-from tools.output import new_figure, save_figure
-from tools.terminal import Console, marked
+from tools.output import Picture, new_figure
+from tools.terminal import marked
 
 if TYPE_CHECKING:
     from matplotlib import colors
@@ -33,9 +33,6 @@ WORST: Final = (
 LISTED: Final = 6
 """Values in a title; of more the first two and the last."""
 
-
-FALLS: Final = "latency-falls.png"
-EFFORT: Final = "latency-effort.png"
 HOLDS: Final = 0.1
 """With a larger share of the time in HOLD, a robot does not follow the hand."""
 DPI: Final = 120
@@ -115,8 +112,9 @@ def _listed(values: Sequence[float]) -> str:
     return ", ".join(words if len(words) <= LISTED else [*words[:2], "...", words[-1]])
 
 
-def show(rows: Sequence[Row], command: str, console: Console) -> None:
-    """Print what came of the study; `command` and a number run one trial alone."""
+def show(finished: Finished) -> None:
+    """Print what came of the study."""
+    rows, console = finished.rows, finished.console
     console.print(_falls_table(rows))
     console.print(_lead_table(rows))
     for name in controls_in(rows):
@@ -140,7 +138,7 @@ def show(rows: Sequence[Row], command: str, console: Console) -> None:
             worst = [words.format(max(figures(standing, key))) for key, words in WORST]
             console.print(f"  standing: {', '.join(worst)}", highlight=False)
         for first in fallen[:1]:
-            again = f"{command} --only {first['number']}"
+            again = f"{finished.command} --only {first['number']}"
             console.print(f"  {first['ending']}: {again}", style="dim", soft_wrap=True)
 
 
@@ -217,16 +215,9 @@ def _shares() -> colors.Colormap:
     return colors.LinearSegmentedColormap.from_list("falls", ["#e3f1e7", "#f2b7a0", "#b3261e"])
 
 
-def draw(rows: Sequence[Row], force_max: float, what: str, folder: Path) -> None:
-    """Draw both pictures into PNG files of a folder.
-
-    The hand gives `force_max` N at most; `what` is what else there is to say, such as the seed.
-    """
-    _draw_falls(rows, what, folder / FALLS)
-    _draw_effort(without_loss(rows), force_max, what, folder / EFFORT)
-
-
-def _draw_falls(rows: Sequence[Row], what: str, path: Path) -> None:
+def draw_falls(finished: Finished) -> Picture:
+    """Draw who falls: a map for each control, and their shares by delay."""
+    rows, what = finished.rows, f"seed {finished.flags.seed}"
     names = controls_in(rows)
     map_in = 0.5 + 0.26 * min(len(values_in(rows, "loss")), 12)
     height = 1.0 + (map_in + 0.2) * len(names) + SHARES_IN
@@ -243,7 +234,7 @@ def _draw_falls(rows: Sequence[Row], what: str, path: Path) -> None:
         "on the way down.\nCells: falls/trials, 95 % interval of the share (Wilson)",
         fontsize=10, x=0.01, ha="left",
     )  # fmt: skip
-    save_figure(figure, path)
+    return figure
 
 
 def _draw_map(axis: Any, rows: Sequence[Row], name: str) -> None:
@@ -324,7 +315,10 @@ def _each(rows: Sequence[Row]) -> str:
     return f"{some} trials a point"
 
 
-def _draw_effort(rows: Sequence[Row], force_max: float, what: str, path: Path) -> None:
+def draw_effort(finished: Finished) -> Picture:
+    """Draw the hand's force and the time in HOLD by delay, with the least loss."""
+    rows, what = without_loss(finished.rows), f"seed {finished.flags.seed}"
+    force_max = finished.robot.simulation.operator.force_max
     figure = new_figure(7.5, 6.0, dpi=DPI)
     effort, hold = figure.subplots(2, 1, sharex=True, height_ratios=(2.2, 1.0))
     delays = values_in(rows, "delay_ms")
@@ -355,7 +349,7 @@ def _draw_effort(rows: Sequence[Row], force_max: float, what: str, path: Path) -
         f"What the hand meets: squats under {PUSHES} pushes; {mix(rows)}; {len(rows)} runs, {what}",
         fontsize=11, x=0.01, ha="left",
     )  # fmt: skip
-    save_figure(figure, path)
+    return figure
 
 
 def _draw_control(effort: Any, hold: Any, rows: Sequence[Row], name: str) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import product
-from pathlib import Path
 from typing import Annotated, Any, Final
 
 import msgspec
@@ -20,15 +19,13 @@ from tools.lab.studies.sweeps.report import FALL_COLOUR
 from tools.lab.studies.sweeps.study import Finished, Study, StudyFlags
 from tools.lab.studies.sweeps.table import Row
 from tools.live.experiment import PlantFlags
-from tools.output import new_figure, save_figure
-from tools.terminal import Console
+from tools.output import Picture, new_figure
 
 ANGLES_DEG: Final = (0, 45, 90, 135, 180)
 """Left and right are alike."""
 SIDES_DEG: Final = ("0", "45", "90", "135", "180", "-135", "-90", "-45")
 """Degrees of a push to the right."""
 DURATIONS_S: Final = (0.3, 3.0)
-PICTURE: Final = "pushes.png"
 SHORT: Final = {"led": "leads", "dead": "dead"}
 CURVES: Final = (
     ("led", "stood_n", "#1f5f8b", "-o", "planner leads"),
@@ -72,14 +69,9 @@ def _inputs(flags: PushStudyFlags) -> dict[str, str]:
     return {"plant": plants.to_toml(plant_from(flags.plant)), "grid": grid}
 
 
-def _report(finished: Finished) -> None:
-    """Draw the envelopes; print the weakest direction of each pose, duration and mode."""
-    draw(finished.rows, finished.out / PICTURE)
-    show(finished.rows, finished.console)
-
-
-def show(rows: Sequence[Row], console: Console) -> None:
+def report(finished: Finished) -> None:
     """Print the hardest pushes by direction, and what gives way in the weakest."""
+    rows = finished.rows
     angles = [f"{angle} deg" for angle in dict.fromkeys(row["angle_deg"] for row in rows)]
     printed = Printed(title="Hardest push that it stood, N", title_justify="left")
     for heading in ("pose", "s", "planner", *angles, "gives way"):
@@ -91,11 +83,12 @@ def show(rows: Sequence[Row], console: Console) -> None:
         forces = [f"{row['stood_n']:g}" for row in some]
         weakest = min(some, key=lambda row: float(row["stood_n"]))
         printed.add_row(pose, f"{duration:g}", SHORT[mode], *forces, weakest["held_part"])
-    console.print(printed)
+    finished.console.print(printed)
 
 
-def draw(rows: Sequence[Row], path: Path) -> None:
-    """Draw the envelopes into a PNG file: a panel for each pose and duration, forwards is up."""
+def draw(finished: Finished) -> Picture:
+    """Draw the envelopes: a panel for each pose and duration, forwards is up."""
+    rows = finished.rows
     poses = list(dict.fromkeys(row["pose"] for row in rows))
     durations = list(dict.fromkeys(row["duration_s"] for row in rows))
     figure = new_figure(0.5 + 4.6 * len(poses), 0.8 + 4.6 * len(durations), dpi=100)
@@ -113,7 +106,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
         axis.set_title(f"{pose}, {duration:g} s, N")
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     figure.suptitle("Hardest push that it stood, by direction (up: forwards)", x=0.01, ha="left")
-    save_figure(figure, path)
+    return figure
 
 
 def _draw_curve(axis: Any, points: Sequence[tuple[int, float]], line: str, **style: object) -> None:
@@ -129,19 +122,17 @@ STUDY: Final = Study[PushTrial](
     name="push",
     case="point",
     table="pushes.csv",
-    pictures=(PICTURE,),
-    code=("tools.lab.studies.sweeps.push_trial",),
+    pictures={"pushes.png": draw},
     total=lambda flags: len(trials_of(flags)),
     cases=lambda flags, _robot: trials_of(flags).__getitem__,
     inputs=_inputs,
-    row=msgspec.structs.asdict,
     words=lambda point: point.words,
     figures=PushResult,
     trial=push_trial.run_trial,
     options=lambda flags: {"plant": plant_from(flags.plant)},
     fell=lambda _row: False,
-    report=_report,
-    exit_code=lambda _rows: 0,
+    report=report,
+    exit_code=lambda _row: 0,
 )
 
 

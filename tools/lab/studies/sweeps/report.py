@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Final
+
+from rich.table import Table as Printed
 
 from tools.lab.studies.sweeps.figures import Ending
 from tools.lab.studies.sweeps.table import Row
-from tools.output import new_figure, save_figure
+from tools.output import Picture, new_figure
 from tools.terminal import Console, marked
 
 FALLS_SHOWN: Final = 10
@@ -50,6 +51,28 @@ def show_falls(
         console.print(f"... and {len(fallen) - FALLS_SHOWN} more in the table")
 
 
+def show_figures(
+    rows: Sequence[Row],
+    figures: Iterable[tuple[str, str, str]],
+    statistics: Mapping[str, Callable[[Sequence[float]], float]],
+    console: Console,
+) -> None:
+    """Print statistics of the trials that stood.
+
+    Args:
+        rows: of these trials.
+        figures: column, in words, and unit; one that no row has is left out.
+        statistics: by heading.
+        console: where to.
+    """
+    printed = Printed("what", *statistics, "", title="Standing trials", title_justify="left")
+    for column, words, unit in figures:
+        if values := [row[column] for row in rows if row[column] is not None]:
+            cells = (f"{statistic(values):.3g}" for statistic in statistics.values())
+            printed.add_row(words, *cells, unit)
+    console.print(printed)
+
+
 def show_share(fallen: int, of: int, console: Console) -> None:
     """Print how many fell, and the bounds of their share."""
     low, high = wilson(fallen, of)
@@ -65,15 +88,13 @@ def draw_predictions(
     groups: Mapping[str, Sequence[tuple[float, float]]],
     labels: tuple[str, str],
     title: str,
-    path: Path,
-) -> None:
-    """Draw what was measured over what was predicted, into a PNG file.
+) -> Picture:
+    """Draw what was measured over what was predicted.
 
     Args:
         groups: points by what came of them, the good first.
         labels: of the axes; a prediction of 0 parts good from bad.
         title: of the picture.
-        path: of the file.
     """
     figure = new_figure(9, 5.5)
     axis = figure.subplots()
@@ -85,4 +106,4 @@ def draw_predictions(
     axis.grid(visible=True, lw=0.3, color="#bbbbbb")
     axis.legend(fontsize=8, framealpha=0.8)
     figure.suptitle(title, fontsize=11, x=0.01, ha="left")
-    save_figure(figure, path)
+    return figure

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Annotated, Final
 
 import numpy as np
-from rich.table import Table as Printed
 
 from shared.config.robot_config import RobotConfig
 from shared.extras import late
@@ -16,13 +15,19 @@ from tools.flags import Arg, Count, Number
 from tools.lab.studies.sweeps import plants, push_range, robust_trial, study
 from tools.lab.studies.sweeps.figures import Ending
 from tools.lab.studies.sweeps.push_range import PushFlags, PushRange
-from tools.lab.studies.sweeps.report import FALL_COLOUR, parted, show_falls, show_share
+from tools.lab.studies.sweeps.report import (
+    FALL_COLOUR,
+    parted,
+    show_falls,
+    show_figures,
+    show_share,
+)
 from tools.lab.studies.sweeps.robust_trial import RobustResult, RobustTrial
 from tools.lab.studies.sweeps.study import AloneFlags, CaseLog, Finished, Study
 from tools.lab.studies.sweeps.table import Row
 from tools.live import experiment
 from tools.live.experiment import ImuFlags
-from tools.output import new_figure, save_figure
+from tools.output import Picture, new_figure
 
 if TYPE_CHECKING:
     from scipy import stats
@@ -30,7 +35,6 @@ else:
     stats = late("scipy.stats")
 
 SLOPE_MAX_DEG: Final = 15.0
-PICTURE: Final = "trials.png"
 RANKED_LEAST: Final = 30
 """Trials from which errors are ranked: among fewer a correlation of 0.36 is chance."""
 FIGURES: Final = (
@@ -95,23 +99,14 @@ def _excursion(row: Row) -> float:
 
 
 def report(finished: Finished) -> None:
-    """Draw and print what came of the study."""
-    flags, rows, console = finished.flags, finished.rows, finished.console
+    """Print what came of the study."""
+    rows, console = finished.rows, finished.console
     standing, fallen = parted(rows)
-    title = f"{len(rows)} trials, every error drawn, ranges x{flags.beyond:g}, seed {flags.seed}, "
-    title += f"{push_range.describe(flags)}: {len(fallen)} fell"
-    draw(rows, title, finished.out / PICTURE)
     show_falls(
         fallen, finished.command, lambda row: f"{row['kind']}: trial {row['number']}", console
     )
     if standing:
-        printed = Printed("what", "median", "largest", "")
-        printed.title, printed.title_justify = "Standing trials", "left"
-        for key, words, unit in FIGURES:
-            values = [row[key] for row in standing if row[key] is not None]
-            if values:
-                printed.add_row(words, f"{np.median(values):.3g}", f"{max(values):.3g}", unit)
-        console.print(printed)
+        show_figures(standing, FIGURES, {"median": median, "largest": max}, console)
     if len(rows) < RANKED_LEAST:
         most = f"{len(rows)} trials are too few to tell; from {RANKED_LEAST} on they are ranked"
     else:
@@ -120,8 +115,9 @@ def report(finished: Finished) -> None:
     show_share(len(fallen), len(rows), console)
 
 
-def draw(rows: Sequence[Row], title: str, path: Path) -> None:
-    """Draw what takes the margin, and the excursions by stiffness, into a PNG file."""
+def draw(finished: Finished) -> Picture:
+    """Draw what takes the margin, and the excursions by stiffness."""
+    flags, rows = finished.flags, finished.rows
     figure = new_figure(13, 6.5)
     left, right = figure.subplots(1, 2)
     ranked = ranking(rows)[:14][::-1]
@@ -139,16 +135,17 @@ def draw(rows: Sequence[Row], title: str, path: Path) -> None:
     right.set_xlabel("drivetrain stiffness, N m/rad")
     right.set_ylabel("COM from the middle of the ankles while led, mm (fell: 200)")
     right.legend()
+    title = f"{len(rows)} trials, every error drawn, ranges x{flags.beyond:g}, seed {flags.seed}, "
+    title += f"{push_range.describe(flags)}: {len(parted(rows)[1])} fell"
     figure.suptitle(title, x=0.01, ha="left")
-    save_figure(figure, path)
+    return figure
 
 
 STUDY: Final = Study[RobustTrial](
     name="robust",
     case="trial",
     table="trials.csv",
-    pictures=(PICTURE,),
-    code=("tools.lab.studies.sweeps.robust_trial",),
+    pictures={"trials.png": draw},
     load=lambda flags: experiment.load_robot(flags.config, imu=flags.imu),
     cases=_cases,
     decided_by=("seed", "beyond", "slope", "push"),

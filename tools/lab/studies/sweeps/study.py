@@ -27,9 +27,10 @@ from shared.extras import require
 from shared.places import DEFAULT_CONFIG
 from tools.flags import Arg, ConfigFlags, Count, Folder, Natural, fields_of
 from tools.lab.studies.sweeps import pool
-from tools.lab.studies.sweeps.figures import Ending, Observer, exit_code
+from tools.lab.studies.sweeps.figures import EXIT_CODES, Ending, Observer, scalars, worst
 from tools.lab.studies.sweeps.table import CaseTable, Row, code_digest, code_of, plain
 from tools.live import experiment
+from tools.output import Picture, save_figure
 from tools.sim.recorded_lockstep import AFTER_FALL_S, judge_in_lockstep, record_run
 from tools.terminal import Console, marked
 
@@ -91,7 +92,6 @@ class Finished(NamedTuple):
     flags: Any
     robot: RobotConfig
     rows: list[Row]
-    out: Path
     command: str
     """Runs one case alone, but for `--only` and its number."""
     console: Console
@@ -119,9 +119,8 @@ class Study(msgspec.Struct, Generic[C], frozen=True, kw_only=True):
     """What a case is called."""
     table: str
     """File name of the table."""
-    pictures: tuple[str, ...] = ()
-    code: tuple[str, ...]
-    """Modules that decide how a case comes out (`code_of`)."""
+    pictures: Mapping[str, Callable[[Finished], Picture]] = {}
+    """What draws each, by file name."""
     load: Callable[[Any], RobotConfig] = _load
     """Returns the robot."""
     total: Callable[[Any], int] = lambda flags: int(flags.n)
@@ -132,14 +131,15 @@ class Study(msgspec.Struct, Generic[C], frozen=True, kw_only=True):
     """Flags that decide the rows, beside robot and code; a folder of others is refused."""
     inputs: Callable[[Any], dict[str, str]] = lambda _flags: {}
     """What else decides them."""
-    row: Callable[[C], dict[str, object]]
+    row: Callable[[Any], dict[str, object]] = scalars
     """The draws of a case by column, its number first."""
     words: Callable[[C], str] = lambda _case: ""
     """Says which case it is, where `--only` cannot."""
     figures: type[msgspec.Struct]
     """What comes of a case: the other columns."""
     trial: Callable[..., msgspec.Struct]
-    """Runs a case: a function of a module, of the case, its robot, and the options."""
+    """Runs a case: a function of the module that decides how it comes out (`code`), of the case,
+    its robot, and the options."""
     options: Callable[[Any], dict[str, Any]] = lambda _flags: {}
     robots: Callable[[Sequence[C], RobotConfig, int, Console], Sequence[RobotConfig]] = (
         lambda cases, robot, _workers, _console: [robot] * len(cases)
@@ -149,12 +149,16 @@ class Study(msgspec.Struct, Generic[C], frozen=True, kw_only=True):
     """None: a case alone has no log."""
     fell: Callable[[Row], bool] = lambda row: row["ending"] is not Ending.STOOD
     report: Callable[[Finished], None]
-    """Prints what came of it and draws the pictures."""
+    """Prints what came of it."""
     counts: Callable[[Row], bool] = lambda _row: True
     """True for a row of the study that decides its exit code."""
-    exit_code: Callable[[Sequence[Row]], int] = lambda rows: exit_code(
-        row["ending"] for row in rows
-    )
+    exit_code: Callable[[Row], int] = lambda row: EXIT_CODES[row["ending"]]
+    """Of a row alone; of several the `worst` one counts."""
+
+    @property
+    def code(self) -> tuple[str, ...]:
+        """All of our code that decides how a case comes out."""
+        return code_of(self.trial.__module__)
 
 
 def run(study: Study[C], flags: Any) -> int:
@@ -172,7 +176,7 @@ def run(study: Study[C], flags: Any) -> int:
         return _run_alone(study, flags, robot, case_of(only), f"{command} --only {only}", console)
     drawn = [case_of(number) for number in range(study.total(flags))]
     out = flags.out or Path("out") / time.strftime(f"sweep-{study.name}-%Y%m%d-%H%M%S")
-    code = code_of(*study.code)
+    code = study.code
     inputs = {
         "study": study.name,
         **{name: _text(getattr(flags, name)) for name in study.decided_by},
@@ -194,10 +198,13 @@ def run(study: Study[C], flags: Any) -> int:
             raise
         rows = table.rows
     pace = f"; {case_s:.2f} s a {study.case}" if case_s else ""
-    study.report(Finished(flags, robot, rows, out, command, console))
+    finished = Finished(flags, robot, rows, command, console)
+    for name, draw in study.pictures.items():
+        save_figure(draw(finished), out / name)
+    study.report(finished)
     files = ", ".join((study.table, *study.pictures))
     console.print(f"{out}/{files}{pace}", style="dim", soft_wrap=True)
-    return study.exit_code([row for row in rows if study.counts(row)])
+    return worst(study.exit_code(row) for row in rows if study.counts(row))
 
 
 def _fill(
@@ -286,7 +293,7 @@ def _run_alone(
         console.print(f"{out}/run.mcap, run.png, summary.json", style="dim", soft_wrap=True)
     if "ending" in row:
         console.print(marked("[bold]{}[/]", row["ending"]))
-    return study.exit_code([row])
+    return study.exit_code(row)
 
 
 def command_of(study: Study[Any], flags: Any) -> str:

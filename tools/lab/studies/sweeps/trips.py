@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from itertools import product
 from typing import Annotated, Final
 
-import msgspec
 from rich.table import Table as Printed
 from rich.text import Text
 
@@ -59,11 +58,16 @@ def trials_of(flags: TripsStudyFlags) -> list[TripTrial]:
     return [TripTrial(number=n, trouble=trouble, on=on) for n, (trouble, on) in enumerate(grid)]
 
 
-def exit_code(rows: Sequence[Row]) -> int:
-    """Return the exit code of a table: a trip that did not save the robot before all else."""
-    if any(row["fell_at_s"] is not None for row in rows):
+def fell(row: Row) -> bool:
+    """Return True if a trip did not save the robot."""
+    return row["fell_at_s"] is not None
+
+
+def exit_code(row: Row) -> int:
+    """Return the exit code of a row."""
+    if fell(row):
         return FELL_EXIT_CODE
-    return FAULT_EXIT_CODE if any(map(wrong_with, rows)) else 0
+    return FAULT_EXIT_CODE if wrong_with(row) else 0
 
 
 def wrong_with(row: Row) -> str:
@@ -72,7 +76,7 @@ def wrong_with(row: Row) -> str:
     Any trip is right: different trips may detect a robot that tips over.
     """
     wanted = TROUBLES[row["trouble"]].trip
-    if row["fell_at_s"] is not None:
+    if fell(row):
         return f"fell at {row['fell_at_s']:g} s"
     if not (row["led"] or TROUBLES[row["trouble"]].unfiltered):
         return "the robot was never led so far that anything could happen"
@@ -123,18 +127,16 @@ def _cell(row: Row) -> Text:
 STUDY: Final = Study[TripTrial](
     name="trips",
     table="trips.csv",
-    code=("tools.lab.studies.sweeps.trips_trial",),
     load=load,
     total=lambda flags: len(trials_of(flags)),
     cases=lambda flags, _robot: trials_of(flags).__getitem__,
     decided_by=("seed",),
     inputs=lambda flags: {"grid": ", ".join(trial.words for trial in trials_of(flags))},
-    row=msgspec.structs.asdict,
     words=lambda trial: trial.words,
     figures=TripResult,
     trial=run_trial,
     options=lambda flags: {"seed": flags.seed},
-    fell=lambda row: row["fell_at_s"] is not None,
+    fell=fell,
     report=_report,
     exit_code=exit_code,
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import os
 import pickle
 import signal
@@ -14,8 +15,12 @@ from typing import Any
 
 import pytest
 
+from shared.config.robot_config import RobotConfig
 from tools import cli
 from tools.lab.studies.sweeps import pool
+from tools.lab.studies.sweeps.study import Finished, StudyFlags
+from tools.lab.studies.sweeps.table import Row
+from tools.terminal import Console
 
 
 def sweep(*words: object) -> int:
@@ -25,6 +30,19 @@ def sweep(*words: object) -> int:
 def rows_of(path: Path) -> list[dict[str, str]]:
     with path.open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
+
+
+def finished(
+    rows: Sequence[Row], robot: RobotConfig, flags: StudyFlags, command: str = ""
+) -> Finished:
+    """Return a study that has run; its console prints into a text of 120 columns."""
+    return Finished(flags, robot, [*rows], command, Console(width=120, file=io.StringIO()))
+
+
+def printed(report: Callable[[Finished], None], done: Finished) -> str:
+    """Return what a report prints."""
+    report(done)
+    return done.console.file.getvalue()  # type: ignore[attr-defined,no-any-return]
 
 
 def run_cases_here(patch: pytest.MonkeyPatch) -> None:

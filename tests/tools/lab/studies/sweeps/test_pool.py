@@ -27,7 +27,7 @@ from tools.lab.studies.sweeps.certificate_trial import (
     run_case,
 )
 from tools.lab.studies.sweeps.pool import Cluster
-from tools.lab.studies.sweeps.table import code_digest, code_of
+from tools.lab.studies.sweeps.table import code_digest
 
 CODE = ("tools/lab/studies/sweeps/pool.py",)
 HERE = Cluster("tcp://127.0.0.1:5", CODE)
@@ -170,6 +170,6 @@ def test_a_case_on_a_real_cluster_is_the_case_of_this_machine(robot: RobotConfig
         host="127.0.0.1",
         protocol="tcp://",
     ) as local:
-        cluster = Cluster(local.scheduler_address, code_of(*STUDY.code))
+        cluster = Cluster(local.scheduler_address, STUDY.code)
         ((_, figures),) = pool.results(run_task, [task], cluster, lambda _task: "the case")
     assert figures == run_task(task)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import re
@@ -11,19 +12,22 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
 
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import RunError
+from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE, RunError
 from tests.tools.exit_codes import exit_code
 from tests.tools.lab.studies.sweeps.tables import rows_of, run_cases_here, sweep
 from tools import cli
 from tools.lab.studies.sweeps import kill, latency, push_trial, study
+from tools.lab.studies.sweeps.figures import Ending, worst
 from tools.lab.studies.sweeps.kill_trial import KillCases
 from tools.lab.studies.sweeps.report import wilson
-from tools.lab.studies.sweeps.table import code_of
+from tools.lab.studies.sweeps.table import Row, code_of
+from tools.verb_table import Verb
 
 KILL = ("kill", "--split", "diagonal")
 """The paper's split needs no gain schedule."""
@@ -175,6 +179,73 @@ def test_a_fall_is_exit_code_1_with_the_command_that_shows_it(
     assert cli.main(command.split()[1:]) == 1
 
 
+GOOD: Mapping[str, Row] = {
+    "kill": {"ending": Ending.STOOD},
+    "heat": {"ending": Ending.STOOD, "unseen": False, "winding_max": 90.0},
+    "dynamics": {"said_stable": True, "grew": False, "ended": "tracked"},
+    "trips": {
+        "trouble": "sags", "led": True, "tripped": "SAGGING", "fell_at_s": None,
+        "untripped_fell_at_s": None,
+    },
+    "certificate": {"margin": 0.5, "stood": True},
+    "push": {"stood_n": 0.0},
+}  # fmt: skip
+"""A row that nothing is wrong with, by study; `latency` and `robust` judge as `kill` does."""
+
+
+def module_of(name: str) -> Any:
+    return importlib.import_module(f"tools.lab.studies.sweeps.{name}")
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "code"),
+    [
+        *((name, {}, 0) for name in GOOD),
+        ("kill", {"ending": Ending.UNREADY}, FAULT_EXIT_CODE),
+        ("kill", {"ending": Ending.TIPPING}, FELL_EXIT_CODE),
+        ("kill", {"ending": Ending.FELL}, FELL_EXIT_CODE),
+        ("heat", {"ending": Ending.FELL}, FELL_EXIT_CODE),
+        ("heat", {"ending": Ending.UNREADY}, 0),
+        ("heat", {"unseen": True}, FAULT_EXIT_CODE),
+        ("heat", {"winding_max": 156.0}, FAULT_EXIT_CODE),
+        ("dynamics", {"grew": True}, FAULT_EXIT_CODE),
+        ("dynamics", {"grew": True, "ended": "left"}, FAULT_EXIT_CODE),
+        ("dynamics", {"grew": True, "ended": "fell"}, FELL_EXIT_CODE),
+        ("dynamics", {"grew": True, "ended": "fell", "said_stable": False}, 0),
+        ("trips", {"tripped": ""}, FAULT_EXIT_CODE),
+        ("trips", {"fell_at_s": 2.1}, FELL_EXIT_CODE),
+        ("certificate", {"stood": False}, FELL_EXIT_CODE),
+        ("certificate", {"stood": False, "margin": -0.5}, 0),
+    ],
+)
+def test_a_row_has_the_exit_code_of_what_is_wrong_with_it(
+    name: str, changes: Row, code: int
+) -> None:
+    assert module_of(name).STUDY.exit_code({**GOOD[name], **changes}) == code
+
+
+@pytest.mark.parametrize(
+    ("codes", "code"), [([], 0), ([0, 0], 0), ([0, 3], 3), ([3, 1, 0], 1), ([2, 3], 3), ([2, 1], 1)]
+)
+def test_of_many_a_fall_decides_before_all_else_then_a_fault(codes: list[int], code: int) -> None:
+    assert worst(codes) == code
+
+
+@pytest.mark.parametrize("name", ["kill", "robust", "heat", "dynamics"])
+def test_a_case_follows_from_seed_and_number_whatever_was_drawn_before(
+    name: str, robot: RobotConfig
+) -> None:
+    kind = Verb(f"study {name}", "", module_of(name).__name__).declaration
+
+    def drawn(seed: int, *numbers: int) -> list[Any]:
+        case_of = module_of(name).STUDY.cases(kind(seed=seed), robot)
+        return [case_of(number) for number in numbers]
+
+    (_, case), (again,), (other,) = drawn(3, 5, 17), drawn(3, 17), drawn(4, 17)
+    assert again == case
+    assert msgspec.structs.replace(other, seed=3) != case
+
+
 def test_the_verbs_help_imports_no_study() -> None:
     code = (
         "import sys\nfrom tools import cli\ntry:\n    cli.main(['study', '--help'])\n"
@@ -311,7 +382,7 @@ def test_the_digest_has_every_tool_that_decides_a_run_and_no_picture() -> None:
         (kill.STUDY, {f"{sweeps}/kill_trial.py", "tools/lab/design/split_program.py"}),
         (latency.STUDY, {f"{sweeps}/latency_trial.py", "tools/sim/centralised/control.py"}),
     ):
-        code = code_of(*one.code)
+        code = one.code
         runs = ("lockstep", "network", "virtual_drive", "virtual_services", "virtual_time")
         assert {"services", "shared", *(f"tools/sim/{name}.py" for name in runs)} | own <= {*code}
         assert [part for part in code if "picture" in part or "report" in part] == []

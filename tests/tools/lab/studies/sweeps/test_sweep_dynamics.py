@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from shared.config.robot_config import RobotConfig
-from tools.lab.studies.sweeps import dynamics, dynamics_trial
+from tools.lab.studies.sweeps import dynamics_trial
 from tools.lab.studies.sweeps.dynamics_trial import (
     delay_s,
     draw,
@@ -16,9 +16,7 @@ from tools.lab.studies.sweeps.dynamics_trial import (
 )
 
 
-def test_a_case_is_the_same_without_the_others_and_within_its_ranges() -> None:
-    assert draw(1, 7) == draw(1, 7)
-    assert draw(1, 7) != draw(2, 7)
+def test_a_case_is_within_its_ranges() -> None:
     for number in range(200):
         trial = draw(3, number)
         for value, (low, high) in (
@@ -56,18 +54,6 @@ def test_motion_that_rises_stays_large_or_ends_the_lead_has_grown(
     early_rad_s: float, late_rad_s: float, ended: str, grew: bool
 ) -> None:
     assert has_grown(early_rad_s, late_rad_s, ended) is grew
-
-
-@pytest.mark.parametrize(
-    ("said", "ended", "code"),
-    [(True, "tracked", 3), (True, "left", 3), (True, "fell", 1), (False, "fell", 0)],
-)
-def test_motion_that_grew_against_the_certificate_is_a_fault_and_a_fall_if_it_fell(
-    said: bool, ended: str, code: int
-) -> None:
-    as_said = {"said_stable": True, "grew": False, "ended": "tracked"}
-    row = {"said_stable": said, "grew": True, "ended": ended}
-    assert dynamics.exit_code([as_said, row]) == code
 
 
 def test_drawn_gains_change_the_schedule_and_nothing_else(robot: RobotConfig) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from shared.config import scenarios
 from shared.config.robot_config import RobotConfig
 from shared.links import DIRECTIONS
 from tests.messages import sample
+from tests.tools.lab.studies.sweeps.tables import finished, printed
 from tools.flags import add_flags, read_flags
 from tools.lab.studies.sweeps import latency, latency_report
 from tools.lab.studies.sweeps.figures import Ending
@@ -32,8 +33,8 @@ from tools.lab.studies.sweeps.latency_trial import (
 )
 from tools.lab.studies.sweeps.study import command_of
 from tools.lab.studies.sweeps.table import Row
+from tools.output import save_figure
 from tools.sim.lockstep import Lockstep
-from tools.terminal import Console
 
 GOOD = Network(0.0, 0.0, 0.0)
 
@@ -232,7 +233,12 @@ def made_up(fell: Callable[[str, float, float], bool]) -> list[Row]:
     ]
 
 
-def test_falls_are_counted_where_they_were(capsys: pytest.CaptureFixture[str]) -> None:
+def shown(rows: Sequence[Row], robot: RobotConfig) -> str:
+    done = finished(rows, robot, latency.LatencyStudyFlags(), "xrl study latency")
+    return printed(latency_report.show, done)
+
+
+def test_falls_are_counted_where_they_were(robot: RobotConfig) -> None:
     rows = made_up(lambda control, delay, _loss: control == "centralised" and delay == 50.0)
     assert latency_report.controls_in(rows) == ["distributed", "centralised"]
     own = latency_report.chosen(rows, "centralised", delay_ms=50.0)
@@ -240,20 +246,16 @@ def test_falls_are_counted_where_they_were(capsys: pytest.CaptureFixture[str]) -
     assert latency_report.falls(latency_report.chosen(rows, "centralised")) == (4, 8)
     assert latency_report.falls(own).bounds[0] > 0.3
     assert {row["loss"] for row in latency_report.without_loss(rows)} == {"0"}
-    latency_report.show(rows, "xrl study latency", Console(width=120))
-    output = capsys.readouterr().out
+    output = shown(rows, robot)
     assert "centralised: 4 of 8 fell; most at 50 ms, 4 of 4" in output
     assert "distributed: none of 8 fell" in output
     assert "xrl study latency --only 4" in output
 
 
-def test_each_delay_has_bounds_of_its_own_and_names_their_mix(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_each_delay_has_bounds_of_its_own_and_names_their_mix(robot: RobotConfig) -> None:
     """The worst of several delays is chosen: 95 % of it would be 83 %."""
     rows = made_up(lambda control, delay, _loss: control == "centralised" and delay == 50.0)
-    latency_report.show(rows, "xrl study latency", Console(width=80))
-    table, _, rest = capsys.readouterr().out.partition("Hand's peak force")
+    table, _, rest = shown(rows, robot).partition("Hand's peak force")
     assert "in this mix: 0, 50 % lost" in " ".join(table.split())
     assert [" ".join(line.split()) for line in table.splitlines() if " of 4" in line] == [
         "0 0 of 4 0-49 % 0 of 4 0-49 %",
@@ -270,14 +272,10 @@ def test_a_study_with_trials_missing_reports_how_many_there_are() -> None:
     assert latency_report._each(rows[:-1]) == "3 to 4 trials a point"
 
 
-def test_pictures_are_drawn_of_what_there_is(tmp_path: Path) -> None:
+def test_pictures_are_drawn_of_what_there_is(robot: RobotConfig, tmp_path: Path) -> None:
     """A study that was stopped early, and one in which everything fell at once."""
     rows = made_up(lambda *_: True)
     short = [{**row, "operator_peak_n": None, "hold_share": None} for row in rows[:3]]
-    for name, some in (("all", rows), ("few", short)):
-        folder = tmp_path / name
-        folder.mkdir()
-        latency_report.draw(some, 150.0, "made up", folder)
-        sizes = [path.stat().st_size for path in folder.iterdir()]
-        assert len(sizes) == 2
-        assert all(10_000 < size < 150_000 for size in sizes)
+    for some, draw in product((rows, short), latency.STUDY.pictures.values()):
+        save_figure(draw(finished(some, robot, latency.LatencyStudyFlags())), tmp_path / "a.png")
+        assert 10_000 < (tmp_path / "a.png").stat().st_size < 150_000

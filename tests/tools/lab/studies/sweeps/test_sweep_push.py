@@ -13,6 +13,7 @@ import pytest
 from services.simulator.physics.plant import PlantConfig
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
+from tests.tools.lab.studies.sweeps.tables import finished
 from tools.lab.studies.sweeps import push, push_trial
 from tools.lab.studies.sweeps.push_range import PushRange
 from tools.lab.studies.sweeps.push_trial import (
@@ -22,6 +23,7 @@ from tools.lab.studies.sweeps.push_trial import (
     run_trial,
     scenario_of,
 )
+from tools.output import save_figure
 
 
 def trials_of(**changes: Any) -> list[PushTrial]:
@@ -88,14 +90,16 @@ def test_the_push_is_in_the_direction_that_was_asked_for() -> None:
     assert scenario_of(point(mode="led"), 40.0).kill == ()
 
 
-def test_a_table_is_drawn_with_both_modes_and_the_limits(tmp_path: Path) -> None:
+def test_a_table_is_drawn_with_both_modes_and_the_limits(
+    robot: RobotConfig, tmp_path: Path
+) -> None:
     trials = trials_of(pose=["stand", "crawl"])
     outcome = PushResult(
         stood_n=50.0, fell_n=55.0, held_limit_n=40.0, held_part="left sole's toe", body_limit_n=90.0
     )
     figures = msgspec.structs.asdict(outcome)
     rows = [msgspec.structs.asdict(trial) | figures for trial in trials]
-    push.draw(rows, tmp_path / "a.png")
+    save_figure(push.draw(finished(rows, robot, push.PushStudyFlags())), tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 30_000
 
 

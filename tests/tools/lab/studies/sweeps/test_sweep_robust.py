@@ -1,8 +1,7 @@
-"""The robustness study: trials that repeat, a ranking that finds the cause, a robot that stands."""
+"""The robustness study: its trials, a ranking that finds the cause, a robot that stands."""
 
 from __future__ import annotations
 
-import io
 import math
 import random
 from pathlib import Path
@@ -11,6 +10,7 @@ import msgspec
 import pytest
 
 from shared.config.robot_config import RobotConfig
+from tests.tools.lab.studies.sweeps.tables import finished, printed
 from tools.lab.studies.sweeps import plants, robust
 from tools.lab.studies.sweeps.figures import Ending
 from tools.lab.studies.sweeps.push_range import PushRange
@@ -22,8 +22,7 @@ from tools.lab.studies.sweeps.robust_trial import (
     run_trial,
     scenario_of,
 )
-from tools.lab.studies.sweeps.study import Finished
-from tools.terminal import Console
+from tools.output import save_figure
 
 
 @pytest.fixture(scope="module")
@@ -46,15 +45,10 @@ def rows_by(drawn: list[dict[str, object]], cause: str) -> list[dict[str, object
     return rows
 
 
-def test_a_trial_follows_from_seed_and_number_alone(pushes: PushRange) -> None:
-    assert draw(pushes, 3, 17) == draw(pushes, 3, 17)
-    assert draw(pushes, 3, 17) != draw(pushes, 4, 17)
-    assert {draw(pushes, 1, number).kind for number in range(3)} == set(KINDS)
-
-
 def test_every_trial_is_a_scenario_that_ends_after_its_kill(
     robot: RobotConfig, pushes: PushRange
 ) -> None:
+    assert {draw(pushes, 1, number).kind for number in range(3)} == set(KINDS)
     for number in range(30):
         trial = draw(pushes, 1, number)
         scenario = scenario_of(robot, trial)
@@ -74,24 +68,22 @@ def test_the_ranking_finds_the_error_that_moves_the_com(
 
 @pytest.mark.parametrize("few", [True, False])
 def test_of_a_few_trials_no_error_is_ranked(
-    robot: RobotConfig, drawn: list[dict[str, object]], few: bool, tmp_path: Path
+    robot: RobotConfig, drawn: list[dict[str, object]], few: bool
 ) -> None:
     figures = dict.fromkeys(key for key, _, _ in robust.FIGURES)
     rows = [figures | row for row in rows_by(drawn, "drive.lag_s")[: robust.RANKED_LEAST - few]]
-    printed = io.StringIO()
-    args = robust.RobustStudyFlags()
-    console = Console(width=200, file=printed)
-    robust.report(Finished(args, robot, rows, tmp_path, "xrl study robust", console))
-    assert ("too few to tell" in printed.getvalue()) is few
-    assert ("drive.lag_s" in printed.getvalue()) is not few
+    said = printed(robust.report, finished(rows, robot, robust.RobustStudyFlags()))
+    assert ("too few to tell" in said) is few
+    assert ("drive.lag_s" in said) is not few
 
 
 def test_a_picture_is_drawn_and_falls_are_in_it(
-    drawn: list[dict[str, object]], tmp_path: Path
+    robot: RobotConfig, drawn: list[dict[str, object]], tmp_path: Path
 ) -> None:
     rows = rows_by(drawn, "drive.lag_s")
     rows[3] |= {"ending": Ending.FELL, "com_led_max_mm": None}
-    robust.draw(rows, "made up", tmp_path / "a.png")
+    figure = robust.draw(finished(rows, robot, robust.RobustStudyFlags()))
+    save_figure(figure, tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 20_000
 
 
