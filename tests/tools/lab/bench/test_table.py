@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from tools.lab.bench.table import Row
 from tools.lab.bench.timing import Cost, Spread
 from tools.lab.bench.worker import Answer, PartRow, Request, row_of
@@ -39,6 +41,15 @@ def test_a_part_that_a_tree_does_not_have_has_no_row_and_no_ratio() -> None:
     lacking = Answer(100.0, missing="ImportError")
     assert row_of(TICK, [lacking], [timed(1.0)], None) is None
     assert rows([timed(1.0)], [lacking])[4:6] == (None, None)
+
+
+def test_turns_are_compared_one_by_one() -> None:
+    """The machine was half as fast in the second turn: the ratio does not see it."""
+    here = [timed(us) for us in (200.0, 400.0, 210.0)]
+    there = [timed(us) for us in (250.0, 500.0, 300.0)]
+    row = rows(here, there)
+    assert (row.value, row.spread, row.other) == (210.0, (200.0, 400.0), 300.0)
+    assert row.ratio == pytest.approx(0.8)
 
 
 def test_a_faster_lockstep_has_a_ratio_below_one_and_meets_a_target_from_above() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import msgspec
 import pytest
@@ -28,6 +29,7 @@ from tools.lab.studies.crash.outcome import CrashMessages, as_expected, measure
 BY_NAME = {case.name: case for case in CASES}
 PLANNER = BY_NAME["kill-planner"]
 KNEE = BY_NAME["kill-knee_left"]
+HARNESS = BY_NAME["kill-harness"]
 S = 1_000_000_000
 
 
@@ -44,14 +46,19 @@ def truth(t: float, **changes: object) -> SimTruth:
 
 
 def change(
-    t: float, module: str, before: Mode, after: Mode, step: float = 0.0
+    t: float,
+    module: str,
+    before: Mode,
+    after: Mode,
+    step: float = 0.0,
+    cause: Cause = Cause.HOLD_ALL,
 ) -> tuple[str, JointEvent]:
     event = sample(
         JointEvent,
         t_ns=round((t + 7.0) * S),
         mode_before=int(before),
         mode_after=int(after),
-        cause=4,
+        cause=int(cause),
         tau_before=(1.0, 2.0),
         tau_after=(1.0, 2.0 - step),
     )
@@ -84,11 +91,44 @@ def heard(
     return CrashMessages(rows, list(events), marks, tuple(modes))
 
 
-def test_a_robot_that_goes_on_has_stood(robot: RobotConfig) -> None:
-    outcome = measure(PLANNER, heard(PLANNER, holds()), robot)
-    assert outcome.verdict is CrashVerdict.STOOD
-    assert outcome.remarks == ()
-    assert outcome.in_real_time
+def hip_left(t: float, before: Mode, after: Mode, **changes: Any) -> tuple[str, JointEvent]:
+    return change(t, "hip_left", before, after, **changes)
+
+
+NOT_ALL = holds(but=("hip_left",))
+
+
+@pytest.mark.parametrize(
+    ("case", "events", "safe_ms", "remarks"),
+    [
+        (PLANNER, holds(), 50.0, ()),
+        (KNEE, [*NOT_ALL, hip_left(2.47, Mode.TRACK, Mode.HOLD)], 70.0, ()),
+        (PLANNER, holds(at=1.0), 0.0, ()),
+        (KNEE, NOT_ALL, None, ("not all of the other modules held",)),
+        (HARNESS, [], None, ()),
+        (HARNESS, [hip_left(2.5, Mode.TRACK, Mode.HOLD)], None, ("left TRACK: hip_left",)),
+        (KNEE, [*holds(), hip_left(2.6, Mode.HOLD, Mode.FAULT)], 50.0,
+         ("hip_left went to FAULT",)),
+        *(
+            (KNEE, [*NOT_ALL, hip_left(2.44, Mode.TRACK, Mode.HOLD, cause=cause)], 50.0,
+             (f"hip_left tripped: {cause.name}",))
+            for cause in (Cause.SHAKING, Cause.TORQUE_LIMIT, Cause.TOO_FAST)
+        ),
+    ],
+    ids=["stood", "the slowest", "held already", "tracks on", "not needed", "disturbed", "fault",
+         "shaking", "torque limit", "too fast"],
+)  # fmt: skip
+def test_safe_is_when_the_slowest_module_that_was_not_hit_holds_and_all_else_is_remarked(
+    robot: RobotConfig,
+    case: CrashCase,
+    events: Sequence[tuple[str, JointEvent]],
+    safe_ms: float | None,
+    remarks: tuple[str, ...],
+) -> None:
+    outcome = measure(case, heard(case, events), robot)
+    assert outcome.safe_ms == (safe_ms if safe_ms is None else pytest.approx(safe_ms))
+    assert outcome.remarks == remarks
+    assert (outcome.verdict, outcome.in_real_time) == (CrashVerdict.STOOD, True)
     assert outcome.sank_mm == pytest.approx(0.0, abs=1e-9)
 
 
@@ -141,46 +181,6 @@ def test_a_run_on_a_machine_that_was_too_slow_is_marked(
 ) -> None:
     run = heard(PLANNER, holds(), world=lambda t: truth(t, **changes))
     assert not measure(PLANNER, run, robot).in_real_time
-
-
-def test_safe_is_when_the_slowest_module_that_was_not_hit_holds(robot: RobotConfig) -> None:
-    late = change(2.47, "hip_right", Mode.TRACK, Mode.HOLD)
-    events = [*holds(but=("hip_right", "knee_left")), late]
-    outcome = measure(KNEE, heard(KNEE, events), robot)
-    assert outcome.safe_ms == pytest.approx(70.0)
-    assert outcome.remarks == ()
-
-
-def test_a_module_that_holds_already_is_safe_at_once(robot: RobotConfig) -> None:
-    outcome = measure(PLANNER, heard(PLANNER, holds(at=1.0)), robot)
-    assert outcome.safe_ms == 0.0
-
-
-def test_a_module_that_goes_on_tracking_is_remarked(robot: RobotConfig) -> None:
-    outcome = measure(KNEE, heard(KNEE, holds(but=("hip_left",))), robot)
-    assert outcome.safe_ms is None
-    assert outcome.remarks == ("not all of the other modules held",)
-
-
-def test_what_balance_does_not_need_must_disturb_no_module(robot: RobotConfig) -> None:
-    case = BY_NAME["kill-harness"]
-    assert measure(case, heard(case), robot).remarks == ()
-    event = change(2.5, "hip_left", Mode.TRACK, Mode.HOLD)
-    assert measure(case, heard(case, [event]), robot).remarks == ("left TRACK: hip_left",)
-
-
-def test_another_module_in_fault_is_remarked(robot: RobotConfig) -> None:
-    events = [*holds(), change(2.6, "hip_left", Mode.HOLD, Mode.FAULT)]
-    assert measure(KNEE, heard(KNEE, events), robot).remarks == ("hip_left went to FAULT",)
-
-
-@pytest.mark.parametrize("cause", [Cause.SHAKING, Cause.TORQUE_LIMIT, Cause.TOO_FAST])
-def test_a_module_that_trips_is_remarked(robot: RobotConfig, cause: Cause) -> None:
-    name, event = change(CRASH_S + 0.04, "hip_left", Mode.TRACK, Mode.HOLD)
-    tripped = (name, msgspec.structs.replace(event, cause=int(cause)))
-    events = [*holds(but=("hip_left",)), tripped]
-    remarks = measure(KNEE, heard(KNEE, events), robot).remarks
-    assert remarks == (f"hip_left tripped: {cause.name}",)
 
 
 def test_a_service_that_ends_by_itself_is_remarked(robot: RobotConfig) -> None:

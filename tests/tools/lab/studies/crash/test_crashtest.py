@@ -192,17 +192,6 @@ def test_cases_are_chosen_by_name_pattern_and_length() -> None:
     assert crash.select(CASES, quick=False, only=()) == list(CASES)
 
 
-def test_a_name_that_fits_no_case_is_one_line_with_those_it_may_mean(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "out"
-    assert exit_code(["study", "crash", "--only", "kill-kne_left", "--out", out]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "kill-knee_left" in line
-    assert "--list" in line
-    assert not out.exists()
-
-
 def test_list_runs_nothing_and_names_every_case(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -19,7 +18,6 @@ import pytest
 
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE, RunError
-from tests.tools.exit_codes import exit_code
 from tests.tools.lab.studies.sweeps.tables import rows_of, run_cases_here, sweep
 from tools import cli
 from tools.lab.studies.sweeps import kill, latency, push_trial, study
@@ -253,38 +251,6 @@ def test_the_verbs_help_imports_no_study() -> None:
         "assert not [name for name in sys.modules if name.startswith('tools.lab')]"
     )
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
-
-
-@pytest.mark.parametrize(
-    ("flags", "words"),
-    [
-        (("kill", "--n", "0"), r"--n: '0': a whole number from 1"),
-        (("robust", "--n", "0"), r"--n: '0': a whole"),
-        (("certificate", "--n", "0"), r"--n: '0': a whole"),
-        (("latency", "--trials", "0"), r"--trials: '0': a whole number from 1"),
-        (("kill", "--workers", "0"), r"--workers: '0': a whole"),
-        (("kill", "--only", "-1"), r"--only: '-1': a whole number from 0"),
-        (("kill", "--cluster", "tcp://127.0.0.1:1", "--workers", "2"), "--workers are of this"),
-        (("kill", "--cluster", "tcp://127.0.0.1:1", "--only", "1"), "--only runs here"),
-        *(((name, "--push", share), "--push") for name in ("kill", "robust")
-          for share in ("0", "-1", "4", "nan")),
-        (("robust", "--slope", "40"), "--slope: '40': a number from 0 to"),
-        (("push", "--duration", "0"), "--duration: '0': a number of at least"),
-        (("latency", "--loss", "1.5"), "from 0 to 1"),
-        (("latency", "--control", "distributed,mine"),
-         "'mine'; some of distributed, diagonal, centralised"),
-        (("latency", "--delay", "0-200"), "FROM:TO:STEP"),
-        (("latency", "--lead-easing", "2"), "lead_easing"),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
-)  # fmt: skip
-def test_flags_that_make_no_sense_are_refused_and_nothing_is_written(
-    flags: tuple[str, ...], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "out"
-    assert exit_code(["study", *flags, "--out", str(out)]) == 2
-    assert re.search(words, capsys.readouterr().err)
-    assert not out.exists()
 
 
 @pytest.mark.parametrize("error", [RunError("a worker was killed"), KeyboardInterrupt()])
