@@ -134,16 +134,15 @@ def run(flags: BusFlags) -> int:
     rows = [median_of(column) for column in zip(*rounds, strict=True)]
     print_table(
         console,
-        ("", "p50", "p99", "p99.9", "missed", "lost", "CPU"),
-        [
-            (
-                row.transport,
-                *(f"{us * 1e-3:.2f} ms" for us in (row.p50_us, row.p99_us, row.p999_us)),
-                *(f"{100.0 * fraction:.2f} %" for fraction in (row.missed, row.lost)),
-                f"{100.0 * row.cpu:.0f} %",
-            )
-            for row in rows
-        ],
+        {
+            "": [row.transport for row in rows],
+            "p50": [f"{row.p50_us * 1e-3:.2f} ms" for row in rows],
+            "p99": [f"{row.p99_us * 1e-3:.2f} ms" for row in rows],
+            "p99.9": [f"{row.p999_us * 1e-3:.2f} ms" for row in rows],
+            "missed": [f"{100.0 * row.missed:.2f} %" for row in rows],
+            "lost": [f"{100.0 * row.lost:.2f} %" for row in rows],
+            "CPU": [f"{100.0 * row.cpu:.0f} %" for row in rows],
+        },
         "From the planner's put to a module's cycle, every 2 ms; medians of the rounds. "
         "Missed: a command came a cycle later than it could have. CPU: of all seven processes, in "
         "percent of one core.",

@@ -10,7 +10,6 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple, TypeAlias
 
@@ -18,7 +17,6 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
-from rich.text import Text
 
 from shared.bus import topics
 from shared.bus.messages import JointCommand
@@ -26,23 +24,22 @@ from shared.bus.traces import JointTrace
 from shared.clock import NS_PER_MS
 from shared.config import files as config_file
 from shared.config import gain_schedule
-from shared.exceptions import FAULT_EXIT_CODE, RunError
+from shared.exceptions import RunError
 from shared.extras import require
 from shared.joints import MODULES
-from shared.places import CHECKOUT
 from shared.toml_file import Range
 from tools.flags import Arg
 from tools.fleet.pace import PACE_MIN
 from tools.fleet.status_table import warn_of_others
 from tools.judge.verdict_table import digits
-from tools.lab.bench.revisions import environment, its_config, unpacked
+from tools.lab.bench.revisions import environment
 from tools.lab.bench.table import (
     AgainstFlags,
     Row,
+    cell,
     compared,
+    compared_columns,
     print_table,
-    ratio_cell,
-    write_rows,
 )
 from tools.logs.run_log import RunLog, read_run
 from tools.terminal import Console
@@ -194,40 +191,28 @@ def run(flags: FleetFlags) -> int:
     gain_schedule.require(robot, flags.config)
     console = Console()
     warn_of_others(console)
-    config = flags.config.resolve()
-    turns: list[list[Turn]] = []
-    with ExitStack() as stack:
-        trees = [(CHECKOUT, config)]
-        if flags.against is not None:
-            other = stack.enter_context(unpacked(flags.against))
-            trees.append((other, its_config(config, other)))
+    with flags.trees() as trees:
         runs = [tree for _ in range(flags.rounds or ROUNDS) for tree in trees]
         led = [
             measure(tree, its, flags.scenario, flags.pace)
             for tree, its in track(runs, "leading", console=console, transient=True)
         ]
-        turns = [led[number :: len(trees)] for number in range(len(trees))]
-    found = rows(turns[0], turns[1] if len(turns) > 1 else (), flags.pace)
-    compare = ("least .. most",) if flags.against is None else (flags.against, "ratio")
+    here, *there = (led[number :: len(trees)] for number in range(len(trees)))
+    found = rows(here, there[0] if there else (), flags.pace)
+    if flags.against is None:
+        spreads = (() if row.spread is None else map(digits, row.spread) for row in found)
+        compare = {"least .. most": [" .. ".join(spread) for spread in spreads]}
+    else:
+        compare = compared_columns(found, flags.against, units=True)
     print_table(
         console,
-        ("", "here", *compare, "target"),
-        [_cells(row, flags.against) for row in found],
+        {
+            "": [row.what for row in found],
+            "here": [cell(row.value, row.unit) for row in found],
+            **compare,
+            "target": [row.marked_target() for row in found],
+        },
         "Medians of the turns. CPU: in percent of one core. Late: later than two periods. "
         "Age: of a command, from the module's state that it answers to the cycle that takes it.",
     )
-    write_rows(flags.json, [{**row._asdict(), "figure": row.what} for row in found])
-    return FAULT_EXIT_CODE if flags.strict and not all(row.ok for row in found) else 0
-
-
-def _cells(row: Row, against: str | None) -> list[Text | str]:
-    cells: list[Text | str] = [row.what, _number(row.value, row.unit)]
-    if against is None:
-        cells.append("" if row.spread is None else " .. ".join(map(digits, row.spread)))
-    else:
-        cells += [_number(row.other, row.unit), ratio_cell(row)]
-    return [*cells, row.marked_target()]
-
-
-def _number(value: float | None, unit: str) -> str:
-    return "" if value is None else f"{digits(value)} {unit}"
+    return flags.finish(found, [{"figure": row.what} for row in found])

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from statistics import median
 from typing import Annotated, NamedTuple
@@ -15,7 +16,11 @@ from rich.text import Text
 
 from shared.atomic_file import replace_file
 from shared.exceptions import FAULT_EXIT_CODE
+from shared.places import CHECKOUT
 from tools.flags import Arg, ConfigFlags, Count, Flags, parsed
+from tools.judge.verdict_table import digits
+from tools.lab.bench import revisions
+from tools.lab.bench.worker import Answer, Request
 from tools.terminal import Console, marked
 
 
@@ -73,22 +78,48 @@ def compared(
     )
 
 
-def print_table(
-    console: Console, columns: Sequence[str], rows: Iterable[Sequence[Text | str]], note: str
-) -> None:
-    """Print a table, its first column to the left, and what its columns mean below it."""
+class PartRow(NamedTuple):
+    """One figure of the bench: CPU time in us, or times real time."""
+
+    row: Row
+    wall: float | None
+    """Its value by the wall's clock; None: CPU time only."""
+    to_yardstick: float
+    """Time in units of the yardstick that ran right before it; a speed's is its inverse."""
+
+
+def row_of(
+    request: Request, turns: Sequence[Answer], others: Sequence[Answer], target: float | None
+) -> PartRow | None:
+    """Return the row of this tree's turns and the other tree's; None if this one lacks the part."""
+    if any(turn.missing for turn in turns):
+        return None
+    walls = [turn.cost.wall.p50 for turn in turns if turn.cost is not None]
+    what = f"{request.name}, {'cold' if request.cold else 'warm'}" if walls else request.name
+    here, there = ([answer.value for answer in answers] for answers in (turns, others))
+    # of a speed, the time of a millisecond
+    times = [value if walls else 1e3 / value for value in here if value]
+    return PartRow(
+        compared(what, "us" if walls else "x", here, there, target),
+        median(walls) if walls else None,
+        median(us / turn.yardstick_us for us, turn in zip(times, turns, strict=True)),
+    )
+
+
+def print_table(console: Console, columns: Mapping[str, Iterable[Text | str]], note: str) -> None:
+    """Print cells by heading, those of no heading to the left, and what they mean below them."""
     shown = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for column in columns:
-        shown.add_column(column, justify="right" if column else "left", no_wrap=True)
-    for row in rows:
+    for heading in columns:
+        shown.add_column(heading, justify="right" if heading else "left", no_wrap=True)
+    for row in zip(*columns.values(), strict=True):
         shown.add_row(*row)
     console.print(shown)
     console.print(note, style="dim")
 
 
-def ratio_cell(row: Row) -> str:
-    """Return a row's ratio to the other revision."""
-    return "" if row.ratio is None else f"{row.ratio:.2f}"
+def cell(value: float | None, unit: str = "") -> str:
+    """Return a figure with its unit."""
+    return "" if value is None else f"{digits(value)} {unit}".rstrip()
 
 
 def _writable(text: str) -> Path:
@@ -115,6 +146,30 @@ class AgainstFlags(BenchFlags, ConfigFlags):
     """also measure a git revision, in turn with this tree, and print the ratios; both run in this
     environment"""
     strict: Annotated[bool, Arg(help=f"exit code {FAULT_EXIT_CODE} if a target is missed")] = False
+
+    @contextmanager
+    def trees(self) -> Iterator[list[tuple[Path, Path]]]:
+        """Yield this tree and the other, each with its own version of the robot file."""
+        here = (CHECKOUT, self.config.resolve())
+        if self.against is None:
+            yield [here]
+            return
+        with revisions.unpacked(self.against) as other:
+            yield [here, (other, revisions.its_config(here[1], other))]
+
+    def finish(self, rows: Sequence[Row], more: Iterable[Mapping[str, object]]) -> int:
+        """Write each row, and what more there is of it; return the exit code."""
+        pairs = zip(rows, more, strict=True)
+        write_rows(self.json, [{**row._asdict(), **its} for row, its in pairs])
+        return FAULT_EXIT_CODE if self.strict and not all(row.ok for row in rows) else 0
+
+
+def compared_columns(rows: Sequence[Row], against: str, *, units: bool) -> dict[str, list[str]]:
+    """Return the other revision's figures, and this tree's ratios to them."""
+    return {
+        against: [cell(row.other, row.unit if units else "") for row in rows],
+        "ratio": ["" if row.ratio is None else f"{row.ratio:.2f}" for row in rows],
+    }
 
 
 def write_rows(file: Path | None, rows: Sequence[Mapping[str, object]]) -> None:

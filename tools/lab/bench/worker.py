@@ -11,18 +11,15 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from statistics import median
-from typing import Final, NamedTuple
+from typing import Final
 
 import msgspec
 
 from shared.config import files as config_file
 from shared.config import scenarios
 from tools.lab.bench import parts
-from tools.lab.bench.table import Row, compared
 from tools.lab.bench.timing import Cost, Repeated, measure, yardstick_us
 from tools.live.experiment import scenario_file
 
@@ -89,38 +86,6 @@ class Bench:
             return Answer(yardstick, missing=self._missing[request.name])
         cost = measure(self._parts[request.name], request.calls, cold=request.cold)
         return Answer(yardstick, cost=cost)
-
-
-class PartRow(NamedTuple):
-    """One figure of the bench: CPU time in us, or times real time."""
-
-    row: Row
-    wall: float | None
-    """Its value by the wall's clock; None: CPU time only."""
-    to_yardstick: float
-    """Time in units of the yardstick that ran right before it; a speed's is its inverse."""
-
-    def as_dict(self) -> dict[str, object]:
-        """Return it for a file."""
-        return {**self.row._asdict(), "wall": self.wall, "to_yardstick": self.to_yardstick}
-
-
-def row_of(
-    request: Request, turns: Sequence[Answer], others: Sequence[Answer], target: float | None
-) -> PartRow | None:
-    """Return the row of this tree's turns and the other tree's; None if this one lacks the part."""
-    if any(turn.missing for turn in turns):
-        return None
-    walls = [turn.cost.wall.p50 for turn in turns if turn.cost is not None]
-    what = f"{request.name}, {'cold' if request.cold else 'warm'}" if walls else request.name
-    here, there = ([answer.value for answer in answers] for answers in (turns, others))
-    # of a speed, the time of a millisecond
-    times = [value if walls else 1e3 / value for value in here if value]
-    return PartRow(
-        compared(what, "us" if walls else "x", here, there, target),
-        median(walls) if walls else None,
-        median(us / turn.yardstick_us for us, turn in zip(times, turns, strict=True)),
-    )
 
 
 def main() -> int:

@@ -18,7 +18,7 @@ from shared.exceptions import RunError
 from shared.places import CHECKOUT, DEFAULT_CONFIG
 from tests.shared.mcap_log.runs import ROBOT, sample, write
 from tests.tools.exit_codes import exit_code
-from tools.lab.bench import fleet
+from tools.lab.bench import fleet, revisions
 from tools.lab.bench.fleet import FIGURES, Turn
 from tools.logs.run_log import read_run
 
@@ -130,7 +130,7 @@ def test_two_trees_take_turns_and_a_missed_target_is_told_by_the_exit_code(
         yield tmp_path
 
     monkeypatch.setattr(fleet, "measure", measure)
-    monkeypatch.setattr(fleet, "unpacked", unpacked)
+    monkeypatch.setattr(revisions, "unpacked", unpacked)
     file = tmp_path / "fleet.json"
     words = ["bench", "fleet", "--against", "old", "--rounds", "2", "--strict", "--json", file]
     assert exit_code(words) == 3

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from tools.lab.bench.table import Row
+from tools.lab.bench.table import PartRow, Row, row_of
 from tools.lab.bench.timing import Cost, Spread
-from tools.lab.bench.worker import Answer, PartRow, Request, row_of
+from tools.lab.bench.worker import Answer, Request
 
 TICK = Request("tick", calls=9)
 
