@@ -8,8 +8,8 @@ import pytest
 from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
-from tools.lab.studies.sweeps import certificate, figures
 from tools.lab.studies.sweeps import certificate_trial as study
+from tools.lab.studies.sweeps import figures
 from tools.lab.studies.sweeps.certificate_trial import CertificateCase, CertificateCases
 
 SEED = 1
@@ -102,10 +102,3 @@ def test_the_same_number_is_the_same_case(robot: RobotConfig, drawn: list[Certif
     np.testing.assert_array_equal(again.D, case.D)
     np.testing.assert_array_equal(again.posture.q, case.posture.q)
     assert again.nudge == case.nudge
-
-
-def test_confusion_counts_predictions_against_outcomes() -> None:
-    margins = (0.5, 0.2, 0.1, -0.3, -0.4, -0.5)
-    predicted = [(margin, margin > 0.15) for margin in margins]
-    assert certificate.confusion(predicted) == (2, 1, 0, 3)
-    assert certificate.threshold(predicted) == pytest.approx(0.15)

@@ -135,33 +135,28 @@ LIMP: Final = {
 }
 """Allowed outcomes of a robot with one limp module, by the kind of module, and why."""
 
-EACH_DRIVE: Final[tuple[tuple[FaultKind, str], ...]] = (
-    ("link_lost", "knee_left"),
-    ("disarmed", "hip_left"),
-    ("encoder", "ankle_left"),
+_LEFT: Final = ("hip_left", "knee_left", "ankle_left")
+FAULTED: Final[tuple[tuple[FaultKind, Sequence[str], str, str], ...]] = (
+    ("link_lost", MODULES, "knee_left", "unplugged"),
+    ("disarmed", MODULES, "hip_left", "disarmed"),
+    ("encoder", MODULES, "ankle_left", "encoder"),
+    ("brown_out", _LEFT, "hip_left", "brown_out"),
+    ("over_voltage", _LEFT, "hip_left", "drive trips"),
+    ("over_temperature", ("hip_left",), "", "drive trips"),
+    ("watchdog", ("hip_left",), "", "drive trips"),
+    ("overspeed", ("hip_left",), "", "drive trips"),
+    ("encoder_zero", ("knee_left",), "", "encoder"),
+    ("encoder_gap", ("knee_left", "hip_left"), "", "encoder"),
+    ("no_ack", ("knee_left",), "knee_left", "dead bus"),
+    ("bus_full", ("knee_left",), "", "dead bus"),
+    ("bus_flap", ("knee_left",), "", "dead bus"),
 )
-"""Faults that every drive has, and the module of the short run."""
+"""Kind, modules, the module of the short run, and sort of crash.
 
-LEFT_ONLY: Final[tuple[tuple[FaultKind, str], ...]] = (
-    ("brown_out", "hip_left"),
-    ("brown_out", "knee_left"),
-    ("brown_out", "ankle_left"),
-    ("over_voltage", "hip_left"),
-    ("over_voltage", "knee_left"),
-    ("over_voltage", "ankle_left"),
-    ("over_temperature", "hip_left"),
-    ("watchdog", "hip_left"),
-    ("overspeed", "hip_left"),
-    ("encoder_zero", "knee_left"),
-    ("encoder_gap", "knee_left"),
-    ("encoder_gap", "hip_left"),
-)
-"""Faults that leave a module limp as `disarmed` does: left and right are mirrored, and one
-module is enough where only the error's name differs."""
-
-DEAD_BUS: Final[tuple[FaultKind, ...]] = ("no_ack", "bus_full", "bus_flap")
-"""Faults of a module's CAN bus; its drive holds its last target meanwhile."""
-_LASTING: Final = ("encoder", "encoder_zero", "link_lost", "over_temperature", *DEAD_BUS)
+Left and right are mirrored, and one module is enough where a module is limp as `disarmed` leaves it
+and only the error's name differs. On a dead bus a drive holds its last target."""
+_DEAD_BUS: Final = ("no_ack", "bus_full", "bus_flap")
+_LASTING: Final = ("encoder", "encoder_zero", "link_lost", "over_temperature", *_DEAD_BUS)
 _FREE: Final = "each drive holds by its own loop, and needs neither its service nor the others'"
 _NEITHER: Final = "HOLD needs neither"
 
@@ -204,8 +199,8 @@ def _is_overspeed_after_a_gap(module: str) -> bool:
     return kind_of(module) == "knee"
 
 
-def _faulted(module: str, kind: FaultKind, *, quick: bool, sort: str = "") -> CrashCase:
-    """Return the case of one drive's fault; `sort` of crash, if it is not its own."""
+def _faulted(module: str, kind: FaultKind, *, quick: bool, sort: str) -> CrashCase:
+    """Return the case of one drive's fault."""
     name: str = kind
     expected = CrashVerdict.STOOD
     if kind == "encoder_gap" and not _is_overspeed_after_a_gap(module):
@@ -218,7 +213,7 @@ def _faulted(module: str, kind: FaultKind, *, quick: bool, sort: str = "") -> Cr
         why = f"limp ({FAULT_KINDS[kind].about}): {reason}"
     return CrashCase(
         name=f"{name}-{module}",
-        kind=sort or name,
+        kind=sort,
         crash=(fault(module, kind),),
         expected=expected,
         why=why,
@@ -250,7 +245,6 @@ def _pair(name: str, *crash: Kill | Fault, why: str = _FREE, **changes: Any) -> 
     return CrashCase(name=f"pair-{name}", kind="pair", crash=crash, why=why, **changes)
 
 
-_SORTS: Final = {"brown_out": "", "encoder_zero": "encoder", "encoder_gap": "encoder"}
 _KNEES: Final = ("knee_right", "knee_left")
 _HIP: Final = fault("hip_left", "disarmed")
 
@@ -258,20 +252,10 @@ CASES: Final[Sequence[CrashCase]] = (
     *(_lost(service, "KILL") for service in CRASHED),
     *(_lost(service, "STOP") for service in CRASHED),
     *(
-        _faulted(module, kind, quick=module == quick)
-        for kind, quick in EACH_DRIVE
-        for module in MODULES
+        _faulted(module, kind, quick=module == quick, sort=sort)
+        for kind, modules, quick, sort in FAULTED
+        for module in modules
     ),
-    *(
-        _faulted(
-            module,
-            kind,
-            quick=module == "hip_left" and kind in ("brown_out", "over_voltage"),
-            sort=_SORTS.get(kind, "drive trips"),
-        )
-        for kind, module in LEFT_ONLY
-    ),
-    *(_faulted("knee_left", kind, quick=kind == "no_ack", sort="dead bus") for kind in DEAD_BUS),
     _reengaging("first", "the first module tracks, and others may hold: all hold again", 1, 0.0),
     _reengaging("blend", "half way from HOLD to TRACK: the blend freezes where it is", 6, 0.15),
     _all_joints("kill-all-joints", *killed(*MODULES), quick=True),

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from functools import partial
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -48,24 +49,14 @@ class CertificateStudyFlags(StudyFlags):
     """with the joints' dry friction, which holds up a robot that is a little too soft"""
 
 
-class Confusion(NamedTuple):
-    """Counts of predictions and results."""
-
-    stand_stood: int
-    stand_fell: int
-    """The certificate said stand, and it fell: the dangerous mistake."""
-    fall_stood: int
-    fall_fell: int
-
-
 def report(finished: Finished) -> None:
     """Print what came of the study."""
     rows, console = finished.rows, finished.console
     predicted = [(row["margin"], row["stood"]) for row in rows]
-    found = confusion(predicted)
+    counts = Counter((margin > 0.0, stood) for margin, stood in predicted)
     console.print(
-        f"said to stand: {found.stand_stood} stood, {found.stand_fell} fell\n"
-        f"said to fall: {found.fall_stood} stood, {found.fall_fell} fell\n"
+        f"said to stand: {counts[True, True]} stood, {counts[True, False]} fell\n"
+        f"said to fall: {counts[False, True]} stood, {counts[False, False]} fell\n"
         f"fewest mistakes with the limit at margin {threshold(predicted):.3f}"
     )
     for row, (margin, stood) in zip(rows, predicted, strict=True):
@@ -86,12 +77,6 @@ def draw(finished: Finished) -> Picture:
     }
     title = f"{len(rows)} random postures and gains, seed {finished.flags.seed}"
     return draw_predictions(points, LABELS, title)
-
-
-def confusion(said: Sequence[tuple[float, bool]]) -> Confusion:
-    """Count predictions and results from pairs of a margin and whether the robot stood."""
-    pairs = [(margin > 0.0, stood) for margin, stood in said]
-    return Confusion(*(pairs.count((says, was)) for says in (True, False) for was in (True, False)))
 
 
 def threshold(said: Sequence[tuple[float, bool]]) -> float:

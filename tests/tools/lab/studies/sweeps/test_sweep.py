@@ -8,7 +8,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,9 +17,10 @@ import pytest
 
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE, RunError
-from tests.tools.lab.studies.sweeps.tables import rows_of, run_cases_here, sweep
+from tests.tools.lab.studies.sweeps.tables import finished, printed, rows_of, run_cases_here, sweep
+from tests.waiting import comes_true
 from tools import cli
-from tools.lab.studies.sweeps import kill, latency, push_trial, study
+from tools.lab.studies.sweeps import certificate, kill, latency, push_trial, study
 from tools.lab.studies.sweeps.figures import Ending, worst
 from tools.lab.studies.sweeps.kill_trial import KillCases
 from tools.lab.studies.sweeps.report import wilson
@@ -164,7 +164,7 @@ def test_a_fall_is_exit_code_1_with_the_command_that_shows_it(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A plain average of the legs cannot carry the whole payload: it falls at the start."""
+    """A plain average of the legs cannot carry the whole payload."""
     run_cases_here(monkeypatch)
     some = KillCases(robot)
     seed = next(s for s in range(100) if some.draw(s, 0).payload_kg == 20.4)
@@ -172,6 +172,8 @@ def test_a_fall_is_exit_code_1_with_the_command_that_shows_it(
     assert sweep(*KILL, *average, "--out", tmp_path) == 1
     output = " ".join(capsys.readouterr().out.split())
     assert "1 falls of 1" in output
+    (row,) = rows_of(tmp_path / "cases.csv")
+    assert row["ending"] == "fell"
     command = f"xrl study kill --seed {seed} --split diagonal --jacobian average --only 0"
     assert command in output
     assert cli.main(command.split()[1:]) == 1
@@ -227,6 +229,18 @@ def test_a_row_has_the_exit_code_of_what_is_wrong_with_it(
 )
 def test_of_many_a_fall_decides_before_all_else_then_a_fault(codes: list[int], code: int) -> None:
     assert worst(codes) == code
+
+
+def test_predictions_are_counted_against_outcomes(robot: RobotConfig) -> None:
+    rows = [
+        {"number": 0, "margin": margin, "stood": margin > 0.15, "weakest": "roll", "com_mm": 1.0}
+        for margin in (0.5, 0.2, 0.1, -0.3, -0.4, -0.5)
+    ]
+    said = printed(certificate.report, finished(rows, robot, certificate.CertificateStudyFlags()))
+    assert "said to stand: 2 stood, 1 fell" in said
+    assert "said to fall: 0 stood, 3 fell" in said
+    assert "with the limit at margin 0.150" in said
+    assert said.count("case 0") == 1, "the one mistake"
 
 
 @pytest.mark.parametrize("name", ["kill", "robust", "heat", "dynamics"])
@@ -287,13 +301,6 @@ def session(sid: int) -> list[int]:
     return found
 
 
-def wait_until(true: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + 60.0
-    while not true():
-        assert time.monotonic() < deadline, what
-        time.sleep(0.05)
-
-
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
 def test_a_study_that_is_stopped_keeps_its_rows_and_leaves_no_process(
     tmp_path: Path, number: signal.Signals, code: int
@@ -309,7 +316,7 @@ def test_a_study_that_is_stopped_keeps_its_rows_and_leaves_no_process(
     )
     table = tmp_path / "certificate.csv"
     try:
-        wait_until(lambda: table.exists() and len(rows_of(table)) >= 2, "no case came")
+        assert comes_true(lambda: table.exists() and len(rows_of(table)) >= 2, 60.0)
         if number is signal.SIGINT:
             os.killpg(process.pid, number)
         else:
@@ -317,7 +324,7 @@ def test_a_study_that_is_stopped_keeps_its_rows_and_leaves_no_process(
         _, said = process.communicate(timeout=60)
         assert process.returncode == code
         assert "Traceback" not in said
-        wait_until(lambda: session(process.pid) == [], "a worker stayed")
+        assert comes_true(lambda: session(process.pid) == [], 60.0), "a worker stayed"
         assert len(rows_of(table)) >= 2
     finally:
         for pid in session(process.pid):

@@ -27,6 +27,7 @@ from tools.lab.studies.sweeps.kill_trial import (
     FootLoads,
     KillCase,
     KillCases,
+    KillRecorder,
     prepare,
     run_case,
 )
@@ -190,14 +191,15 @@ def test_the_hand_is_off_from_the_time_in_the_case(
     assert set(off) == {0.0}
 
 
+AT_REST: SimTruth = filled(SimTruth, {bool: False, int: 0, float: 0.0})
+
+
 def test_a_robot_that_falls_before_it_can_begin_has_fallen(
-    diagonal: RobotConfig, drawn: list[KillCase]
+    robot: RobotConfig, drawn: list[KillCase]
 ) -> None:
-    law = msgspec.structs.replace(diagonal.law, jacobian="average")
-    average = msgspec.structs.replace(diagonal, law=law)
-    outcome = run_case(drawn[0], average)
-    assert outcome.ending == Ending.FELL
-    assert not outcome.stood
+    row = msgspec.structs.replace(AT_REST, scenario_s=-1.0, fallen=True)
+    outcome = cases.measure(drawn[0], [row], [0.0], [], KillRecorder(lockstep.forget), robot)
+    assert (outcome.ending, outcome.fell_at_s, outcome.stood) == (Ending.FELL, None, False)
 
 
 @pytest.mark.parametrize(
@@ -215,8 +217,7 @@ def test_a_robot_on_its_way_down_at_the_end_does_not_stand(
     robot: RobotConfig, com: tuple[float, float], tilt: float, tipping: bool
 ) -> None:
     """The soles end 0.127 m before and behind the ankles, and 0.41 m to the sides."""
-    row = filled(SimTruth, {bool: False, int: 0, float: 0.0})
-    row = msgspec.structs.replace(row, com=(*com, 0.8), foot_right_tilt=tilt)
+    row = msgspec.structs.replace(AT_REST, com=(*com, 0.8), foot_right_tilt=tilt)
     assert is_tipping(row, robot) is tipping
 
 
