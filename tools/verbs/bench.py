@@ -17,7 +17,7 @@ from shared.extras import require
 from tools.lab.bench import bus as bus_bench
 from tools.lab.bench import fleet as fleet_bench
 from tools.lab.bench.parts import LOCKSTEP, LOCKSTEP_RECORDED, PARTS
-from tools.lab.bench.revisions import Worker
+from tools.lab.bench.revisions import worker
 from tools.lab.bench.table import AgainstFlags, PartRow, cell, compared_columns, print_table, row_of
 from tools.lab.bench.timing import ASLEEP_S, SWEPT_BYTES, YARDSTICK_CALLS
 from tools.lab.bench.worker import READY, Request
@@ -79,9 +79,9 @@ def measure(flags: AgainstFlags, console: Console) -> tuple[list[PartRow], list[
     rounds = flags.rounds or ROUNDS
     with ExitStack() as stack:
         trees = stack.enter_context(flags.trees())
-        workers = [stack.enter_context(Worker(tree, config)) for tree, config in trees]
-        for worker in workers:  # the machine is then this measurement's alone
-            worker.ask(READY)
+        asks = [stack.enter_context(worker(tree, config)) for tree, config in trees]
+        for ask in asks:  # the machine is then this measurement's alone
+            ask(READY)
         plan = [
             (Request(part.name, cold=cold, calls=COLD_CALLS if cold else WARM_CALLS), target)
             for part in PARTS
@@ -90,7 +90,7 @@ def measure(flags: AgainstFlags, console: Console) -> tuple[list[PartRow], list[
         plan += [(Request(name), target) for name, target in SPEEDS.items()]
         rows, missing = [], []
         for request, target in track(plan, "measuring", console=console, transient=True):
-            turns = [[worker.ask(request) for worker in workers] for _ in range(rounds)]
+            turns = [[ask(request) for ask in asks] for _ in range(rounds)]
             here, *there = zip(*turns, strict=True)
             row = row_of(request, here, there[0] if there else (), target)
             rows += [] if row is None else [row]

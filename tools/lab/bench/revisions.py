@@ -13,10 +13,10 @@ import subprocess
 import sys
 import tarfile
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final, Self
+from typing import Final, TypeAlias
 
 import msgspec
 
@@ -74,45 +74,45 @@ def environment(tree: Path) -> dict[str, str]:
     return os.environ | {"PYTHONPATH": str(tree), "OPENBLAS_NUM_THREADS": "1"}
 
 
-class Worker:
-    """A tree's bench in a process of its own. Use it in a `with` statement."""
+Ask: TypeAlias = Callable[[Request], Answer]
 
-    def __init__(self, tree: Path, config: Path) -> None:
-        """Start it in a source tree."""
-        self.tree = tree
-        self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - closed in __exit__
-        self._process = subprocess.Popen(
+
+@contextmanager
+def worker(tree: Path, config: Path) -> Iterator[Ask]:
+    """Start a tree's bench in a process of its own; yield what has it measure.
+
+    The others wait meanwhile. What is asked raises `RunError` if the process ended.
+    """
+    with (
+        tempfile.TemporaryFile("w+") as errors,
+        subprocess.Popen(
             [sys.executable, "-m", "tools.lab.bench.worker", str(config)],
             cwd=tree, env=environment(tree), text=True,
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors,
-        )  # fmt: skip
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors,
+        ) as process,
+    ):  # fmt: skip
 
-    def __enter__(self) -> Self:
-        """Return itself."""
-        return self
+        def ask(request: Request) -> Answer:
+            assert process.stdin is not None  # noqa: S101 - both are pipes
+            assert process.stdout is not None  # noqa: S101
+            try:
+                process.stdin.write(msgspec.json.encode(request).decode() + "\n")
+                process.stdin.flush()
+                line = process.stdout.readline()
+            except BrokenPipeError:
+                line = ""
+            if not line:
+                code = process.wait()
+                errors.seek(0)
+                last = (errors.read().strip().splitlines() or ["it said nothing"])[-1]
+                raise RunError(f"{tree}: the bench ended with {code}: {last}")
+            return msgspec.json.decode(line, type=Answer)
 
-    def __exit__(self, *_: object) -> None:
-        """End the process; it removes its files once its input ends."""
         try:
-            self._process.communicate(timeout=PATIENCE_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.communicate()
-        self._errors.close()
-
-    def ask(self, request: Request) -> Answer:
-        """Have it measure; the others wait meanwhile."""
-        assert self._process.stdin is not None  # noqa: S101 - both are pipes
-        assert self._process.stdout is not None  # noqa: S101
-        try:
-            self._process.stdin.write(msgspec.json.encode(request).decode() + "\n")
-            self._process.stdin.flush()
-            line = self._process.stdout.readline()
-        except BrokenPipeError:
-            line = ""
-        if not line:
-            code = self._process.wait()
-            self._errors.seek(0)
-            last = (self._errors.read().strip().splitlines() or ["it said nothing"])[-1]
-            raise RunError(f"{self.tree}: the bench ended with {code}: {last}")
-        return msgspec.json.decode(line, type=Answer)
+            yield ask
+        finally:  # it removes its files once its input ends
+            try:
+                process.communicate(timeout=PATIENCE_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.communicate()

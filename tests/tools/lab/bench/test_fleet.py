@@ -107,11 +107,12 @@ except KeyboardInterrupt:
     assert (tree / "cleared").exists()
 
 
-def test_an_unknown_revision_is_refused_before_a_fleet_starts(
-    monkeypatch: pytest.MonkeyPatch,
+def test_an_unknown_revision_is_refused_by_name_before_a_fleet_starts(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(fleet, "measure", lambda *_: pytest.fail("a fleet was started"))
     assert exit_code(["bench", "fleet", "--against", "no-such"]) == 2
+    assert "no-such: no git revision here" in capsys.readouterr().err
 
 
 def test_two_trees_take_turns_and_a_missed_target_is_told_by_the_exit_code(

@@ -15,7 +15,7 @@ from shared.joints import MODULES
 from shared.places import CHECKOUT, DEFAULT_CONFIG
 from tools.lab.bench import parts, revisions, timing
 from tools.lab.bench.parts import PARTS, Part, Recorded
-from tools.lab.bench.revisions import Worker
+from tools.lab.bench.revisions import worker
 from tools.lab.bench.timing import Repeated, measure
 from tools.lab.bench.worker import Bench, Request
 from tools.live.experiment import scenario_file
@@ -89,21 +89,12 @@ def test_another_revision_is_measured_by_this_trees_bench_and_goes_afterwards() 
     assert not tree.exists()
 
 
-@pytest.mark.usefixtures("checkout")
-def test_an_unknown_revision_is_refused_by_name() -> None:
-    with (
-        pytest.raises(RunError, match="no-such: no git revision here"),
-        revisions.unpacked("no-such"),
-    ):
-        pass
-
-
 def test_a_bench_that_cannot_start_is_an_error_with_its_last_line(tmp_path: Path) -> None:
     with (
-        Worker(CHECKOUT, tmp_path / "no.toml") as worker,
+        worker(CHECKOUT, tmp_path / "no.toml") as ask,
         pytest.raises(RunError, match=r"the bench ended with 1: .*no\.toml"),
     ):
-        worker.ask(Request("planner tick", calls=1))
+        ask(Request("planner tick", calls=1))
 
 
 def test_a_bench_answers_for_each_part_and_names_one_it_cannot_run(
