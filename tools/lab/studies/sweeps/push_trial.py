@@ -49,11 +49,6 @@ class PushTrial(msgspec.Struct, frozen=True, kw_only=True):
     duration_s: float
     mode: str
 
-    @property
-    def words(self) -> str:
-        """The point in words."""
-        return f"{self.pose}, {self.angle_deg} degrees, {self.duration_s:g} s, {self.mode}"
-
 
 class PushResult(msgspec.Struct, frozen=True, kw_only=True):
     """How hard a push is stood."""
