@@ -22,7 +22,7 @@ from tools.lab.studies.sweeps.certificate_trial import (
     CertificateResult,
 )
 from tools.lab.studies.sweeps.report import draw_predictions
-from tools.lab.studies.sweeps.study import Finished, Study, StudyFlags
+from tools.lab.studies.sweeps.study import Study, StudyFlags, StudyRun
 from tools.output import Picture
 
 LABELS: Final = (
@@ -49,7 +49,7 @@ class CertificateStudyFlags(StudyFlags):
     """with the joints' dry friction, which holds up a robot that is a little too soft"""
 
 
-def report(finished: Finished) -> None:
+def report(finished: StudyRun) -> None:
     """Print what came of the study."""
     rows, console = finished.rows, finished.console
     predicted = [(row["margin"], row["stood"]) for row in rows]
@@ -68,7 +68,7 @@ def report(finished: Finished) -> None:
             )
 
 
-def draw(finished: Finished) -> Picture:
+def draw(finished: StudyRun) -> Picture:
     """Draw how far each case came over its margin."""
     rows = finished.rows
     points = {

@@ -11,7 +11,7 @@ from tools.flags import Count
 from tools.lab.studies.sweeps import dynamics_trial, study
 from tools.lab.studies.sweeps.dynamics_trial import DynamicsResult, DynamicsTrial
 from tools.lab.studies.sweeps.report import draw_predictions
-from tools.lab.studies.sweeps.study import AloneFlags, Finished, Study
+from tools.lab.studies.sweeps.study import AloneFlags, Study, StudyRun
 from tools.lab.studies.sweeps.table import Row
 from tools.output import Picture
 
@@ -35,7 +35,7 @@ class DynamicsStudyFlags(AloneFlags):
     """cases"""
 
 
-def report(finished: Finished) -> None:
+def report(finished: StudyRun) -> None:
     """Print what came of the study."""
     rows, console, tried = finished.rows, finished.console, tried_in(finished)
     counts = Counter((row["said_stable"], row["grew"]) for row in tried)
@@ -55,12 +55,12 @@ def report(finished: Finished) -> None:
         )
 
 
-def tried_in(finished: Finished) -> list[Row]:
+def tried_in(finished: StudyRun) -> list[Row]:
     """Return the cases in which the drawn gains took over."""
     return [row for row in finished.rows if row["ended"] != "unready"]
 
 
-def draw(finished: Finished) -> Picture:
+def draw(finished: StudyRun) -> Picture:
     """Draw how the motion changed over the rate that the certificate gives it."""
     points = {
         name: [

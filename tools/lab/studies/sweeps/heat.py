@@ -36,7 +36,7 @@ from tools.lab.studies.sweeps.heat_trial import (
     HeatTrial,
 )
 from tools.lab.studies.sweeps.report import parted, show_falls, show_figures, show_share
-from tools.lab.studies.sweeps.study import AloneFlags, CaseLog, Finished, Study
+from tools.lab.studies.sweeps.study import AloneFlags, CaseLog, Study, StudyRun
 from tools.lab.studies.sweeps.table import Row
 from tools.live import experiment
 from tools.output import new_figure, save_figure
@@ -203,7 +203,7 @@ def exit_code(row: Row) -> int:
     return FAULT_EXIT_CODE if wrong_with(row) else 0
 
 
-def report(finished: Finished) -> None:
+def report(finished: StudyRun) -> None:
     """Print what came of the study."""
     rows, console = finished.rows, finished.console
     standing, others = parted(rows)

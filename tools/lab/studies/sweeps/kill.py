@@ -23,7 +23,7 @@ from tools.lab.studies.sweeps.kill_trial import (
 )
 from tools.lab.studies.sweeps.push_range import PushFlags
 from tools.lab.studies.sweeps.report import FALL_COLOUR, parted, show_falls, show_share
-from tools.lab.studies.sweeps.study import AloneFlags, CaseLog, Finished, Study, bar
+from tools.lab.studies.sweeps.study import AloneFlags, CaseLog, Study, StudyRun, bar
 from tools.lab.studies.sweeps.table import Row
 from tools.live import experiment
 from tools.live.experiment import LawFlags
@@ -91,7 +91,7 @@ def _metadata(case: KillCase, command: str) -> dict[str, str]:
     return {"lockstep": f"{command}; delay {case.delay_ms:g} ms, {hand}"}
 
 
-def report(finished: Finished) -> None:
+def report(finished: StudyRun) -> None:
     """Print what came of the study."""
     rows, console, command = finished.rows, finished.console, finished.command
     standing, fallen = parted(rows)
@@ -136,7 +136,7 @@ def describe(row: Row) -> str:
     return ", ".join(words)
 
 
-def draw(finished: Finished) -> Picture:
+def draw(finished: StudyRun) -> Picture:
     """Draw the study."""
     flags, rows, robot = finished.flags, finished.rows, finished.robot
     figure = new_figure(13, 11)

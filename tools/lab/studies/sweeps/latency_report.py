@@ -14,7 +14,7 @@ from shared.extras import late
 from tools.lab.studies.sweeps.latency_trial import CONTROLS, DURATION_S, PUSHES
 from tools.lab.studies.sweeps.push_range import SHARE
 from tools.lab.studies.sweeps.report import parted, wilson
-from tools.lab.studies.sweeps.study import Finished
+from tools.lab.studies.sweeps.study import StudyRun
 from tools.lab.studies.sweeps.table import Row
 from tools.output import Picture, new_figure
 from tools.terminal import marked
@@ -112,7 +112,7 @@ def _listed(values: Sequence[float]) -> str:
     return ", ".join(words if len(words) <= LISTED else [*words[:2], "...", words[-1]])
 
 
-def show(finished: Finished) -> None:
+def show(finished: StudyRun) -> None:
     """Print what came of the study."""
     rows, console = finished.rows, finished.console
     console.print(_falls_table(rows))
@@ -215,7 +215,7 @@ def _shares() -> colors.Colormap:
     return colors.LinearSegmentedColormap.from_list("falls", ["#e3f1e7", "#f2b7a0", "#b3261e"])
 
 
-def draw_falls(finished: Finished) -> Picture:
+def draw_falls(finished: StudyRun) -> Picture:
     """Draw who falls: a map for each control, and their shares by delay."""
     rows, what = finished.rows, f"seed {finished.flags.seed}"
     names = controls_in(rows)
@@ -315,7 +315,7 @@ def _each(rows: Sequence[Row]) -> str:
     return f"{some} trials a point"
 
 
-def draw_effort(finished: Finished) -> Picture:
+def draw_effort(finished: StudyRun) -> Picture:
     """Draw the hand's force and the time in HOLD by delay, with the least loss."""
     rows, what = without_loss(finished.rows), f"seed {finished.flags.seed}"
     force_max = finished.robot.simulation.operator.force_max

@@ -16,7 +16,7 @@ from tools.flags import Arg, Degrees, Duration
 from tools.lab.studies.sweeps import push_trial, study
 from tools.lab.studies.sweeps.push_trial import MODES, POSES, PushResult, PushTrial
 from tools.lab.studies.sweeps.report import FALL_COLOUR
-from tools.lab.studies.sweeps.study import Finished, Study, StudyFlags
+from tools.lab.studies.sweeps.study import Study, StudyFlags, StudyRun
 from tools.lab.studies.sweeps.table import Row
 from tools.live.experiment import PlantFlags
 from tools.output import Picture, new_figure
@@ -69,7 +69,7 @@ def _inputs(flags: PushStudyFlags) -> dict[str, str]:
     return {"plant": plants.to_toml(plant_from(flags.plant)), "grid": grid}
 
 
-def report(finished: Finished) -> None:
+def report(finished: StudyRun) -> None:
     """Print the hardest pushes by direction, and what gives way in the weakest."""
     rows = finished.rows
     angles = [f"{angle} deg" for angle in dict.fromkeys(row["angle_deg"] for row in rows)]
@@ -86,7 +86,7 @@ def report(finished: Finished) -> None:
     finished.console.print(printed)
 
 
-def draw(finished: Finished) -> Picture:
+def draw(finished: StudyRun) -> Picture:
     """Draw the envelopes: a panel for each pose and duration, forwards is up."""
     rows = finished.rows
     poses = list(dict.fromkeys(row["pose"] for row in rows))

@@ -23,7 +23,7 @@ from tools.lab.studies.sweeps.report import (
     show_share,
 )
 from tools.lab.studies.sweeps.robust_trial import RobustResult, RobustTrial
-from tools.lab.studies.sweeps.study import AloneFlags, CaseLog, Finished, Study
+from tools.lab.studies.sweeps.study import AloneFlags, CaseLog, Study, StudyRun
 from tools.lab.studies.sweeps.table import Row
 from tools.live import experiment
 from tools.live.experiment import ImuFlags
@@ -98,7 +98,7 @@ def _excursion(row: Row) -> float:
     return 1e3 if row["ending"] is not Ending.STOOD or value is None else value
 
 
-def report(finished: Finished) -> None:
+def report(finished: StudyRun) -> None:
     """Print what came of the study."""
     rows, console = finished.rows, finished.console
     standing, fallen = parted(rows)
@@ -115,7 +115,7 @@ def report(finished: Finished) -> None:
     show_share(len(fallen), len(rows), console)
 
 
-def draw(finished: Finished) -> Picture:
+def draw(finished: StudyRun) -> Picture:
     """Draw what takes the margin, and the excursions by stiffness."""
     flags, rows = finished.flags, finished.rows
     figure = new_figure(13, 6.5)

@@ -86,15 +86,15 @@ class AloneFlags(StudyFlags):
             raise RunError("--only runs here, in one process; leave --cluster out")
 
 
-class Finished(NamedTuple):
-    """A study that has run, for its report."""
+class StudyRun(NamedTuple):
+    """A study that runs; with its rows, once it has, for its report."""
 
     flags: Any
     robot: RobotConfig
-    rows: list[Row]
     command: str
     """Runs one case alone, but for `--only` and its number."""
     console: Console
+    rows: Sequence[Row] = ()
 
 
 class CaseLog(NamedTuple, Generic[C]):
@@ -119,7 +119,7 @@ class Study(msgspec.Struct, Generic[C], frozen=True, kw_only=True):
     """What a case is called."""
     table: str
     """File name of the table."""
-    pictures: Mapping[str, Callable[[Finished], Picture]] = {}
+    pictures: Mapping[str, Callable[[StudyRun], Picture]] = {}
     """What draws each, by file name."""
     load: Callable[[Any], RobotConfig] = _load
     """Returns the robot."""
@@ -148,7 +148,7 @@ class Study(msgspec.Struct, Generic[C], frozen=True, kw_only=True):
     log: CaseLog[C] | None = None
     """None: a case alone has no log."""
     fell: Callable[[Row], bool] = lambda row: row["ending"] is not Ending.STOOD
-    report: Callable[[Finished], None]
+    report: Callable[[StudyRun], None]
     """Prints what came of it."""
     counts: Callable[[Row], bool] = lambda _row: True
     """True for a row of the study that decides its exit code."""
@@ -171,62 +171,54 @@ def run(study: Study[C], flags: Any) -> int:
     only = getattr(flags, "only", None)
     robot = study.load(flags)
     case_of = study.cases(flags, robot)
-    console, command = Console(), command_of(study, flags)
+    begun = StudyRun(flags, robot, command_of(study, flags), Console())
     if only is not None:
-        return _run_alone(study, flags, robot, case_of(only), f"{command} --only {only}", console)
+        return _run_alone(study, begun, case_of(only))
     drawn = [case_of(number) for number in range(study.total(flags))]
     out = flags.out or Path("out") / time.strftime(f"sweep-{study.name}-%Y%m%d-%H%M%S")
-    code = study.code
     inputs = {
         "study": study.name,
         **{name: _text(getattr(flags, name)) for name in study.decided_by},
         **study.inputs(flags),
         "robot": digest_of(robot),
-        "code": code_digest(code),
+        "code": code_digest(study.code),
     }
     with CaseTable(out / study.table, list(map(study.row, drawn)), study.figures, inputs) as table:
         try:
-            case_s = _fill(table, study, flags, robot, drawn, code, console)
+            case_s = _fill(table, study, begun, drawn)
         except (KeyboardInterrupt, SystemExit, RunError):
             if done := len(table.numbers):
                 many = [
                     f"--{name} {getattr(flags, name)}" for name in HOW_MANY if hasattr(flags, name)
                 ]
                 many += [f"--cluster {flags.cluster}"] if flags.cluster else []
-                again = " ".join([command, *many, f"--out {shlex.quote(str(out))}"])
-                console.print(f"{done} cases are in {out}; resume with: {again}", soft_wrap=True)
+                again = " ".join([begun.command, *many, f"--out {shlex.quote(str(out))}"])
+                said = f"{done} cases are in {out}; resume with: {again}"
+                begun.console.print(said, soft_wrap=True)
             raise
-        rows = table.rows
+        finished = begun._replace(rows=table.rows)
     pace = f"; {case_s:.2f} s a {study.case}" if case_s else ""
-    finished = Finished(flags, robot, rows, command, console)
     for name, draw in study.pictures.items():
         save_figure(draw(finished), out / name)
     study.report(finished)
     files = ", ".join((study.table, *study.pictures))
-    console.print(f"{out}/{files}{pace}", style="dim", soft_wrap=True)
-    return worst(study.exit_code(row) for row in rows if study.counts(row))
+    finished.console.print(f"{out}/{files}{pace}", style="dim", soft_wrap=True)
+    return worst(study.exit_code(row) for row in finished.rows if study.counts(row))
 
 
-def _fill(
-    table: CaseTable,
-    study: Study[C],
-    flags: Any,
-    robot: RobotConfig,
-    drawn: Sequence[C],
-    code: tuple[str, ...],
-    console: Console,
-) -> float:
+def _fill(table: CaseTable, study: Study[C], begun: StudyRun, drawn: Sequence[C]) -> float:
     """Run the cases that a table lacks into it; return the wall time for each, s."""
+    flags, robot, command, console, _ = begun
     done, workers = table.rows, flags.workers or pool.cores()
+    fallen = sum(map(study.fell, done))
     if done:
         console.print(f"{len(done)} of {len(drawn)} cases are done already")
     missing = [case for case in drawn if case.number not in table.numbers]
     robots = study.robots(missing, robot, workers, console)
-    command, fallen = command_of(study, flags), sum(map(study.fell, done))
     results = pool.results(
         partial(_run_task, partial(study.trial, **study.options(flags))),
         list(zip(missing, robots, strict=True)),
-        pool.Cluster(flags.cluster, code) if flags.cluster else workers,
+        pool.Cluster(flags.cluster, study.code) if flags.cluster else workers,
         lambda task: _name_of(study, task[0], command),
     )
     text = "{task.completed} of {task.total} cases, {task.fields[fallen]} fell"
@@ -249,15 +241,9 @@ def _name_of(study: Study[C], case: C, command: str) -> str:
     return f"{study.case} {case.number} ({alone})"
 
 
-def _run_alone(
-    study: Study[C],
-    flags: Any,
-    robot: RobotConfig,
-    case: C,
-    command: str,
-    console: Console,
-) -> int:
+def _run_alone(study: Study[C], begun: StudyRun, case: C) -> int:
     """Run a case, recorded and judged like a run of `xrl sim` if it is asked for."""
+    flags, robot, command, console, _ = begun
     begin = study.row(case)
     (robot,) = study.robots([case], robot, 1, console)
     show(f"{study.case.capitalize()} {begin['number']}, drawn", begin, console)
@@ -281,7 +267,7 @@ def _run_alone(
                     scenario,
                     robot,
                     out,
-                    asked.metadata(case, command),
+                    asked.metadata(case, f"{command} --only {case.number}"),
                     lambda record, watched: trial(Observer(record, watched, AFTER_FALL_S)),
                     watch,
                     asked.plant(case),

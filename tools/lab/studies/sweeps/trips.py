@@ -14,7 +14,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE, RunError
 from tools.flags import Arg
 from tools.lab.studies.sweeps import study
-from tools.lab.studies.sweeps.study import Finished, Study, StudyFlags
+from tools.lab.studies.sweeps.study import Study, StudyFlags, StudyRun
 from tools.lab.studies.sweeps.table import Row
 from tools.lab.studies.sweeps.trips_trial import (
     PLANTS,
@@ -86,7 +86,7 @@ def wrong_with(row: Row) -> str:
     return "" if row["tripped"] or stands else f"{wanted.name} never tripped"
 
 
-def _report(finished: Finished) -> None:
+def _report(finished: StudyRun) -> None:
     rows, console = finished.rows, finished.console
     _show(rows, console)
     wrong = [row for row in rows if wrong_with(row)]

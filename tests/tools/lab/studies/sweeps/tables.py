@@ -18,7 +18,7 @@ import pytest
 from shared.config.robot_config import RobotConfig
 from tools import cli
 from tools.lab.studies.sweeps import pool
-from tools.lab.studies.sweeps.study import Finished, StudyFlags
+from tools.lab.studies.sweeps.study import StudyFlags, StudyRun
 from tools.lab.studies.sweeps.table import Row
 from tools.terminal import Console
 
@@ -34,12 +34,12 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 
 def finished(
     rows: Sequence[Row], robot: RobotConfig, flags: StudyFlags, command: str = ""
-) -> Finished:
+) -> StudyRun:
     """Return a study that has run; its console prints into a text of 120 columns."""
-    return Finished(flags, robot, [*rows], command, Console(width=120, file=io.StringIO()))
+    return StudyRun(flags, robot, command, Console(width=120, file=io.StringIO()), rows)
 
 
-def printed(report: Callable[[Finished], None], done: Finished) -> str:
+def printed(report: Callable[[StudyRun], None], done: StudyRun) -> str:
     """Return what a report prints."""
     report(done)
     return done.console.file.getvalue()  # type: ignore[attr-defined,no-any-return]
