@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import Final
 
-import numpy as np
-
 from shared.config.robot_config import RobotConfig
 from tools.bringup.hanging_leg import HEAVY, HangingJoint
 from tools.bringup.motion import MotionPlan, Sample
 from tools.bringup.tune.excitation import BODY_RATE, Excitation, excitation
-from tools.bringup.tune.pose_probe import ProbeCourse
+from tools.bringup.tune.pose_probe import ProbeCourse, course_from
 from tools.bringup.tune.response import SecondOrder
 
 LIGHT_TORQUE: Final = 15.0
@@ -56,9 +54,5 @@ def course_of_samples(samples: list[Sample], plan: ProbePlan) -> ProbeCourse:
     """Return the course of the moved axis during the excitation."""
     begin, end = plan.rest_s, plan.duration_s - plan.rest_s
     rows = [s for s in samples if begin <= s.t_s < end]
-    t_s = np.array([s.t_s - begin for s in rows])
-    r = np.array([s.q_ref[plan.axis] for s in rows])
-    y = np.array([s.q[plan.axis] for s in rows])
-    return (
-        ProbeCourse(t_s, r - r[0], y - y[0], "") if rows else ProbeCourse(t_s, r, y, "no samples")
-    )
+    r, y = [s.q_ref[plan.axis] for s in rows], [s.q[plan.axis] for s in rows]
+    return course_from([s.t_s - begin for s in rows], r, y)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -43,19 +43,24 @@ class ProbeCourse(NamedTuple):
     """Offset of the reference (n,), m or rad."""
     y: Array
     """The robot's displacement from where it stood (n,), m or rad."""
-    ended: str
+    ended: str = ""
     """Why it ended before its time; "" if it did not."""
+
+
+def course_from(
+    t_s: Sequence[float], r: Sequence[float], y: Sequence[float], ended: str = ""
+) -> ProbeCourse:
+    """Return a course from where reference and robot were at first, m or rad."""
+    at, asked, moved = (np.array(part, float) for part in (t_s, r, y))
+    return ProbeCourse(at, asked - asked[:1], moved - moved[:1], ended)
 
 
 def course_of(statuses: list[PlannerStatus], row: int, ended: str = "") -> ProbeCourse:
     """Return the course of a row of p in the statuses of an excitation."""
     begin = statuses[0].t_ns if statuses else 0
-    t_s = np.array([(status.t_ns - begin) / NS_PER_S for status in statuses])
-    r = np.array([status.p_ref[row] for status in statuses])
-    y = np.array([status.p[row] for status in statuses])
-    if len(statuses):
-        r, y = r - r[0], y - y[0]
-    return ProbeCourse(t_s, r, y, ended)
+    t_s = [(status.t_ns - begin) / NS_PER_S for status in statuses]
+    r, y = ([getattr(status, name)[row] for status in statuses] for name in ("p_ref", "p"))
+    return course_from(t_s, r, y, ended)
 
 
 class ProbedLockstep(Lockstep):

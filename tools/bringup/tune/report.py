@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from rich import box
@@ -19,11 +19,18 @@ from tools.output import new_figure, save_figure
 _COLOURS: Final = {"measured": "#1f5fa8", "predicted": "#9aa0a6", "proposed": "#2c7a4b"}
 
 
-def answer_table(answers: dict[str, ResponseFit], *, closed: bool) -> Table:
+class Probed(NamedTuple):
+    """A robot that was probed, or its simulation."""
+
+    course: ProbeCourse
+    fit: ResponseFit
+
+
+def answer_table(probed: Mapping[str, Probed], *, closed: bool) -> Table:
     """Return answers beside each other; a direction that the planner closes has a phase margin."""
     table = Table(box=box.SIMPLE_HEAD)
     table.add_column("")
-    for name in answers:
+    for name in probed:
         table.add_column(name, justify="right")
     table.add_column("unit")
     rows: list[tuple[str, Callable[[ResponseFit], float], str, int]] = [
@@ -37,26 +44,21 @@ def answer_table(answers: dict[str, ResponseFit], *, closed: bool) -> Table:
     if closed:
         rows.append(("phase margin", lambda a: _fitted(a, a.phase_margin_deg), "degrees", 0))
     for what, value_of, unit, digits in rows:
-        table.add_row(what, *(_number(value_of(a), digits) for a in answers.values()), unit)
+        table.add_row(what, *(_number(value_of(one.fit), digits) for one in probed.values()), unit)
     return table
 
 
-def draw(
-    title: str, courses: dict[str, ProbeCourse], answers: dict[str, ResponseFit], path: Path
-) -> None:
+def draw(title: str, probed: Mapping[str, Probed], path: Path) -> None:
     """Draw step and frequency responses into a PNG file."""
     figure = new_figure(12, 6)
     figure.suptitle(title)
     axes = figure.subplot_mosaic([["step", "size"], ["step", "phase"]])
     step, size, phase = axes["step"], axes["size"], axes["phase"]
-    asked = False
-    for name, course in courses.items():
+    for name, (course, answer) in probed.items():
         shown = course.t_s < REST_S + 2.0 * HOLD_S
-        if not asked:
+        if not step.lines:
             step.plot(course.t_s[shown], course.r[shown], color="black", lw=0.8, label="reference")
-            asked = True
         step.plot(course.t_s[shown], course.y[shown], color=_COLOURS[name], label=name)
-    for name, answer in answers.items():
         hertz = np.array([point.frequency_hz for point in answer.points])
         H = np.array([point.H for point in answer.points])
         size.plot(hertz, np.abs(H), "o", color=_COLOURS[name])

@@ -33,7 +33,7 @@ from tools.bringup.tune.pose_probe import (
     in_lockstep,
     inertia_along,
 )
-from tools.bringup.tune.report import answer_table, draw
+from tools.bringup.tune.report import Probed, answer_table, draw
 from tools.bringup.tune.response import ResponseFit, answer_of, propose
 from tools.flags import FINITE_MAX, Arg, Folder, MotionFlags, Number, positional
 from tools.fleet.supervise import SupervisedFleet
@@ -148,17 +148,16 @@ def _tune_direction(flags: TuneFlags, console: Console) -> int:
     if course.ended:
         console.print(marked("[bold red]STOPPED[/]: {}", course.ended))
         return FAULT_EXIT_CODE
-    answer = _answer(course, plan)
-    courses, answers = {"measured": course}, {"measured": answer}
-    _simulate("predicted", robot, row, plan, IDEAL, courses, answers, console)
+    probed = {"measured": _answer(course, plan)}
+    _simulate("predicted", robot, row, plan, IDEAL, probed, console)
     closed = not robot.law.S[row]
     if flags.wanted is not None and closed:
-        proposed = _proposed(flags.wanted, robot, row, answer, console)
+        proposed = _proposed(flags.wanted, robot, row, probed["measured"].fit, console)
         if proposed is not None:
             # on the plant that was measured, where it is known
             plant = plant_from(flags.plant) if flags.sim else IDEAL
-            _simulate("proposed", proposed, row, plan, plant, courses, answers, console)
-    _tell(flags, courses, answers, console, closed=closed)
+            _simulate("proposed", proposed, row, plan, plant, probed, console)
+    _tell(flags, probed, console, closed=closed)
     if not closed:
         console.print(
             "the person leads this direction: it was held on local gains while it was probed, with "
@@ -173,16 +172,14 @@ def _simulate(
     row: int,
     plan: Excitation,
     plant: PlantConfig,
-    courses: dict[str, ProbeCourse],
-    answers: dict[str, ResponseFit],
+    probed: dict[str, Probed],
     console: Console,
 ) -> None:
-    """Add the course and answer of a simulation; if it fails say so, the measured one stays."""
+    """Add a simulation; if it fails say so, the measured one stays."""
     try:
         with progress_along(f"simulated: {name}", plan.duration_s) as progress:
             course = in_lockstep(robot, row, plan, plant, progress)
-        answers[name] = _answer(course, plan)
-        courses[name] = course
+        probed[name] = _answer(course, plan)
     except RunError as error:
         console.print(marked("[yellow]{}: {}[/]", name, error))
 
@@ -231,8 +228,8 @@ def _size(flags: TuneFlags, robot: RobotConfig, row: int) -> float:
     return size
 
 
-def _answer(course: ProbeCourse, plan: Excitation) -> ResponseFit:
-    """Return how a reference was answered.
+def _answer(course: ProbeCourse, plan: Excitation) -> Probed:
+    """Return a course with how its reference was answered.
 
     Raises:
         RunError: it was not offset, or hardly answered.
@@ -245,7 +242,7 @@ def _answer(course: ProbeCourse, plan: Excitation) -> ResponseFit:
     answer = answer_of(course.t_s, course.r, course.y, plan)
     if answer is None:
         raise RunError("the response to the offset is hardly measurable; try a larger one (--size)")
-    return answer
+    return Probed(course, answer)
 
 
 def _proposed(
@@ -325,15 +322,14 @@ def _tune_module(flags: TuneFlags, console: Console) -> int:
         module_motion.exit_if_interrupted(interrupts)
         return code
     plan, hung = moved.plan, hanging_joint(robot, moved.q, module, axis)
-    course = module_probe.course_of_samples(moved.samples, plan)
-    answer = _answer(course, plan.course)
+    measured = _answer(module_probe.course_of_samples(moved.samples, plan), plan.course)
     model = module_probe.predicted(robot, module, axis, hung)
-    _tell(flags, {"measured": course}, {"measured": answer}, console, closed=False)
+    _tell(flags, {"measured": measured}, console, closed=False)
     console.print(
         f"predicted, rotor and leg rigid: natural frequency {model.natural_frequency:.1f} rad/s, "
         f"damping ratio {model.damping_ratio:.2f}"
     )
-    if not answer.is_second_order:
+    if not measured.fit.is_second_order:
         console.print(
             "the encoder is at the motor: behind play and a soft drivetrain this leg is no "
             "second-order system; compare step and picture with another leg's"
@@ -341,7 +337,7 @@ def _tune_module(flags: TuneFlags, console: Console) -> int:
     elif flags.wanted is not None:
         bandwidth, damping = flags.wanted
         # k_p below 0: gravity alone is stiffer than what is wanted
-        inertia = k_p / answer.model.b_0
+        inertia = k_p / measured.fit.model.b_0
         k_p = inertia * bandwidth**2 - hung.gravity
         k_d = 2.0 * damping * bandwidth * inertia
         console.print(
@@ -351,16 +347,9 @@ def _tune_module(flags: TuneFlags, console: Console) -> int:
     return 0
 
 
-def _tell(
-    flags: TuneFlags,
-    courses: dict[str, ProbeCourse],
-    answers: dict[str, ResponseFit],
-    console: Console,
-    *,
-    closed: bool,
-) -> None:
+def _tell(flags: TuneFlags, probed: dict[str, Probed], console: Console, *, closed: bool) -> None:
     out = make_folder(flags.out, "tune")
-    console.print(answer_table(answers, closed=closed))
+    console.print(answer_table(probed, closed=closed))
     title = flags.what if flags.what in DIRECTIONS else f"{flags.what} {flags.axis or 'theta'}"
-    draw(title, courses, answers, out / "tune.png")
+    draw(title, probed, out / "tune.png")
     console.print(f"{out}/tune.png", style="dim")
