@@ -97,11 +97,6 @@ def advised(
     return warning(subject, what, found, wanted, fix, why)
 
 
-def count(rows: Iterable[Finding], verdict: FindingKind) -> int:
-    """Return how many rows have a verdict."""
-    return sum(row.verdict is verdict for row in rows)
-
-
 def merged(rows: Iterable[Finding]) -> list[Finding]:
     """Return the rows with those on the same subject merged.
 
@@ -176,25 +171,28 @@ class Report(msgspec.Struct, frozen=True):
 
 def report_of(groups: Groups) -> Report:
     """Return the findings with their counts."""
-    rows = list(chain(*groups.values()))
-    wrong = count(rows, FindingKind.WRONG)
-    return Report(wrong == 0, wrong, count(rows, FindingKind.WARNING), groups)
+    verdicts = [row.verdict for row in chain(*groups.values())]
+    wrong = verdicts.count(FindingKind.WRONG)
+    return Report(wrong == 0, wrong, verdicts.count(FindingKind.WARNING), groups)
 
 
 def show(console: Console, groups: Groups, *, verbose: bool) -> None:
     """Print the findings, and one line for all of them."""
     for title, rows in groups.items():
         console.print(_group(title, rows if verbose else merged(rows), console.width))
-    console.print(Text(verdict_line(groups), style=COLOURS[_worst(chain(*groups.values()))]))
+    report = report_of(groups)
+    worst = FindingKind.WARNING if report.warnings else FindingKind.OK
+    style = COLOURS[worst if report.ok else FindingKind.WRONG]
+    console.print(Text(verdict_line(groups), style=style))
 
 
 def verdict_line(groups: Groups) -> str:
     """Return "all ok", or how much is wrong and what: the command's answer in a line."""
-    rows = list(chain(*groups.values()))
-    wrong, warnings = count(rows, FindingKind.WRONG), count(rows, FindingKind.WARNING)
+    report = report_of(groups)
+    warnings = report.warnings
     noted = f"{warnings} warning{'s' * (warnings != 1)}: {_names(groups, FindingKind.WARNING)}"
-    if wrong:
-        text = f"{wrong} wrong: {_names(groups, FindingKind.WRONG)}"
+    if report.wrong:
+        text = f"{report.wrong} wrong: {_names(groups, FindingKind.WRONG)}"
         return f"{text}; {noted}" if warnings else text
     return f"nothing wrong; {noted}" if warnings else "all ok"
 
@@ -235,9 +233,3 @@ def _names(groups: Groups, verdict: FindingKind) -> str:
     ]
     more = len(rows) - NAMED_MAX
     return ", ".join(names) + (f" and {more} more" if more > 0 else "")
-
-
-def _worst(rows: Iterable[Finding]) -> FindingKind:
-    verdicts = {row.verdict for row in rows}
-    order = (FindingKind.WRONG, FindingKind.WARNING)
-    return next((verdict for verdict in order if verdict in verdicts), FindingKind.OK)

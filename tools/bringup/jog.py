@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from statistics import fmean
 from typing import Final, NamedTuple
 
 from shared.bus.messages import Pair
@@ -89,16 +90,16 @@ def judge(samples: list[Sample], plan: JogPlan) -> list[JogCheck]:
     if not rest or not moving:
         found = f"{len(rest)} at rest, {len(moving)} moving"
         return [JogCheck("samples", found, "some of both", False)]
-    q_rest = _mean([s.q[axis] for s in rest])
+    q_rest = fmean([s.q[axis] for s in rest])
     sag = q_rest - rest[-1].q_ref[axis]
     sign = math.copysign(1.0, by)
     travel = sign * max(sign * (s.q[axis] - q_rest) for s in moving)
     lag = max(abs(s.q[axis] - s.q_ref[axis] - sag) for s in moving)
-    still = _mean([s.q[other] for s in rest])
+    still = fmean([s.q[other] for s in rest])
     strayed = max(abs(s.q[other] - still) for s in moving)
     peak = max(abs(s.tau[0]) + abs(s.tau[1]) for s in samples)
     went, wanted = f"{travel:+.4f} rad", f"{by:+.4f} within {TRAVEL_SHARE:.0%}"
-    at_rest = f"{_mean([s.tau[axis] for s in rest]):+.2f} N m"
+    at_rest = f"{fmean([s.tau[axis] for s in rest]):+.2f} N m"
     stray_max = f"<= {SIBLING_MAX:g}"
     return [
         JogCheck(f"{AXES[axis]} went", went, wanted, abs(travel - by) <= TRAVEL_SHARE * abs(by)),
@@ -123,8 +124,4 @@ def friction(moving: list[Sample], plan: JogPlan) -> float:
         sine = math.sin(omega * (s.t_s - SETTLE_S))
         if abs(sine) > 0.5:
             (there if sine > 0.0 else back).append(sign * s.tau[plan.axis])
-    return 0.5 * (_mean(there) - _mean(back)) if there and back else math.nan
-
-
-def _mean(values: list[float]) -> float:
-    return math.fsum(values) / len(values)
+    return 0.5 * (fmean(there) - fmean(back)) if there and back else math.nan
