@@ -188,7 +188,7 @@ def run_ankle(
             at_third()
 
     leg, limited = hung.leg(ANKLE), limit_drives(within_stops(robot), HELD)
-    q = hanging_angles(leg, robot, Interrupts(), hung.clock)
+    q = hanging_angles(leg, robot, Interrupts(), hung.clock, until_still=False)
     assert q is not None
     return move(leg, limited, ANKLE, HELD, q[ANKLE], hung.clock, progress), len(seen)
 

@@ -175,7 +175,6 @@ def test_legs_that_were_cut_off_at_work_are_resumed_once_they_have_swung(
 
 
 def test_without_a_stored_zero_the_protractor_is_named(bench: Bench) -> None:
-    bench.cut_power()
     with pytest.raises(DriveError, match=r"no zero is stored.*protractor"):
         bench.run(resume=True)
 

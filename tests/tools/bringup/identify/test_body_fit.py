@@ -111,6 +111,17 @@ def fitted(robot: RobotConfig, true_robot: RobotConfig) -> BodyFit:
     return fit(robot, [Record(moments(true_robot))], level_sd=0.003)
 
 
+@pytest.fixture(scope="module")
+def squat(true_robot: RobotConfig) -> Record:
+    """Return the record of a robot that hardly moves."""
+    return Record(moments(true_robot, 60, rich=False))
+
+
+@pytest.fixture(scope="module")
+def by_squat(robot: RobotConfig, squat: Record) -> BodyFit:
+    return fit(robot, [squat], level_sd=0.003)
+
+
 def test_each_planted_error_is_found_within_its_interval(
     robot: RobotConfig, true_robot: RobotConfig, fitted: BodyFit
 ) -> None:
@@ -171,10 +182,9 @@ def test_a_file_that_is_not_the_records_robot_is_not_written(
 
 
 def test_a_record_that_hardly_moves_claims_little(
-    robot: RobotConfig, true_robot: RobotConfig, fitted: BodyFit
+    robot: RobotConfig, fitted: BodyFit, by_squat: BodyFit
 ) -> None:
-    found = fit(robot, [Record(moments(true_robot, 60, rich=False))], level_sd=0.003)
-    rows = {row.what: row for row in of_body(found, robot)}
+    rows = {row.what: row for row in of_body(by_squat, robot)}
     assert rows["harness point z"].verdict is Verdict.UNKNOWN
     assert rows["harness point x"].verdict is Verdict.UNKNOWN
     assert "geometry.harness_point" not in changes(list(rows.values()), robot)
@@ -183,23 +193,22 @@ def test_a_record_that_hardly_moves_claims_little(
 
 
 def test_a_known_weight_and_a_weighed_payload_sharpen_the_torques_scale(
-    robot: RobotConfig, true_robot: RobotConfig
+    robot: RobotConfig, true_robot: RobotConfig, squat: Record, by_squat: BodyFit
 ) -> None:
-    plain = Record(moments(true_robot, 60, rich=False))
     heavier = Record(moments(true_robot, 60, rich=False, added_kg=10.0), added_kg=10.0)
-    alone = fit(robot, [plain], level_sd=0.003).of(SCALE)[1]
-    added = fit(robot, [plain, heavier], level_sd=0.003)
+    added = fit(robot, [squat, heavier], level_sd=0.003)
     weighed = with_mass(robot, payload=PAYLOAD_TRUE)
-    known = fit(weighed, [plain], level_sd=0.003, payload_sd=0.1)
+    known = fit(weighed, [squat], level_sd=0.003, payload_sd=0.1)
     assert of_body(known, weighed)[0].verdict is Verdict.AGREES
     for value, sd in (added.of(SCALE), known.of(SCALE)):
-        assert sd < 0.5 * alone
+        assert sd < 0.5 * by_squat.of(SCALE)[1]
         assert abs(value - (SCALE_TRUE - 1.0)) < 1.96 * sd
 
 
-def test_too_few_moments_are_refused_in_words(robot: RobotConfig, true_robot: RobotConfig) -> None:
+def test_too_few_moments_are_refused_in_words(robot: RobotConfig, squat: Record) -> None:
+    few = Moments(*(part[:30] for part in squat.moments))
     with pytest.raises(RunError, match=r"30 quasi-static moments.*50 or more"):
-        fit(robot, [Record(moments(true_robot, 30))], level_sd=0.003)
+        fit(robot, [Record(few)], level_sd=0.003)
 
 
 def fit_of(robot: RobotConfig, more_kg: float, moment: float, sd: float) -> BodyFit:
