@@ -10,7 +10,7 @@ import socket
 import subprocess
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import pytest
@@ -21,6 +21,7 @@ from shared.exceptions import DriveError, FleetError
 from shared.joints import MODULES
 from tests.system.fleets import xrl
 from tests.tools.bringup.board_in_memory import BoardInMemory, as_wanted
+from tests.tools.exit_codes import exit_code
 from tools.bringup import backup, changes, drive_access
 from tools.bringup.boards import FoundBoards, Value
 from tools.bringup.motion_runner import Interrupts
@@ -53,29 +54,34 @@ def run_dir() -> Iterator[Path]:
         assert procfs.fleet_pids(path) == set(), "no process is left"
 
 
+@pytest.mark.parametrize(
+    ("limit", "apply", "code", "words"),
+    [
+        (2.0, [], 3, ("vel_limit", "OVERSPEED", "nothing was written")),
+        (60.0, ["--apply"], 0, ("nothing to change",)),
+    ],
+    ids=["shown only", "as wanted"],
+)
+def test_what_is_only_shown_or_as_wanted_is_not_written(
+    run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch, limit: float, apply: list[str], code: int,
+    words: tuple[str, ...],
+) -> None:  # fmt: skip
+    board = BoardInMemory(as_wanted() | {VEL_LIMIT: limit})
+    found = FoundBoards({SERIAL: board}, {}, ())
+    monkeypatch.setattr(configure, "drives_within_reach", lambda *_, **__: nullcontext(False))
+    monkeypatch.setattr(configure, "boards_on_usb", lambda *_: nullcontext(found))
+    place = ["--module", MODULE, "--out", tmp_path / "b", "--run-dir", run_dir]
+    assert exit_code(["drive", "configure", *place, *apply]) == code
+    told = capsys.readouterr().out
+    assert all(word in told for word in words)
+    assert not (tmp_path / "b").exists()
+    assert (board.writes, board.saves) == ([], 0)
+
+
 def verb(run_dir: Path, out: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     words = ("drive", "configure", "--out", out, *arguments)
     return xrl(*words, run_dir=run_dir, timeout_s=170.0)
-
-
-@pytest.mark.system
-@pytest.mark.timeout(180)
-def test_the_difference_is_shown_and_nothing_is_written(run_dir: Path, tmp_path: Path) -> None:
-    result = verb(run_dir, tmp_path / "b", f"--plant={MODULE}.{VEL_LIMIT}=2")
-    assert result.returncode == 3, result.stderr
-    assert "vel_limit" in result.stdout
-    assert "OVERSPEED" in result.stdout
-    assert "nothing was written" in result.stdout
-    assert not (tmp_path / "b").exists()
-
-
-@pytest.mark.system
-@pytest.mark.timeout(180)
-def test_drives_as_wanted_have_nothing_to_change(run_dir: Path, tmp_path: Path) -> None:
-    result = verb(run_dir, tmp_path / "b", "--apply")
-    assert result.returncode == 0, result.stderr
-    assert "nothing to change" in result.stdout
-    assert not (tmp_path / "b").exists()
 
 
 @pytest.mark.system
