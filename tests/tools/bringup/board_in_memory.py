@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+import msgspec
+
 from shared.can.drive_settings import AXES, of_module
 from shared.config.files import load_without_schedule
+from shared.config.robot_config import RobotConfig
 from tests.conftest import ROBOT_FILE
 from tools.bringup.boards import Value
 
@@ -78,6 +81,12 @@ class BoardInMemory:
         assert isinstance(first, int)
         assert isinstance(second, int)
         return first, second
+
+
+def with_driver(robot: RobotConfig, driver: str) -> RobotConfig:
+    """Return a robot whose joint services have another driver."""
+    service = msgspec.structs.replace(robot.joint_service, driver=driver)
+    return msgspec.structs.replace(robot, joint_service=service)
 
 
 def as_wanted() -> dict[str, Value]:

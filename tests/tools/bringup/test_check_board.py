@@ -10,7 +10,7 @@ import pytest
 from shared.can.cansimple import AxisError, AxisState, MotorError
 from shared.can.drive_settings import of_module
 from shared.config.robot_config import RobotConfig
-from tests.tools.bringup.board_in_memory import as_wanted, healthy
+from tests.tools.bringup.board_in_memory import as_wanted, healthy, with_driver
 from tests.tools.bringup.verdicts import OK, WARNING, WRONG, bad
 from tools.bringup import check_board
 from tools.bringup.boards import Value
@@ -28,14 +28,11 @@ def rows_of(
     robot: RobotConfig, change: dict[str, Value], *, lacks: str = "", driver: str = "odrive_can"
 ) -> list[Finding]:
     """Return all rows of a board as wanted, but for a change, and a setting that it lacks."""
-    service = msgspec.structs.replace(robot.joint_service, driver=driver)
     values = as_wanted() | healthy() | change
     values.pop(lacks, None)
     return [
         *check_board.settings_rows(MODULE, of_module(robot, MODULE), values),
-        *check_board.direction_rows(
-            MODULE, values, msgspec.structs.replace(robot, joint_service=service)
-        ),
+        *check_board.direction_rows(MODULE, values, with_driver(robot, driver)),
         *check_board.error_rows(MODULE, values),
         *check_board.condition_rows(MODULE, values, (8.0, 59.92), services_up=False),
     ]

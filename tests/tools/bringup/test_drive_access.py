@@ -21,10 +21,5 @@ def test_a_robot_file_with_one_bus_forgotten_never_finds_emulated_drives_right(
     with pytest.raises(FleetError, match=r"\[can\.harness\] is emulated"), drives:
         pass
     assert not (tmp_path / "r").exists()
-
-
-def test_a_robot_file_that_is_all_real_or_all_emulated_is_clear(
-    robot: RobotConfig, real: RobotConfig
-) -> None:
     drive_access.refuse_half_emulated(robot)
     drive_access.refuse_half_emulated(real)

@@ -7,14 +7,13 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import can
-import msgspec
 import pytest
 
 from shared.can import cansimple
 from shared.can.cansimple import Command
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
-from tests.tools.bringup.board_in_memory import BoardInMemory, as_wanted
+from tests.tools.bringup.board_in_memory import BoardInMemory, as_wanted, with_driver
 from tools.bringup import module_motion
 from tools.bringup.boards import FoundBoards
 
@@ -84,8 +83,7 @@ def found(monkeypatch: pytest.MonkeyPatch) -> FoundBoards:
 
 @pytest.fixture
 def on_usb(robot: RobotConfig) -> RobotConfig:
-    service = msgspec.structs.replace(robot.joint_service, driver="odrive_usb")
-    return msgspec.structs.replace(robot, joint_service=service)
+    return with_driver(robot, "odrive_usb")
 
 
 def test_over_usb_they_are_written_and_read_back(on_usb: RobotConfig, found: FoundBoards) -> None:

@@ -18,6 +18,7 @@ from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError, RunError, XrlError
+from tests.tools.bringup.board_in_memory import with_driver
 from tools.bringup import drive_access, zeroing
 from tools.bringup.motion_runner import await_reading
 from tools.bringup.stand_angles import stand_angles
@@ -137,26 +138,20 @@ def test_a_drive_that_its_service_armed_meanwhile_is_not_written_again(robot: Ro
     assert drive.told == 1
 
 
+@pytest.mark.parametrize("status", [DriveStatus.IDLE, DriveStatus.ARMED])
 @pytest.mark.parametrize(
     ("turns", "zeroed"),
     [((MARK + 1.0, MARK - 2.0), True), ((0.2, 0.9), False), ((MARK, 0.4), False)],
 )
-def test_a_drive_that_lost_its_power_is_known(
-    robot: RobotConfig, turns: Pair, zeroed: bool
+def test_a_drive_that_lost_its_power_is_known_armed_or_not(
+    robot: RobotConfig, turns: Pair, zeroed: bool, status: DriveStatus
 ) -> None:
     drive = PlayedDrive()
-    drive.pos = turns
+    drive.pos, drive.status = turns, status
     seen = look(drive, robot)
-    assert seen.zeroed == zeroed
-    assert seen.status is DriveStatus.IDLE
+    assert (seen.status, seen.zeroed) == (status, zeroed)
     if zeroed:
         assert seen.q == pytest.approx(joint_from_motor((1.0, -2.0), N))
-
-
-def test_an_armed_drive_is_armed_though_it_is_unzeroed(robot: RobotConfig) -> None:
-    drive = PlayedDrive()
-    drive.status = DriveStatus.ARMED
-    assert "armed" in refusal(look(drive, robot))
 
 
 @pytest.mark.parametrize(
@@ -233,9 +228,7 @@ def test_a_stand_that_no_leg_reaches_names_the_reason(robot: RobotConfig) -> Non
 
 
 def test_over_usb_the_services_must_be_down(robot: RobotConfig, tmp_path: Path) -> None:
-    usb = msgspec.structs.replace(
-        robot, joint_service=msgspec.structs.replace(robot.joint_service, driver="odrive_usb")
-    )
+    usb = with_driver(robot, "odrive_usb")
     with pytest.raises(FleetError, match=r"has the drive's USB.*xrl down"):
         verb.refuse_services(usb, {MODULE: SupervisedFleet(tmp_path)})
     verb.refuse_services(usb, {MODULE: None})
