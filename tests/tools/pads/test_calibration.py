@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 
 import pytest
@@ -27,7 +27,11 @@ def device(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakePad:
     return FakePad(UNKNOWN)
 
 
-def person(device: FakePad, clumsy: Collection[str] = ()) -> Callable[[str], None]:
+def person(
+    device: FakePad,
+    clumsy: Collection[str] = (),
+    moves: Mapping[str, tuple[int, float]] = MOVES,
+) -> Callable[[str], None]:
     """Return someone who does what is asked, at first not well where clumsy."""
     tried: set[str] = set()
 
@@ -41,9 +45,8 @@ def person(device: FakePad, clumsy: Collection[str] = ()) -> Callable[[str], Non
             for axis in (0, 1, 2, 5):
                 device.move(axis, 0.9)
             device.report_rest()
-        elif name in MOVES:
-            axis, share = MOVES[name]
-            device.move(axis, share)
+        elif name in moves:
+            device.move(*moves[name])
             device.report_rest()
         elif name in BUTTONS:
             device.press(BUTTONS[name])
@@ -81,18 +84,8 @@ def test_a_trigger_that_is_also_a_button_is_its_axis(device: FakePad) -> None:
 
 def test_one_control_is_not_taken_for_two(device: FakePad) -> None:
     moves = {**MOVES, "righttrigger": MOVES["lefttrigger"]}
-
-    def do(text: str) -> None:
-        name = next((name for name, asked in ASKED.items() if asked in text), "")
-        device.report_rest()
-        if not name:
-            device.press(0x13C)
-        elif name in moves:
-            device.move(*moves[name])
-            device.report_rest()
-
     with pytest.raises(FleetError, match=r"righttrigger: nothing moved as asked.*nothing is"):
-        calibrate(device, do, patience_s=1.0)
+        calibrate(device, person(device, moves=moves), patience_s=1.0)
 
 
 def test_a_person_who_does_nothing_writes_nothing(device: FakePad, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from shared.bus.messages import Pair
 from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import FleetError, RunError, XrlError
+from shared.exceptions import FleetError, XrlError
 from tests.tools.bringup.board_in_memory import with_driver
 from tools.bringup import drive_access, zeroing
 from tools.bringup.motion_runner import await_reading
@@ -220,11 +220,6 @@ def test_a_stand_is_at_its_height_level_and_inside_the_limits(
         assert stand.hips_forward == pytest.approx(forward, abs=2e-3)
     for module, q_module in stand.q.items():
         assert why_outside(robot, module, q_module) == ""
-
-
-def test_a_stand_that_no_leg_reaches_names_the_reason(robot: RobotConfig) -> None:
-    with pytest.raises(RunError, match=r"--standing 1\.294.*at its limit"):
-        stand_angles(robot, 1.294)
 
 
 def test_over_usb_the_services_must_be_down(robot: RobotConfig, tmp_path: Path) -> None:
