@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from services.joint.differential import joint_from_motor
-from services.joint.drivers.base import Drive
+from services.joint.drivers.base import Drive, DriveStatus
 from services.joint.drivers.wired_drive import MotorFrame
 from services.simulator.physics.plant import PlantConfig, changed
 from shared.config.robot_config import RobotConfig
@@ -93,14 +93,15 @@ class Bench:
     def errors(self) -> list[float]:
         """Return by how much each joint's zero is off, rad; a joint of an unzeroed drive by 9."""
         found = []
-        with self.drives_of(self.robot, MODULES, self.run_dir) as drives:
-            for index, (name, drive) in enumerate(drives.items()):
-                seen = zeroing.look(drive, self.robot)
-                turns = self.hung.world.motor_turns()[0][2 * index : 2 * index + 2]
-                signs = self.robot.module_named(name).motor_signs
-                true = joint_from_motor((turns[0] * signs[0], turns[1] * signs[1]), 17.5)
-                off = max(abs(a - b) for a, b in zip(seen.q, true, strict=True))
-                found.append(off if seen.zeroed else 9.0)
+        for index, (name, drive) in enumerate(self.hung.drives.items()):
+            reading = drive.read(0.02)
+            assert reading is not None
+            turns = self.hung.world.motor_turns()[0][2 * index : 2 * index + 2]
+            signs = self.robot.module_named(name).motor_signs
+            true = joint_from_motor((turns[0] * signs[0], turns[1] * signs[1]), 17.5)
+            q = joint_from_motor(reading.pos_turns, 17.5)
+            off = max(abs(a - b) for a, b in zip(q, true, strict=True))
+            found.append(9.0 if reading.status is DriveStatus.UNZEROED else off)
         return found
 
 
@@ -165,12 +166,13 @@ def test_legs_that_were_cut_off_at_work_are_resumed_once_they_have_swung(
 
     monkeypatch.setattr(swing, "watch", pushed)
     bench.run(resume=True, untouched=True, level=True, swing=True)
-    assert max(bench.errors()[i] for i in (1, 2, 4, 5)) < EXACT
+    errors = dict(zip(MODULES, bench.errors(), strict=True))
+    assert max(errors[module] for module in legs) < EXACT
     said = capsys.readouterr().out
     assert said.count("gravity") >= 4
     assert "second best" in said
     for module in ("ankle_right", "ankle_left"):  # they moved with the swing, or not
-        if bench.errors()[MODULES.index(module)] == 9.0:
+        if errors[module] == 9.0:
             assert re.search(rf"{module}: refused.*--at PHI,THETA", said, re.DOTALL)
 
 
