@@ -199,7 +199,6 @@ def test_where_the_joints_rest_is_stored_of_zeroed_drives_only(
 ) -> None:
     bench.zero()
     bench.push()
-    bench.hung.wait(12.0)
     assert bench.run(rest=True) == 0
     bench.cut_power()
     assert bench.run(resume=True) == 0
