@@ -6,7 +6,7 @@ Beside it curves may grow: the paper's Fig. 7 as an animation.
 from __future__ import annotations
 
 import bisect
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -21,6 +21,7 @@ from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.joints import MODULES, SIDES
+from shared.robot.frames import UPRIGHT, Quaternion, product, rotated
 from tools.judge.reports import scene
 from tools.judge.reports.scene import RobotPose
 from tools.logs.run_log import RunLog
@@ -114,7 +115,8 @@ def write_gif(
     The pose is the simulated world's, or as the legs know the torso. `progress` takes 0 .. 1.
     """
     began = _began_ns(log)
-    chosen = list(_thinned([pose for pose in scene.poses(log, robot) if pose.t_ns >= began]))
+    poses = [pose for pose in scene.poses(log, robot) if pose.t_ns >= began]
+    chosen = list(scene.thinned(poses, poses[0].t_ns if poses else 0, FRAMES_S))
     if not chosen:
         raise RunError(f"{log.path}: the scenario never began; there is nothing to draw")
     captions = _captions(log, began)
@@ -149,28 +151,16 @@ def write_gif(
     return len(flat)
 
 
-def world_frames(robot: RobotConfig, pose: RobotPose) -> dict[str, tuple[Array, Array]]:
-    """Return each frame's origin (3,), m, and rotation (3, 3), in the world."""
-    placed = {"world": (np.zeros(3), np.eye(3))}
+def world_frames(robot: RobotConfig, pose: RobotPose) -> dict[str, tuple[Array, Quaternion]]:
+    """Return each frame's origin (3,), m, and rotation, in the world."""
+    placed = {"world": (np.zeros(3), UPRIGHT)}
     for frame in scene.frames(robot, pose):
         origin, rotation = placed[frame.parent]
         placed[frame.child] = (
-            origin + rotation @ np.array(frame.position),
-            rotation @ _matrix(frame.rotation),
+            origin + rotated(rotation, frame.position),
+            product(rotation, frame.rotation),
         )
     return placed
-
-
-def _matrix(quaternion: Sequence[float]) -> Array:
-    """Return the rotation matrix (3, 3) of a quaternion (x, y, z, w)."""
-    x, y, z, w = quaternion
-    return np.array(
-        (
-            (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-            (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-            (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
-        )
-    )
 
 
 def _palette() -> Image.Image:
@@ -205,16 +195,6 @@ def _captions(log: RunLog, began: int) -> list[Caption]:
     return captions
 
 
-def _thinned(poses: Sequence[RobotPose]) -> Iterator[RobotPose]:
-    """Yield poses at the picture's rate on average, so that it plays as fast as the run was."""
-    period_ns = round(NS_PER_S / FRAMES_S)
-    due_ns = poses[0].t_ns if poses else 0
-    for pose in poses:
-        if pose.t_ns >= due_ns:
-            due_ns += period_ns * (1 + (pose.t_ns - due_ns) // period_ns)
-            yield pose
-
-
 def _draw_frame(
     canvas: Canvas, robot: RobotConfig, pose: RobotPose, seconds: float, captions: Sequence[Caption]
 ) -> None:
@@ -237,7 +217,7 @@ def _draw_robot(
     canvas: Canvas,
     robot: RobotConfig,
     pose: RobotPose,
-    frames: dict[str, tuple[Array, Array]],
+    frames: dict[str, tuple[Array, Quaternion]],
     view: tuple[float, int, float],
 ) -> None:
     centre, axis, sign = view
@@ -251,10 +231,11 @@ def _draw_robot(
         half = 0.5 * size[axis], 0.5 * size[2]
         found = []
         for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
-            corner = np.array(middle, dtype=float)
+            corner = [*middle]
             corner[axis] += a * half[0]
             corner[2] += b * half[1]
-            found.append(at(origin + rotation @ corner))
+            x, y, z = corner
+            found.append(at(origin + rotated(rotation, (x, y, z))))
         return found
 
     geometry = robot.geometry

@@ -154,7 +154,7 @@ def poses(log: RunLog, robot: RobotConfig) -> Iterator[RobotPose]:
     first_ns = max(next((row.t_ns for row in rows if row.t_ns > 0), 0) for rows in states)
     if not log.is_first:
         first_ns = max(first_ns, log.begin_ns)
-    for row in _thin(truth or states[0], first_ns):
+    for row in thinned(truth or states[0], first_ns, RATE_HZ):
         if row.t_ns >= log.end_ns and not log.is_last:
             break
         states_now: list[Any] = [one.at(row.t_ns) for one in newest]
@@ -188,9 +188,9 @@ def pose_of_legs(
     return (x, y, z), (p[3], p[4], p[5]), (p[0], p[1], p[2])
 
 
-def _thin(rows: list[Any], first_ns: int) -> Iterator[Any]:
-    """Yield rows at about the scene's rate, without changing their stamps."""
-    period_ns = round(NS_PER_S / RATE_HZ)
+def thinned(rows: Iterable[Any], first_ns: int, rate_hz: float) -> Iterator[Any]:
+    """Yield rows from a time on, at about a rate on average, without changing their stamps."""
+    period_ns = round(NS_PER_S / rate_hz)
     due_ns = first_ns
     for row in rows:
         if row.t_ns >= due_ns:
