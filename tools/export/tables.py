@@ -6,10 +6,11 @@ one key, `time_s` is the sender's stamp on the report's axis (`stamped`).
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, get_args, get_origin
 
@@ -124,7 +125,7 @@ def columns_of(kind: type[msgspec.Struct]) -> dict[str, Column]:
     found: dict[str, Column] = {}
     fields = msgspec.structs.fields(kind)
     for field in sorted(fields, key=lambda field: field.name not in _HEAD):
-        _add_column(found, field.name, field.type, _getter(field.name))
+        _add_column(found, field.name, field.type, attrgetter(field.name))
     return found
 
 
@@ -144,7 +145,7 @@ def write_tables(
     open_files: dict[str, CsvFile | ParquetFile] = {}
     rows: dict[str, int] = {}
     readers = {key.topic: columns_of(key.topic.type) for key in keys}
-    try:
+    with contextlib.ExitStack() as stack:
         for log in parts_of(index, part, done=done):
             for key in keys:
                 held = list(stamped(log, *key))
@@ -154,7 +155,8 @@ def write_tables(
                 name = key.name.replace("/", ".")
                 if name not in open_files:
                     kinds = {column: row.kind for column, row in getters.items()}
-                    open_files[name] = make(folder / name, {TIME: float, **kinds})
+                    file = contextlib.closing(make(folder / name, {TIME: float, **kinds}))
+                    open_files[name] = stack.enter_context(file)
                 times = [(at_ns - zero) / NS_PER_S for at_ns, _ in held]
                 cells = {
                     column: [row.read(message) for _, message in held]
@@ -162,9 +164,6 @@ def write_tables(
                 }
                 open_files[name].add({TIME: times, **cells})
                 rows[name] = rows.get(name, 0) + len(held)
-    finally:
-        for file in open_files.values():
-            file.close()
     return rows
 
 
@@ -189,8 +188,7 @@ def write_grid(
         f"{key.name}.{name}": row.kind for key in steady for name, row in readers[key.topic].items()
     }
     zero, step_ns, count, heard = zero_ns(index), NS_PER_S / rate_hz, 0, False
-    file = make(path, {TIME: float, **kinds})
-    try:
+    with contextlib.closing(make(path, {TIME: float, **kinds})) as file:
         for log in parts_of(index, part, done=done):
             first = math.ceil((log.begin_ns - zero) / step_ns)
             last = math.ceil((log.end_ns - zero) / step_ns)
@@ -206,8 +204,6 @@ def write_grid(
             if grid:
                 file.add(cells)
             count += len(grid)
-    finally:
-        file.close()
     if not heard:
         raise RunError(f"{index.path}: has no message of these topics in this part; {SEE_INFO}")
     return count
@@ -234,10 +230,6 @@ def _add_column(found: dict[str, Column], name: str, kind: Any, read: Callable[[
             _add_column(found, f"{name}[{number}]", element, _element(read, number))
     else:
         found[name] = Column(lambda message: msgspec.json.encode(read(message)).decode(), str)
-
-
-def _getter(name: str) -> Callable[[Any], Any]:
-    return lambda message: getattr(message, name)
 
 
 def _element(read: Callable[[Any], Any], number: int) -> Callable[[Any], Any]:

@@ -99,10 +99,8 @@ def _of(
     begun: Sequence[LinkEvent], ended: Sequence[LinkEvent], all_: Sequence[Sequence[LinkEvent]]
 ) -> Impaired:
     first = begun[0]
-    again = [row[0].t_ns for row in all_ if row[0].number == first.number]
-    end_ns = next((t_ns for t_ns in again if t_ns > first.t_ns), None)
-    if ended:
-        end_ns = ended[0].t_ns
+    again = (row[0].t_ns for row in all_ if row[0].number == first.number)
+    end_ns = ended[0].t_ns if ended else next((t for t in again if t > first.t_ns), None)
     return Impaired(
         link=first.requested,
         words=first.detail,

@@ -154,7 +154,7 @@ class LiveSource(Source):
         self._session: Session | None = None
         self._latest: list[tuple[Topic, str, Latest[Any]]] = []
         self._newest = Newest(robot)
-        self._acting = LiveOrders(robot, fleet, self._scenario_s) if act else None
+        self._acting = LiveOrders(robot, fleet, lambda: self._newest.scenario_s) if act else None
         if self._acting is not None:
             self.orders = self._acting.orders
             self.processes = self._acting.services
@@ -206,9 +206,6 @@ class LiveSource(Source):
         if self._acting is None:
             return f"{order.order}: this page only looks; `xrl view --act` lets it act"
         return self._acting.carry_out(order)
-
-    def _scenario_s(self) -> float:
-        return self._newest.scenario_s
 
     def _look(self) -> None:
         """Ask the supervisor and the network proxy, until nobody looks any more."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from itertools import chain
 from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from shared.bus import topics
 from shared.bus.messages import PlannerMode
+from shared.config.robot_config import RobotConfig
 from shared.joints import JOINTS, MODULES
 from tools.judge import stalls
 from tools.judge.reports.page_model import TimelineEvent
@@ -83,16 +85,18 @@ class LimitViolations:
 
     def add(self, run: RunData) -> None:
         """Add a run, or the next part of it."""
-        for look in (_world, *((_torques, _stops, _margins) if run.robot is not None else ())):
-            for what, name, t, passed, values in look(run):
-                beyond = passed & run.inside(t)
-                new = first_violation(what, name, t, beyond)
-                if new is None:
-                    continue
-                if values is not None:
-                    new = new._replace(least=float(values[beyond].min()))
-                old = self._found.get((what, name))
-                self._found[what, name] = new if old is None else old.joined(new)
+        figures = [_world(run)]
+        if run.robot is not None:
+            figures += [look(run, run.robot) for look in (_torques, _stops, _margins)]
+        for what, name, t, passed, values in chain.from_iterable(figures):
+            beyond = passed & run.inside(t)
+            new = first_violation(what, name, t, beyond)
+            if new is None:
+                continue
+            if values is not None:
+                new = new._replace(least=float(values[beyond].min()))
+            old = self._found.get((what, name))
+            self._found[what, name] = new if old is None else old.joined(new)
 
     def events(self) -> Iterator[TimelineEvent]:
         """Yield the first violation of each limit; modules and joints that pass it together."""
@@ -152,9 +156,8 @@ def _world(run: RunData) -> Iterator[Beyond]:
                 yield what, name, t, (values > row.limit) & mask & ~stalled, None
 
 
-def _torques(run: RunData) -> Iterator[Beyond]:
-    assert run.robot is not None  # noqa: S101 - looked at with a robot only
-    most = run.robot.joint.tau_module_max
+def _torques(run: RunData, robot: RobotConfig) -> Iterator[Beyond]:
+    most = robot.joint.tau_module_max
     for module in MODULES:
         tau = run.wide(topics.JOINT_STATE, "tau", 2, module)
         t = run.times(topics.JOINT_STATE, module)
@@ -162,9 +165,8 @@ def _torques(run: RunData) -> Iterator[Beyond]:
         yield f"{TORQUE} of {most:g} N m", module, t, at_limit, None
 
 
-def _stops(run: RunData) -> Iterator[Beyond]:
-    assert run.robot is not None  # noqa: S101 - looked at with a robot only
-    limits, armed_s = run.robot.joint_limits(), run.armed_s()
+def _stops(run: RunData, robot: RobotConfig) -> Iterator[Beyond]:
+    limits, armed_s = robot.joint_limits(), run.armed_s()
     for number, joint in enumerate(JOINTS):
         module = MODULES[number // 2]
         t = run.times(topics.JOINT_STATE, module)
@@ -174,9 +176,8 @@ def _stops(run: RunData) -> Iterator[Beyond]:
         yield "beyond a soft stop", joint, t, outside, None
 
 
-def _margins(run: RunData) -> Iterator[Beyond]:
-    assert run.robot is not None  # noqa: S101 - looked at with a robot only
-    certificate = run.robot.certificate
+def _margins(run: RunData, robot: RobotConfig) -> Iterator[Beyond]:
+    certificate = robot.certificate
     mode, service, onboard = run.columns(
         topics.PLANNER_STATUS, "", "mode", "margin", "margin_onboard"
     )

@@ -74,12 +74,12 @@ class Playhead:
 
     def pause(self, now_ns: int) -> None:
         """Stand still from now on."""
-        self._lay(now_ns, self.position(now_ns))
+        self._lay(now_ns)
         self.paused = True
 
     def resume(self, now_ns: int) -> None:
         """Go on from where it stands."""
-        self._lay(now_ns, self.position(now_ns))
+        self._lay(now_ns)
         self.paused = False
 
     def step(self, position_ns: int) -> None:
@@ -88,11 +88,12 @@ class Playhead:
 
     def change_rate(self, now_ns: int, rate: float) -> None:
         """Go on faster or slower, within `RATE_MIN` .. `RATE_MAX`."""
-        self._lay(now_ns, self.position(now_ns))
+        self._lay(now_ns)
         self.rate = min(max(rate, RATE_MIN), RATE_MAX)
 
-    def _lay(self, now_ns: int, position_ns: int) -> None:
-        self._since_ns, self._from_ns = now_ns, position_ns
+    def _lay(self, now_ns: int) -> None:
+        """Begin the line anew where it is now."""
+        self._since_ns, self._from_ns = now_ns, self.position(now_ns)
 
 
 BLOCK_NS: Final = 60 * NS_PER_S

@@ -58,7 +58,6 @@ def targets(
 
     Remaps are as `harness/wrench=harness/before` or `joint/*/state=was/*/state`.
     """
-    names = {key: short(key) for key in chosen}
     done: dict[str, str] = {}
     for remap in remaps:
         old, equals, new = remap.partition("=")
@@ -71,16 +70,12 @@ def targets(
         for key in fitting:
             if key in done:
                 raise RunError(
-                    f"--remap {remap!r}: {names[key]} has been given another name before"
+                    f"--remap {remap!r}: {short(key)} has been given another name before"
                 )
             done[key] = _renamed(remap, old, new, key)
     lead = f"{prefix}/" if prefix else ""
-    found = {}
-    for key in chosen:
-        if key in done:
-            found[key] = f"{lead}{LIVE}/{robot}/{done[key]}"
-        else:
-            found[key] = f"{lead}{key}"
+    names = {key: f"{LIVE}/{robot}/{name}" for key, name in done.items()}
+    found = {key: lead + names.get(key, key) for key in chosen}
     _check_apart(found)
     return found
 

@@ -218,10 +218,8 @@ def tick_at(log: RunLog, at_s: float | None, zero_ns: int) -> Tick:
 
 def _find(messages: list[Any], seq: int, session: int | None = None) -> Any:
     """Return the newest message with a sequence number, or None."""
-    for message in reversed(messages):
-        if message.seq == seq and (session is None or message.session == session):
-            return message
-    return None
+    found = (row for row in reversed(messages) if row.seq == seq)
+    return next((row for row in found if session is None or row.session == session), None)
 
 
 def _joined(messages: list[Any], name: str) -> Array:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 from rich.progress import Progress
 
-from shared.clock import NS_PER_S
 from shared.exceptions import RunError
 from shared.extras import require
 from shared.mcap_log.files import SUFFIX
@@ -206,16 +204,9 @@ def _draw(log: RunLog, out: Path, console: Console, *, with_curves: bool) -> Non
 def export_scene(index: RunIndex, out: Path) -> int:
     """Write a copy of a log with its scene, with progress; return how many messages it has."""
     robot = robot_of(index)
-
-    def parts() -> Iterator[RunLog]:
-        with progress_along("copying", index.length_s) as done:
-            for log in parts_of(index):
-                yield log
-                done((log.end_ns - log.began_ns()) / NS_PER_S)
-
-    return write_extended(
-        index.path, out, scene.channels(index.robot), scene.messages(parts(), robot)
-    )
+    with progress_along("copying", index.length_s) as done:
+        found = scene.messages(parts_of(index, done=done), robot)
+        return write_extended(index.path, out, scene.channels(index.robot), found)
 
 
 def layout_for(robot: str) -> dict[str, Any]:

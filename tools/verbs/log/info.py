@@ -13,7 +13,6 @@ from rich.text import Text
 from shared.bus import topics
 from shared.clock import NS_PER_S
 from shared.exceptions import XrlError
-from shared.mcap_log.reader import LostBytes
 from shared.mcap_log.recover import clock_time, describe_lost, describe_passed_over
 from shared.mcap_log.writer import SCHEMA_VERSION
 from tools.flags import Arg, Flags, option, positional
@@ -283,15 +282,11 @@ def _file_as_json(file: FileFacts) -> dict[str, Any]:
         "end_ns": file.last_ns if file.messages else None,
         "orphans": file.orphans,
         "passed_over": file.passed_over,
-        "cut": _loss_as_json(file.cut),
-        "damage": [_loss_as_json(loss) for loss in file.damage],
+        "cut": file.cut and file.cut._asdict(),
+        "damage": [loss._asdict() for loss in file.damage],
         "attachments": file.attachments,
         "metadata": file.metadata,
     }
-
-
-def _loss_as_json(loss: LostBytes | None) -> dict[str, int] | None:
-    return None if loss is None else loss._asdict()
 
 
 def _seconds(first_ns: int, last_ns: int) -> float:
