@@ -39,7 +39,7 @@ def part_of(flags: PartFlags, index: RunIndex) -> RunPart:
     if math.isinf(begin_s) and math.isinf(end_s):
         return RunPart()
     offset_s = (zero_ns(index) - index.span_ns[0]) / 1e9
-    first_s, last_s = -offset_s, index.length_s - offset_s
+    first_s, last_s = 0.0 - offset_s, index.length_s - offset_s  # no -0
     if begin_s > last_s or end_s < first_s:
         raise RunError(
             f"{index.path}: has nothing from {begin_s:g} to {end_s:g} s; it holds "

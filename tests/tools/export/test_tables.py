@@ -13,7 +13,6 @@ from shared.bus import topics
 from shared.bus.messages import JointState
 from shared.bus.topics import TOPICS
 from shared.clock import NS_PER_S
-from tests.tools.exit_codes import exit_code
 from tools import cli
 from tools.export.tables import FOR_REEXECUTION, HELD_S, columns_of
 from tools.judge.run_parts import zero_ns
@@ -108,25 +107,6 @@ def test_the_columns_of_a_type_are_all_of_its_fields_each_element_one() -> None:
             fields, key=lambda name: name not in ("t_ns", "seq")
         )
         assert all(column.kind in (int, float, bool, str) for column in columns.values())
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--csv", "OUT", "--topic", "joint/foot/state"], "no topic is so named"),
-        (["--csv", "OUT", "--rate", "10", "--topic", "run/event"], "none of these topics has"),
-        (["--csv", "OUT", "--from", "900", "--to", "901"], "has nothing from 900"),
-        (["--csv", "OUT", "--topic", "imu/attitude"], "has no message of these topics"),
-    ],
-)
-def test_what_cannot_be_is_one_line_and_leaves_no_folder(
-    run_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
-) -> None:
-    out = tmp_path / "t"
-    given = [str(out) if word == "OUT" else word for word in words]
-    assert exit_code(["log", "export", str(run_file), *given]) == 2
-    assert said in " ".join(capsys.readouterr().err.split())
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_earlier_export_is_replaced_only_with_force(run_file: Path, tmp_path: Path) -> None:

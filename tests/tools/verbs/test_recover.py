@@ -63,29 +63,6 @@ def test_an_existing_output_is_replaced_only_by_force(
     assert read_run(out).complete
 
 
-def test_the_file_itself_is_no_output_even_by_force(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    killed = runs.killed_file(tmp_path)
-    before = killed.path.read_bytes()
-    words = ["log", "recover", str(killed.path), "-o", str(killed.path), "--force"]
-    assert cli.main(words) == 2
-    assert "is the record itself" in capsys.readouterr().err
-    assert killed.path.read_bytes() == before
-
-
-def test_an_output_that_cannot_be_written_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    killed = runs.killed_file(tmp_path)
-    assert (
-        cli.main(["log", "recover", str(killed.path), "-o", str(tmp_path / "no" / "x.mcap")]) == 2
-    )
-    output = capsys.readouterr().err
-    assert "cannot be written: No such file or directory" in output
-    assert len(output.splitlines()) == 1
-
-
 def test_a_file_that_is_being_written_is_recovered_so_far(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

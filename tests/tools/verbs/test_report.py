@@ -36,14 +36,6 @@ def test_an_old_page_is_replaced_and_no_other_file_remains(record: Path, tmp_pat
     assert sorted(path.name for path in tmp_path.iterdir()) == ["report.html", "run.mcap"]
 
 
-@pytest.mark.parametrize("out", ["", "absent/report.html"])
-def test_an_impossible_output_prints_one_line(
-    record: Path, tmp_path: Path, out: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert report(record, "-o", tmp_path / out) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-
-
 def test_a_browser_opens_on_request(record: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []
     monkeypatch.setattr("webbrowser.open", opened.append)

@@ -9,10 +9,8 @@ import threading
 from typing import Any
 
 import aiohttp
-import pytest
 
 from shared.config.robot_config import RobotConfig
-from tests.tools.exit_codes import exit_code
 from tests.tools.view.test_view_server import Recorded
 from tools.view.foxglove_server import FoxgloveServer
 
@@ -77,11 +75,3 @@ def test_a_client_finds_the_robots_frames_and_is_served_only_while_it_looks(
     finally:
         ended.set()
         serving.join()
-
-
-@pytest.mark.parametrize("words", [["run.mcap"], ["--act"]])
-def test_it_only_looks_and_leaves_records_to_foxglove(
-    words: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert exit_code(["view", "--foxglove", *words]) == 2
-    assert "--foxglove shows a fleet" in capsys.readouterr().err

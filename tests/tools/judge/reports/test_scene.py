@@ -285,8 +285,6 @@ def test_an_impossible_export_prints_one_line(
     bare = runs.written(runs.changed(log, attachments={}), tmp_path / "bare").path
     out = str(tmp_path / "x.mcap")
     for arguments, words in (
-        ([made.path], "say what to write"),
-        ([made.path, "--scene", "-o", made.path, "--force"], "is the record itself"),
         ([made.path, "--scene", "-o", shown], "exists already"),
         ([shown, "--scene", "-o", out], "already; export the original"),
         ([half, "--scene", "-o", out], "no states of hip_left"),
