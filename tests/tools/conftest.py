@@ -1,4 +1,4 @@
-"""One recorded run, for all tests that read one; and a robot that is not emulated."""
+"""Recorded runs, for all tests that read one; and a robot that is not emulated."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from shared.config.robot_config import RobotConfig
 from shared.config.sections import CanConfig
 from tests.tools.judge.reports import runs
 from tests.tools.judge.reports.runs import Made
+from tests.tools.once import once
 from tools import cli
 from tools.judge.reports.page import render
 from tools.logs.run_log import RunLog, read_run
@@ -27,7 +28,8 @@ def real(robot: RobotConfig) -> RobotConfig:
 @pytest.fixture(scope="session")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     """A short squat in virtual time: planner killed and restarted, a push, a lost link."""
-    return runs.make(tmp_path_factory.mktemp("report") / "run")
+    folder = once(tmp_path_factory, "made", runs.make)
+    return Made(folder / "run.mcap", (folder / "printed.txt").read_text(encoding="utf-8"))
 
 
 @pytest.fixture(scope="session")
@@ -43,9 +45,12 @@ def page(log: RunLog) -> str:
 @pytest.fixture(scope="session")
 def shown(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run with its scene."""
-    out = tmp_path_factory.mktemp("shown") / "shown.mcap"
-    assert cli.main(["log", "export", str(made.path), "--scene", "-o", str(out)]) == 0
-    return out
+
+    def show(folder: Path) -> None:
+        words = ["--scene", "-o", str(folder / "shown.mcap")]
+        assert cli.main(["log", "export", str(made.path), *words]) == 0
+
+    return once(tmp_path_factory, "shown", show) / "shown.mcap"
 
 
 IMPAIRED = (
@@ -58,7 +63,9 @@ IMPAIRED = (
 @pytest.fixture(scope="session")
 def impaired(tmp_path_factory: pytest.TempPathFactory) -> RunLog:
     """A run over a network that is impaired twice, one over the other, and then cut."""
-    out = tmp_path_factory.mktemp("impaired")
-    flags = [word for impairment in IMPAIRED for word in ("--inject", impairment)]
-    assert cli.main(["sim", "--out", str(out), "--duration", "2", *flags]) == 0
-    return read_run(out / "run.mcap")
+
+    def impair(folder: Path) -> None:
+        flags = [word for impairment in IMPAIRED for word in ("--inject", impairment)]
+        assert cli.main(["sim", "--out", str(folder), "--duration", "2", *flags]) == 0
+
+    return read_run(once(tmp_path_factory, "impaired", impair) / "run.mcap")

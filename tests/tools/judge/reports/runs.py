@@ -39,11 +39,12 @@ class Made(NamedTuple):
     printed: str
 
 
-def make(directory: Path) -> Made:
+def make(directory: Path) -> None:
+    """Make the run of these tests; what the command said is in `printed.txt` beside it."""
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
         assert cli.main([*SIM.split(), "--out", str(directory)]) == 0
-    return Made(directory / "run.mcap", printed.getvalue())
+    (directory / "printed.txt").write_text(printed.getvalue(), encoding="utf-8")
 
 
 Change = Callable[[float, dict[str, Any]], object]

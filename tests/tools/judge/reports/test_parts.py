@@ -134,21 +134,6 @@ def test_a_part_of_a_run_has_the_time_of_the_whole_and_all_events(
     assert np.isfinite(values).any()
 
 
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (("--from", "5", "--to", "2"), "the smaller one"),
-        (("--from", "900"), "it holds"),
-        (("--to", "-900"), "it holds"),
-    ],
-)
-def test_a_part_that_is_not_there_is_told_with_what_is(
-    made: Made, words: tuple[str, ...], told: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.main(["log", "report", str(made.path), *words, "--open", "no"]) == 2
-    assert told in capsys.readouterr().err
-
-
 def test_a_run_too_long_to_be_read_at_once_says_what_to_give(
     log: RunLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -211,8 +196,7 @@ def test_before_the_drives_are_armed_no_soft_stop_is_passed(log: RunLog, tmp_pat
             state |= {"q": (9.0, 9.0), "drive": int(DriveStatus.IDLE)}
 
     hung = runs.written(runs.changed(log, {"joint/*/state": hanging}), tmp_path)
-    for page in (render(hung), render_parts(hung.index, part_s=PART_S)):
-        assert "beyond a soft stop" not in page
+    assert "beyond a soft stop" not in render_parts(hung.index, part_s=PART_S)
 
 
 def test_a_change_across_a_silence_at_the_edge_of_a_part_has_its_row(
