@@ -30,7 +30,6 @@ from shared.clock import NS_PER_MS, NS_PER_S, now_ns
 from shared.joints import MODULES
 from tests.shared.mcap_log.runs import sample
 from tests.tools.logs.test_impairment_intervals import judged, shown
-from tools import cli
 from tools.fleet.stall_watch import ANY_CORE, Gap
 from tools.judge import verdict, verdict_table
 from tools.judge.stalls import (
@@ -55,7 +54,7 @@ from tools.live.live_stalls import (
     StallFinder,
     merged,
 )
-from tools.logs.run_log import RunLog, read_run
+from tools.logs.run_log import RunLog, RunPart
 
 CYCLE_MS = 4
 
@@ -156,37 +155,37 @@ def test_a_world_that_is_slow_all_the_time_does_not_stand_still_all_the_time() -
 A = Stall(ms(100), ms(160), "core 0")
 
 
+A_THREADS, OF_SERVICES, OF_THE_WORLD = (
+    A._replace(who=who) for who in (A_THREAD, SERVICES, SIMULATOR)
+)
+
+
 @pytest.mark.parametrize(
-    ("others", "cores", "who"),
+    ("stalls", "cores", "who"),
     [
-        ([], 2, "core 0"),
-        ([A._replace(who="core 1")], 2, MACHINE),
-        ([A._replace(who="core 1")], 4, "cores 0, 1"),
-        ([A._replace(who="core 1", begin_ns=ms(160), end_ns=ms(230))], 2, "cores 0, 1"),
-        ([], 1, MACHINE),
-        ([A._replace(who=A_THREAD)], 2, "core 0"),
-        ([A._replace(who=SERVICES, end_ns=ms(190))], 2, "core 0"),
-        ([A._replace(who=MACHINE)], 2, MACHINE),
-        ([A._replace(who=SIMULATOR)], 2, "core 0"),
+        ([A], 2, "core 0"),
+        ([A, A._replace(who="core 1")], 2, MACHINE),
+        ([A, A._replace(who="core 1")], 4, "cores 0, 1"),
+        ([A, A._replace(who="core 1", begin_ns=ms(160), end_ns=ms(230))], 2, "cores 0, 1"),
+        ([A], 1, MACHINE),
+        ([A, A_THREADS], 2, "core 0"),
+        ([A, OF_SERVICES._replace(end_ns=ms(190))], 2, "core 0"),
+        ([A, A._replace(who=MACHINE)], 2, MACHINE),
+        ([A, OF_THE_WORLD], 2, "core 0"),
+        ([OF_SERVICES, OF_THE_WORLD], 2, ALL),
+        ([A_THREADS, OF_SERVICES], 2, SERVICES),
     ],
 )
 def test_what_overlaps_is_one_stall_of_all_that_stood_still(
-    others: list[Stall], cores: int, who: str
+    stalls: list[Stall], cores: int, who: str
 ) -> None:
-    (stall,) = merged([A, *others], cores)
+    (stall,) = merged(stalls, cores)
     assert stall.who == who
-    assert stall.end_ns == max(row.end_ns for row in [A, *others])
-
-
-def test_joint_services_and_simulator_together_are_all_services() -> None:
-    services, world = A._replace(who=SERVICES), A._replace(who=SIMULATOR)
-    assert [stall.who for stall in merged([services, world], 2)] == [ALL]
+    assert stall.end_ns == max(row.end_ns for row in stalls)
 
 
 def test_a_thread_without_real_time_tells_nothing_alone() -> None:
-    thread = A._replace(who=A_THREAD)
-    assert merged([thread], 2) == []
-    assert [stall.who for stall in merged([thread, A._replace(who=SERVICES)], 2)] == [SERVICES]
+    assert merged([A_THREADS], 2) == []
 
 
 def test_stalls_that_follow_each_other_closely_are_told_while_they_come() -> None:
@@ -414,29 +413,20 @@ def test_what_a_stall_made_is_apart_in_the_next_part_of_a_run_too() -> None:
     assert disturbances(log, 3 * NS_PER_S, 5 * NS_PER_S) == []
 
 
-@pytest.fixture(scope="module")
-def stopped(tmp_path_factory: pytest.TempPathFactory) -> RunLog:
-    """A planner that stands still for 80 ms while the hand leads down; as by a stall of it all."""
-    out = tmp_path_factory.mktemp("stalled")
-    flags = ("--kill", "planner@1.2:STOP", "--restart", "planner@1.28", "--duration", "2.5")
-    assert cli.main(["sim", *flags, "--out", str(out)]) == 0
-    return read_run(out / "run.mcap")
-
-
-def test_figures_leave_out_what_a_stall_made_of_a_run_and_a_line_tells_it(stopped: RunLog) -> None:
-    events = stopped.messages(topics.RUN_EVENT)
+def test_figures_leave_out_what_a_stall_made_of_a_run_and_a_line_tells_it(log: RunLog) -> None:
+    """The planner is dead from 1 to 1.8 s while the hand leads down: as if all had stood still."""
+    until_s = (verdict.course(log).zero_ns - log.began_ns()) / 1e9 + 3.15  # before the fault
+    part = RunLog(log.index, RunPart(0.0, until_s))
+    events = part.messages(topics.RUN_EVENT)
     (stop,) = (row for row in events if row.kind == RunEventKind.KILLED)
     kept = [row for row in events if row.kind == RunEventKind.STARTED]
     zero_ns = round(stop.t_ns - stop.scenario_s * NS_PER_S)
     stall = Stall(stop.t_ns, stop.t_ns + ms(80), MACHINE)
-    series = stopped._series[topics.RUN_EVENT.key(stopped.robot)]
-    try:
-        series.decoded = [*kept]
-        without = verdict.summarise(stopped, 2.5)
-        series.decoded = [*kept, stall.event(9, zero_ns)]
-        apart = verdict.summarise(stopped, 2.5)
-    finally:
-        series.decoded = events
+    series = part._series[topics.RUN_EVENT.key(part.robot)]
+    series.decoded = [*kept]
+    without = verdict.summarise(part, 3.1)
+    series.decoded = [*kept, stall.event(9, zero_ns)]
+    apart = verdict.summarise(part, 3.1)
     (force,) = (row for row in LIMITS if row.key == "operator_peak_n")
     assert verdict_table.mark(force, without) == "over"
     assert verdict_table.mark(force, apart) == "ok"

@@ -23,7 +23,6 @@ from tests.tools.live.test_experiment import parse
 from tools.judge import verdict
 from tools.live import describe_inject, experiment
 from tools.logs.run_log import RunLog, read_run
-from tools.sim.lockstep import Lockstep
 from tools.sim.network import BASE
 from tools.sim.recorded_lockstep import simulate
 
@@ -215,28 +214,3 @@ def test_the_time_in_hold_is_not_judged_as_the_planner_leading(cut: RunLog) -> N
     assert summary["handover_max_ms"] is None, "nobody was killed"
     assert summary["handover_torque_step_nm"] < 5.0
     assert 3.0 < summary["command_age_ms"]["median"] < 12.0
-
-
-def test_impairments_that_overlap_end_each_at_its_own_time(robot: RobotConfig) -> None:
-    inner = Inject(link="planner->knee_left", at=0.4, duration=0.2, delay_ms=20.0)
-    outer = Inject(link="planner->joints", at=0.2, duration=1.0, delay_ms=5.0)
-    scenario = still(1.5, inject=(inner, outer))
-    ages: list[tuple[float, float]] = []
-
-    def take(topic: topics.Topic, module: str, message: object) -> None:
-        if topic is topics.JOINT_STATE and module == "knee_left":
-            ages.append((fleet.world.scenario_s, message.age_ns / 1e6))  # type: ignore[attr-defined]
-
-    fleet = Lockstep(robot, scenario, Impairment(delay_ms=1.0), record=take)
-    for _ in fleet.run():
-        pass
-
-    def mean(begin: float, end: float) -> float:
-        found = [age for at, age in ages if begin <= at < end]
-        return sum(found) / len(found)
-
-    plain, first, second = mean(0.0, 0.2), mean(0.25, 0.4), mean(0.45, 0.6)
-    assert first == pytest.approx(plain + 5.0, abs=2.5)
-    assert second == pytest.approx(plain + 20.0, abs=2.5)
-    assert mean(0.65, 1.2) == pytest.approx(first, abs=1.0)
-    assert mean(1.25, 1.5) == pytest.approx(plain, abs=1.0)

@@ -13,6 +13,7 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Fault, Scenario
 from shared.exceptions import RunError
 from tests.lockstep.runs import kill, push, run, still
+from tests.tools.judge.reports.runs import Made
 from tools import cli
 from tools.lab.studies.counterfactual import (
     Moment,
@@ -120,13 +121,14 @@ def test_a_fall_is_a_fall_there_as_well(
 
 
 def test_no_moment_counts_at_which_the_service_was_dead_already(
-    robot: RobotConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    record(robot, still(1.3, kill=kill(0.7)), tmp_path)
-    words = [str(tmp_path / "run.mcap"), "--kill", "planner", "--for", "0.3", "--workers", "1"]
-    assert _main([*words, "--every", "0.5"]) == 0
-    assert "planner killed at 2 moments at which it ran" in capsys.readouterr().out
-    assert _main([*words, "--from", "0.9"]) == 2
+    """It is dead from 1 to 1.8 s."""
+    words = [str(made.path), "--kill", "planner", "--for", "0.3", "--workers", "1"]
+    words += ["--every", "0.5", "--out", str(tmp_path)]
+    assert _main([*words, "--to", "1.7"]) == 0
+    assert "planner killed at 3 moments at which it ran" in capsys.readouterr().out
+    assert _main([*words, "--from", "1.2", "--to", "1.7"]) == 2
     assert "planner: did not run" in capsys.readouterr().err
 
 
