@@ -75,23 +75,21 @@ def test_it_ends_by_itself_after_the_time_it_was_given(robot: RobotConfig) -> No
     assert assist.ask(planner, planner, WISH, lambda: False, planner, for_s=0.02) == 80.0
 
 
-def test_one_who_asks_already_goes_on(robot: RobotConfig) -> None:
-    planner = FakePlanner(lambda _: status(robot, "xrl lead by ada (7)"))
-    with pytest.raises(FleetError, match=r"xrl lead by ada \(7\) asks already"):
+@pytest.mark.parametrize(
+    ("follows", "said"),
+    [
+        ("xrl lead by ada (7)", r"xrl lead by ada \(7\) asks already"),
+        (SCENARIO, "does not take what is asked; it follows the scenario"),
+        (None, "the planner is silent"),
+    ],
+)
+def test_a_request_that_is_not_followed_ends_in_words(
+    robot: RobotConfig, follows: str | None, said: str
+) -> None:
+    planner = FakePlanner(lambda _: None if follows is None else status(robot, follows))
+    with pytest.raises(FleetError, match=said):
         assist.ask(planner, planner, WISH, lambda: False, planner)
-    assert not planner.heard
-
-
-def test_a_planner_that_does_not_accept_is_reported(robot: RobotConfig) -> None:
-    planner = FakePlanner(lambda _: status(robot, SCENARIO))
-    with pytest.raises(FleetError, match="does not take what is asked; it follows the scenario"):
-        assist.ask(planner, planner, WISH, lambda: False, planner)
-
-
-def test_a_missing_planner_is_reported() -> None:
-    planner = FakePlanner(lambda _: None)
-    with pytest.raises(FleetError, match="the planner is silent"):
-        assist.ask(planner, planner, WISH, lambda: False, planner)
+    assert bool(planner.heard) is (follows == SCENARIO), "one who asks already goes on"
 
 
 def test_why_it_is_not_given_is_shown(robot: RobotConfig) -> None:

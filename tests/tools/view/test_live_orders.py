@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -94,22 +95,20 @@ def test_a_viewers_key_may_not_act(robot: RobotConfig, tmp_path: Path) -> None:
     assert LiveSource(secured, Fleet(REAL)).orders == (), "but look"  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("typed", "goes_on"), [("{name}", True), ("yes", False), ("", False)])
-def test_a_real_robots_name_has_to_be_typed(
-    robot: RobotConfig, typed: str, goes_on: bool, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("terminal", "typed", "refusal"),
+    [
+        (True, "{name}", ""),
+        (True, "yes", "another name"),
+        (True, "", "another name"),
+        (False, "{name}", "only if somebody types"),
+    ],
+)
+def test_a_real_robots_name_has_to_be_typed_in_a_terminal(
+    robot: RobotConfig, terminal: bool, typed: str, refusal: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: terminal, raising=False)
     monkeypatch.setattr(view.Console, "input", lambda *_: typed.format(name=robot.name))
-    if goes_on:
-        view.confirm(robot)
-    else:
-        with pytest.raises(FleetError, match="another name"):
-            view.confirm(robot)
-
-
-def test_without_a_terminal_nobody_can_type_it(
-    robot: RobotConfig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sys.stdin, "isatty", lambda: False, raising=False)
-    with pytest.raises(FleetError, match="only if somebody types"):
+    refused = pytest.raises(FleetError, match=refusal)
+    with refused if refusal else contextlib.nullcontext():
         view.confirm(robot)

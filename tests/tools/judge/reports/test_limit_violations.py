@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from shared.bus import topics
 from shared.bus.traces import LinkEvent
+from tests.messages import sample
 from tests.tools.judge.reports import runs
 from tools.judge.reports.limit_violations import LimitViolations, first_violation
 from tools.judge.reports.page_model import TimelineEvent
@@ -109,11 +110,7 @@ def test_hold_has_the_other_limits_only_if_the_network_was_impaired_on_purpose(
 ) -> None:
     """Rule of the verdict: a module that drops out for another reason changes no limit."""
     zero_ns = RunData(log).zero_ns
-    link = "planner->ankle_right"
-    event = LinkEvent(
-        t_ns=zero_ns, seq=1, link=link, requested=link, number=1, active=True, delay_ms=1.0,
-        jitter_ms=0.0, loss=0.0, partition=False, detail="delay=1", passed=0, lost=0,
-    )  # fmt: skip
+    event = sample(LinkEvent, t_ns=zero_ns, link="planner->ankle_right")
     more = [(zero_ns, topics.LINK_EVENT.name, msgspec.json.encode(event))]
 
     def spared(_t: float, event: dict[str, Any]) -> None:

@@ -13,17 +13,15 @@ from shared import revision
 from shared.bus.messages import JointEvent
 from shared.bus.traces import PlannerCheckpoint
 from shared.mcap_log import provenance
+from tests.messages import sample
 from tools.logs.reexecution.compare import Comparison, Origin, likely_reason, ulp
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 
 
 def event(tau: float = 1.5, **changes: object) -> JointEvent:
-    fields = {
-        "t_ns": 7, "seq": 1, "mode_before": 1, "mode_after": 2, "cause": 2, "age_ns": 5,
-        "tau_before": (0.0, 0.0), "tau_after": (tau, -2.0),
-    }  # fmt: skip
-    return JointEvent(**(fields | changes))  # type: ignore[arg-type]
+    found: JointEvent = sample(JointEvent, t_ns=7, tau_after=(tau, -2.0), **changes)
+    return found
 
 
 @given(value=finite)

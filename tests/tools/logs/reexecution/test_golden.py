@@ -29,10 +29,6 @@ TRACE, CYCLE = -2, 3
 """Place of a recorded cycle, after the first snapshot."""
 
 
-def test_there_is_a_golden_log() -> None:
-    assert GOLDEN
-
-
 @pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
 def test_a_golden_log_is_read_message_by_message(path: Path) -> None:
     log = read_run(path)
