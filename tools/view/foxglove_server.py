@@ -41,16 +41,16 @@ class FoxgloveServer:
         self._frame = foxglove.Channel(
             f"xrl/{robot}/frame", schema=_schema_of_frames(), context=self._context
         )
-        self._poses = self._channel("frames", encoding.transforms_schema())
-        self._links = self._channel("links", encoding.scene_schema())
-        self._state = self._channel("state", encoding.scene_schema())
-
-    def _channel(self, name: str, schema: foxglove.Schema) -> foxglove.Channel:
-        return foxglove.Channel(
-            f"xrl/{self._source.robot.name}/scene/{name}",
-            schema=schema,
-            message_encoding=encoding.ENCODING,
-            context=self._context,
+        self._poses, self._links, self._state = (
+            foxglove.Channel(
+                row.topic,
+                schema=foxglove.Schema(
+                    name=row.schema_name, encoding=row.schema_encoding, data=row.schema
+                ),
+                message_encoding=row.encoding,
+                context=self._context,
+            )
+            for row in scene.channels(robot)[: scene.MODEL]
         )
 
     @property
