@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import random
 from collections.abc import Mapping
 from typing import Any, Final, get_args, get_origin, get_type_hints
@@ -26,8 +27,12 @@ LEAVES: Final[Mapping[type, Any]] = {bool: True, int: 1, float: 0.25, str: "word
 
 def sample(message_type: type[Any], **fields: Any) -> Any:
     """Return a message with a value of the right type in every field."""
-    plain = msgspec.to_builtins(filled(message_type, LEAVES))
-    return msgspec.convert(plain | fields, message_type)
+    return msgspec.convert(_plain(message_type) | fields, message_type)
+
+
+@functools.cache
+def _plain(message_type: type[Any]) -> Any:
+    return msgspec.to_builtins(filled(message_type, LEAVES))
 
 
 def filled(message_type: type[Any], leaves: Mapping[type, Any]) -> Any:
