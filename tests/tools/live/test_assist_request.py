@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from types import SimpleNamespace
 
-import msgspec
 import pytest
 from rich.text import Text
 
-from services.planner.planner import Planner
 from shared.bus.messages import STRAIGHT, OperatorIntent, PlannerMode, PlannerStatus, Vector4
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import SCENARIO
 from shared.exceptions import FleetError
+from tests.messages import planner_status
 from tools.live import assist_request as assist
 
 WISH = OperatorIntent(t_ns=1, seq=0, assist_n=80.0, shift=(0.02, 0.0, 0.0, 0.0), source="me")
@@ -48,16 +47,13 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(assist, "time", clock)
 
 
-def status(robot: RobotConfig, requested_by: str, given: float = 0.0) -> PlannerStatus:
-    blank = Planner(robot, 1).status(0, 0.0)
-    return msgspec.structs.replace(
-        blank, requested_by=requested_by, assist_n=given, mode=int(PlannerMode.LEADING)
-    )
+def status(requested_by: str, given: float = 0.0) -> PlannerStatus:
+    return planner_status(requested_by=requested_by, assist_n=given)
 
 
-def test_it_asks_until_it_is_stopped_and_reports_what_is_given(robot: RobotConfig) -> None:
+def test_it_asks_until_it_is_stopped_and_reports_what_is_given() -> None:
     def answer(heard: list[OperatorIntent]) -> PlannerStatus:
-        return status(robot, "me", 80.0) if len(heard) > 2 else status(robot, SCENARIO)
+        return status("me", 80.0) if len(heard) > 2 else status(SCENARIO)
 
     planner = FakePlanner(answer)
     given = assist.ask(planner, planner, WISH, lambda: len(planner.heard) > 20, planner)
@@ -70,8 +66,8 @@ def test_it_asks_until_it_is_stopped_and_reports_what_is_given(robot: RobotConfi
     assert "requested 80 N, given 80 N, shift x 0.02 m" in planner.lines[-1]
 
 
-def test_it_ends_by_itself_after_the_time_it_was_given(robot: RobotConfig) -> None:
-    planner = FakePlanner(lambda heard: status(robot, "me" if heard else "", 80.0))
+def test_it_ends_by_itself_after_the_time_it_was_given() -> None:
+    planner = FakePlanner(lambda heard: status("me" if heard else "", 80.0))
     assert assist.ask(planner, planner, WISH, lambda: False, planner, for_s=0.02) == 80.0
 
 
@@ -83,19 +79,16 @@ def test_it_ends_by_itself_after_the_time_it_was_given(robot: RobotConfig) -> No
         (None, "the planner is silent"),
     ],
 )
-def test_a_request_that_is_not_followed_ends_in_words(
-    robot: RobotConfig, follows: str | None, said: str
-) -> None:
-    planner = FakePlanner(lambda _: None if follows is None else status(robot, follows))
+def test_a_request_that_is_not_followed_ends_in_words(follows: str | None, said: str) -> None:
+    planner = FakePlanner(lambda _: None if follows is None else status(follows))
     with pytest.raises(FleetError, match=said):
         assist.ask(planner, planner, WISH, lambda: False, planner)
     assert bool(planner.heard) is (follows == SCENARIO), "one who asks already goes on"
 
 
-def test_why_it_is_not_given_is_shown(robot: RobotConfig) -> None:
-    holds = msgspec.structs.replace(
-        status(robot, "me"), mode=int(PlannerMode.TRIPPED), why="the torso turns fast"
-    )
+def test_why_it_is_not_given_is_shown() -> None:
+    mode = int(PlannerMode.TRIPPED)
+    holds = planner_status(requested_by="me", mode=mode, why="the torso turns fast")
     assert "TRIPPED: the torso turns fast" in assist.describe(WISH, holds)
 
 
