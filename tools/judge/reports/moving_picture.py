@@ -121,9 +121,7 @@ def write_gif(
         raise RunError(f"{log.path}: the scenario never began; there is nothing to draw")
     captions = _captions(log, began)
     images = []
-    curves = None
-    if with_curves:
-        curves = Curves(chosen, began, SIZE[0], (HAND_INK, COM_INK), INK)
+    curves = Curves(chosen, began) if with_curves else None
     for number, pose in enumerate(chosen):
         width = SIZE[0] + (WIDTH if curves is not None else 0)
         image = Image.new("RGB", (width * SCALE, SIZE[1] * SCALE), BACKGROUND)
@@ -262,6 +260,8 @@ WIDTH: Final = 440
 """By which the picture is wider, px."""
 TOP, HEIGHT, GAP = 66.0, 84.0, 22.0
 LEFT, RIGHT = 64.0, 16.0
+CURVES_X, CURVES_WIDTH = SIZE[0] + LEFT, WIDTH - LEFT - RIGHT
+CURVE_INKS: Final = (HAND_INK, COM_INK)
 
 
 class CurvePanel(NamedTuple):
@@ -284,11 +284,8 @@ PANELS: Final = (
 class Curves:
     """All panels of a run."""
 
-    def __init__(
-        self, poses: Sequence[RobotPose], began_ns: int, left: float, inks: Sequence[str], ink: str
-    ) -> None:
+    def __init__(self, poses: Sequence[RobotPose], began_ns: int) -> None:
         self._t = [(pose.t_ns - began_ns) / NS_PER_S for pose in poses]
-        self._left, self._inks, self._ink = left + LEFT, inks, ink
         self._columns = [list(zip(*map(panel.values, poses), strict=True)) for panel in PANELS]
         self._ranges = [
             _range(columns, p.least) for columns, p in zip(self._columns, PANELS, strict=True)
@@ -301,31 +298,25 @@ class Curves:
             low, high = self._ranges[index]
             for value in (low, high):
                 y = self._y(value, index)
-                canvas.line([(self._left, y), (self._left + self._width, y)], self._ink, 0.5)
-                canvas.text((self._left - 46.0, y - 7.0), f"{value:.3g}", self._ink, 11)
-            canvas.text((self._left, top - 17.0), panel.title, self._ink, 12)
+                canvas.line([(CURVES_X, y), (CURVES_X + CURVES_WIDTH, y)], INK, 0.5)
+                canvas.text((CURVES_X - 46.0, y - 7.0), f"{value:.3g}", INK, 11)
+            canvas.text((CURVES_X, top - 17.0), panel.title, INK, 12)
             for line, name in enumerate(panel.names):
-                canvas.text(
-                    (self._left + 90.0 + 60.0 * line, top - 17.0), name, self._inks[line], 12
-                )
+                canvas.text((CURVES_X + 90.0 + 60.0 * line, top - 17.0), name, CURVE_INKS[line], 12)
                 values = self._columns[index][line][: number + 1]
                 points = [
                     (self._x(t), self._y(value, index))
                     for t, value in zip(self._t, values, strict=False)
                 ]
                 if len(points) > 1:
-                    canvas.line(points, self._inks[line], 1.6)
+                    canvas.line(points, CURVE_INKS[line], 1.6)
         x, bottom = self._x(self._t[number]), TOP + len(PANELS) * (HEIGHT + GAP) - GAP
-        canvas.line([(x, TOP), (x, bottom)], self._ink, 0.5)
-        canvas.text((x - 12.0, bottom + 4.0), f"{self._t[number]:.1f} s", self._ink, 11)
-
-    @property
-    def _width(self) -> float:
-        return WIDTH - LEFT - RIGHT
+        canvas.line([(x, TOP), (x, bottom)], INK, 0.5)
+        canvas.text((x - 12.0, bottom + 4.0), f"{self._t[number]:.1f} s", INK, 11)
 
     def _x(self, t: float) -> float:
         begin, end = self._t[0], self._t[-1]
-        return self._left + self._width * (t - begin) / max(1e-9, end - begin)
+        return CURVES_X + CURVES_WIDTH * (t - begin) / max(1e-9, end - begin)
 
     def _y(self, value: float, index: int) -> float:
         low, high = self._ranges[index]
