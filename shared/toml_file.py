@@ -6,6 +6,7 @@ What does not fit is refused with the file, the key, the value and what would be
 
 from __future__ import annotations
 
+import functools
 import re
 import stat
 import tomllib
@@ -106,7 +107,7 @@ def _follow(path: str, raw: Any, hint: Any) -> tuple[str, Any, Any]:
     key, value = "", raw
     for name, index in re.findall(r"([A-Za-z_]\w*)|\[(\d+|\.\.\.)\]", path):
         if name:
-            hint = get_type_hints(hint, include_extras=True)[name]
+            hint = _hints_of(hint)[name]
             key, value = f"{key}.{name}".lstrip("."), value[name]
         elif index == "...":
             hint = get_args(hint)[1]
@@ -121,6 +122,12 @@ def _follow(path: str, raw: Any, hint: Any) -> tuple[str, Any, Any]:
         if get_origin(hint) is Annotated:
             hint = get_args(hint)[0]
     return key, value, hint
+
+
+@functools.cache
+def _hints_of(kind: type) -> dict[str, Any]:
+    """Return the type of each field; found by evaluating text, which takes milliseconds."""
+    return get_type_hints(kind, include_extras=True)
 
 
 def _fits(value: Any, hint: Any) -> bool:
@@ -149,7 +156,7 @@ def _check_ranges(file: str, key: str, value: Any, hint: Any) -> None:
         if value is not None:
             _check_ranges(file, key, value, next(one for one in get_args(hint) if one is not None))
     elif isinstance(value, msgspec.Struct):
-        hints = get_type_hints(type(value), include_extras=True)
+        hints = _hints_of(type(value))
         for name in value.__struct_fields__:
             _check_ranges(file, f"{key}.{name}".lstrip("."), getattr(value, name), hints[name])
     elif origin is tuple:
