@@ -42,37 +42,6 @@ def test_only_messages_are_lost(rig: Rig) -> None:
     assert rig.ended() == (0, 20)
 
 
-def test_what_is_doubled_comes_out_twice_byte_for_byte(rig: Rig) -> None:
-    planner, knee = rig.link()
-    rig.there.begin(1, Impairment(duplicate=1.0))
-    rig.say(planner, 1, 2)
-    assert heard(knee) == 2 * batch(MESSAGE, 1) + 2 * batch(MESSAGE, 2)
-
-
-def test_jitter_lets_some_overtake_loses_none_and_keeps_within_its_bounds(rig: Rig) -> None:
-    planner, knee = rig.link()
-    rig.there.begin(1, Impairment(delay_ms=20.0, jitter_ms=10.0))
-    rig.say(planner, *range(50))
-    rig.at(9.9)
-    assert heard(knee) is None
-    came = []
-    for ms in range(10, 31):
-        rig.at(ms)
-        came += numbers(knee)
-    assert sorted(came) == list(range(50))
-    assert came != sorted(came)
-
-
-def test_what_is_reordered_has_no_delay(rig: Rig) -> None:
-    planner, knee = rig.link()
-    rig.there.begin(1, Impairment(delay_ms=20.0, reorder=0.5))
-    rig.say(planner, *range(40))
-    first = numbers(knee)
-    assert 10 < len(first) < 30
-    rig.at(20.0)
-    assert sorted(first + numbers(knee)) == list(range(40))
-
-
 def test_a_slow_line_lets_out_so_many_bytes_a_second(rig: Rig) -> None:
     planner, knee = rig.link()
     size = len(batch(MESSAGE))
