@@ -18,7 +18,6 @@ from shared.config.robot_config import RobotConfig
 from shared.joints import JOINTS, MODULES
 from shared.robot import frames
 from shared.robot.frames import Quaternion
-from shared.robot.robot_urdf import cross_of
 from tests.messages import all_states, joint_state, planner_status, wrench
 from tests.ros2_gateway.others import read
 
@@ -37,18 +36,6 @@ def test_joint_states_have_name_angle_rate_and_torque_of_every_joint(convert: Co
     assert tuple(message.name) == JOINTS
     for part, values in (("q", message.position), ("v", message.velocity), ("tau", message.effort)):
         assert list(values) == [x for name in MODULES for x in getattr(states[name], part)]
-
-
-def test_a_module_that_is_silent_is_left_out_and_none_is_made_up(convert: Conversions) -> None:
-    states = all_states()
-    del states["knee_left"]
-    message = read(conversions.JOINT_STATE, convert.joint_states(NS, states))
-    assert len(message.name) == len(message.position) == len(message.effort) == 10
-    assert "knee_left_phi" not in message.name
-    rows = read(conversions.TRANSFORMS, convert.transforms(NS, states, planner_status()))
-    children = [row.child_frame_id for row in rows.transforms]
-    assert {"torso", "knee_left", cross_of("knee_left")} & set(children) == set()
-    assert "ankle_left" in children
 
 
 def test_the_transforms_carry_every_frame_to_where_it_is(

@@ -15,6 +15,7 @@ from shared.bus.messages import JointState
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.joints import JOINTS
+from shared.robot.robot_urdf import cross_of
 from tests.messages import all_states, planner_status, wrench
 from tests.ros2_gateway.others import read
 
@@ -86,7 +87,9 @@ def test_history_is_not_repeated(robot: RobotConfig, age_ns: int, shown: bool) -
     assert len(silent) == (0 if shown else 8), "six modules, planner and harness"
 
 
-def test_a_silent_module_ends_the_torso_and_its_own_joints_only(robot: RobotConfig) -> None:
+def test_a_silent_module_ends_the_torso_and_its_own_joints_only_and_none_is_made_up(
+    robot: RobotConfig,
+) -> None:
     gateway = made(robot)
     states = all_states()
     feed(gateway, T0)
@@ -94,10 +97,11 @@ def test_a_silent_module_ends_the_torso_and_its_own_joints_only(robot: RobotConf
     del states["hip_right"]
     feed(gateway, later, states)
     found = {outgoing.topic: outgoing.payload for outgoing in gateway.due(later, later)}
-    names = read(KNOWN.joint_states.type, found[KNOWN.joint_states]).name
-    assert set(JOINTS) - set(names) == {"hip_right_phi", "hip_right_theta"}
+    joints = read(KNOWN.joint_states.type, found[KNOWN.joint_states])
+    assert set(JOINTS) - set(joints.name) == {"hip_right_phi", "hip_right_theta"}
+    assert len(joints.position) == len(joints.effort) == len(joints.name) == 10
     children = {row.child_frame_id for row in read(KNOWN.tf.type, found[KNOWN.tf]).transforms}
-    assert "torso" not in children
+    assert children & {"torso", "hip_right", cross_of("hip_right")} == set()
     assert "knee_right" in children
 
 
