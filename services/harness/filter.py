@@ -41,7 +41,10 @@ less than a hand on the harness makes, or a robot that sways."""
 
 
 class FilterState(msgspec.Struct, frozen=True, gc=False, kw_only=True):
-    """All that the filter remembers; its arrays are never written to."""
+    """All that the filter remembers; its arrays are never written to.
+
+    As made, it is that at power-up: waiting for the first sample of the tare.
+    """
 
     tare: Tare = Tare.RUNNING
     tare_start_ns: int = NEVER_NS
@@ -77,11 +80,6 @@ class FilteredWrench(msgspec.Struct, frozen=True, gc=False, kw_only=True):
     saturated: bool
     age_ns: int
     """Age of the newest finite sample; -1 before the first."""
-
-
-def initial_state() -> FilterState:
-    """Return the state at power-up: waiting for the first sample of the tare."""
-    return FilterState()
 
 
 def tared_state(offset: Array) -> FilterState:

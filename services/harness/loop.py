@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from services.harness import filter as wrench_filter
-from services.harness.filter import FilterState, WrenchFilter
+from services.harness.filter import FilterState, WrenchFilter, start_tare
 from shared.bus.messages import TareRequest, Vector6, Wrench
 from shared.bus.ports import Inbox, Outbox
 from shared.can.sensor_loop import Sensor, SensorLoop
@@ -20,7 +19,7 @@ class HarnessLoop(SensorLoop[Vector6, Wrench]):
         requests: Inbox[TareRequest],
     ) -> None:
         super().__init__(sensor, publisher)
-        self.state: FilterState = wrench_filter.initial_state()
+        self.state = FilterState()
         self._law, self._requests = law, requests
 
     @property
@@ -34,7 +33,7 @@ class HarnessLoop(SensorLoop[Vector6, Wrench]):
         The sensor is fixed to the torso.
         """
         if self._requests.take() is not None:
-            self.state = wrench_filter.start_tare(self.state)
+            self.state = start_tare(self.state)
         self.state, reading = self._law.step(self.state, now_ns, sample)
         fx, fy, fz, mx, my, mz = reading.wrench.tolist()
         return Wrench(

@@ -13,7 +13,6 @@ from services.harness.filter import (
     FilteredWrench,
     FilterState,
     WrenchFilter,
-    initial_state,
     start_tare,
 )
 from shared.bus.messages import Tare
@@ -48,7 +47,7 @@ def feed(
 
 def tared(law: WrenchFilter = LAW, bias: tuple[float, ...] = ZERO) -> tuple[FilterState, int]:
     """Return a state after the tare, and the time of its last sample."""
-    state, t_ns = initial_state(), T0
+    state, t_ns = FilterState(), T0
     while True:
         state, reading = feed(law, state, t_ns, bias)
         if reading.valid:
@@ -69,14 +68,14 @@ def settled(
 
 
 def test_nothing_is_valid_before_the_first_sample() -> None:
-    state, reading = LAW.step(initial_state(), T0, None)
+    state, reading = LAW.step(FilterState(), T0, None)
     assert (reading.valid, reading.age_ns) == (False, -1)
     assert not reading.wrench.any()
     assert state.tare is not Tare.DONE
 
 
 def test_valid_comes_exactly_when_the_tare_time_is_full() -> None:
-    state = initial_state()
+    state = FilterState()
     for t_ns in range(T0, T0 + TARE_NS, PERIOD_NS):
         state, reading = feed(LAW, state, t_ns, ZERO)
         assert not reading.valid
@@ -100,7 +99,7 @@ def test_tare_removes_any_constant_bias(
 
 def test_tare_averages_noise() -> None:
     noise = np.random.default_rng(1).standard_normal((200, 6))
-    state, t_ns, used = initial_state(), T0, 0
+    state, t_ns, used = FilterState(), T0, 0
     while state.tare is not Tare.DONE:
         state, _ = feed(LAW, state, t_ns, tuple(50.0 + noise[used]))
         used += 1
@@ -110,7 +109,7 @@ def test_tare_averages_noise() -> None:
 
 @pytest.mark.parametrize("disturbance", ["gap", "saturation"])
 def test_a_disturbed_tare_starts_over_and_forgets_what_it_had(disturbance: str) -> None:
-    state, t_ns = initial_state(), T0
+    state, t_ns = FilterState(), T0
     for _ in range(100):
         state, _ = feed(LAW, state, t_ns, (100.0,) * 6)
         t_ns += PERIOD_NS
@@ -133,7 +132,7 @@ def test_a_disturbed_tare_starts_over_and_forgets_what_it_had(disturbance: str) 
 @pytest.mark.parametrize("share", [0.99, 1.01])
 def test_a_tare_is_taken_up_to_the_limit_of_the_forces_deviation(leg: int, share: float) -> None:
     """Alternating between two values, the deviation is half their distance, whatever the bias."""
-    state, t_ns = initial_state(), T0
+    state, t_ns = FilterState(), T0
     for n in range(TARE_CYCLES + 1):
         forces = [1000.0] * 6
         forces[leg] += 2.0 * share * TARE_DEVIATION_MAX * (n % 2)
@@ -144,7 +143,7 @@ def test_a_tare_is_taken_up_to_the_limit_of_the_forces_deviation(leg: int, share
 
 
 def test_a_gap_of_just_the_stale_time_does_not_disturb_the_tare() -> None:
-    state, t_ns = initial_state(), T0
+    state, t_ns = FilterState(), T0
     while state.tare is not Tare.DONE:
         state, _ = feed(LAW, state, t_ns, ZERO)
         t_ns += STALE_NS
@@ -236,7 +235,7 @@ def test_a_cell_at_the_end_of_its_range_is_saturated_whatever_float32_makes_of_i
     limit: float,
 ) -> None:
     law = WrenchFilter(harness_with(leg_force_max=limit))
-    _, reading = feed(law, initial_state(), T0, (as_sent(limit), *ZERO[1:]))
+    _, reading = feed(law, FilterState(), T0, (as_sent(limit), *ZERO[1:]))
     assert reading.saturated
 
 
@@ -312,7 +311,7 @@ def test_whatever_the_sensor_sends_the_reading_is_finite(
     stream: list[tuple[int, tuple[float, ...] | None]], tare_ms: float
 ) -> None:
     law = WrenchFilter(harness_with(tare_s=tare_ms / 1e3))
-    state, now_ns = initial_state(), T0
+    state, now_ns = FilterState(), T0
     for dt_ns, forces in stream:
         now_ns += dt_ns
         state, reading = law.step(state, now_ns, None if forces is None else six(forces))

@@ -58,25 +58,6 @@ def test_every_cycle_publishes_once_with_the_next_sequence_number() -> None:
     assert stamps == [(n, T0 + n * PERIOD_NS) for n in range(10)]
 
 
-@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
-def test_a_number_that_is_not_finite_never_reaches_the_bus(number: float) -> None:
-    loop, sensor, sink = make_loop()
-    _, t_ns = cycles(loop, T0, TARE_CYCLES + 1)
-    sensor.forces = (0.0, 0.0, number, 0.0, 0.0, 0.0)
-    message, _ = cycles(loop, t_ns, 10)
-    assert loop.state.refused == 10
-    assert not message.valid
-    assert len(sink.payloads) == TARE_CYCLES + 11, "Sink.put would have raised NonFiniteError"
-
-
-def test_what_the_bus_did_not_take_is_counted() -> None:
-    loop, _, sink = make_loop()
-    cycles(loop, T0, 3)
-    sink.closed = True
-    cycles(loop, T0 + 3 * PERIOD_NS, 2)
-    assert loop.unsent == 2
-
-
 def test_a_tare_on_request_makes_the_present_wrench_the_zero_and_is_reported_until_it_is_done() -> (
     None
 ):

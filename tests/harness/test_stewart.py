@@ -17,10 +17,6 @@ GEOMETRY = (HARNESS.base_radius, HARNESS.platform_radius, HARNESS.height)
 
 lengths = st.floats(0.05, 0.2)
 forces = st.lists(st.floats(-1500.0, 1500.0), min_size=6, max_size=6).map(np.array)
-wrenches = st.tuples(
-    st.lists(st.floats(-300.0, 300.0), min_size=3, max_size=3),
-    st.lists(st.floats(-60.0, 60.0), min_size=3, max_size=3),
-).map(lambda pair: np.array(pair[0] + pair[1]))
 
 
 def leg_lengths(base: Array, platform: Array, rotation: Array, shift: Array) -> Array:
@@ -63,15 +59,6 @@ def test_wrench_does_the_work_of_the_legs(leg_forces: Array) -> None:
             ends.append(leg_lengths(base, platform, rotation, shift))
         shortening = (ends[1] - ends[0]) / (2.0 * step)
         assert (G @ leg_forces)[axis] == pytest.approx(float(leg_forces @ shortening), abs=1e-4)
-
-
-@given(wrench=wrenches, base_radius=lengths, platform_radius=lengths, height=lengths)
-def test_a_wrench_goes_to_the_legs_and_back(
-    wrench: Array, base_radius: float, platform_radius: float, height: float
-) -> None:
-    matrix = geometry_matrix(base_radius, platform_radius, height)
-    back = matrix @ np.linalg.solve(matrix, wrench)
-    np.testing.assert_allclose(back, wrench, rtol=1e-9, atol=1e-9)
 
 
 def test_tension_pulls_the_torso_towards_the_operator() -> None:
