@@ -19,8 +19,9 @@ from services.simulator.fronts.fibre_port import FibreHub, FibrePort
 from services.simulator.fronts.usb_standin import build, load
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES, N_JOINTS
+from tests.waiting import comes_true as eventually
 
-__all__ = ["Control", "UsbRobot", "build", "load"]
+__all__ = ["Control", "UsbRobot", "build", "eventually", "load"]
 
 MODULE = 2
 """The module that the driver under test is for."""
@@ -87,16 +88,6 @@ class UsbRobot:
                 self.vel += torque / (2 * np.pi * INERTIA) * passed_s
                 self.pos += self.vel * passed_s
                 before = now
-
-
-def eventually(claim: Callable[[], bool], within_s: float = 20.0) -> bool:
-    """Return whether a claim comes true in time."""
-    deadline = time.monotonic() + within_s
-    while time.monotonic() < deadline:
-        if claim():
-            return True
-        time.sleep(0.005)
-    return claim()
 
 
 def axis_name(axis: int) -> str:
