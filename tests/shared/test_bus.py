@@ -376,19 +376,9 @@ def test_session_that_cannot_be_opened_is_one_clear_error(run_dir: Path, name: s
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("endpoint", "why"),
-    [
-        ("tcp/127.0.0.1:0", "a port from 1 to 65535"),
-        ("tcp/127.0.0.1:65536", "a port from 1 to 65535"),
-        ("unixsock-stream/{Run}/x.zenoh", r"\{Run\} is no placeholder"),
-    ],
-)
-def test_a_tool_listens_at_no_endpoint_that_there_cannot_be(
-    run_dir: Path, endpoint: str, why: str
-) -> None:
-    with pytest.raises(BusError, match=why):
-        open_session(ROBOT, TOOL, run_dir, listen=[endpoint])
+def test_a_tool_listens_at_no_endpoint_that_there_cannot_be(run_dir: Path) -> None:
+    with pytest.raises(BusError, match="a port from 1 to 65535"):
+        open_session(ROBOT, TOOL, run_dir, listen=["tcp/127.0.0.1:0"])
 
 
 USES_REFUSED: dict[str, Callable[[Session], object]] = {

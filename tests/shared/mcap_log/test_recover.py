@@ -131,13 +131,6 @@ def test_a_foreign_file_is_recovered_too(
     assert names == {"/a": "std_msgs/String", "/b": None}
 
 
-def test_an_unfinished_file_at_the_start_is_replaced_by_its_recovery(tmp_path: Path) -> None:
-    path = runs.killed_file(tmp_path).path
-    auto_recover.recover_in_place(path, 0, LOGGER, lambda: False)
-    assert by_the_package(path) == list(range(1200))
-    assert [p.name for p in tmp_path.glob("*.mcap")] == ["killed.mcap"]
-
-
 def test_a_damaged_original_stays_and_its_recovery_goes_beside_it_once(tmp_path: Path) -> None:
     killed = runs.killed_file(tmp_path)
     data = bytearray(killed.path.read_bytes())
@@ -201,11 +194,13 @@ def test_the_rescue_of_a_directory_takes_what_is_unfinished_and_survives_the_res
     finished = runs.write(tmp_path / "written2", [item(0)])
     target = tmp_path / "finished.mcap"
     target.write_bytes(finished.read_bytes())
+    there = sorted(tmp_path.glob("*.mcap"))
     thread = auto_recover.AutoRecovery(tmp_path, 0, LOGGER)
     thread.start()
     thread.join(60.0)
     assert not thread.is_alive()
-    assert by_the_package(path) == list(range(1200))
+    assert by_the_package(path) == list(range(1200)), "replaced by its recovery"
+    assert sorted(tmp_path.glob("*.mcap")) == there
     assert target.read_bytes() == finished.read_bytes()
     warned = [r.getMessage() for r in caplog.records if r.levelno == logging.WARNING]
     assert len(warned) == 3
