@@ -17,12 +17,10 @@ from shared.bus.messages import Vector3, Vector4
 from shared.can.imu_can import ImuSample
 from shared.clock import NS_PER_MS
 from shared.config.sections import ImuConfig
+from shared.robot.frames import rotated, torso_rotation
 
 UNIT_TOLERANCE: Final = 0.02
 """How far a quaternion's length may be from 1; rounding to 2^-15 makes 6e-5."""
-
-Rotation = tuple[Vector3, Vector3, Vector3]
-"""Rows."""
 
 
 class AttitudeReading(NamedTuple):
@@ -45,7 +43,7 @@ class AttitudeLaw:
     def __init__(self, config: ImuConfig) -> None:
         self.refused = 0
         """Samples whose quaternion was not of unit length."""
-        self._mounting = rotation(*config.mounting)
+        self._mounting = torso_rotation(config.mounting)
         self._stale_ns = round(config.stale_ms * NS_PER_MS)
         self._up: Vector3 = (0.0, 0.0, 1.0)
         self._rate: Vector3 = (0.0, 0.0, 0.0)
@@ -61,8 +59,8 @@ class AttitudeLaw:
             self._sample_ns = now_ns
             self._knows = sample.valid
             if sample.valid:
-                self._up = _turned(self._mounting, up_in_sensor(sample.quaternion))
-                self._rate = _turned(self._mounting, sample.rate)
+                self._up = rotated(self._mounting, up_in_sensor(sample.quaternion))
+                self._rate = rotated(self._mounting, sample.rate)
         if self._sample_ns is None:
             return AttitudeReading(self._up, self._rate, valid=False, age_ns=-1)
         age_ns = now_ns - self._sample_ns
@@ -78,22 +76,5 @@ def up_in_sensor(quaternion: Vector4) -> Vector3:
     return (up[0] / length, up[1] / length, up[2] / length)
 
 
-def rotation(roll: float, pitch: float, yaw: float) -> Rotation:
-    """Return Rz(yaw) Rx(roll) Ry(pitch), the project's order of angles (rad)."""
-    cr, sr = math.cos(roll), math.sin(roll)
-    cp, sp = math.cos(pitch), math.sin(pitch)
-    cy, sy = math.cos(yaw), math.sin(yaw)
-    return (
-        (cy * cp - sy * sr * sp, -sy * cr, cy * sp + sy * sr * cp),
-        (sy * cp + cy * sr * sp, cy * cr, sy * sp - cy * sr * cp),
-        (-cr * sp, sr, cr * cp),
-    )
-
-
 def _is_unit(quaternion: Vector4) -> bool:
     return abs(math.hypot(*quaternion) - 1.0) <= UNIT_TOLERANCE
-
-
-def _turned(rows: Rotation, vector: Vector3) -> Vector3:
-    x, y, z = (row[0] * vector[0] + row[1] * vector[1] + row[2] * vector[2] for row in rows)
-    return (x, y, z)
