@@ -22,7 +22,7 @@ from shared.bus.messages import (
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.joints import AXES, MODULES, SIDES
-from shared.robot.frames import ORIGIN, UPRIGHT, FramePose, leg_offsets, rotation_about, torso_pose
+from shared.robot.frames import ORIGIN, UPRIGHT, FramePose, leg_modules, rotation_about, torso_pose
 from shared.robot.robot_urdf import cross_of
 from shared.robot.trip_table import reason_of, remedy_of
 
@@ -100,15 +100,12 @@ class Conversions:
             x, y, z, *_ = status.p
             rows.append(FramePose("world", "com", (x, y, z), UPRIGHT))
         for side in SIDES:
-            parent = "torso"
-            for kind, offset in leg_offsets(geometry, side):
-                module = f"{kind}_{side}"
+            for parent, module, offset in leg_modules(geometry, side):
                 if module in states:
                     phi, theta = states[module].q
                     cross = cross_of(module)
                     rows.append(FramePose(parent, cross, offset, rotation_about(1, -theta)))
                     rows.append(FramePose(cross, module, ORIGIN, rotation_about(0, -phi)))
-                parent = module
         return self._encode(TRANSFORMS, transforms=[self._transform(ns, row) for row in rows])
 
     def wrench(self, ns: int, wrench: Wrench) -> bytes:

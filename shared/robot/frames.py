@@ -35,23 +35,25 @@ class FramePose(NamedTuple):
 
 def body_frames(geometry: GeometryConfig, q: Sequence[float]) -> list[FramePose]:
     """Return the frames on the torso and below it, at joint angles (12,), rad."""
-    found = [FramePose("torso", "harness", geometry.harness_point, UPRIGHT)]
-    for side in SIDES:
-        parent = "torso"
-        for kind, position in leg_offsets(geometry, side):
-            module = f"{kind}_{side}"
-            phi, theta = joint_pair(q, module)
-            found.append(FramePose(parent, module, position, module_rotation(phi, theta)))
-            parent = module
-    return found
+    harness = FramePose("torso", "harness", geometry.harness_point, UPRIGHT)
+    modules = (
+        FramePose(parent, module, position, module_rotation(*joint_pair(q, module)))
+        for side in SIDES
+        for parent, module, position in leg_modules(geometry, side)
+    )
+    return [harness, *modules]
 
 
-def leg_offsets(geometry: GeometryConfig, side: str) -> tuple[tuple[str, Vector3], ...]:
-    """Return each module's kind and its position in the frame above it, m, from the torso down."""
+def leg_modules(geometry: GeometryConfig, side: str) -> tuple[tuple[str, str, Vector3], ...]:
+    """Return the frame above each module of a leg, the module, and its position there, m.
+
+    From the torso down.
+    """
+    hip, knee, ankle = (f"{kind}_{side}" for kind in ("hip", "knee", "ankle"))
     return (
-        ("hip", (0.0, side_sign(side) * geometry.w_hip / 2, 0.0)),
-        ("knee", (0.0, 0.0, -geometry.l1)),
-        ("ankle", (0.0, 0.0, -geometry.l2)),
+        ("torso", hip, (0.0, side_sign(side) * geometry.w_hip / 2, 0.0)),
+        (hip, knee, (0.0, 0.0, -geometry.l1)),
+        (knee, ankle, (0.0, 0.0, -geometry.l2)),
     )
 
 
@@ -103,10 +105,10 @@ def _ankle_in_torso(
 ) -> tuple[Vector3, Quaternion]:
     """Return the pose of a foot in the torso's frame."""
     position, rotation = ORIGIN, UPRIGHT
-    for kind, offset in leg_offsets(geometry, side):
+    for _, module, offset in leg_modules(geometry, side):
         x, y, z = rotated(rotation, offset)
         position = position[0] + x, position[1] + y, position[2] + z
-        rotation = product(rotation, module_rotation(*joint_pair(q, f"{kind}_{side}")))
+        rotation = product(rotation, module_rotation(*joint_pair(q, module)))
     return position, rotation
 
 

@@ -14,7 +14,7 @@ from shared.bus.messages import Vector3
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import LimitConfig
 from shared.joints import SIDES, kind_of
-from shared.robot.frames import ORIGIN, leg_offsets
+from shared.robot.frames import ORIGIN, leg_modules
 from shared.robot.robot_model import MODULE_RADIUS, ball_inertia, box_inertia, numbers
 
 THETA_AXIS: Final[Vector3] = (0.0, -1.0, 0.0)
@@ -40,15 +40,12 @@ def urdf(config: RobotConfig) -> str:
     _add_visual(torso, "box", size=numbers(*size))
     _add_fixed(root, "torso", "harness", geometry.harness_point)
     for side in SIDES:
-        parent = "torso"
-        for kind, offset in leg_offsets(geometry, side):
-            module = f"{kind}_{side}"
+        for parent, module, offset in leg_modules(geometry, side):
             ET.SubElement(root, "link", name=cross_of(module))
             link = ET.SubElement(root, "link", name=module)
-            _add_body(link, config, kind)
+            _add_body(link, config, kind_of(module))
             _add_joint(root, config, f"{module}_theta", (parent, cross_of(module)), offset)
             _add_joint(root, config, f"{module}_phi", (cross_of(module), module), ORIGIN)
-            parent = module
     ET.indent(root)
     return ET.tostring(root, encoding="unicode")
 
