@@ -205,28 +205,24 @@ class LogReader:
 
     def _place(self, at: int) -> tuple[ChunkPlace | None, int]:
         """Return a chunk's place and the offset behind its indices; None for other records."""
-        opcode, end = self._head(at)
-        if opcode != Opcode.CHUNK or end > self._end or not self._plausible(end):
+        opcode, start, following = self._extent(at)
+        if opcode != Opcode.CHUNK or not start + CHUNK_TIMES.size <= following <= self._end:
             return None, at
-        first_ns, last_ns = CHUNK_TIMES.unpack_from(self._data, at + PREFIX.size)[:2]
+        if not self._plausible(following):
+            return None, at
+        first_ns, last_ns, _, _ = CHUNK_TIMES.unpack_from(self._data, start)
         channels = set()
-        following = end
         while True:
-            opcode, end = self._head(following)
-            if opcode != Opcode.MESSAGE_INDEX or end > self._end:
+            opcode, start, end = self._extent(following)
+            if opcode != Opcode.MESSAGE_INDEX or not start + _INDEX_HEAD.size <= end <= self._end:
                 break
-            number, size = _INDEX_HEAD.unpack_from(self._data, following + PREFIX.size)
+            number, size = _INDEX_HEAD.unpack_from(self._data, start)
             if size:
                 channels.add(number)
             following = end
+        if end > self._end:  # the data ends here: an index of it may be missing
+            channels.clear()
         return ChunkPlace(at, first_ns, last_ns, frozenset(channels) or None), following
-
-    def _head(self, at: int) -> tuple[int, int]:
-        """Return the opcode of the record at a place and the offset of its end; 0 if none fits."""
-        if self._end - at < PREFIX.size + CHUNK_TIMES.size:
-            return 0, self._end
-        opcode, length = PREFIX.unpack_from(self._data, at)
-        return opcode, at + PREFIX.size + length
 
     def raw(self, start: int, end: int) -> bytes:
         """Return the file's bytes from one place to another."""
@@ -236,8 +232,7 @@ class LogReader:
         """Return the record at a place, if it can be read, and where to go on."""
         if self._end - at < PREFIX.size:
             return None, self._lost(at, self._end)
-        opcode, length = PREFIX.unpack(self._data[at : at + PREFIX.size])
-        start, end = at + PREFIX.size, at + PREFIX.size + length
+        opcode, start, end = self._extent(at)
         if end > self._end:
             following = self._chunk_after(at + 1)
             if following is None and opcode == Opcode.CHUNK and not self.finished:
@@ -253,7 +248,7 @@ class LogReader:
 
     def _record(self, opcode: int, at: int, start: int, end: int) -> LogRecord:
         # an index of messages follows a chunk only: anything else there is a damaged one
-        index_follows = self._prefix(end)[0] == Opcode.MESSAGE_INDEX
+        index_follows = self._extent(end)[0] == Opcode.MESSAGE_INDEX
         if opcode == Opcode.MESSAGE:
             rows, end = split_messages(self._data, at, self._end, LOOSE_MAX)
             if not rows or (len(rows) == 1 and index_follows):
@@ -284,12 +279,12 @@ class LogReader:
         """
         at = max(at, self._vouched)
         while self._end - at >= PREFIX.size:
-            opcode, length = self._prefix(at)
+            opcode, _, end = self._extent(at)
             if opcode in KNOWN:
                 break
             if not opcode:
                 return False
-            at += PREFIX.size + length
+            at = end
         if not self._plausible(at):
             return False
         self._vouched = at
@@ -350,16 +345,19 @@ class LogReader:
         """Return True if a record may begin here, or the data ends here."""
         if self._end - at < PREFIX.size:
             return at <= self._end
-        opcode, length = self._prefix(at)
-        fits = at + PREFIX.size + length <= self._end
-        return opcode in KNOWN and (fits or length <= DECOMPRESSED_MAX)
+        opcode, start, end = self._extent(at)
+        return opcode in KNOWN and (end <= self._end or end - start <= DECOMPRESSED_MAX)
 
-    def _prefix(self, at: int) -> tuple[int, int]:
-        """Return opcode and length of the record at a place; 0 if the data ends before."""
-        if self._end - at < PREFIX.size:
-            return 0, 0
+    def _extent(self, at: int) -> tuple[int, int, int]:
+        """Return the opcode of the record at a place, and where its content begins and ends.
+
+        The opcode is 0, and the end beyond the data's, if the data ends within its prefix.
+        """
+        start = at + PREFIX.size
+        if start > self._end:
+            return 0, start, start
         opcode, length = PREFIX.unpack_from(self._data, at)
-        return opcode, length
+        return opcode, start, start + length
 
     def _chunk_after(self, at: int) -> int | None:
         """Return where the next chunk is that is whole and right, or None."""
@@ -369,8 +367,7 @@ class LogReader:
             if not self._marks:
                 return None
             at = min(marks[mark] for mark in self._marks) - _MARK_AT
-            opcode, length = PREFIX.unpack(self._data[at : at + PREFIX.size])
-            start, end = at + PREFIX.size, at + PREFIX.size + length
+            opcode, start, end = self._extent(at)
             if opcode == Opcode.CHUNK and end <= self._end:
                 with contextlib.suppress(Malformed):
                     self._record(opcode, at, start, end)

@@ -178,6 +178,16 @@ def test_a_file_cut_anywhere_keeps_the_messages_before_the_cut(features: Feature
         assert not reader.damage
 
 
+def test_a_chunk_before_a_cut_is_told_with_all_of_its_channels_or_none() -> None:
+    """The last index of a killed file was passed over, and an event that it told of not found."""
+    messages = Message(1, 1, 1, 1, b""), Message(2, 1, 2, 2, b"")
+    records = (Channel(1, 0, "a"), Channel(2, 0, "b"), *messages)
+    data = file_of(records, frozenset({Feature.CHUNK, Feature.MESSAGE_INDEX}), per_chunk=2)
+    first_index = data.index(struct.pack("<BQH", 0x07, 6 + 16, 1))
+    for size in range(first_index, len(data)):
+        skimmed(data[:size])
+
+
 def _record_of(message: Message) -> bytes:
     data = file_of([message], frozenset())
     start = data.index(b"by hand") + len(b"by hand")
