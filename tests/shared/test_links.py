@@ -8,7 +8,7 @@ from shared.bus.topics import Topic
 from shared.config.robot_config import SERVICES
 from shared.joints import MODULES
 
-TOOL = "test"
+TOOL = topics.OPERATOR
 
 TALK: dict[Topic, tuple[tuple[str, ...], tuple[str, ...]]] = {
     topics.JOINT_STATE: (MODULES, ("planner", "recorder", TOOL)),
@@ -23,14 +23,14 @@ TALK: dict[Topic, tuple[tuple[str, ...], tuple[str, ...]]] = {
     topics.PLANNER_STATUS: (("planner",), ("recorder", TOOL)),
     topics.OPERATOR_INTENT: (("simulator", TOOL), ("planner", "simulator", "recorder", TOOL)),
     topics.OPERATOR_HAND: ((TOOL,), ("simulator", "recorder")),
-    topics.ESTOP: ((TOOL,), (*MODULES, "planner", "recorder")),
+    topics.ESTOP: ((TOOL,), (*MODULES, "recorder")),
     topics.SIM_TRUTH: (("simulator",), ("recorder", TOOL)),
     topics.SIM_CONTROL: ((TOOL,), ("simulator", "recorder")),
     topics.RUN_EVENT: ((TOOL,), ("recorder",)),
-    topics.LINK_EVENT: ((TOOL,), ("recorder",)),
+    topics.LINK_EVENT: (("network_proxy",), ("recorder",)),
     topics.TOOLS: (("recorder",), (TOOL,)),
 }
-"""Who puts each topic on the bus, and who takes it."""
+"""Who puts each topic on the bus, and who takes it, by hand: not from the topic table."""
 
 
 def linked(one: str, other: str) -> bool:

@@ -29,6 +29,7 @@ from shared.exceptions import BusError, ConfigError
 from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
 from tests.certified import certified, give, install_all, opened, signer_of, with_keys
+from tests.shared.test_links import TALK
 from tests.waiting import comes_true
 from tools.keys.authority import Authority
 
@@ -37,29 +38,17 @@ TRIES_S = 8.0
 LOOPBACK = ("127.0.0.1",)
 LEG = ("ankle_left", "knee_left", "hip_left")
 
-PUTS = {
-    "planner": ["joint/*/command", "planner/status", "planner/checkpoint"],
-    "harness": ["harness/wrench"],
-    "imu": ["imu/attitude"],
-    "recorder": ["recorder/tools"],
-    "simulator": ["sim/truth", "sim/state", "operator/intent"],
-    "operator": ["estop", "harness/tare", "operator/intent", "operator/hand", "sim/control",
-                 "run/event"],
-    "viewer": [],
-    **{m: [f"joint/{m}/state", f"joint/{m}/event", f"joint/{m}/trace"] for m in MODULES},
-}  # fmt: skip
-"""What each may put, by hand: not from the topic table."""
-READS = {
-    "planner": ["joint/*/state", "harness/wrench", "imu/attitude", "operator/intent"],
-    "harness": ["harness/tare"],
-    "imu": [],
-    "recorder": ["*"],
-    "simulator": ["operator/intent", "operator/hand", "sim/control"],
-    "operator": ["*"],
-    "viewer": ["*"],
-    **{m: [f"joint/{m}/command", "estop"] for m in MODULES},
-}
-"""What each may receive, by hand."""
+READ_ALL = ("recorder", "operator", "viewer")
+
+
+def own_topics(name: str, column: int) -> list[str]:
+    """Return what `TALK` has somebody put (0) or take (1); a module, of its own keys."""
+    found = [topic.name for topic, columns in TALK.items() if name in columns[column]]
+    return [text.replace("*", name) for text in found] if name in MODULES else found
+
+
+PUTS = {name: own_topics(name, 0) for name in PRINCIPALS}
+READS = {name: ["*"] if name in READ_ALL else own_topics(name, 1) for name in PRINCIPALS}
 
 
 class Bus:
