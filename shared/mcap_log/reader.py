@@ -250,7 +250,7 @@ class LogReader:
         # an index of messages follows a chunk only: anything else there is a damaged one
         index_follows = self._extent(end)[0] == Opcode.MESSAGE_INDEX
         if opcode == Opcode.MESSAGE:
-            rows, end = split_messages(self._data, at, self._end, LOOSE_MAX)
+            rows, end = split_messages(self._data, at, self._end, enough=LOOSE_MAX, origin=at)
             if not rows or (len(rows) == 1 and index_follows):
                 raise Malformed
             return LogRecord(opcode, at, end, self._data[at:end], rows=rows)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import mmap
 import struct
+import sys
 import zlib
 from collections.abc import Callable, Iterable, Mapping
 from io import BytesIO
@@ -276,21 +277,21 @@ class ChunkMessage(NamedTuple):
 
 
 def split_messages(
-    data: bytes | mmap.mmap, begin: int, end: int, enough: int
+    data: bytes | mmap.mmap, at: int, end: int, *, enough: int = sys.maxsize, origin: int = 0
 ) -> tuple[list[ChunkMessage], int]:
-    """Return the messages that follow each other from `begin` on, and where they end.
+    """Return the messages that follow each other from `at` on, and where they end.
 
-    Their places are counted from `begin`. A message that does not fit before `end`, or is too
+    Their places are counted from `origin`. A message that does not fit before `end`, or is too
     short, is left out with all behind it; at `enough` bytes no further message is taken.
     """
     rows: list[ChunkMessage] = []
-    at, new, message, head = begin, ChunkMessage._make, int(Opcode.MESSAGE), MESSAGE_RECORD
-    while at < begin + enough and at + head.size <= end and data[at] == message:
+    begin, new, message, head = at, ChunkMessage._make, int(Opcode.MESSAGE), MESSAGE_RECORD
+    while at - begin < enough and at + head.size <= end and data[at] == message:
         _, length, *fields = head.unpack_from(data, at)
         start, following = at + head.size, at + PREFIX.size + length
         if not start <= following <= end:
             break
-        rows.append(new((*fields, start - begin, following - begin)))
+        rows.append(new((*fields, start - origin, following - origin)))
         at = following
     return rows, at
 
@@ -300,21 +301,14 @@ def split_chunk(data: bytes) -> tuple[list[ChunkMessage], list[tuple[int, bytes]
 
     An incomplete record at the end is left out, so this reads the start of a cut chunk too.
     """
-    rows: list[ChunkMessage] = []
     others: list[tuple[int, bytes]] = []
-    at, size, new, message = 0, len(data), ChunkMessage._make, int(Opcode.MESSAGE)
-    head, prefix = MESSAGE_RECORD, PREFIX
-    while at + prefix.size <= size:
-        if data[at] == message and at + head.size <= size:
-            _, length, *fields = head.unpack_from(data, at)
-            start, at = at + head.size, at + prefix.size + length
-            if at > size or start > at:
-                break
-            rows.append(new((*fields, start, at)))
-        else:
-            opcode, length = prefix.unpack_from(data, at)
-            start, at = at + prefix.size, at + prefix.size + length
-            if at > size:
-                break
-            others.append((opcode, data[start:at]))
+    rows, at = split_messages(data, 0, len(data))
+    while at + PREFIX.size <= len(data):
+        opcode, length = PREFIX.unpack_from(data, at)
+        start, at = at + PREFIX.size, at + PREFIX.size + length
+        if opcode == Opcode.MESSAGE or at > len(data):
+            break
+        others.append((opcode, data[start:at]))
+        found, at = split_messages(data, at, len(data))
+        rows += found
     return rows, others
