@@ -56,20 +56,17 @@ def main() -> int:
 
     def joined() -> RosSession:
         ros = RosSession(ros2.router, arguments.domain, types, namespace=ros2.namespace)
+        known = inbound_topics(ros2.namespace)
         try:
-            declare(ros)
+            ros.show_node()
+            ros.publish(gateway.sent_topics)
+            ros.subscribe([getattr(known, name) for name in arguments.accept])
+            ros.put(*gateway.description())
         except BaseException:
             ros.close()
             raise
         logger.info("the router answers")
         return ros
-
-    def declare(ros: RosSession) -> None:
-        ros.show_node()
-        ros.publish(gateway.sent_topics)
-        known = inbound_topics(ros2.namespace)
-        ros.subscribe([getattr(known, name) for name in arguments.accept])
-        ros.put(*gateway.description())
 
     with bus.open_session(config, "ros2_gateway", arguments.run_dir) as session:
         wanted = [(t, m) for t in INPUTS for m in (MODULES if t.per_module else ("",))]

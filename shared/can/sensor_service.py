@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from shared import log, process, scheduling
 from shared.bus.session import Session, open_session
@@ -13,13 +13,6 @@ from shared.can.sensor_loop import SensorLoop
 from shared.clock import NS_PER_S, now_ns, sleep_until
 from shared.config.files import load
 from shared.config.robot_config import RobotConfig
-
-
-class Stop(Protocol):
-    """Something that becomes true when the loop is to end."""
-
-    def __bool__(self) -> bool:
-        """Return True to stop."""
 
 
 class SensorService(NamedTuple):
@@ -67,7 +60,7 @@ def next_deadline(deadline_ns: int, period_ns: int, now_ns: int) -> tuple[int, i
     return deadline_ns + (missed + 1) * period_ns, missed
 
 
-def run(loop: SensorLoop[Any, Any], rate_hz: float, stop: Stop) -> None:
+def run(loop: SensorLoop[Any, Any], rate_hz: float, stop: process.StopFlag) -> None:
     """Run cycles at `rate_hz` until stopped; missed cycles are skipped."""
     period_ns = round(NS_PER_S / rate_hz)
     deadline_ns = now_ns()

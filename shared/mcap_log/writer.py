@@ -41,7 +41,6 @@ from shared.mcap_log.sequence_stats import KeyCount
 SCHEMA_VERSION: Final = "6"
 """Version of the layout above and of the messages in `shared/bus/messages.py`."""
 
-FILE_NAME: Final = files.FIRST
 PROFILE: Final = "xrl"
 COUNTS: Final = "counts"
 """Metadata at the end of a file: counts, gaps and restarts of each key in it."""
@@ -104,7 +103,7 @@ class RunWriter:
         is the size of a chunk before compression. Without `begin` the first file is left to
         `begin`. Raises RunError if the file cannot be created or written, as all methods do.
         """
-        self.path = directory / FILE_NAME
+        self.path = directory / files.FIRST
         """The file being written, or the last one."""
         self.begun = 0
         """Files started so far."""

@@ -62,7 +62,7 @@ def test_a_long_cycle_is_followed_by_one_cycle_and_not_by_many(
     monkeypatch.setattr(sensor_service, "now_ns", lambda: clock[0])
     monkeypatch.setattr(sensor_service, "sleep_until", sleep_until)
     loop = SlowOnce()
-    run(cast("Any", loop), 250.0, StopAfterSix())
+    run(cast("Any", loop), 250.0, cast("Any", StopAfterSix()))
     assert [(t_ns - T0) // period_ns for t_ns in times] == [0, 1, 2, 3, 14, 15]
     assert loop.skipped == 10
 
