@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import re
+import tomllib
 from pathlib import Path
 from typing import Final
 
 import msgspec
+import tomli_w
 
 from shared.config import files as config_file
 from shared.config import gain_schedule
 from tests.conftest import ROBOT_FILE
 
-RATES: Final = (
-    ("joint_service", "rate_hz", "200.0"),
-    ("joint_service", "state_rate_hz", "200.0"),
-    ("planner", "rate_hz", "200.0"),
-    ("simulation", "encoder_rate_hz", "200.0"),
-    ("drive", "encoder_period_ms", "5"),
-)
+CHANGES: Final[dict[str, dict[str, object]]] = {
+    "joint_service": {"driver": "odrive_usb", "rate_hz": 200.0, "state_rate_hz": 200.0},
+    "planner": {"rate_hz": 200.0},
+    "simulation": {"encoder_rate_hz": 200.0},
+    "drive": {"encoder_period_ms": 5},
+}
 """A v3 board's USB carries 200 Hz."""
 
 
@@ -28,11 +28,11 @@ def write(folder: Path) -> Path:
     The gains are the shipped ones: `xrl gains --damping-of deploy/robot.gains.json` finds the same
     at these rates, with 6 dB and 48 ms in hand, but takes most of a minute for it.
     """
-    text = ROBOT_FILE.read_text(encoding="utf-8")
-    for section, key, value in (("joint_service", "driver", '"odrive_usb"'), *RATES):
-        text = _set(text, section, key, value)
+    raw = tomllib.loads(ROBOT_FILE.read_text(encoding="utf-8"))
+    for section, changes in CHANGES.items():
+        raw[section] |= changes
     path = folder / ROBOT_FILE.name
-    path.write_text(text, encoding="utf-8")
+    path.write_text(tomli_w.dumps(raw), encoding="utf-8")
     shipped = gain_schedule.read(gain_schedule.path_beside(ROBOT_FILE))
     assert shipped is not None
     inputs = gain_schedule.inputs_of(config_file.load_without_schedule(path))
@@ -41,10 +41,3 @@ def write(folder: Path) -> Path:
     )
     gain_schedule.write(gain_schedule.path_beside(path), schedule)
     return path
-
-
-def _set(text: str, section: str, key: str, value: str) -> str:
-    """Return a robot file with another value of one key."""
-    found = re.search(rf"^\[{section}\].*?^{key} = (\S+)", text, re.MULTILINE | re.DOTALL)
-    assert found is not None, f"{section}.{key}"
-    return text[: found.start(1)] + value + text[found.end(1) :]
