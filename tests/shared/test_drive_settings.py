@@ -18,7 +18,6 @@ from services.simulator.drives.axis_settings import (
 )
 from shared.can.drive_settings import (
     AXIS_TABLE,
-    DRIVE_TABLE,
     Compare,
     WantedSetting,
     of_module,
@@ -50,10 +49,6 @@ def test_every_wanted_setting_exists_in_the_firmware_with_its_type(
     for row in wanted:
         assert row.name in NAMES
         assert isinstance(row.value, bool) is isinstance(shipped[row.name], bool)
-
-
-def test_every_row_names_its_reason() -> None:
-    assert all(len(setting.why) > 20 for setting in (*AXIS_TABLE, *DRIVE_TABLE))
 
 
 def test_the_simulators_drives_are_as_wanted_but_for_the_nodes_that_their_front_gives(

@@ -24,7 +24,6 @@ from tools.logs.survey import Survey
 from tools.verbs.log.info import as_json
 
 CUTS = 250
-CUTS_BY_VERB = 15
 SENT = [runs.state(seq) for seq in range(120)]
 
 
@@ -157,22 +156,6 @@ def test_a_flip_in_one_chunk_costs_no_other(tmp_path: Path, killed: Killed) -> N
         found = recovered(path)
         assert found is not None
         assert found >= 110
-
-
-def test_the_verbs_answer_a_cut_file_with_a_good_end_or_one_line(
-    tmp_path: Path, killed: Killed, capsys: pytest.CaptureFixture[str]
-) -> None:
-    data, dice = killed.path.read_bytes(), random.Random(3)
-    path = tmp_path / "cut.mcap"
-    for size in [0, 1, 8, 9, *(dice.randrange(len(data) + 1) for _ in range(CUTS_BY_VERB))]:
-        path.write_bytes(data[:size])
-        for verb in ("info", "recover"):
-            flags = ["--force"] if verb == "recover" else []
-            code = cli.main(["log", verb, str(path), *flags])
-            output = capsys.readouterr()
-            assert code in (0, 2)
-            assert len(output.err.splitlines()) == (1 if code else 0)
-            assert "Traceback" not in output.err + output.out
 
 
 def old_version(path: Path) -> None:
