@@ -1,7 +1,6 @@
 import itertools
 import math
 import re
-import struct
 from collections.abc import Callable
 from typing import Any, get_args, get_origin, get_type_hints
 
@@ -68,11 +67,6 @@ def with_float(message: Message, place: int, number: float) -> Message:
     return with_floats(message, lambda value: number if next(met) == place else value)
 
 
-def bits(message: Message) -> bytes:
-    numbers = floats_of(message)
-    return struct.pack(f"{len(numbers)}d", *numbers)
-
-
 each_topic = pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
 
 
@@ -82,7 +76,7 @@ def test_every_message_type_round_trips_bit_exactly(topic: Topic) -> None:
     def round_trips(message: Message) -> None:
         decoded = Decoder(topic.type).decode(encode(message))
         assert decoded == message
-        assert bits(decoded) == bits(message)
+        assert repr(decoded) == repr(message), "the sign of a zero, too"
 
     round_trips()
 

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import copy
+import functools
 import math
+import operator
 import shutil
 import tomllib
 from collections.abc import Callable, Iterator
@@ -56,28 +58,18 @@ def check_refusal(
     return error
 
 
-def setting(dotted: str, value: object) -> Callable[[Table], None]:
-    """Return a change that sets a dotted key; a number in it is an index."""
-
-    def change(raw: Table) -> None:
-        *path, last = [int(part) if part.isdigit() else part for part in dotted.split(".")]
-        at: Any = raw
-        for part in path:
-            at = at[part]
-        at[last] = value
-
-    return change
+def place(table: Any, dotted: str) -> tuple[Any, Any]:
+    """Return what holds a dotted key, and its key there; a number in it is an index."""
+    *path, last = [int(part) if part.isdigit() else part for part in dotted.split(".")]
+    return functools.reduce(operator.getitem, path, table), last
 
 
-def without(dotted: str) -> Callable[[Table], None]:
-    def change(raw: Table) -> None:
-        *path, last = dotted.split(".")
-        at = raw
-        for part in path:
-            at = at[part]
-        del at[last]
+def setting(dotted: str, value: object) -> Change:
+    return lambda raw: operator.setitem(*place(raw, dotted), value)
 
-    return change
+
+def without(dotted: str) -> Change:
+    return lambda raw: operator.delitem(*place(raw, dotted))
 
 
 def on_one_bus(raw: Table) -> None:
@@ -275,10 +267,8 @@ def test_a_file_that_cannot_be_read_is_refused_by_name(tmp_path: Path, kind: str
 def test_what_a_robot_can_do_and_python_can_knows_is_taken(
     tmp_path: Path, key: str, value: object
 ) -> None:
-    taken: Any = msgspec.to_builtins(load_changed(tmp_path, setting(key, value)))
-    for part in key.split("."):
-        taken = taken[part]
-    assert taken == value
+    taken = msgspec.to_builtins(load_changed(tmp_path, setting(key, value)))
+    assert operator.getitem(*place(taken, key)) == value
 
 
 def test_the_interfaces_that_python_can_knows_are_all_there() -> None:
@@ -344,10 +334,8 @@ def test_every_number_of_the_file_is_refused_when_it_is_absurd(tmp_path: Path, h
     keys = list(numbers_in(RAW, ""))
     assert len(keys) > 100
     for key in keys:
-        at: Any = RAW
-        for part in key.split("."):
-            at = at[int(part) if part.isdigit() else part]
-        absurd = int(huge) if isinstance(at, int) else huge
+        is_whole = isinstance(operator.getitem(*place(RAW, key)), int)
+        absurd = int(huge) if is_whole else huge
         with pytest.raises(ConfigError) as caught:
             load_changed(tmp_path, setting(key, absurd))
         named = caught.value.key.replace("[", ".").replace("]", "")
