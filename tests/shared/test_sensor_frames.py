@@ -125,11 +125,3 @@ def test_foreign_frames_are_ignored_between_those_of_a_sample(kind: Kind, foreig
     assembler = kind.assembler()
     came = added(assembler, [f for own in kind.one for f in ((foreign, bytes(8)), own)])
     assert (came[-1], assembler.malformed) == (kind.samples()[0], 0)
-
-
-@each_kind
-def test_a_partial_sample_is_forgotten_on_reset(kind: Kind) -> None:
-    assembler = kind.assembler()
-    added(assembler, kind.one[:2])
-    assembler.reset()
-    assert assembler.add(*kind.one[2]) is None
