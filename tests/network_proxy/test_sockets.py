@@ -6,7 +6,7 @@ import resource
 import socket
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
@@ -60,11 +60,8 @@ def tcp(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
         beyond = listening(family, (host, 0))
     except OSError:
         pytest.skip(f"this machine has no {host}")
-    made = Rig(tmp_path, beyond)
-    try:
+    with closing(Rig(tmp_path, beyond)) as made:
         yield made
-    finally:
-        made.close()
 
 
 def receive(rig: Rig, end: socket.socket, size: int) -> bytes:
@@ -153,10 +150,9 @@ def test_with_a_descriptor_for_one_end_only_neither_is_kept(rig: Rig) -> None:
 
 @pytest.fixture
 def pair() -> Iterator[tuple[socket.socket, socket.socket]]:
-    ends = socket.socketpair()
-    yield ends
-    for end in ends:
-        end.close()
+    near, far = socket.socketpair()
+    with near, far:
+        yield near, far
 
 
 def test_each_socket_calls_its_own_function_for_its_own_events(

@@ -26,10 +26,9 @@ print(subprocess.run(["ip", "-o", "link", "show", "lo", "up"], capture_output=Tr
 
 @pytest.fixture
 def pair() -> Iterator[tuple[socket.socket, socket.socket]]:
-    ends = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    yield ends
-    for end in ends:
-        end.close()
+    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with near, far:
+        yield near, far
 
 
 def test_a_row_of_frames_waits_and_not_many_more(
