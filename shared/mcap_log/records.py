@@ -9,9 +9,9 @@ which the format lets a reader skip.
 from __future__ import annotations
 
 import contextlib
+import math
 import mmap
 import struct
-import sys
 import zlib
 from collections.abc import Callable, Iterable, Mapping
 from io import BytesIO
@@ -277,7 +277,7 @@ class ChunkMessage(NamedTuple):
 
 
 def split_messages(
-    data: bytes | mmap.mmap, at: int, end: int, *, enough: int = sys.maxsize, origin: int = 0
+    data: bytes | mmap.mmap, at: int, end: int, *, enough: float = math.inf, origin: int = 0
 ) -> tuple[list[ChunkMessage], int]:
     """Return the messages that follow each other from `at` on, and where they end.
 
