@@ -94,14 +94,14 @@ def test_a_silent_module_ends_the_torso_and_its_own_joints_only_and_none_is_made
     states = all_states()
     feed(gateway, T0)
     later = T0 + 2 * STALE_NS
-    del states["hip_right"]
+    del states["knee_left"]
     feed(gateway, later, states)
     found = {outgoing.topic: outgoing.payload for outgoing in gateway.due(later, later)}
     joints = read(KNOWN.joint_states.type, found[KNOWN.joint_states])
-    assert set(JOINTS) - set(joints.name) == {"hip_right_phi", "hip_right_theta"}
+    assert set(JOINTS) - set(joints.name) == {"knee_left_phi", "knee_left_theta"}
     assert len(joints.position) == len(joints.effort) == len(joints.name) == 10
     children = {row.child_frame_id for row in read(KNOWN.tf.type, found[KNOWN.tf]).transforms}
-    assert children & {"torso", "hip_right", cross_of("hip_right")} == set()
+    assert children & {"torso", "knee_left", cross_of("knee_left")} == set()
     assert "knee_right" in children
 
 
