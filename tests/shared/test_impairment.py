@@ -37,6 +37,7 @@ def test_nothing_is_done_unless_asked() -> None:
 
 def test_uniform_jitter_stays_in_its_bounds_and_fills_them() -> None:
     found = delays_ms(Impairment(delay_ms=20.0, jitter_ms=10.0))
+    assert len(found) == 4000, "none is lost"
     assert 10.0 <= min(found) < 10.1
     assert 29.9 < max(found) <= 30.0
     assert statistics.mean(found) == pytest.approx(20.0, abs=0.3)

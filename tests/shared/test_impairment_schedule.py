@@ -60,10 +60,13 @@ def test_what_would_be_over_before_it_is_seen_never_begins(rig: Rig) -> None:
     assert rig.impairments.requested == {}
 
 
-def test_clearing_keeps_what_has_not_begun_from_beginning(rig: Rig) -> None:
+def test_clearing_ends_what_touches_a_link_and_keeps_it_from_beginning(rig: Rig) -> None:
+    rig.impairments.begin("planner->joints", LATE, math.inf, 0)
     rig.impairments.plan("planner->joints", LATE, 1.0, math.inf)
     kept = rig.impairments.plan(WRENCHES, LATE, 1.0, math.inf)
-    assert rig.impairments.clear("planner->knee_left", 0) == 1
+    assert rig.impairments.clear("planner->knee_left", 0) == 2
+    assert list(rig.impairments.requested) == [kept]
+    rig.told.clear()
     rig.impairments.advance(1.0, 1)
     assert rig.begun() == [(kept, True)]
 
