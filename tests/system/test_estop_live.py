@@ -129,12 +129,3 @@ def test_one_that_waits_says_whom_it_hears_and_stops_at_enter_but_not_at_q(
     finally:
         os.close(person)
         os.close(terminal)
-
-
-def test_a_module_without_a_service_here_is_named(run_dir: Path, robot: RobotConfig) -> None:
-    with started(run_dir, "simulator", *MODULES[:5]), heard(robot, run_dir) as ear:
-        ear.wait_for(dict.fromkeys(MODULES[:5], Mode.HOLD))
-        done = xrl("estop", "--local", run_dir=run_dir)
-        assert done.returncode == 2
-        assert f"{MODULES[5]} has no service on this host" in done.stderr
-        ear.wait_for(dict.fromkeys(MODULES[:5], Mode.DAMP))

@@ -49,17 +49,23 @@ def test_the_robot_of_this_hosts_fleet_is_stopped_by_shared_memory_too(
     assert all(guard.stop_requested for guard in fleet)
 
 
-def test_of_several_hosts_one_answers_for_its_own_modules_and_for_each_of_them(
+def test_of_several_hosts_one_answers_for_its_own_modules(
     run_dir: Path, fleet: list[RearmGuard], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    local = ["estop", "--local", "--run-dir", run_dir]
-    assert exit_code([*local, "--partly", "knee_left,hip_left"]) == 0
+    words = ["estop", "--local", "--run-dir", run_dir, "--partly", "knee_left,hip_left"]
+    assert exit_code(words) == 0
     assert "knee_left, hip_left are stopped" in capsys.readouterr().out
-    for path in run_dir.glob("knee_left*"):
-        path.unlink()
-    del fleet
-    assert exit_code([*local, "--partly", "knee_left,hip_left"]) == 2
+
+
+@pytest.mark.parametrize("partly", [["--partly", "knee_left,hip_left"], []], ids=["partly", "all"])
+def test_a_module_without_a_service_here_is_named_and_the_others_are_stopped(
+    partly: list[str], run_dir: Path, fleet: list[RearmGuard], capsys: pytest.CaptureFixture[str]
+) -> None:
+    (run_dir / "knee_left.rearm").unlink()
+    assert exit_code(["estop", "--local", "--run-dir", run_dir, *partly]) == 2
     assert "knee_left has no service on this host" in capsys.readouterr().err
+    stopped = [guard.stop_requested for guard in fleet]
+    assert stopped == [module != "knee_left" for module in MODULES]
 
 
 def test_a_viewers_key_stands_by_for_nothing(
