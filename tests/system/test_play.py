@@ -123,35 +123,24 @@ def test_chosen_topics_of_a_part_go_under_other_names_with_the_recorded_time_bes
     assert first <= stamps[0] < stamps[-1] <= last
 
 
-def test_a_loop_runs_until_ctrl_c_and_then_reports_its_counts(
-    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_loop_runs_until_a_signal_and_then_reports_its_counts_and_leaves_nothing(
+    number: signal.Signals, run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows = items(0.5)
     log = write(tmp_path, rows, monkeypatch)
     with listening(run_dir) as ear, playing(run_dir, str(log), "--loop", "--wait", "60") as process:
         assert ear.has(2 * len(rows) + 5)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         done = ended(process)
-    assert done.code == 130, done.out
+    assert done.code == 128 + number, done.out
     assert "messages on 3 keys" in done.out
     assert "passes" in done.out
     assert "Traceback" not in done.out
+    assert not list(run_dir.glob("*"))
     assert [payload for _, payload in ear.received] == [
         row[1] for row in itertools.islice(itertools.cycle(rows), len(ear.received))
     ]
-
-
-def test_sigterm_ends_it_as_cleanly(
-    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    log = write(tmp_path, items(0.5), monkeypatch)
-    with listening(run_dir) as ear, playing(run_dir, str(log), "--loop", "--wait", "60") as process:
-        assert ear.has(1)
-        process.terminate()
-        done = ended(process)
-    assert done.code == 128 + signal.SIGTERM, done.out
-    assert "messages on" in done.out
-    assert not list(run_dir.glob("*"))
 
 
 def test_on_a_terminal_space_begins_right_steps_and_q_ends(
@@ -199,22 +188,16 @@ def test_on_a_terminal_space_begins_right_steps_and_q_ends(
     assert [payload for _, payload in ear.received] == [row[1] for row in rows[: len(ear.received)]]
 
 
-def test_under_its_prefix_a_player_never_reaches_a_live_joint_service(
-    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    log = write(tmp_path, command_items(), monkeypatch)
-    with LiveJoint(run_dir) as joint, listening(run_dir) as ear:
-        with playing(run_dir, str(log), "--wait", "60") as process:
-            assert len(ear.all(process)) == 400
-            assert process.returncode == 0
-        assert (joint.commands, joint.estops) == (0, 0)
-
-
 def test_on_live_keys_commands_are_refused_beside_a_live_drive_and_never_forced(
     run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Under its prefix a player does not reach a live joint service at all."""
     log = str(write(tmp_path, command_items(), monkeypatch))
     with LiveJoint(run_dir) as joint:
+        with listening(run_dir) as ear, playing(run_dir, log, "--wait", "60") as process:
+            assert len(ear.all(process)) == 400
+            assert process.returncode == 0
+        assert (joint.commands, joint.estops) == (0, 0)
         refused = play(run_dir, log, "--prefix", "")
         assert refused.code == 2
         assert "knee_left" in refused.out
