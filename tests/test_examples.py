@@ -8,11 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from shared.config.robot_config import RobotConfig
-from tests.lockstep.runs import still
 from tests.tools.exit_codes import exit_code
-from tools.sim.network import BASE
-from tools.sim.recorded_lockstep import simulate
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
@@ -61,10 +57,14 @@ def test_the_robot_in_virtual_time_holds_while_the_planner_is_dead_and_is_led_ag
 def test_the_lqr_leads_in_the_planners_place_and_the_robot_stands_when_it_is_killed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """And its run is read into NumPy."""
     words = ["sim", "--controller", EXAMPLES / "lqr_controller.py", "--scenario", "squat"]
     words += ["--duration", "3", "--kill", "planner@1.5", "--out", tmp_path / "run"]
     assert exit_code(words) == 0
     assert "STOOD" in capsys.readouterr().out
+    lines = lines_of("read_a_run.py", str(tmp_path / "run" / "run.mcap"))
+    assert lines[0].startswith("3.0 s, COM x ")
+    assert "states, age 4." in lines[1]
 
 
 def test_a_controller_that_is_not_there_leaves_nothing_behind(
@@ -80,13 +80,6 @@ def test_a_gentler_hand_leads_the_same_squat_with_less_force() -> None:
     force, height = 2, 8
     assert float(gentle[force]) <= 12.0 < float(shipped[force])
     assert float(gentle[height]) == pytest.approx(float(shipped[height]), abs=0.005)
-
-
-def test_a_run_is_read_into_numpy(tmp_path: Path, robot: RobotConfig) -> None:
-    simulate(robot, still(1.0), BASE, 0, tmp_path)
-    lines = lines_of("read_a_run.py", str(tmp_path / "run.mcap"))
-    assert lines[0].startswith("1.0 s, COM x ")
-    assert "states, age 4." in lines[1]
 
 
 def test_without_a_log_the_reader_names_its_usage() -> None:

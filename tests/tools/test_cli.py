@@ -84,7 +84,7 @@ def test_a_run_directory_of_the_environment_that_is_none_is_one_line(
     assert capsys.readouterr().err.endswith("is no directory; give another --run-dir\n")
 
 
-@pytest.mark.parametrize("line", ["faults", "--help", "completion bash"])
+@pytest.mark.parametrize("line", ["faults", "--help"])
 def test_an_output_that_takes_nothing_is_one_line_and_no_fall(line: str) -> None:
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
