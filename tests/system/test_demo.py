@@ -1,6 +1,7 @@
-"""`xrl demo` on the real fleet: a fall, an end by Ctrl-C, a stall. Outcomes only, no milliseconds.
+"""`xrl demo` and `xrl study crash` on the real fleet: falls, Ctrl-C, a stall, a case of the matrix.
 
-How it survives its planner, and what it records of that: test_agreement.
+Outcomes only, no milliseconds. How the demo survives its planner, and what it records of that:
+test_agreement.
 """
 
 from __future__ import annotations
@@ -34,19 +35,38 @@ def test_a_robot_that_cannot_stand_is_a_finding_and_not_an_error(tmp_path: Path)
     assert json.loads((tmp_path / "summary.json").read_text())["stood"] is False
 
 
-def test_an_interrupted_demo_leaves_nothing_behind(tmp_path: Path) -> None:
-    with leaving_nothing():
+@pytest.mark.parametrize(
+    ("verb", "said"), [("demo", "interrupted"), ("study crash --only kill-*", "stopped; 0 of")]
+)
+def test_one_that_is_interrupted_leaves_nothing_behind(
+    verb: str, said: str, tmp_path: Path
+) -> None:
+    with leaving_nothing() as mine:
         process = subprocess.Popen(
-            command("demo", "--out", tmp_path), cwd=CHECKOUT, stdout=subprocess.PIPE, text=True,
-            start_new_session=True,
+            command(*verb.split(), "--out", tmp_path), cwd=CHECKOUT,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
         )  # fmt: skip
-        assert process.stdout is not None
-        for line in process.stdout:
-            if "modes" in line:
-                break
+        while not mine():
+            assert process.poll() is None, process.communicate()
+            time.sleep(0.05)
+        time.sleep(2.0)  # in the middle of its start
         os.killpg(process.pid, signal.SIGINT)
-        assert process.wait(timeout=60) == 130
-        process.stdout.close()
+        output, _ = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert said in output
+
+
+def test_the_robot_stands_when_a_knees_service_is_killed_in_the_squat(tmp_path: Path) -> None:
+    with leaving_nothing():
+        done = xrl_led("study crash", tmp_path, "--only", "kill-knee_left")
+    assert done.returncode == 0, done.stdout + done.stderr
+    document = json.loads((tmp_path / "results.json").read_text())
+    assert document["complete"] is True
+    (row,) = document["cases"]
+    assert row["verdict"] == "stood"
+    assert row["safe_ms"] is not None
+    assert "kill-knee_left" in (tmp_path / "junit.xml").read_text()
+    assert (tmp_path / "kill-knee_left" / "logs" / "knee_left.log").is_file()
 
 
 def test_a_stall_of_all_services_is_told_in_line_record_and_verdict(tmp_path: Path) -> None:

@@ -90,6 +90,7 @@ def test_all_parts_are_run_and_success_is_exit_code_0(root: Path) -> None:
     ], "what runs beside the others is shown last"
     assert said.count("python called: -m tools.dev.mutants --sample") == 1
     assert said.count("python called: -m tools.graph_libraries") == 1
+    assert "graph_libraries" not in run(root)[1], "what is translated is not translated again"
 
 
 def test_what_runs_beside_live_fleets_gives_way_to_them(root: Path) -> None:
@@ -114,11 +115,6 @@ def test_graphs_that_cannot_be_translated_cost_speed_only(root: Path, in_the_way
     assert "the law's graphs stay interpreted" in said
     again = run(root)[1]
     assert "-m tools.graph_libraries" in again, "it is tried again"
-
-
-def test_translated_graphs_are_not_translated_again(root: Path) -> None:
-    run(root)
-    assert "graph_libraries" not in run(root)[1]
 
 
 @pytest.mark.parametrize("status", [1, 2], ids=["a failure", "a file that cannot be imported"])

@@ -132,16 +132,6 @@ def assert_nothing_left(run_dir: Path, pids: Sequence[int]) -> None:
     assert not run_dir.exists() or {path.name for path in run_dir.iterdir()} <= {"logs", MARKER}
 
 
-def test_a_stopped_fleet_leaves_no_process_and_no_file(start: Start, run_dir: Path) -> None:
-    fleet = start()
-    assert [row.state for row in fleet.info()] == ["running", "running"]
-    pids = [*fleet.pids().values(), supervisor_pid(fleet)]
-    assert set(pids) == procfs.fleet_pids(run_dir)
-    fleet.stop()
-    assert_nothing_left(run_dir, pids)
-    assert not run_dir.exists()
-
-
 def test_a_service_is_suspended_resumed_killed_restarted_and_counted(start: Start) -> None:
     fleet = start()
     before = fleet.kill("planner", signal.SIGSTOP)
@@ -156,8 +146,14 @@ def test_a_service_is_suspended_resumed_killed_restarted_and_counted(start: Star
     assert "SIGKILL" in planner.last_exit
 
 
-def test_a_service_that_is_not_to_restart_stays_down_until_it_is_started(start: Start) -> None:
-    fleet = start(no_restart=frozenset({"planner"}))
+def test_a_service_that_is_asleep_or_not_to_restart_stays_down_until_it_is_started(
+    start: Start, order: Order
+) -> None:
+    fleet = start(not_started=("planner",), no_restart=frozenset({"planner"}))
+    assert [service(fleet, name).state for name in ("planner", "harness")] == ["stopped", "running"]
+    code, said = order("start", "planner")
+    assert (code, "planner: started" in said) == (0, True)
+    assert wait_for(lambda: service(fleet, "planner").state == "running")
     fleet.kill("planner")
     assert wait_for(lambda: service(fleet, "planner").state == "exited")
     time.sleep(1.0)
@@ -166,30 +162,18 @@ def test_a_service_that_is_not_to_restart_stays_down_until_it_is_started(start: 
     assert wait_for(lambda: service(fleet, "planner").state == "running")
 
 
-def test_a_service_that_is_asleep_waits_until_it_is_started(start: Start, order: Order) -> None:
-    fleet = start(not_started=("planner",))
-    assert [service(fleet, name).state for name in ("planner", "harness")] == ["stopped", "running"]
-    code, said = order("start", "planner")
-    assert (code, "planner: started" in said) == (0, True)
-    assert wait_for(lambda: service(fleet, "planner").state == "running")
-
-
-@pytest.mark.parametrize("program", [SLEEPER, STUBBORN])
-def test_a_suspended_or_stubborn_service_does_not_hold_the_stop(
-    start: Start, run_dir: Path, program: str
+@pytest.mark.parametrize("suspended", ["service", "stubborn service", "supervisor"])
+def test_who_is_suspended_or_stubborn_does_not_hold_the_stop_which_leaves_nothing(
+    start: Start, run_dir: Path, suspended: str
 ) -> None:
+    program = STUBBORN if suspended.startswith("stubborn") else SLEEPER
     fleet = start({"planner": program, "harness": SLEEPER})
-    pid = fleet.kill("planner", signal.SIGSTOP)
+    pids = fleet.pids() | {"supervisor": supervisor_pid(fleet)}
+    assert {*pids.values()} == procfs.fleet_pids(run_dir)
+    os.kill(pids["supervisor" if suspended == "supervisor" else "planner"], signal.SIGSTOP)
     fleet.stop()
-    assert_nothing_left(run_dir, [pid])
-
-
-def test_a_suspended_supervisor_does_not_hold_the_stop(start: Start, run_dir: Path) -> None:
-    fleet = start()
-    pid = supervisor_pid(fleet)
-    os.kill(pid, signal.SIGSTOP)
-    fleet.stop()
-    assert_nothing_left(run_dir, [pid])
+    assert_nothing_left(run_dir, list(pids.values()))
+    assert not run_dir.exists()
 
 
 def test_services_outlive_their_supervisor_and_are_shown_signalled_and_ended(
@@ -217,7 +201,7 @@ def test_services_outlive_their_supervisor_and_are_shown_signalled_and_ended(
     assert_nothing_left(run_dir, list(pids.values()))
 
 
-def test_a_start_that_nobody_asked_for_takes_the_place_of_an_unsupervised_fleet(
+def test_a_fleet_starts_where_one_was_killed_and_unasked_where_one_is_unsupervised(
     start: Start, run_dir: Path
 ) -> None:
     first = start(simulation=False)
@@ -228,10 +212,6 @@ def test_a_start_that_nobody_asked_for_takes_the_place_of_an_unsupervised_fleet(
     assert all(procfs.is_gone(pid) for pid in pids)
     assert not second.supervision_fault()
     assert len(second.pids()) == 2
-
-
-def test_a_fleet_can_start_where_one_was_killed(start: Start, run_dir: Path) -> None:
-    start()
     procfs.signal_all(procfs.fleet_pids(run_dir), signal.SIGKILL)
     assert wait_for(lambda: not procfs.fleet_pids(run_dir))
     assert len(start().pids()) == 2
@@ -362,8 +342,7 @@ def up_in_a_process(run_dir: Path, table: Path, *, then: str = "") -> subprocess
     return subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("delay_s", [0.0, 0.4])
+@pytest.mark.parametrize(("number", "delay_s"), [(signal.SIGINT, 0.4), (signal.SIGTERM, 0.0)])
 def test_an_interrupt_in_the_middle_of_a_start_leaves_nothing(
     run_dir: Path, tmp_path: Path, number: signal.Signals, delay_s: float
 ) -> None:
@@ -433,6 +412,7 @@ def test_a_second_fleet_here_is_refused_and_the_first_is_killed_and_ended_by_ver
     start: Start, run_dir: Path, order: Order
 ) -> None:
     fleet = start()
+    assert [row.state for row in fleet.info()] == ["running", "running"]
     pids = list(fleet.pids().values())
     with pytest.raises(FleetError, match="a fleet is up in"):
         start()

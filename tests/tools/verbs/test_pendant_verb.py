@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from services.joint.neighbours import NeighbourRow, Neighbours
 from services.joint.rearm_guard import RearmGuard
 from shared.bus.messages import Mode
 from shared.joints import MODULES
+from tests.waiting import comes_true
 from tools import cli
 
 ROOT = Path(__file__).parents[3]
@@ -28,13 +29,6 @@ PATIENCE_S = 30.0
 def files(tmp_path: Path) -> list[RearmGuard]:
     """Return what six joint services of a fleet have open."""
     return [RearmGuard(tmp_path, module) for module in MODULES]
-
-
-def wait_for(happens: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not happens():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
 
 
 @contextmanager
@@ -48,15 +42,19 @@ def held(
         command, cwd=ROOT, stdin=stdin, stdout=pipe, stderr=pipe, text=True
     ) as process:
         try:
-            wait_for(lambda: all(file.beats > 3 for file in files))
+            assert comes_true(lambda: all(file.beats > 3 for file in files), PATIENCE_S)
             yield process
         finally:
             process.kill()
 
 
-def test_after_a_kill_it_sends_no_more(tmp_path: Path, files: list[RearmGuard]) -> None:
+def test_beside_it_a_second_is_refused_and_after_a_kill_it_sends_no_more(
+    tmp_path: Path, files: list[RearmGuard], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Beside a second one the first would not be missed."""
     with held(tmp_path, files):
-        pass
+        assert cli.main(["pendant", "--run-dir", str(tmp_path)]) == 2
+    assert "another pendant is held" in capsys.readouterr().err
     beats = [file.beats for file in files]
     assert min(beats) > 3
     time.sleep(0.1)
@@ -97,17 +95,9 @@ def test_a_terminal_that_is_cut_is_the_stop(tmp_path: Path, files: list[RearmGua
     with held(tmp_path, files, terminal) as process:
         os.close(terminal)
         os.close(person)
-        wait_for(lambda: all(file.stop_requested for file in files))
+        assert comes_true(lambda: all(file.stop_requested for file in files), PATIENCE_S)
         process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 2, "no service is there to stop"
-
-
-def test_a_second_pendant_is_refused_for_the_first_would_not_be_missed(
-    tmp_path: Path, files: list[RearmGuard], capsys: pytest.CaptureFixture[str]
-) -> None:
-    with held(tmp_path, files):
-        assert cli.main(["pendant", "--run-dir", str(tmp_path)]) == 2
-    assert "another pendant is held" in capsys.readouterr().err
 
 
 def test_a_time_lays_it_down_by_itself(
