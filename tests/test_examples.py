@@ -67,14 +67,6 @@ def test_the_lqr_leads_in_the_planners_place_and_the_robot_stands_when_it_is_kil
     assert "states, age 4." in lines[1]
 
 
-def test_a_controller_that_is_not_there_leaves_nothing_behind(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert exit_code(["sim", "--controller", "nowhere.py", "--out", tmp_path / "run"]) == 2
-    assert "nowhere.py: --controller: no such file" in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_gentler_hand_leads_the_same_squat_with_less_force() -> None:
     shipped, gentle = (line.split() for line in lines_of("own_operator.py"))
     force, height = 2, 8

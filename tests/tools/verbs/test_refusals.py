@@ -36,6 +36,7 @@ REFUSALS: Final = {
     "sim --loss 1.5": "a number from 0 to 1",
     "sim --delay -1": "of at least 0 ms",
     "sim --hand LOG": "nobody led the hand there",
+    "sim --controller nowhere.py": "nowhere.py: --controller: no such file",
     "sim --controller x.py --control centralised": "both choose what computes the torques",
     "up --config nowhere.toml": "nowhere.toml",
     "up --scenario moonwalk": "no scenario 'moonwalk'; one of bad_network, crawl, ",
