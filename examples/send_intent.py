@@ -13,7 +13,6 @@ from shared.bus import topics
 from shared.bus.messages import OperatorIntent, PlannerStatus
 from shared.bus.session import open_session
 from shared.clock import now_ns
-from shared.config.files import load
 from shared.run_directory import default_run_dir
 from tools.fleet.supervise import SupervisedFleet
 
@@ -23,7 +22,7 @@ FOR_S, ASSIST_N = 5.0, 40.0
 def main(run_dir: Path) -> None:
     """Publish the intent and print what the planner gives."""
     fleet = SupervisedFleet.attach(run_dir)
-    robot = load(Path(fleet.manifest.config))
+    robot = fleet.manifest.robot()
     with open_session(robot, "assist", run_dir) as session:
         intents = session.publisher(topics.OPERATOR_INTENT, OperatorIntent)
         statuses = session.latest(topics.PLANNER_STATUS, PlannerStatus)

@@ -38,8 +38,8 @@ from tests.certified import certified
 from tests.system.namespaces import Network
 from tools.fleet import process_table
 from tools.fleet.pace import run_at_fitting_pace
-from tools.fleet.parent_death import die_with_parent
 from tools.fleet.process_table import FleetOptions
+from tools.fleet.procfs import die_with_parent
 from tools.fleet.supervise import SupervisedFleet
 from tools.live import experiment
 from tools.live.scenario_runner import LiveSnapshot, ScenarioRunner

@@ -17,6 +17,7 @@ from shared.bus.messages import Estop, JointState, Mode, name_of
 from shared.bus.session import Session, open_session
 from shared.clock import now_ns
 from shared.config.robot_config import RobotConfig
+from shared.exceptions import FleetError
 from shared.joints import MODULES
 from shared.user import user_name
 from tools.fleet import procfs
@@ -118,6 +119,12 @@ def stop_all(robot: RobotConfig, run_dir: Path, *, here: bool) -> list[str]:
     """Stop over the bus, in a new session; `here`: its services are in this run directory."""
     with open_session(robot, "estop", run_dir) as session:
         return BusStop(robot, session, run_dir if here else None).stop()
+
+
+def refuse_going(going: list[str]) -> None:
+    """Say that these have not stopped, if there are any."""
+    if going:
+        raise FleetError(f"not stopped after {GIVE_UP_S:g} s: {', '.join(going)}; cut the power")
 
 
 def _source() -> str:

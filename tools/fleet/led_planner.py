@@ -32,13 +32,24 @@ LEADS_S: Final = 15.0
 """Longest wait for a planner that does not lead yet: a fleet that was just started."""
 
 
+def asker(verb: str) -> str:
+    """Return who asks by a verb, as `OperatorIntent.source` has it."""
+    return f"xrl {verb} by {user_name()} ({os.getpid()})"
+
+
+def other_asker(status: PlannerStatus | None, own: str) -> str:
+    """Return who else asks the planner for something; "" for nobody but a scenario."""
+    by = "" if status is None else status.requested_by
+    return "" if by in (SCENARIO, own) else by
+
+
 class LedPlanner:
     """The planner of a robot that is up, and its newest status."""
 
     def __init__(self, session: Session, verb: str) -> None:
         self._intents = session.publisher(topics.OPERATOR_INTENT, OperatorIntent)
         self._statuses = session.latest(topics.PLANNER_STATUS, PlannerStatus)
-        self.source = f"xrl {verb} by {user_name()} ({os.getpid()})"
+        self.source = asker(verb)
         self._sent = 0
         deadline = time.monotonic() + LINKS_S
         while (status := self._statuses.take()) is None:
@@ -68,9 +79,8 @@ class LedPlanner:
         if status.mode != PlannerMode.LEADING:
             why = f" ({status.why})" if status.why else ""
             return f"the planner does not lead: {name_of(PlannerMode, status.mode)}{why}"
-        if status.requested_by not in ("", SCENARIO, self.source):
-            return f"{status.requested_by} asks the robot for something else"
-        return ""
+        other = other_asker(status, self.source)
+        return f"{other} asks the robot for something else" if other else ""
 
     def lead(
         self,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -14,11 +13,10 @@ from shared.bus.messages import Estop, JointState, OperatorIntent, PlannerStatus
 from shared.bus.session import Session, open_session
 from shared.clock import now_ns
 from shared.config.robot_config import RobotConfig
-from shared.config.scenarios import SCENARIO
 from shared.exceptions import BusError, FleetError
 from shared.joints import MODULES
-from shared.user import user_name
 from tools.fleet.descent import WAYS, Ask, Descent, Phase
+from tools.fleet.led_planner import asker, other_asker
 
 LOOK_S: Final = 0.02
 """An intent that is not repeated ends within `assist.stale_ms`."""
@@ -63,7 +61,7 @@ class _Lowering:
         ]
         self._intents = session.publisher(topics.OPERATOR_INTENT, OperatorIntent)
         self._stops = session.publisher(topics.ESTOP, Estop)
-        self._source = f"xrl down by {user_name()} ({os.getpid()})"
+        self._source = asker("down")
         self._assist_n = 0.0
         self._seq = 0
 
@@ -111,9 +109,8 @@ class _Lowering:
         """Repeat what is asked for; a simulated person keeps the hand off until it is down."""
         if ask in (Ask.SIT, Ask.STOP) and not self._seq:
             require_operator(self._robot, "down")
-            by = status.requested_by if status is not None else ""
-            if by not in ("", SCENARIO, self._source):
-                raise FleetError(f"{by} asks the robot for something else; end that first")
+            if other := other_asker(status, self._source):
+                raise FleetError(f"{other} asks the robot for something else; end that first")
             # the person who is carried is carried on
             self._assist_n = status.assist_requested_n if status is not None else 0.0
         if ask is Ask.STOP:

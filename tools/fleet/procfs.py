@@ -1,4 +1,4 @@
-"""Finds a fleet's processes in Linux's /proc.
+"""A fleet's processes by Linux's /proc: found, looked at, signalled; and tied to a parent's life.
 
 Every process of a fleet has the run directory in `FLEET_VARIABLE` of its environment, so
 it can be found without its supervisor, and a reused process id is never mistaken.
@@ -7,7 +7,9 @@ it can be found without its supervisor, and a reused process id is never mistake
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
+import signal
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -18,6 +20,8 @@ from shared.run_directory import FLEET_VARIABLE
 
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 _POLL_S = 0.05
+_PR_SET_PDEATHSIG = 1
+_prctl = ctypes.CDLL(None, use_errno=True).prctl
 _SERVICE_VARIABLE = b"SUPERVISOR_PROCESS_NAME="
 """Set by supervisord: the service's name."""
 
@@ -144,3 +148,14 @@ def wait_until_gone(run_dir: Path, timeout_s: float) -> set[int]:
         if not left or time.monotonic() > deadline:
             return left
         time.sleep(_POLL_S)
+
+
+def die_with_parent(parent_pid: int, number: signal.Signals) -> None:
+    """Have the kernel send this process a signal when its parent dies.
+
+    Also when the parent is dead already: it may have died before this call.
+    """
+    if _prctl(_PR_SET_PDEATHSIG, int(number), 0, 0, 0) != 0:
+        raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG)")
+    if os.getppid() != parent_pid:
+        os.kill(os.getpid(), number)

@@ -17,7 +17,8 @@ from services.joint import neighbours, rearm_guard
 from services.joint.rearm_guard import LastState, RearmGuard
 from services.simulator.fronts import usb_standin
 from shared.clock import PACE_FILE
-from shared.config.robot_config import SERVICES
+from shared.config.files import load
+from shared.config.robot_config import SERVICES, RobotConfig
 from shared.exceptions import FleetError
 from shared.joints import MODULES
 from shared.run_directory import check_own
@@ -59,6 +60,10 @@ class Manifest(msgspec.Struct, frozen=True):
     """Every socket that the services may leave behind."""
     stop_s: float
     """Longest time a service may take to stop."""
+
+    def robot(self) -> RobotConfig:
+        """Return the robot of its file."""
+        return load(Path(self.config))
 
 
 class RunDir:

@@ -23,7 +23,7 @@ from supervisor import loggers, process, supervisord
 from supervisor.options import ServerOptions, decode_wait_status
 from supervisor.states import ProcessStates, getProcessStateDescription
 
-from tools.fleet.parent_death import die_with_parent
+from tools.fleet.procfs import die_with_parent
 
 BACKOFF_MAX_S: Final = 5.0
 """Longest wait before a service that ends at once is started again, s. supervisord adds a second

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Final
 
-from shared.config.files import load
 from shared.exceptions import FleetError
 from shared.joints import MODULES
 from tools.bringup.resuming import rests_after_down
@@ -77,7 +76,7 @@ def _lower(fleet: SupervisedFleet, flags: DownFlags) -> None:
             f"{fleet.run.path}: the fleet's files are gone, so nobody knows whether the robot "
             f"bears weight: {WAYS}"
         )
-    robot = load(Path(manifest.config))
+    robot = manifest.robot()
     lower(robot, fleet.run.path, _tell, wait_s=flags.wait, simulated=simulated)
 
 

@@ -19,7 +19,7 @@ from shared.places import ROBOT_FILE
 from shared.process import StopFlag
 from shared.run_directory import default_run_dir
 from tools.flags import Arg, Flags, names_of, parsed
-from tools.fleet.emergency_stop import GIVE_UP_S, BusStop, request_here, stop_all, wait_here
+from tools.fleet.emergency_stop import BusStop, refuse_going, request_here, stop_all, wait_here
 from tools.fleet.run_dir import RunDir
 from tools.keyboard import typed_line
 from tools.terminal import Console
@@ -112,7 +112,7 @@ def _robot(flags: EstopFlags) -> RobotConfig:
         return load(flags.config)
     manifest = RunDir(flags.run_dir).read_manifest()  # whether or not its supervisor lives
     if manifest is not None:
-        return load(Path(manifest.config))
+        return manifest.robot()
     if places.robot_file_here() is None:  # a stop of the shipped robot would be heard by nobody
         raise FleetError(f"no fleet is up in {flags.run_dir}; name its robot file with --config")
     return load(places.robot_file())
@@ -146,9 +146,7 @@ def _wait(robot: RobotConfig, run_dir: Path, *, here: bool) -> int:
 
 
 def _conclude(going: list[str], which: str) -> None:
-    """Say how it ended."""
-    if going:
-        raise FleetError(f"not stopped after {GIVE_UP_S:g} s: {', '.join(going)}; cut the power")
+    refuse_going(going)
     Console().print(
         f"{which} are stopped: DAMP. The robot sinks slowly, or holds beside a limp or dead "
         "module; `xrl down` ends it"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Sequence
 from enum import Enum
@@ -18,14 +17,12 @@ from shared.bus.messages import STRAIGHT, HandLead, OperatorIntent, PlannerStatu
 from shared.bus.session import Session, open_session
 from shared.bus.traces import SimTruth
 from shared.clock import now_ns
-from shared.config.files import load
 from shared.config.robot_config import RobotConfig
-from shared.config.scenarios import SCENARIO
 from shared.exceptions import FleetError
 from shared.process import StopFlag
-from shared.user import user_name
 from tools.flags import Arg, Duration, Number, RunDirFlags, numbers, option, parsed
-from tools.fleet.emergency_stop import BusStop, request_here
+from tools.fleet.emergency_stop import BusStop, refuse_going, request_here
+from tools.fleet.led_planner import asker, other_asker
 from tools.fleet.supervise import SupervisedFleet
 from tools.keyboard import Keyboard
 from tools.live.assist_request import ask, refuse_beyond_limits
@@ -114,7 +111,7 @@ def run(flags: LeadFlags) -> int:
     if flags.calibrate:
         return _calibrate(flags)
     fleet = SupervisedFleet.attach(flags.run_dir)
-    robot = load(Path(fleet.manifest.config))
+    robot = fleet.manifest.robot()
     if flags.assist is not None:
         return _ask(robot, fleet.run.path, flags.assist, flags)
     require_operator(robot, "lead")
@@ -129,9 +126,7 @@ def run(flags: LeadFlags) -> int:
                 raise FleetError(f"{pad.name}: lost: unplugged, or out of its receiver's range")
             return 0
         request_here(fleet.run.path)
-        going = BusStop(robot, session, fleet.run.path).stop()
-    if going:
-        raise FleetError(f"not stopped: {', '.join(going)}; cut the power")
+        refuse_going(BusStop(robot, session, fleet.run.path).stop())
     console.print("stopped: DAMP. It sinks slowly; `xrl status` names the way out")
     return 0
 
@@ -140,7 +135,7 @@ def _ask(robot: RobotConfig, run_dir: Path, assist_n: float, flags: LeadFlags) -
     """Publish a request for assist until stopped."""
     x, y, roll, yaw = flags.shift or STRAIGHT
     request = OperatorIntent(
-        t_ns=now_ns(), seq=0, assist_n=assist_n, shift=(x, y, roll, yaw), source=_source()
+        t_ns=now_ns(), seq=0, assist_n=assist_n, shift=(x, y, roll, yaw), source=asker("lead")
     )
     refuse_beyond_limits(robot, request.assist_n, request.shift)
     stop = StopFlag()
@@ -152,10 +147,6 @@ def _ask(robot: RobotConfig, run_dir: Path, assist_n: float, flags: LeadFlags) -
     fade_s = robot.assist.fade_s
     Console().print(f"request ended: {given:.0f} N were given; they fade out in {fade_s:g} s")
     return 0
-
-
-def _source() -> str:
-    return f"xrl lead by {user_name()} ({os.getpid()})"
 
 
 def _opened(flags: LeadFlags) -> Gamepad:
@@ -190,7 +181,7 @@ class Leader:
             time.sleep(0.01)
         height, pitch = (truth.torso[2], truth.angles[1]) if truth is not None else (1.0, 0.0)
         self.pilot = Pilot(height, pitch, robot.assist.force_max)
-        self._source = _source()
+        self._source = asker("lead")
         self._sent = 0
 
     def take_hold(self) -> None:
@@ -201,9 +192,7 @@ class Leader:
     @property
     def other(self) -> str:
         """Who else asks for assist now; "" for nobody."""
-        status = self._newest()
-        by = "" if status is None else status.requested_by
-        return "" if by in ("", SCENARIO, self._source) else by
+        return other_asker(self._newest(), self._source)
 
     def lead(self, wanted: Deflection, dt: float) -> None:
         """Go on by dt, s, and tell the robot; assist only while nobody else asks for it."""

@@ -10,7 +10,7 @@ from shared.exceptions import FleetError
 from shared.joints import MODULES
 from shared.process import StopFlag
 from tools.flags import Duration, RunDirFlags, option
-from tools.fleet.emergency_stop import GIVE_UP_S, request_here, wait_here
+from tools.fleet.emergency_stop import refuse_going, request_here, wait_here
 from tools.keyboard import typed_line
 from tools.terminal import Console
 
@@ -61,9 +61,7 @@ def run(flags: PendantFlags) -> int:
             console.print("laid down: the robot continues without it")
             return 0
     request_here(flags.run_dir)  # faster than the pendant's silence
-    going = wait_here(flags.run_dir, list(pendant.modules), pendant.modules)
-    if going:
-        raise FleetError(f"not stopped after {GIVE_UP_S:g} s: {', '.join(going)}; cut the power")
+    refuse_going(wait_here(flags.run_dir, list(pendant.modules), pendant.modules))
     console.print(
         "stopped: DAMP. It sinks slowly, or holds beside a limp or dead module; `xrl down` ends it"
     )

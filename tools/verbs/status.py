@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Annotated, Final
 
 import msgspec
@@ -11,7 +10,6 @@ from rich.console import Group
 
 from shared.bus.session import open_session
 from shared.clock import pace
-from shared.config.files import load
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.process import StopFlag
@@ -56,7 +54,7 @@ class StatusFlags(RunDirFlags):
 def run(flags: StatusFlags) -> int:
     """Look at the fleet once, or until interrupted."""
     fleet = SupervisedFleet.attach(flags.run_dir, warn=False)  # it is in the table
-    robot = load(Path(fleet.manifest.config))
+    robot = fleet.manifest.robot()
     security = robot.bus.security.mode
     if flags.traffic:
         return _show_traffic(fleet, robot, watch=flags.watch)

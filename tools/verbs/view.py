@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Final
 
 from shared import places
-from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError, RunError
 from shared.extras import require
@@ -96,7 +95,7 @@ def _source(flags: ViewFlags) -> Iterator[Source]:
         yield RecordSource(log, robot_of(log))
     else:
         fleet = SupervisedFleet.attach(flags.run_dir)
-        robot = config_file.load(Path(fleet.manifest.config))
+        robot = fleet.manifest.robot()
         if flags.act and "simulator" not in fleet.manifest.services:
             confirm(robot)
         live = LiveSource(robot, fleet, act=flags.act)

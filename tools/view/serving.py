@@ -21,7 +21,7 @@ from shared.extras import require
 from shared.run_directory import private_files
 from shared.toml_file import Range
 from tools.flags import Arg, Flags
-from tools.fleet.parent_death import die_with_parent
+from tools.fleet.procfs import die_with_parent
 from tools.terminal import Console
 from tools.view.source import HOST, PORT, Source
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from pathlib import Path
 from typing import Annotated, Final
 
 from shared.bus import topics
@@ -12,7 +11,6 @@ from shared.bus.messages import Tare, TareRequest, Wrench
 from shared.bus.ports import Inbox, Outbox
 from shared.bus.session import open_session
 from shared.clock import now_ns
-from shared.config.files import load
 from shared.exceptions import FleetError
 from shared.user import user_name
 from tools.flags import Arg, RunDirFlags
@@ -46,7 +44,7 @@ class TareFlags(RunDirFlags):
 def run(flags: TareFlags) -> int:
     """Ask for it, and wait until the wrench is valid again."""
     fleet = SupervisedFleet.attach(flags.run_dir)
-    robot = load(Path(fleet.manifest.config))
+    robot = fleet.manifest.robot()
     with open_session(robot, "tare", flags.run_dir) as session:
         requests = session.publisher(topics.HARNESS_TARE, TareRequest)
         wrenches = session.latest(topics.WRENCH, Wrench)

@@ -6,14 +6,12 @@ import sys
 import time
 from collections.abc import Sequence
 from enum import IntEnum
-from pathlib import Path
 from typing import Annotated, Any, Final
 
 import msgspec
 
 from shared.bus.messages import Message
 from shared.bus.session import Session, open_session
-from shared.config.files import load
 from shared.exceptions import FAULT_EXIT_CODE, RunError
 from shared.mcap_log.schema import ENUMERATIONS
 from shared.process import StopFlag
@@ -58,7 +56,7 @@ def run(flags: EchoFlags) -> int:
             fields = ", ".join(keys[0].topic.type.__struct_fields__)
             raise RunError(f"--field {name}: {keys[0].name} has no such field; it has {fields}")
     fleet = SupervisedFleet.attach(flags.run_dir)
-    robot = load(Path(fleet.manifest.config))
+    robot = fleet.manifest.robot()
     with open_session(robot, "echo", fleet.run.path) as session:
         return 0 if _print(session, keys, flags) else FAULT_EXIT_CODE
 

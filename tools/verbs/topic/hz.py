@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Final
 
 from shared.bus.session import open_session
 from shared.clock import pace
-from shared.config.files import load
 from shared.exceptions import FAULT_EXIT_CODE
 from shared.process import StopFlag
 from tools.flags import Duration, RunDirFlags, option, positional
@@ -40,7 +38,7 @@ def run(flags: HzFlags) -> int:
     """Measure; time apart and age are median and largest of a window, as received here."""
     keys = keys_named(flags.topic)
     fleet = SupervisedFleet.attach(flags.run_dir)
-    robot = load(Path(fleet.manifest.config))
+    robot = fleet.manifest.robot()
     console, stop = Console(), StopFlag()
     with open_session(robot, "hz", fleet.run.path) as session:
         traffic = Traffic(session, keys, services_elsewhere(robot, fleet.run.path))
