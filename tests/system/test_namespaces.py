@@ -12,7 +12,6 @@ import socket
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,6 +32,8 @@ from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
+from shared.places import CHECKOUT
+from tests.system.fleets import wait_for
 from tests.system.multihost import BODY, LEGS, RECORDED, REPORT, Cut, Report
 from tests.system.namespaces import isolation, processes_in
 from tests.system.stalls import stalled_before_it_began
@@ -43,18 +44,9 @@ from tools.logs.run_log import RunLog, read_run
 
 pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(240)]
 
-ROOT = Path(__file__).resolve().parents[2]
 TRIES = 2
 LEADING_S = 80.0
 ENDING_S = 20.0
-HOLDING_HOSTS = """
-import sys, time
-from tests.system.namespaces import Network
-with Network(("one", "two")) as network:
-    print(*network.namespaces(), flush=True)
-    while True:
-        time.sleep(0.1)  # a signal that comes just before a sleep begins is seen after it
-"""
 
 
 class Ended(NamedTuple):
@@ -75,32 +67,9 @@ class Led(NamedTuple):
     interfaces_before: list[str]
 
 
-def start(*arguments: str, **options: object) -> subprocess.Popen[str]:
-    """Start Python in a network namespace of its own, or skip the test where none can be had."""
-    words, refusal = isolation()
-    if refusal:
-        pytest.skip(refusal)
-    command = [*words, sys.executable, "-X", "faulthandler", *arguments]
-    # a session of its own: Ctrl-C reaches this process alone, which then ends the other
-    return subprocess.Popen(
-        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        start_new_session=True,
-    )  # fmt: skip
-
-
 def interfaces() -> list[str]:
     """Return the network interfaces of this process's own namespace."""
     return sorted(name for _, name in socket.if_nameindex())
-
-
-def wait_until_empty(namespaces: list[str]) -> set[int]:
-    """Wait until no process is in these namespaces; return those that still are."""
-    deadline = time.monotonic() + ENDING_S
-    while left := processes_in(namespaces):
-        if time.monotonic() > deadline:
-            break
-        time.sleep(0.05)
-    return left
 
 
 @pytest.fixture(scope="module")
@@ -134,23 +103,27 @@ def led(tmp_path_factory: pytest.TempPathFactory) -> Led:
 
 
 def lead_in_a_process(out: Path, run_dir: Path) -> Ended:
-    """Run `tests.system.multihost` to its end."""
-    leader = start("-m", "tests.system.multihost", str(out), str(run_dir), str(os.getpid()))
+    """Run `tests.system.multihost` to its end, or skip the test where no namespace can be had."""
+    words, refusal = isolation()
+    if refusal:
+        pytest.skip(refusal)
+    program = ("-X", "faulthandler", "-m", "tests.system.multihost")
+    # a session of its own: Ctrl-C reaches this process alone, which then ends the other
+    leader = subprocess.Popen(
+        [*words, sys.executable, *program, str(out), str(run_dir), str(os.getpid())],
+        cwd=CHECKOUT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        start_new_session=True,
+    )  # fmt: skip
     try:
         output = leader.communicate(timeout=LEADING_S)[0]
         return Ended(leader.returncode, output)
     finally:
         leader.terminate()
-        wait_for_end(leader)
-
-
-def wait_for_end(process: subprocess.Popen[str]) -> None:
-    """Wait until a process has ended; fail with where it is in its program if it does not."""
-    try:
-        process.wait(ENDING_S)
-    except subprocess.TimeoutExpired:
-        process.send_signal(signal.SIGABRT)  # Python's fault handler then tells
-        pytest.fail(f"{process.args} has not ended: {process.communicate()[0]}")
+        try:
+            leader.wait(ENDING_S)
+        except subprocess.TimeoutExpired:
+            leader.send_signal(signal.SIGABRT)  # Python's fault handler then tells where it is
+            pytest.fail(f"{leader.args} has not ended: {leader.communicate()[0]}")
 
 
 def spans(led: Led) -> list[tuple[Cut, int]]:
@@ -255,22 +228,6 @@ def test_the_cut_off_legs_own_record_has_every_state_that_reached_nobody(led: Le
 
 def test_a_run_on_three_hosts_leaves_no_process_and_no_network(led: Led) -> None:
     assert len(set(led.report.namespaces)) == len(LEGS) + 2
-    assert wait_until_empty(led.report.namespaces) == set()
+    assert wait_for(lambda: not processes_in(led.report.namespaces), ENDING_S)
     assert procfs.fleet_pids(led.run_dir) == set()
     assert interfaces() == led.interfaces_before
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_namespaces_end_with_the_process_that_made_them(number: signal.Signals) -> None:
-    before = interfaces()
-    process = start("-c", HOLDING_HOSTS)
-    assert process.stdout is not None
-    try:
-        namespaces = process.stdout.readline().split()
-        assert len(processes_in(namespaces)) == len(namespaces) == 3, namespaces
-    finally:
-        process.send_signal(number)
-        wait_for_end(process)
-        process.stdout.close()
-    assert wait_until_empty(namespaces) == set()
-    assert interfaces() == before

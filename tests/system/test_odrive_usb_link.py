@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
@@ -22,15 +23,33 @@ pytestmark = [pytest.mark.system, pytest.mark.timeout(60)]
 LOST = DriveStatus.LOST
 
 
+def plug(usb: UsbRobot, *, up: bool) -> None:
+    with usb.lock:
+        usb.bank.conditions.link(MODULE, up=up)
+
+
+@pytest.fixture
+def patient(usb: UsbRobot, config: RobotConfig) -> Iterator[OdriveUsb]:
+    """Return the driver of a drive without a watchdog, which answers."""
+    off = msgspec.structs.replace(config.drive, watchdog_timeout=0.0)
+    drive = OdriveUsb(serial_number(MODULE), off)
+    assert eventually(lambda: answers(drive))
+    yield drive
+    drive.close()
+
+
+def answers(drive: OdriveUsb) -> bool:
+    reading = drive.read(0.01)
+    return reading is not None and reading.status is not LOST
+
+
 def test_a_pulled_plug_is_lost_and_the_drive_comes_back_by_itself(
     usb: UsbRobot, control: Control, drive: OdriveUsb
 ) -> None:
     for turn in (2, 3):
-        with usb.lock:
-            usb.bank.conditions.link(MODULE, up=False)
+        plug(usb, up=False)
         assert eventually(lambda: control.status is LOST)
-        with usb.lock:
-            usb.bank.conditions.link(MODULE, up=True)
+        plug(usb, up=True)
         assert eventually(lambda: control.status is DriveStatus.IDLE)
         assert drive.connections == turn
     assert control.raised is None
@@ -42,8 +61,7 @@ def test_the_other_drives_go_on_while_one_is_unplugged(
     other = OdriveUsb(serial_number(0), config.drive)
     with Control(other).running() as sibling:
         assert eventually(lambda: sibling.status is DriveStatus.IDLE)
-        with usb.lock:
-            usb.bank.conditions.link(MODULE, up=False)
+        plug(usb, up=False)
         assert eventually(lambda: control.status is LOST)
         before = sibling.samples
         assert eventually(lambda: sibling.samples > before + 10)
@@ -72,13 +90,11 @@ def test_what_was_asked_of_a_lost_drive_is_forgotten_when_it_returns(
         armed.idle()
         assert eventually(lambda: armed.status is DriveStatus.IDLE)
     before = usb.bank.state[4:6]
-    with usb.lock:
-        usb.bank.conditions.link(MODULE, up=False)
+    plug(usb, up=False)
     assert eventually(lambda: armed.status is LOST)
     getattr(armed, asked)()
     time.sleep(0.05)
-    with usb.lock:
-        usb.bank.conditions.link(MODULE, up=True)
+    plug(usb, up=True)
     assert eventually(lambda: armed.status is not LOST)
     samples = armed.samples
     assert eventually(lambda: armed.samples > samples + 20)
@@ -121,36 +137,28 @@ def test_no_call_waits_for_a_board_that_hangs(
 
 
 def test_a_drive_without_a_watchdog_is_not_lost_at_the_first_silence(
-    usb: UsbRobot, config: RobotConfig
+    usb: UsbRobot, patient: OdriveUsb
 ) -> None:
-    off = msgspec.structs.replace(config.drive, watchdog_timeout=0.0)
-    drive = OdriveUsb(serial_number(MODULE), off)
-    assert eventually(lambda: (reading := drive.read(0.01)) is not None and reading.status != LOST)
     usb.stalled.set()
-    answers = [drive.read(0.02) for _ in range(50)]
+    readings = [patient.read(0.02) for _ in range(50)]
     usb.stalled.clear()
-    drive.close()
-    silence = answers[answers.index(None) :]
-    assert [answer for answer in silence if answer is not None], "it is lost in the end"
-    assert all(answer is None or answer.status == LOST for answer in silence)
+    silence = readings[readings.index(None) :]
+    assert [reading for reading in silence if reading is not None], "it is lost in the end"
+    assert all(reading is None or reading.status == LOST for reading in silence)
 
 
 def test_silence_without_a_reader_does_not_count_against_the_drive(
-    usb: UsbRobot, config: RobotConfig
+    usb: UsbRobot, patient: OdriveUsb
 ) -> None:
     """As when the service is stopped and continued: it has heard nothing because it slept."""
-    off = msgspec.structs.replace(config.drive, watchdog_timeout=0.0)
-    drive = OdriveUsb(serial_number(MODULE), off)
-    assert eventually(lambda: (reading := drive.read(0.01)) is not None and reading.status != LOST)
     usb.stalled.set()
     time.sleep(0.25)
-    heard = drive.read(0.01)
+    heard = patient.read(0.01)
     assert heard is None or heard.status is not LOST, "of before the silence"
-    assert drive.read(0.01) is None
+    assert patient.read(0.01) is None
     usb.stalled.clear()
-    assert eventually(lambda: (reading := drive.read(0.01)) is not None and reading.status != LOST)
-    assert drive.connections == 1
-    drive.close()
+    assert eventually(lambda: answers(patient))
+    assert patient.connections == 1
 
 
 def test_a_board_that_is_no_v3_is_named_in_trouble(
