@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from services.ros2_gateway.gateway import RosTopics, topics_of
@@ -39,29 +38,26 @@ def check(robot: RobotConfig, domain: int, wait_s: float) -> list[CheckRow]:
     with ros:
         rows = [CheckRow(True, f"router {ros2.router}", "answers")]
         name = f"/{ros2.namespace}/{NODE}" if ros2.namespace else f"/{NODE}"
-        seen: list[SeenEndpoint] = []
-
-        def look() -> bool:
-            seen[:] = ros.graph()
-            return any(one.kind == "NN" and one.node == name for one in seen)
-
-        if not _wait(look, wait_s):
-            others = _nodes(seen)
-            fix = f"start it: xrl up --ros2 --domain {domain}; it may be in another domain"
-            return [*rows, CheckRow(False, f"node {name}", f"not among: {others}", fix)]
+        deadline = time.monotonic() + wait_s
+        while name not in (nodes := _nodes(seen := ros.graph())):
+            if time.monotonic() > deadline:
+                found = f"not among: {', '.join(nodes) or 'none'}"
+                fix = f"start it: xrl up --ros2 --domain {domain}; it may be in another domain"
+                return [*rows, CheckRow(False, f"node {name}", found, fix)]
+            time.sleep(LOOK_S)
         rows.append(CheckRow(True, f"node {name}", "in the graph"))
         known = topics_of(ros2.namespace)
-        shown = [topic for topic in known if _is_shown(topic, seen, name, types)]
+        own = {(one.topic, one.type_hash) for one in seen if one.kind == "MP" and one.node == name}
+        shown = [topic for topic in known if (topic.name, types.hash(topic.type)) in own]
         rows += [
-            _topic_row(topic, seen, name, types)
+            CheckRow(True, topic.name, topic.type) if topic in shown else _missing(topic, seen)
             for topic in known
             if _has_rate(topic, known, robot)
         ]
         steady = [topic for topic in shown if topic != known.description]
-        slowest_hz = ros2.diagnostics_hz or 1.0
-        rows += _received(ros, steady, known, slowest_hz)
-        rows.append(CheckRow(True, "other nodes", _nodes([s for s in seen if s.node != name])))
-        return rows
+        rows += _received(ros, steady, known, ros2.diagnostics_hz or 1.0)
+        others = [node for node in nodes if node != name]
+        return [*rows, CheckRow(True, "other nodes", ", ".join(others) or "none")]
 
 
 def _opened(router: str, domain: int, types: RosTypes, wait_s: float) -> RosSession | None:
@@ -86,22 +82,11 @@ def _has_rate(topic: RosTopic, known: RosTopics, robot: RobotConfig) -> bool:
     return rates.get(topic, 1.0) > 0.0
 
 
-def _is_shown(topic: RosTopic, seen: list[SeenEndpoint], node: str, types: RosTypes) -> bool:
-    return any(
-        one.kind == "MP" and one.node == node and one.topic == topic.name
-        and one.type_hash == types.hash(topic.type)
-        for one in seen
-    )  # fmt: skip
-
-
-def _topic_row(topic: RosTopic, seen: list[SeenEndpoint], node: str, types: RosTypes) -> CheckRow:
-    if _is_shown(topic, seen, node, types):
-        return CheckRow(True, topic.name, topic.type)
+def _missing(topic: RosTopic, seen: list[SeenEndpoint]) -> CheckRow:
     others = [one for one in seen if one.kind == "MP" and one.topic == topic.name]
     found = f"with another type, {others[0].type}" if others else "not in the graph"
-    return CheckRow(
-        False, topic.name, found, "the same distribution on both sides: ros2.distribution"
-    )
+    fix = "the same distribution on both sides: ros2.distribution"
+    return CheckRow(False, topic.name, found, fix)
 
 
 def _received(
@@ -130,14 +115,5 @@ def _received(
     return rows
 
 
-def _nodes(seen: list[SeenEndpoint]) -> str:
-    return ", ".join(sorted({one.node for one in seen if one.kind == "NN"})) or "none"
-
-
-def _wait(condition: Callable[[], bool], wait_s: float) -> bool:
-    deadline = time.monotonic() + wait_s
-    while not condition():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(LOOK_S)
-    return True
+def _nodes(seen: list[SeenEndpoint]) -> list[str]:
+    return sorted({one.node for one in seen if one.kind == "NN"})

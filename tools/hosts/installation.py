@@ -41,9 +41,8 @@ class HostFile(NamedTuple):
 
     path: str
     content: bytes
-    mode: int
-    of_service: bool
-    """True: it belongs to who runs the services; else to root."""
+    of_service: bool = False
+    """True: it belongs to who runs the services, and is theirs alone; else to root."""
 
 
 class HostRow(NamedTuple):
@@ -68,16 +67,17 @@ def files_of(
     spread = robot_on_hosts(robot, hosts)
     folder = hosts.folder
     files = [
-        HostFile(f"{folder}/{ROBOT_FILE}", config_file.to_toml(spread).encode(), 0o644, False),
-        HostFile(f"{folder}/{SCHEDULE}", schedule, 0o644, False),
-        HostFile(f"{_UNIT_FOLDER}/{UNIT}", unit(hosts, host).encode(), 0o644, False),
+        HostFile(f"{folder}/{ROBOT_FILE}", config_file.to_toml(spread).encode()),
+        HostFile(f"{folder}/{SCHEDULE}", schedule),
+        HostFile(f"{_UNIT_FOLDER}/{UNIT}", unit(hosts, host).encode()),
     ]
     if host.private:
-        text = network_unit(host).encode()
-        files.append(HostFile(f"{_UNIT_FOLDER}/{NETWORK_UNIT}", text, 0o644, False))
+        files.append(HostFile(f"{_UNIT_FOLDER}/{NETWORK_UNIT}", network_unit(host).encode()))
     if authority is not None:
         keys = bundle(authority, principals_on(host))
-        files += [HostFile(f"{folder}/{KEYS}/{n}", text, 0o600, True) for n, text in keys.items()]
+        files += [
+            HostFile(f"{folder}/{KEYS}/{n}", text, of_service=True) for n, text in keys.items()
+        ]
     return files
 
 
@@ -97,7 +97,7 @@ def update(hosts: Hosts, remote: Remote, files: list[HostFile], *, while_up: boo
     remote.must("install", "-d", "-m", "755", folder)
     remote.must("install", "-d", "-m", "700", "-o", hosts.user, keys)
     for file in files:
-        remote.write(file.path, file.content, file.mode, as_user=file.of_service)
+        remote.write(file.path, file.content, private=file.of_service)
     names = [Path(file.path).name for file in files if file.of_service]
     others = [word for name in names for word in ("!", "-name", name)]
     remote.must(

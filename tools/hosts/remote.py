@@ -121,7 +121,7 @@ class Remote:
 
     def fetch(self, *words: str, into: BinaryIO) -> None:
         """Run a command as the services' user, and put what it prints into a file."""
-        command = [*self._begin, shlex.join([*self._as_user, *words])]
+        command = self._command(words, {"as_user": True})
         try:
             done = subprocess.run(command, stdout=into, stderr=subprocess.PIPE, check=False)
         except OSError as error:
@@ -130,18 +130,18 @@ class Remote:
             why = _last(done.stderr.decode(errors="replace"))
             raise FleetError(f"{self.host.name}: {words[0]}: {why}")
 
-    def write(self, path: str, content: bytes, mode: int, *, as_user: bool) -> None:
-        """Write a file whole or not at all; it belongs to who writes it."""
-        part = shlex.quote(f"{path}.part")
+    def write(self, path: str, content: bytes, *, private: bool) -> None:
+        """Write a file whole or not at all; a private one is the services' user's alone."""
+        part, mode = shlex.quote(f"{path}.part"), 0o600 if private else 0o644
         script = (
             f"umask 077 && rm -f {part} && set -C && cat > {part} && chmod {mode:o} {part} && "
             f"mv {part} {shlex.quote(path)}"
         )
-        self.must("sh", "-c", script, content=content, as_user=as_user)
+        self.must("sh", "-c", script, content=content, as_user=private)
 
     def echoed(self, *words: str) -> tuple[str, ClockOffset]:
         """Return the first line of a command that then answers each line with its clock."""
-        command = [*self._begin, shlex.join([*self._as_user, *words])]
+        command = self._command(words, {"as_user": True})
         pipe = subprocess.PIPE
         with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
             limit = threading.Timer(TIMEOUT_S, process.kill)
