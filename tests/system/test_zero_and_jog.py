@@ -119,14 +119,10 @@ def test_a_leg_of_the_emulated_robot_follows_and_nothing_is_left_behind(run_dir:
     assert not run_dir.exists()
 
 
-def test_on_the_emulated_robot_a_small_limit_an_interrupt_and_a_service_stop_it(
+def test_on_the_emulated_robot_an_interrupt_and_a_service_stop_it(
     run_dir: Path, robot: RobotConfig
 ) -> None:
     with started(run_dir, "simulator", "ankle_left"):
-        weak = xrl("drive", "jog", MODULE, "--torque-limit", "4", "--yes", run_dir=run_dir)
-        assert weak.returncode == 3, weak.stdout + weak.stderr
-        assert "torque limit of 4 N m" in weak.stdout
-        assert "both axes are idle" in weak.stdout
         process = subprocess.Popen(
             command("drive", "jog", *LEG, "--cycles", "20", "--run-dir", run_dir),
             cwd=CHECKOUT,
@@ -154,11 +150,15 @@ def test_on_the_emulated_robot_a_small_limit_an_interrupt_and_a_service_stop_it(
             assert why in refused.stderr
 
 
-def test_after_a_jog_the_doctor_finds_the_drive_as_it_was(run_dir: Path) -> None:
+def test_a_small_limit_stops_it_and_the_doctor_then_finds_the_drive_as_it_was(
+    run_dir: Path,
+) -> None:
     """Its limits too: `drive configure --apply` would restart the board for them, zero and all."""
     with started(run_dir, "simulator"):
-        jogged = xrl("drive", "jog", MODULE, "--torque-limit", "4", "--yes", run_dir=run_dir)
-        assert "both axes are idle" in jogged.stdout, jogged.stdout + jogged.stderr
+        weak = xrl("drive", "jog", MODULE, "--torque-limit", "4", "--yes", run_dir=run_dir)
+        assert weak.returncode == 3, weak.stdout + weak.stderr
+        assert "torque limit of 4 N m" in weak.stdout
+        assert "both axes are idle" in weak.stdout
         report = json.loads(xrl("doctor", "--json", run_dir=run_dir).stdout)
     rows = [row for group in report["groups"].values() for row in group]
     assert [row for row in rows if row["verdict"] == "wrong"] == []
