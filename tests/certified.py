@@ -73,13 +73,14 @@ def give(
     folder: Path,
     name: str,
     *,
+    generation: int = 1,
     from_day: int = 0,
     days: int = 90,
     host: str = "127.0.0.1",
 ) -> None:
     """Write a certificate and its key, whose time begins a day before `from_day` from today."""
     then = dt.datetime.now(dt.UTC) + dt.timedelta(days=from_day)
-    issued = certificates.issue(signer, f"{name}.1", (host,), then, days)
+    issued = certificates.issue(signer, f"{name}.{generation}", (host,), then, days)
     folder.mkdir(exist_ok=True)
     (folder / f"{name}.pem").write_bytes(issued.certificate)
     (folder / f"{name}.key").write_bytes(issued.key)

@@ -6,11 +6,13 @@ import time
 from collections.abc import Callable
 
 
-def comes_true(condition: Callable[[], object], limit_s: float = 20.0) -> bool:
-    """Return True once a condition holds; False if it does not within a time."""
+def comes_true(
+    condition: Callable[[], object], limit_s: float = 20.0, every_s: float = 0.002
+) -> bool:
+    """Return True once a condition holds, looked at so often; False if it does not in time."""
     deadline = time.monotonic() + limit_s
     while not condition():
         if time.monotonic() > deadline:
             return False
-        time.sleep(0.002)
+        time.sleep(every_s)
     return True

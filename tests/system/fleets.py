@@ -20,6 +20,7 @@ from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
 from shared.places import CHECKOUT, DEFAULT_CONFIG
 from tests.system.stalls import stalled_before_it_began
+from tests.waiting import comes_true
 from tools.fleet import procfs
 from tools.fleet.process_table import FleetOptions
 from tools.fleet.supervise import SupervisedFleet
@@ -30,14 +31,9 @@ OF_VERBS: Final = ("/tmp/xrl-demo-", "/tmp/xrl-crash-")
 """Run directories of the fleets that `xrl demo` and `xrl study crash` start."""
 
 
-def wait_for(truth: Callable[[], bool], timeout_s: float = 60.0) -> bool:
-    """Return True as soon as it is so; False if it is not in time."""
-    deadline = time.monotonic() + timeout_s
-    while not truth():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.05)
-    return True
+def wait_for(truth: Callable[[], object], timeout_s: float = 60.0) -> bool:
+    """Return True as soon as it is so; False if it is not in time; a look may cost something."""
+    return comes_true(truth, timeout_s, every_s=0.05)
 
 
 @contextmanager

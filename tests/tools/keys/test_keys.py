@@ -8,7 +8,7 @@ import subprocess
 import tarfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import pytest
@@ -17,11 +17,10 @@ from shared.bus.credentials import read_names
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import BusSecurityConfig
-from tests.certified import tls_endpoints
+from tests.certified import give, signer_of, tls_endpoints
 from tools import cli
 from tools.keys import certificates
 from tools.keys.authority import Authority
-from tools.keys.certificates import Issued
 
 
 class Place(NamedTuple):
@@ -132,22 +131,12 @@ def test_renewing_keeps_the_generation_and_revoking_goes_on_to_the_next(made: Pl
     assert made.check() == 0
 
 
-def _place(place: Place, issued: Issued) -> None:
-    (place.keys / "planner.pem").write_bytes(issued.certificate)
-    (place.keys / "planner.key").write_bytes(issued.key)
-
-
-def _issue(place: Place, name: str, host: str, later_days: int, days: int) -> None:
-    authority = Authority(place.authority)
-    signer = Issued(authority.certificate, (place.authority / "authority.key").read_bytes())
-    now = dt.datetime.now(dt.UTC) + dt.timedelta(days=later_days)
-    _place(place, certificates.issue(signer, name, (host,), now, days))
+def _give(place: Place, **how: Any) -> None:
+    give(signer_of(Authority(place.authority)), place.keys, "planner", **how)
 
 
 def _another_authority(place: Place) -> None:
-    now = dt.datetime.now(dt.UTC)
-    signer = certificates.make_authority("xrl", now)
-    _place(place, certificates.issue(signer, "planner.1", ("127.0.0.1",), now))
+    give(certificates.make_authority("xrl", dt.datetime.now(dt.UTC)), place.keys, "planner")
 
 
 def _another_key(place: Place) -> None:
@@ -155,11 +144,11 @@ def _another_key(place: Place) -> None:
 
 
 FAULTS: dict[str, tuple[Callable[[Place], object], int, str]] = {
-    "not valid yet": (lambda p: _issue(p, "planner.1", "127.0.0.1", 40, 10), 3, "not valid before"),
-    "expired": (lambda p: _issue(p, "planner.1", "127.0.0.1", -40, 10), 3, "expired"),
-    "expires soon": (lambda p: _issue(p, "planner.1", "127.0.0.1", 0, 20), 0, "expires in 19 days"),
-    "an earlier generation": (lambda p: _issue(p, "planner.0", "127.0.0.1", 0, 90), 3, "planner.0"),
-    "another host's": (lambda p: _issue(p, "planner.1", "10.1.1.1", 0, 90), 3, "not for 127.0.0.1"),
+    "not valid yet": (lambda p: _give(p, from_day=40), 3, "not valid before"),
+    "expired": (lambda p: _give(p, from_day=-40, days=10), 3, "expired"),
+    "expires soon": (lambda p: _give(p, days=20), 0, "expires in 19 days"),
+    "an earlier generation": (lambda p: _give(p, generation=0), 3, "planner.0"),
+    "another host's": (lambda p: _give(p, host="10.1.1.1"), 3, "not for 127.0.0.1"),
     "another authority's": (_another_authority, 3, "another authority"),
     "another's key": (_another_key, 3, "its key is another's"),
     "readable": (lambda p: (p.keys / "planner.key").chmod(0o644), 3, "chmod 600"),
