@@ -28,7 +28,7 @@ from shared.places import DEFAULT_CONFIG
 from tools.fleet import emergency_stop, process_table, procfs, supervise
 from tools.fleet.run_dir import RunDir
 from tools.fleet.supervise import SupervisedFleet
-from tools.verbs import kill
+from tools.verbs import services
 
 MODULE = "knee_left"
 
@@ -110,8 +110,8 @@ class Fleet:
     def kill(self, service: str, name: str) -> None:
         """Run `xrl kill` on a service that is up."""
         self.pids = {service: PID}
-        flags = kill.KillFlags(run_dir=self.run_dir, service=service, signal=cast("Any", name))
-        assert kill.run(flags) == 0
+        flags = services.KillFlags(run_dir=self.run_dir, service=service, signal=cast("Any", name))
+        assert services.kill(flags) == 0
 
 
 @pytest.fixture

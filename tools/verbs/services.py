@@ -1,4 +1,4 @@
-"""`xrl kill`: send a signal to one service."""
+"""`xrl kill` and `xrl start`: a signal to one service, and its next process."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from tools.flags import RunDirFlags, positional
 from tools.fleet.supervise import SupervisedFleet
 
 EXAMPLES: Final = """
+xrl start planner       # after `xrl up --no-planner`: it leads once all six are ready
+xrl start knee_left     # at once, even if the supervisor waits after several failures
 xrl kill planner                        # dead at once; the supervisor restarts it
 xrl kill planner --signal STOP          # frozen, like a hung process
 xrl kill planner --signal CONT          # resumed
@@ -17,15 +19,30 @@ xrl kill knee_left                      # its drive holds; the new service takes
 """
 
 
-class KillFlags(RunDirFlags):
-    """Which service, and how."""
+class ServiceFlags(RunDirFlags):
+    """Which service."""
 
     service: Annotated[str, positional("SERVICE")]
     """a name that `xrl status` shows"""
+
+
+class KillFlags(ServiceFlags):
+    """And how."""
+
     signal: Literal["KILL", "STOP", "CONT", "TERM"] = "KILL"
 
 
-def run(flags: KillFlags) -> int:
+def start(flags: ServiceFlags) -> int:
+    """Start it, or continue it."""
+    runs = SupervisedFleet.attach(flags.run_dir).start_service(flags.service)
+    if runs is not None:
+        print(f"{flags.service}: runs already, as process {runs}; nothing was done")
+    else:
+        print(f"{flags.service}: started; `xrl status` shows its state")
+    return 0
+
+
+def kill(flags: KillFlags) -> int:
     """Send the signal."""
     fleet = SupervisedFleet.attach(flags.run_dir)
     if flags.signal in ("KILL", "TERM") and flags.service in MODULES:
