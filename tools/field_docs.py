@@ -6,7 +6,6 @@ import ast
 import functools
 import inspect
 import itertools
-import re
 import textwrap
 from typing import Final
 
@@ -21,11 +20,6 @@ def field_docs(struct: type) -> dict[str, str]:
         if owner.__module__.partition(".")[0] in PACKAGES:
             docs |= _own_docs(owner)
     return docs
-
-
-def cell_docs(struct: type) -> dict[str, str]:
-    """Return the same for cells of a table (`one_line`)."""
-    return {name: one_line(text) for name, text in field_docs(struct).items()}
 
 
 @functools.cache
@@ -44,14 +38,3 @@ def _own_docs(struct: type) -> dict[str, str]:
             text = ast.literal_eval(below.value)
             docs[target.id] = " ".join(text.split())
     return docs
-
-
-def summary(documented: object) -> str:
-    """Return the whole docstring in one line."""
-    return one_line(inspect.getdoc(documented) or "")
-
-
-def one_line(text: str) -> str:
-    """Return the text on one line, ready for a table's cell; names of pages become links."""
-    text = " ".join(text.split()).replace("|", "\\|")
-    return re.sub(r"docs/(\w[\w-]*)\.md(#[\w-]+)?", r"[\1](../\1.md\2)", text)

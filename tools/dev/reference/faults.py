@@ -11,8 +11,7 @@ from shared.config.sections import TripLimit, TripsConfig
 from shared.places import DEFAULT_CONFIG
 from shared.robot.fault_table import DRIVE_FAULTS, LOSSES
 from shared.robot.trip_table import JOINT_TRIPS, PLANNER_TRIPS, TripRow
-from tools.dev.reference.markdown import table
-from tools.field_docs import one_line
+from tools.dev.reference.markdown import one_line, table
 
 _INTRODUCTION: Final = """\
 # Faults

@@ -8,8 +8,7 @@ from typing import Final
 
 from services.joint.failsafe import TRANSITIONS, Event
 from shared.bus.messages import Mode
-from tools.dev.reference.markdown import table
-from tools.field_docs import cell_docs
+from tools.dev.reference.markdown import cell_docs, table
 
 _INTRODUCTION: Final = """\
 # Modes of a joint service

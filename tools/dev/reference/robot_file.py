@@ -13,8 +13,7 @@ from shared.config.gain_schedule import inputs_of
 from shared.config.robot_config import RobotConfig
 from shared.places import DEFAULT_CONFIG
 from shared.toml_file import Range
-from tools.dev.reference.markdown import table
-from tools.field_docs import cell_docs, one_line, summary
+from tools.dev.reference.markdown import cell_docs, one_line, summary, table
 
 _INTRODUCTION: Final = """\
 # The robot file

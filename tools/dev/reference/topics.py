@@ -12,8 +12,7 @@ from shared.bus import messages, topics
 from shared.bus.topics import Topic
 from shared.joints import MODULES
 from shared.mcap_log.schema import ENUMERATIONS
-from tools.dev.reference.markdown import table
-from tools.field_docs import cell_docs, one_line, summary
+from tools.dev.reference.markdown import cell_docs, one_line, summary, table
 
 ENUMS: Final[tuple[type[IntEnum], ...]] = tuple(
     sorted(set(ENUMERATIONS.values()), key=lambda enum: enum.__name__)
