@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
 from shared.exceptions import RunError
+from tests.tools.exit_codes import exit_code
 from tests.tools.logs.reexecution.test_golden import NEWEST
 from tools import cli
 from tools.logs.run_log import RunLog, read_run
@@ -47,11 +48,7 @@ CASES: list[list[str]] = [
 
 def told(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     """Return the last line of what a refused command line is told."""
-    try:
-        code: object = cli.main(words)
-    except SystemExit as ended:
-        code = ended.code
-    err = capsys.readouterr().err
+    code, err = exit_code(words), capsys.readouterr().err
     assert code == 2, err
     return err.strip().splitlines()[-1]
 

@@ -113,11 +113,6 @@ class Traffic:
         return time.monotonic() - began
 
 
-def rate_hz(traffic: KeyTraffic, window_s: float) -> float:
-    """Return messages per second of a window."""
-    return traffic.count / window_s if window_s > 0.0 else 0.0
-
-
 def traffic_table(traffic: Traffic, window_s: float, *, only_seen: bool = False) -> Table:
     """Return one row for each key; the window is in s of the fleet's clock."""
     table = Table(box=box.SIMPLE_HEAD)
@@ -134,7 +129,7 @@ def _cells(one: KeyTraffic, window_s: float) -> list[str]:
     """Return rate and nominal rate, spacing and age (median, largest), size, flow and losses."""
     nominal = f"/{one.key.topic.rate_hz:g}" if one.key.topic.rate_hz else ""
     return [
-        f"{rate_hz(one, window_s):.0f}{nominal}" if one.count else f"-{nominal}",
+        f"{one.count / window_s:.0f}{nominal}" if one.count else f"-{nominal}",
         _two(one.gaps_ms),
         _two(one.ages_ms),
         f"{one.size / one.count:.0f}" if one.count else "-",

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import msgspec
+from typing import NamedTuple
 
 from shared.bus import codec, topics
 from shared.bus.messages import JointState
@@ -41,14 +38,8 @@ def recorded_topics() -> dict[str, Topic]:
 
 
 def state(seq: int) -> JointState:
-    return msgspec.structs.replace(
-        _sample_state(), seq=seq, t_ns=1_000_000 * seq, q=(seq * 0.001, -0.37)
-    )
-
-
-@functools.cache
-def _sample_state() -> Any:
-    return sample(JointState)
+    found: JointState = sample(JointState, seq=seq, t_ns=1_000_000 * seq, q=(seq * 0.001, -0.37))
+    return found
 
 
 def item(seq: int, key: str = STATE_KEY) -> tuple[str, bytes, int]:
