@@ -76,27 +76,30 @@ def test_a_pendant_that_is_killed_stops_all_six_without_a_planner(
     assert f"emergency stop by {PENDANT}: {', '.join(MODULES)}" in " ".join(said.split())
 
 
-@pytest.mark.parametrize("disaster", ["hung", "dead, disk full", "dead, directory gone"])
+@pytest.mark.parametrize("gone", [False, True], ids=["hung", "dead, its directory gone"])
 def test_it_needs_no_supervisor(
-    disaster: str, fleet: SupervisedFleet, ear: FleetEar, run_dir: Path
+    gone: bool, fleet: SupervisedFleet, ear: FleetEar, run_dir: Path
 ) -> None:
     """The services hold on without it, and hear both ways, or else a signal."""
     supervisor = int(fleet.run.supervisor_pid.read_text(encoding="utf-8"))
-    gone = disaster.endswith("gone")
+    pids = fleet.pids()
+
+    def assert_all_hold() -> None:
+        time.sleep(1.0)
+        assert fleet.pids() == pids, "every service goes on"
+        ear.wait_for(Mode.HOLD)
+
     try:
-        if disaster == "hung":
-            os.kill(supervisor, signal.SIGSTOP)
-        else:
+        os.kill(supervisor, signal.SIGSTOP)
+        assert_all_hold()
+        if gone:
             for log in fleet.run.logs.iterdir():
                 log.unlink()
                 log.symlink_to("/dev/full")
             os.kill(supervisor, signal.SIGKILL)
-        if gone:
+            assert_all_hold()
             shutil.rmtree(run_dir)
-        pids = fleet.pids()
-        time.sleep(1.0)
-        assert fleet.pids() == pids, "every service goes on"
-        ear.wait_for(Mode.HOLD)
+            assert_all_hold()
         done = xrl("estop", run_dir=run_dir)
         assert ("unconfirmed" in done.stderr) == gone, done.stderr
         assert done.returncode == (2 if gone else 0), done.stdout + done.stderr
