@@ -6,6 +6,7 @@ import contextlib
 import fcntl
 import os
 import shlex
+import shutil
 import stat
 import time
 from pathlib import Path
@@ -239,8 +240,7 @@ class RunDir:
 
 def free_mib_at(path: Path) -> float:
     """Return the free space where a directory is, MiB."""
-    found = os.statvfs(path)
-    return found.f_bavail * found.f_frsize / (1 << 20)
+    return shutil.disk_usage(path).free / (1 << 20)
 
 
 def supervisor_config(run: RunDir, plan: FleetPlan) -> str:

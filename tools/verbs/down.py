@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -77,8 +78,4 @@ def _lower(fleet: SupervisedFleet, flags: DownFlags) -> None:
             f"bears weight: {WAYS}"
         )
     robot = manifest.robot()
-    lower(robot, fleet.run.path, _tell, wait_s=flags.wait, simulated=simulated)
-
-
-def _tell(line: str) -> None:
-    print(line, flush=True)
+    lower(robot, fleet.run.path, partial(print, flush=True), wait_s=flags.wait, simulated=simulated)

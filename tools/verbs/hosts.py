@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Final, NamedTuple
 
@@ -194,7 +195,7 @@ def down(flags: HostsDownFlags) -> int:
     given = _given(flags)
     if not flags.limp:
         everyone = [Remote(given.hosts, host) for host in given.hosts.host]
-        running.lower(given.hosts, everyone, _progress, wait_s=flags.wait)
+        running.lower(given.hosts, everyone, partial(print, flush=True), wait_s=flags.wait)
     return _each(given, lambda remote: running.down(given.hosts, remote))
 
 
@@ -269,10 +270,6 @@ def _each(given: _Given, work: Callable[[Remote], str]) -> int:
     found = on_all(given.remotes, work, _tell)
     failed = any(isinstance(result, FleetError) for result in found.values())
     return FAULT_EXIT_CODE if failed else 0
-
-
-def _progress(line: str) -> None:
-    print(line, flush=True)
 
 
 def _tell(name: str, result: str | FleetError) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Sized
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -167,9 +167,8 @@ def _named(flags: RenewFlags, robot: RobotConfig) -> tuple[Authority, Sequence[s
     return authority, names
 
 
-def _count(names: object) -> str:
-    count = len(names)  # type: ignore[arg-type]  # a list or a dict
-    return f"{count} certificate{'s' if count != 1 else ''}"
+def _count(names: Sized) -> str:
+    return f"{len(names)} certificate{'s' if len(names) != 1 else ''}"
 
 
 def _table(folder: Path, rows: list[KeyRow]) -> Table:
