@@ -53,26 +53,18 @@ def called(one: CompiledGraph) -> list[bytes]:
 
 
 @needs_compiler
-def test_a_translated_graph_gives_the_interpreters_numbers_to_the_last_bit(folder: Path) -> None:
+def test_a_translated_graph_gives_the_interpreters_numbers_to_the_last_bit_and_no_other_uses_it(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     interpreted = CompiledGraph(graph())
     assert not interpreted.translated
     assert build(graph(), folder) == library_of(graph())
     translated = CompiledGraph(graph())
     assert translated.translated
     assert called(translated) == called(interpreted)
-
-
-@needs_compiler
-def test_a_library_is_used_for_its_own_graph_alone(folder: Path) -> None:
-    build(graph(), folder)
     assert not CompiledGraph(graph(factor=2.0000001)).translated
-
-
-@needs_compiler
-def test_the_switch_leaves_libraries_aside(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    build(graph(), folder)
     monkeypatch.setenv(SWITCH, "interpreted")
-    assert not CompiledGraph(graph()).translated
+    assert not CompiledGraph(graph()).translated, "the switch leaves libraries aside"
 
 
 @can_fuse

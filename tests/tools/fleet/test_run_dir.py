@@ -68,15 +68,13 @@ def test_clearing_leaves_foreign_files_and_sockets_alone(claimed: RunDir) -> Non
     ]  # fmt: skip
 
 
-def test_a_start_in_a_used_directory_keeps_what_a_person_put_beside_its_logs(
+def test_a_start_in_a_used_directory_keeps_what_a_person_put_there_and_an_empty_one_goes(
     claimed: RunDir,
 ) -> None:
     (claimed.logs / "thesis.tex").write_text("mine")
     claimed.prepare(plan(claimed.path))
     assert (claimed.logs / "thesis.tex").read_text() == "mine"
-
-
-def test_an_empty_directory_is_gone_after_the_fleet(claimed: RunDir) -> None:
+    (claimed.logs / "thesis.tex").unlink()
     claimed.clear(keep_logs=False)
     assert not claimed.path.exists()
 
@@ -107,20 +105,19 @@ def test_down_where_nothing_is_makes_nothing(run_dir: Path) -> None:
     assert not run_dir.exists()
 
 
-def test_sockets_of_services_started_by_hand_are_no_obstacle(run_dir: Path) -> None:
+def test_what_services_started_by_hand_or_an_earlier_version_left_is_no_obstacle(
+    run_dir: Path, tmp_path: Path
+) -> None:
+    """An earlier version left its logs, and no mark."""
     run_dir.mkdir()
     with closing(socket.socket(socket.AF_UNIX)) as dead:
         dead.bind(str(run_dir / "play.zenoh"))
     (run_dir / "play.zenoh.lock").touch()
     (run_dir / "knee_left.rearm").touch()
-    os.close(RunDir(run_dir).claim())
-
-
-def test_what_a_fleet_of_an_earlier_version_left_is_no_obstacle(run_dir: Path) -> None:
-    """It left its logs, and no mark."""
-    (run_dir / "logs").mkdir(parents=True)
-    (run_dir / "logs/supervisord.log").touch()
-    os.close(RunDir(run_dir).claim())
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs/supervisord.log").touch()
+    for used in (run_dir, tmp_path):
+        os.close(RunDir(used).claim())
 
 
 @pytest.mark.parametrize("mode", [0o777, 0o770, 0o720, 0o702])
