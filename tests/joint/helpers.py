@@ -41,17 +41,36 @@ def with_service(robot: RobotConfig, **changes: Any) -> RobotConfig:
     return msgspec.structs.replace(robot, joint_service=service)
 
 
-class Bench:
-    """One controller, cycled at its rate; the joint stays where it is put."""
+def firmware(
+    target: MotorTarget,
+    pos: Pair,
+    vel: Pair,
+    *,
+    vel_limit: float = math.inf,
+    input_torque_max: float = math.inf,
+) -> Pair:
+    """Return the motors' torques by the firmware's law, as its documentation writes it, N m."""
+    torques = []
+    for i in (0, 1):
+        wanted = target.vel_turns[i] + target.pos_gain[i] * (target.pos_turns[i] - pos[i])
+        wanted = max(-vel_limit, min(vel_limit, wanted))
+        torque = max(-input_torque_max, min(input_torque_max, target.torque[i]))
+        torques.append(torque + target.vel_gain[i] * (wanted - vel[i]))
+    return torques[0], torques[1]
 
-    def __init__(self, robot: RobotConfig, module: str = "knee_right") -> None:
-        self.controller = JointController(believing(robot), module)
+
+class BenchJoint:
+    """A joint that stays where it is put, and the drive that measures it, in virtual time."""
+
+    controller: JointController
+
+    def __init__(self, robot: RobotConfig, status: DriveStatus) -> None:
         self.gear_ratio = robot.joint.gear_ratio
         self.cycle_ns = round(NS_PER_S / robot.joint_service.rate_hz)
         self.now_ns = T0
         self.q: Pair = (0.02, -1.0)
         self.v: Pair = (0.0, 0.0)
-        self.status = DriveStatus.ARMED
+        self.status = status
         self.seq = 0
 
     @property
@@ -59,16 +78,24 @@ class Bench:
         """Return the mode the controller is in."""
         return self.controller.failsafe.mode
 
-    @property
-    def is_stiffened(self) -> bool:
-        """Return True if the module says that it holds with all it has."""
-        return self.controller.state(self.now_ns).stiffened
-
     def reading(self) -> DriveReading:
         """Return what the drive measures."""
         pos = motor_from_joint(self.q, self.gear_ratio)
         vel = motor_from_joint(self.v, self.gear_ratio)
         return DriveReading(self.now_ns, pos, vel, self.status, 0)
+
+
+class Bench(BenchJoint):
+    """One controller, cycled at its rate."""
+
+    def __init__(self, robot: RobotConfig, module: str = "knee_right") -> None:
+        super().__init__(robot, DriveStatus.ARMED)
+        self.controller = JointController(believing(robot), module)
+
+    @property
+    def is_stiffened(self) -> bool:
+        """Return True if the module says that it holds with all it has."""
+        return self.controller.state(self.now_ns).stiffened
 
     def fresh(self, **changes: Any) -> JointCommand:
         """Return the next command, echoing the state of the cycle before."""
@@ -134,7 +161,7 @@ class Bench:
         assert self.mode is mode
 
 
-class ModuleBench:
+class ModuleBench(BenchJoint):
     """A module and its drive: the drive goes on with what it was told last, if it obeys."""
 
     def __init__(
@@ -150,41 +177,31 @@ class ModuleBench:
     ) -> None:
         """Begin after a service that left `last_state`, with a drive that `carries` torques."""
         self.robot = with_service(robot, loop=loop)
+        super().__init__(self.robot, status)
         self.module = DriveManager(self.robot, module, last_state)
-        self.ratio = robot.joint.gear_ratio
-        self.cycle_ns = round(NS_PER_S / robot.joint_service.rate_hz)
-        self.now_ns = T0
-        self.q: Pair = (0.02, -1.0)
-        self.v: Pair = (0.0, 0.0)
-        self.status, self.carries, self.obeys = status, carries, obeys
+        self.controller = self.module.controller
+        self.carries, self.obeys = carries, obeys
         self.error = AxisError.NONE
         self.zero: Pair | None = None
         """Where the drive answers that its encoders read 0."""
         self.target: MotorTarget | None = None
         self.torque: Pair = (0.0, 0.0)
-        self.seq = 0
-
-    @property
-    def mode(self) -> Mode:
-        """Return the mode of the module."""
-        return self.module.controller.failsafe.mode
 
     def carried(self) -> Pair:
         """Return the joint torques that the drive gives now, N m, by the firmware's law."""
-        if self.target is None:
-            return joint_torque(self.torque, self.ratio)
-        t, motors = self.target, []
-        pos, vel = motor_from_joint(self.q, self.ratio), motor_from_joint(self.v, self.ratio)
-        for i in (0, 1):
-            wanted = t.vel_turns[i] + t.pos_gain[i] * (t.pos_turns[i] - pos[i])
-            motors.append(t.torque[i] + t.vel_gain[i] * (wanted - vel[i]))
-        return joint_torque((motors[0], motors[1]), self.ratio)
+        motors = self.torque
+        if self.target is not None:
+            now = super().reading()
+            motors = firmware(self.target, now.pos_turns, now.vel_turns)
+        return joint_torque(motors, self.gear_ratio)
 
     def reading(self) -> DriveReading:
-        """Return what the drive measures."""
-        pos, vel = motor_from_joint(self.q, self.ratio), motor_from_joint(self.v, self.ratio)
-        return DriveReading(
-            self.now_ns, pos, vel, self.status, int(self.error), self.carries, self.zero
+        """Return what the drive measures and tells."""
+        return msgspec.structs.replace(
+            super().reading(),
+            error=int(self.error),
+            torque=self.carries,
+            encoder_zero=self.zero,
         )
 
     def cycle(

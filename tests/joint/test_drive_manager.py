@@ -151,7 +151,7 @@ def test_what_a_link_kept_in_a_freeze_is_no_jump(robot: RobotConfig, loop: LoopN
     bench.q = (0.02, -1.1)
     bench.run(100 * bench.cycle_ns)
     assert bench.mode is Mode.HOLD
-    assert bench.module.controller.samples.q == pytest.approx(bench.q)
+    assert bench.controller.samples.q == pytest.approx(bench.q)
 
 
 def test_a_jump_without_a_freeze_is_not_believed(held: ModuleBench) -> None:
@@ -171,7 +171,7 @@ def test_after_a_freeze_the_event_has_the_torques_carried(bench: ModuleBench) ->
     assert event is not None
     assert (event.mode_before, event.mode_after) == (Mode.TRACK, Mode.HOLD)
     assert event.tau_before == pytest.approx(carried)
-    assert event.tau_after == pytest.approx(bench.module.controller.tau)
+    assert event.tau_after == pytest.approx(bench.controller.tau)
     assert event.tau_after == pytest.approx(carried, abs=1.0)
 
 
@@ -298,7 +298,7 @@ def test_samples_that_jump_as_the_link_is_read_out_after_a_freeze_lack_no_turns(
     bench.zero = (0.25, 0.75)
     bench.cycle()
     bench.run(NS_PER_S // 10)
-    assert not bench.module.controller.samples.turns_lost
+    assert not bench.controller.samples.turns_lost
     assert bench.mode is Mode.HOLD
 
 
@@ -307,7 +307,7 @@ def test_what_the_neighbours_do_comes_through(bench: ModuleBench) -> None:
     assert bench.module.needs_neighbours
     for _ in range(2 * DOUBT_NS // bench.cycle_ns):
         bench.cycle(silent=True, estop=True, near=NeighbourView(sinks=False))
-    assert bench.module.controller.caught
+    assert bench.controller.caught
 
 
 def test_a_module_goes_on_from_all_that_it_remembers(bench: ModuleBench) -> None:
@@ -338,7 +338,7 @@ OFF: Pair = (0.02, -0.03)
 def joint_gains(bench: ModuleBench) -> Pair:
     """Return the stiffness, N m/rad, and the damping, N m s/rad, of each axis, by its drive."""
     assert bench.target is not None
-    scale = (2.0 * bench.ratio) ** 2 / (4.0 * math.pi)
+    scale = (2.0 * bench.gear_ratio) ** 2 / (4.0 * math.pi)
     (pos_gain, _), (vel_gain, _) = bench.target.pos_gain, bench.target.vel_gain
     return scale * pos_gain * vel_gain, scale * vel_gain
 
@@ -381,7 +381,7 @@ def test_a_drive_left_in_damp_goes_on_with_damps_own_gains(robot: RobotConfig, m
     bench.cycle(estop=True)
     bench.run(1000 * bench.cycle_ns)
     assert bench.mode is Mode.DAMP
-    own = bench.module.controller.setpoint
+    own = bench.controller.setpoint
     wanted = (sum(own.k_p) / 2.0, sum(own.k_d) / 2.0)
     assert joint_gains(bench) == pytest.approx(wanted, rel=0.03)
 

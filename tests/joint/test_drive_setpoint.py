@@ -28,6 +28,7 @@ from services.joint.pd_law import ZERO, Setpoint
 from services.joint.pd_law import torque as law_torque
 from shared.bus.messages import Pair
 from shared.clock import NS_PER_MS
+from tests.joint.helpers import firmware
 
 gear_ratios = st.floats(1.0, 200.0)
 
@@ -106,23 +107,12 @@ setpoints = st.builds(
 )
 
 
-def firmware(target: MotorTarget, pos: Pair, vel: Pair, input_torque_max: float = math.inf) -> Pair:
-    """Return the motors' torques by the firmware's law, as its documentation writes it, N m."""
-    torques = []
-    for i in range(2):
-        wanted = target.vel_turns[i] + target.pos_gain[i] * (target.pos_turns[i] - pos[i])
-        wanted = max(-VEL_LIMIT, min(VEL_LIMIT, wanted))
-        torque = max(-input_torque_max, min(input_torque_max, target.torque[i]))
-        torques.append(torque + target.vel_gain[i] * (wanted - vel[i]))
-    return torques[0], torques[1]
-
-
-@given(setpoints, pairs(angle), pairs(rate), pairs(torque))
-def test_the_drive_gives_the_torque_asked(setpoint: Setpoint, q: Pair, v: Pair, tau: Pair) -> None:
-    """At the sample, for any gains, references and rates, whatever the clamp does."""
-    pos, vel = motor_from_joint(q, N), motor_from_joint(v, N)
-    target = DriveSetpointLaw(N, VEL_LIMIT).target(NOW, setpoint, tau, pos, vel)
-    np.testing.assert_allclose(joint_torque(firmware(target, pos, vel), N), tau, atol=1e-7)
+def given_by_drive(
+    target: MotorTarget, pos: Pair, vel: Pair, input_torque_max: float = math.inf
+) -> Pair:
+    """Return the joint torques of a drive with this target, N m."""
+    motors = firmware(target, pos, vel, vel_limit=VEL_LIMIT, input_torque_max=input_torque_max)
+    return joint_torque(motors, N)
 
 
 @given(setpoints, pairs(torque), pairs(angle), pairs(rate), pairs(angle), pairs(rate))
@@ -132,17 +122,20 @@ def test_the_service_knows_what_a_drive_that_it_left_alone_gives_anywhere(
     onboard = DriveSetpointLaw(N, VEL_LIMIT)
     target = onboard.target(NOW, setpoint, tau, motor_from_joint(q, N), motor_from_joint(v, N))
     pos, vel = motor_from_joint(later_q, N), motor_from_joint(later_v, N)
-    given_by_drive = joint_torque(firmware(target, pos, vel), N)
-    np.testing.assert_allclose(onboard.carried(target, pos, vel), given_by_drive, atol=1e-7)
+    expected = given_by_drive(target, pos, vel)
+    np.testing.assert_allclose(onboard.carried(target, pos, vel), expected, atol=1e-7)
 
 
-@given(st.lists(setpoints, min_size=2, max_size=5), pairs(angle), pairs(torque))
-def test_it_does_so_with_whatever_gains_it_has(course: list[Setpoint], q: Pair, tau: Pair) -> None:
+@given(st.lists(setpoints, min_size=1, max_size=5), pairs(angle), pairs(rate), pairs(torque))
+def test_the_drive_gives_the_torque_asked_with_whatever_gains_it_has(
+    course: list[Setpoint], q: Pair, v: Pair, tau: Pair
+) -> None:
+    """At the sample, for any gains, references and rates, whatever the clamp does."""
     law = DriveSetpointLaw(N, VEL_LIMIT)
-    pos = motor_from_joint(q, N)
+    pos, vel = motor_from_joint(q, N), motor_from_joint(v, N)
     for cycle, setpoint in enumerate(course):
-        target = law.target(NOW + cycle * CYCLE_NS, setpoint, tau, pos, ZERO)
-        np.testing.assert_allclose(joint_torque(firmware(target, pos, ZERO), N), tau, atol=1e-7)
+        target = law.target(NOW + cycle * CYCLE_NS, setpoint, tau, pos, vel)
+        np.testing.assert_allclose(given_by_drive(target, pos, vel), tau, atol=1e-7)
 
 
 @given(pairs(st.floats(1.0, 1500.0)), pairs(st.floats(8.0, 200.0)), pairs(torque))
@@ -155,10 +148,10 @@ def test_left_alone_it_holds_with_the_mean_of_its_axes(k_p: Pair, k_d: Pair, tau
     for axis in range(2):
         e = np.eye(2)[axis]
         moved = motor_from_joint((0.1 + 1e-4 * e[0], -1.0 + 1e-4 * e[1]), N)
-        held = np.subtract(joint_torque(firmware(target, moved, ZERO), N), tau) / 1e-4
+        held = np.subtract(given_by_drive(target, moved, ZERO), tau) / 1e-4
         np.testing.assert_allclose(held, -mean_p * e, rtol=1e-4, atol=0.05)
         turning = motor_from_joint((1e-3 * e[0], 1e-3 * e[1]), N)
-        damped = np.subtract(joint_torque(firmware(target, at, turning), N), tau) / 1e-3
+        damped = np.subtract(given_by_drive(target, at, turning), tau) / 1e-3
         np.testing.assert_allclose(damped, -mean_d * e, rtol=1e-4, atol=0.05)
 
 
@@ -236,8 +229,7 @@ def test_the_firmware_clamps_no_input_torque_if_any_target_gives_the_torque_aske
     for wanted, gain, now in zip(motor_torque(tau, N), target.vel_gain, vel, strict=True):
         assume(gain * (-VEL_LIMIT - now) - most <= wanted <= gain * (VEL_LIMIT - now) + most)
     assert max(map(abs, target.torque)) <= most + 1e-9
-    given_by_drive = joint_torque(firmware(target, pos, vel, TORQUE_MAX), N)
-    np.testing.assert_allclose(given_by_drive, tau, atol=1e-6)
+    np.testing.assert_allclose(given_by_drive(target, pos, vel, TORQUE_MAX), tau, atol=1e-6)
 
 
 @given(setpoints, pairs(angle), pairs(rate), pairs(torque))
@@ -259,12 +251,12 @@ def test_a_hip_far_off_its_reference_stays_as_soft_as_commanded(off: float, phi_
     hip = Setpoint(ZERO, ZERO, (0.0, -10.0), ZERO, (900.0, 26.0), (30.0, 4.0))
     law = DriveSetpointLaw(N, VEL_LIMIT, TORQUE_MAX)
     thetas = np.linspace(off, off + 0.05, 11)
-    given_by_drive = []
+    torques = []
     for theta in thetas:
         q = (phi_off, float(theta))
         pos = motor_from_joint(q, N)
         target = law.target(NOW, hip, law_torque(hip, q, ZERO), pos, ZERO)
-        given_by_drive.append(joint_torque(firmware(target, pos, ZERO, TORQUE_MAX), N))
-    torques = np.array(given_by_drive)
-    np.testing.assert_allclose(np.diff(torques[:, 1]) / np.diff(thetas), -26.0, rtol=1e-6)
-    np.testing.assert_allclose(torques[:, 0], -900.0 * phi_off, atol=1e-7)
+        torques.append(given_by_drive(target, pos, ZERO, TORQUE_MAX))
+    phi, theta = np.transpose(torques)
+    np.testing.assert_allclose(np.diff(theta) / np.diff(thetas), -26.0, rtol=1e-6)
+    np.testing.assert_allclose(phi, -900.0 * phi_off, atol=1e-7)

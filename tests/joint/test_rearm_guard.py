@@ -110,11 +110,11 @@ def test_what_holds_waits_for_a_planner_to_send(robot: RobotConfig, last_state: 
     assert {step.command for step in steps} == {DriveCommand.NOTHING}
     assert {step.inhibit for step in steps} == {ArmingInhibit.NONE, ArmingInhibit.WAITING}
     assert service.mode is Mode.DISARMED
-    assert service.module.controller.state(service.now_ns).drive == DriveStatus.HOLDING
+    assert service.controller.state(service.now_ns).drive == DriveStatus.HOLDING
     assert service.module.leaves_holding, "should it end before it has taken the drive over"
     service.lead(2, hold=True)
     assert service.mode is Mode.HOLD
-    assert service.module.controller.state(service.now_ns).drive == DriveStatus.ARMED
+    assert service.controller.state(service.now_ns).drive == DriveStatus.ARMED
     service.lead(hold=True)
     assert service.module.snapshot().tries == 1, "it counts as asked once"
 
@@ -131,19 +131,19 @@ def test_it_is_taken_over_with_the_commands_gains_and_the_torque_that_it_carries
     assert listens.target is None
     assert takes_over.target is not None
     assert takes_over.target.torque == pytest.approx(CARRIED)
-    at = motor_from_joint(service.q, service.ratio)
+    at = motor_from_joint(service.q, service.gear_ratio)
     assert takes_over.target.pos_turns == pytest.approx(at)
-    setpoint = service.module.controller.setpoint
+    setpoint = service.controller.setpoint
     assert (setpoint.k_p, setpoint.k_d) == (k_p, told["k_d"])
     assert setpoint.q_ref == pytest.approx(service.q)
-    last = joint_torque(CARRIED, service.ratio)
-    assert service.module.controller.tau == pytest.approx(last)
+    last = joint_torque(CARRIED, service.gear_ratio)
+    assert service.controller.tau == pytest.approx(last)
     for _ in range(250):
         service.lead(**told)
-        tau = service.module.controller.tau
+        tau = service.controller.tau
         assert tau == pytest.approx(last, abs=0.6)
         last = tau
-    risen = service.module.controller.setpoint
+    risen = service.controller.setpoint
     assert risen.k_p[1] == k_p[1], "theta of a knee as soft as the other knee's"
 
 
@@ -173,14 +173,14 @@ def test_what_found_nothing_or_let_go_leaves_nothing_holding(robot: RobotConfig)
 def test_after_a_stop_a_drive_that_holds_is_taken_over_and_sinks(robot: RobotConfig) -> None:
     """Without a planner too: in HOLD it would be the one strut while five sink."""
     service = successor(robot, LastState.DAMP)
-    before = joint_torque(CARRIED, service.ratio)
+    before = joint_torque(CARRIED, service.gear_ratio)
     first = service.run(20 * NS_PER_MS)[0].event
     assert service.mode is Mode.DAMP
     assert first is not None
     assert first.mode_after == Mode.HOLD, "first it is taken over"
-    assert service.module.controller.tau == pytest.approx(before, abs=2.0)
+    assert service.controller.tau == pytest.approx(before, abs=2.0)
     service.run(round(robot.joint_service.damp_fade_s) * NS_PER_S)
-    assert service.module.controller.tau == pytest.approx((before[0], 0.0), abs=1e-6)
+    assert service.controller.tau == pytest.approx((before[0], 0.0), abs=1e-6)
     assert service.module.last_state is LastState.DAMP
 
 
@@ -197,16 +197,16 @@ def test_an_emergency_stop_waits_until_the_drive_is_known(robot: RobotConfig, un
     service.status, service.carries = DriveStatus.ARMED, CARRIED
     service.run(2 * service.cycle_ns)
     assert service.mode is Mode.DAMP
-    controller = service.module.controller
+    controller = service.controller
     assert controller.setpoint.q_ref == pytest.approx(service.q)
-    assert controller.tau == pytest.approx(joint_torque(CARRIED, service.ratio), abs=2.0)
+    assert controller.tau == pytest.approx(joint_torque(CARRIED, service.gear_ratio), abs=2.0)
 
 
 @pytest.mark.parametrize("last_state", [LastState.NOTHING, LastState.HELD])
 def test_a_drive_is_armed_only_once_it_is_zeroed(robot: RobotConfig, last_state: LastState) -> None:
     service = successor(robot, last_state, DriveStatus.UNZEROED)
     assert DriveCommand.ARM not in orders(service, NS_PER_S)
-    assert service.module.controller.state(service.now_ns).drive == DriveStatus.UNZEROED
+    assert service.controller.state(service.now_ns).drive == DriveStatus.UNZEROED
     service.status = DriveStatus.IDLE
     assert DriveCommand.ARM in orders(service, ARM_EVERY_NS + 10 * NS_PER_MS)
 
