@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from itertools import pairwise
 
 import msgspec
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from services.joint.drive_manager import (
     ARM_EVERY_NS,
@@ -19,7 +18,6 @@ from services.joint.drive_manager import (
     LISTEN_NS,
     ArmingInhibit,
     DriveCommand,
-    DriveManager,
     DriveManagerState,
 )
 from services.joint.drive_setpoint import INPUT_TORQUE_SHARE
@@ -126,19 +124,6 @@ def test_an_emergency_stop_that_came_meanwhile_is_obeyed(held: ModuleBench) -> N
     assert held.mode is Mode.DAMP
     held.run(10 * held.cycle_ns)
     assert held.carried() == pytest.approx(before, abs=5.0)
-
-
-@given(st.integers(0, 60), st.tuples(st.floats(-0.05, 0.09), st.floats(-1.1, -0.9)))
-def test_its_memory_goes_on_bit_for_bit(robot: RobotConfig, cycles: int, moved: Pair) -> None:
-    bench, twin = ModuleBench(robot), ModuleBench(robot)
-    bench.to(Mode.HOLD)
-    bench.freeze(NS_PER_S, moved)
-    bench.run(cycles * bench.cycle_ns)
-    text = msgspec.json.encode(bench.module.snapshot())
-    twin.module.restore(msgspec.json.decode(text, type=DriveManagerState))
-    twin.now_ns, twin.q, twin.status = bench.now_ns, bench.q, bench.status
-    for _ in range(30):
-        assert bench.cycle() == twin.cycle()
 
 
 @pytest.mark.parametrize("loop", LOOPS)
@@ -310,16 +295,6 @@ def test_what_the_neighbours_do_comes_through(bench: ModuleBench) -> None:
     assert bench.controller.caught
 
 
-def test_a_module_goes_on_from_all_that_it_remembers(bench: ModuleBench) -> None:
-    bench.to(Mode.TRACK)
-    memory = bench.module.snapshot()
-    assert memory.gains_changed_ns > 0
-    assert min(memory.gains) > 0.0
-    other = DriveManager(bench.robot, "knee_right")
-    other.restore(memory)
-    assert other.snapshot() == memory
-
-
 def test_a_motors_torque_is_within_what_its_current_gives(held: ModuleBench) -> None:
     """N m of the motor: current limit times torque constant, not over it."""
     drive = held.robot.drive
@@ -408,3 +383,54 @@ def test_a_lost_drive_that_is_back_holding_is_left(held: ModuleBench, back: Driv
         assert {step.command for step in held.run(4 * NS_PER_S)} == {DriveCommand.NOTHING}
     assert held.mode is Mode.FAULT
     assert held.module.leaves_holding, "nor does ending its service idle it"
+
+
+# ---- a module goes on from its snapshot, bit for bit
+
+
+def frozen(bench: ModuleBench, cycles: int) -> None:
+    bench.to(Mode.HOLD)
+    bench.freeze(NS_PER_S, MOVED)
+    bench.run(cycles * bench.cycle_ns)
+
+
+def stiffening(bench: ModuleBench, cycles: int) -> None:
+    bench.to(Mode.HOLD)
+    bench.lead(1 + cycles, hold=True, stiffen=True)
+
+
+def shaking(bench: ModuleBench, cycles: int) -> None:
+    bench.to(Mode.TRACK)
+    bench.v = (0.6, -0.3)
+    bench.lead(3 + cycles)
+    assert min(bench.controller.snapshot().state.trips.mean) > 0.0
+
+
+def phased(bench: ModuleBench, cycles: int) -> None:
+    bench.to(Mode.TRACK)
+    bench.lead(1 + cycles, state_phase=1)
+
+
+def sinking(bench: ModuleBench, cycles: int) -> None:
+    bench.to(Mode.DAMP)
+    bench.run(cycles * bench.cycle_ns)
+
+
+@pytest.mark.parametrize("begin", [frozen, stiffening, shaking, phased, sinking])
+@pytest.mark.parametrize("cycles", [0, 1, 5, 60])
+def test_a_module_goes_on_from_its_snapshot_bit_for_bit(
+    robot: RobotConfig, begin: Callable[[ModuleBench, int], None], cycles: int
+) -> None:
+    bench, twin = ModuleBench(robot), ModuleBench(robot)
+    begin(bench, cycles)
+    snapshot = bench.module.snapshot()
+    assert min(*snapshot.gains, snapshot.gains_changed_ns) > 0
+    text = msgspec.json.encode(snapshot)
+    twin.module.restore(msgspec.json.decode(text, type=DriveManagerState))
+    assert twin.module.snapshot() == snapshot
+    twin.now_ns, twin.q, twin.v, twin.status = bench.now_ns, bench.q, bench.v, bench.status
+    for _ in range(200):
+        assert bench.cycle() == twin.cycle()
+        assert bench.controller.is_state_due is twin.controller.is_state_due
+    assert bench.controller.state(bench.now_ns) == twin.controller.state(twin.now_ns)
+    assert bench.module.snapshot() == twin.module.snapshot()

@@ -9,11 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.joint.controller import JointController
 from services.joint.sample_clock import SampleClock
 from shared.bus.messages import JointCommand
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config.gain_schedule import believing
 from shared.config.robot_config import RobotConfig
 from tests.joint.helpers import T0, Bench, command, with_service
 
@@ -88,20 +86,15 @@ def sent(
     commands: dict[int, JointCommand],
     *,
     late_ns: dict[int, int] | None = None,
-    restored_at: int = -1,
     cycles: int = 400,
 ) -> list[int]:
     """Return the numbers of the periods in which a service sends a state.
 
-    Commands come, and cycles are late, by period; before `restored_at` another controller goes on.
+    Commands come, and cycles are late, by period.
     """
     bench = Bench(robot)
     periods = []
     for number in range(1, cycles + 1):
-        if number == restored_at:
-            other = JointController(believing(robot), "knee_right")
-            other.restore(bench.controller.snapshot())
-            bench.controller = other
         bench.now_ns = T0 + number * PERIOD_NS + (late_ns or {}).get(number, 0)
         bench.controller.step(bench.now_ns, bench.reading(), commands.get(number), estop=False)
         if bench.controller.is_state_due:
@@ -126,12 +119,6 @@ def test_it_keeps_the_phase_that_a_command_names(
     assert {number % every for number in before} == {0}
     assert {number % every for number in after} == {phase % every}
     assert len(after) >= 299 // every - 1, "and none is left out, though no other command comes"
-
-
-def test_the_first_after_a_restore_comes_as_it_would_have(robot: RobotConfig) -> None:
-    commands = {101: asked(1, 101)}
-    for restored_at in (100, 101, 102, 103, 250):
-        assert sent(robot, commands, restored_at=restored_at) == sent(robot, commands)
 
 
 def test_cycles_that_are_held_up_lose_no_state(robot: RobotConfig) -> None:

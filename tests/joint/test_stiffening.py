@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from services.joint import pd_law
-from services.joint.controller import ControllerSnapshot, JointController
 from services.joint.failsafe import Failsafe
 from services.joint.neighbours import NeighbourView
 from services.joint.setpoint_law import SetpointLaw
@@ -193,19 +191,6 @@ def test_stiffening_and_tracking_again_is_without_a_step(robot: RobotConfig) -> 
     assert bench.mode is Mode.TRACK
     whole = robot.support_gains("hip_right")[0][1] * 0.05
     assert largest < 3.0 * whole / blended(bench, robot), "a share of it in each cycle"
-
-
-def test_a_controller_that_is_restored_stays_stiff(robot: RobotConfig) -> None:
-    bench = holding(robot, "hip_right")
-    bench.run(20, fresh=True, hold=True, stiffen=True)
-    text = msgspec.json.encode(bench.controller.snapshot())
-    twin = JointController(robot, "hip_right")
-    twin.restore(msgspec.json.decode(text, type=ControllerSnapshot))
-    for _ in range(200):
-        bench.cycle()
-        twin.step(bench.now_ns, bench.reading(), None, estop=False)
-        assert twin.setpoint == bench.controller.setpoint
-    assert twin.state(bench.now_ns).stiffened
 
 
 @pytest.mark.parametrize("module", ["ankle_left", "knee_right", "hip_right"])

@@ -117,13 +117,6 @@ def test_every_trip_has_its_row_and_its_cause() -> None:
     assert {event.name for event in TRIPS} == {cause.name for cause in JOINT_TRIPS}
 
 
-@pytest.fixture
-def tracking(robot: RobotConfig) -> Bench:
-    bench = Bench(robot)
-    bench.to_track()
-    return bench
-
-
 @pytest.mark.parametrize(
     ("v", "tau_ff", "cause"),
     [
@@ -150,21 +143,3 @@ def test_a_module_that_trips_holds_and_is_led_again_after_a_wait(
     events = [result.event for result in bench.run(2000, fresh=True)]
     assert [event.cause for event in events if event is not None][-1] == Cause.COMMANDS_FRESH
     assert bench.mode is Mode.TRACK
-
-
-def test_in_hold_nothing_trips(robot: RobotConfig) -> None:
-    bench = Bench(robot)
-    bench.to_hold()
-    for cycle in range(400):
-        bench.v = (3.0 if cycle % 4 < 2 else -3.0, 0.0)
-        assert bench.run(1)[-1].event is None
-    assert bench.controller.failsafe.mode is Mode.HOLD
-
-
-def test_a_restored_controller_knows_its_trips(tracking: Bench, robot: RobotConfig) -> None:
-    tracking.v = (0.6, -0.3)
-    tracking.run(3, fresh=True)
-    snapshot, other = tracking.controller.snapshot(), Bench(robot).controller
-    other.restore(snapshot)
-    assert other.snapshot() == snapshot
-    assert snapshot.state.trips.mean != (0.0, 0.0)
