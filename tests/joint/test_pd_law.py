@@ -1,4 +1,4 @@
-""""""
+"""The algebra of setpoints: blended, raised, frozen, damped and caught."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from services.joint import pd_law
 from services.joint.pd_law import Setpoint
 from shared.bus.messages import Pair
-from tests.joint.helpers import command
 
 shares = st.floats(0.0, 1.0)
 
@@ -93,16 +92,6 @@ def test_held_keeps_all_but_rates_and_coupled_torque_which_fade(s: Setpoint, sha
     np.testing.assert_allclose(kept.tau_coupled, left * np.array(s.tau_coupled), rtol=1e-12)
 
 
-@pytest.mark.parametrize("age_s", [0.0, 0.004, 0.03])
-def test_aged_moves_references_on_by_their_rates(age_s: float) -> None:
-    sent = command(v_ref=(0.5, -2.0), dtau_ff=(100.0, -40.0), tau_coupled=(1.0, -2.0))
-    now = pd_law.extrapolate(sent, age_s)
-    np.testing.assert_allclose(now.q_ref, np.add(sent.q_ref, age_s * np.array(sent.v_ref)))
-    np.testing.assert_allclose(now.tau_ff, np.add(sent.tau_ff, age_s * np.array(sent.dtau_ff)))
-    assert (now.v_ref, now.tau_coupled) == (sent.v_ref, sent.tau_coupled)
-    assert (now.k_p, now.k_d) == (sent.k_p, sent.k_d)
-
-
 @given(s=setpoints, share=shares, q=angles, v=rates)
 def test_damped_only_feedforward_is_left(s: Setpoint, share: float, q: Pair, v: Pair) -> None:
     expected = share * np.array(s.tau_ff) - 60.0 * np.array(v)
@@ -126,12 +115,6 @@ def test_damping_begins_with_the_torque_before(s: Setpoint, q: Pair, v: Pair, k_
         pd_law.damp(pd_law.load_to_feedforward(s, both, q), both, k_d, 1.0, 0.0), q, v
     )
     np.testing.assert_allclose(begun, pd_law.torque(s, q, v), rtol=1e-12, atol=1e-9)
-
-
-@given(q=angles)
-def test_stand_asks_for_no_torque_where_it_stands(q: Pair) -> None:
-    s = pd_law.stand(q, (900.0, 1500.0), (40.0, 60.0))
-    assert pd_law.torque(s, q, (0.0, 0.0)) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("away_phi", [-0.126, -0.125, 0.0, 0.125, 0.126])
