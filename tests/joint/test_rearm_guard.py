@@ -51,7 +51,10 @@ def orders(service: ModuleBench, lasting_ns: int) -> set[DriveCommand]:
     return {step.command for step in service.run(lasting_ns)}
 
 
-def test_a_service_that_faults_leaves_that_it_held_or_was_stopped(robot: RobotConfig) -> None:
+@pytest.mark.parametrize("stopped", [True, False])
+def test_a_service_that_faults_leaves_that_it_held_or_was_stopped(
+    robot: RobotConfig, stopped: bool
+) -> None:
     service = successor(robot, LastState.NOTHING, DriveStatus.IDLE)
     left = [service.module.last_state]
     assert service.cycle().command is DriveCommand.ARM
@@ -62,23 +65,15 @@ def test_a_service_that_faults_leaves_that_it_held_or_was_stopped(robot: RobotCo
     service.lead(200)
     assert service.mode is Mode.TRACK
     left.append(service.module.last_state)
-    service.cycle(estop=True)
+    service.cycle(estop=stopped)
     left.append(service.module.last_state)
     service.status = DriveStatus.ERROR
     service.cycle()
     assert service.mode is Mode.FAULT
     left.append(service.module.last_state)
-    nothing, held, damp = LastState.NOTHING, LastState.HELD, LastState.DAMP
-    assert left == [nothing, nothing, held, held, damp, damp]
-
-
-def test_a_fault_of_a_module_that_held_leaves_that_it_held(robot: RobotConfig) -> None:
-    service = successor(robot, LastState.NOTHING, DriveStatus.IDLE)
-    for status in (DriveStatus.IDLE, DriveStatus.ARMED, DriveStatus.ERROR):
-        service.status = status
-        service.cycle()
-    assert service.mode is Mode.FAULT
-    assert service.module.last_state is LastState.HELD
+    nothing, held = LastState.NOTHING, LastState.HELD
+    last = LastState.DAMP if stopped else held
+    assert left == [nothing, nothing, held, held, last, last]
 
 
 @LET_GO
@@ -149,14 +144,12 @@ def test_it_is_taken_over_with_the_commands_gains_and_the_torque_that_it_carries
 
 @pytest.mark.parametrize("carries", [CARRIED, None])
 def test_unknown_torques_are_not_taken_over(robot: RobotConfig, carries: Pair | None) -> None:
+    """Nor are they a reason to wait for a planner."""
     service = successor(robot, LastState.HELD, carries=carries)
+    waits = {ArmingInhibit.WAITING} if carries is not None else set()
+    assert {step.inhibit for step in service.run(NS_PER_S)} == {ArmingInhibit.NONE, *waits}
     service.lead(100)
     assert (service.mode is Mode.DISARMED) is (carries is None)
-
-
-def test_a_drive_of_unknown_torques_is_no_reason_to_wait_for_a_planner(robot: RobotConfig) -> None:
-    service = successor(robot, LastState.NOTHING, carries=None)
-    assert {step.inhibit for step in service.run(3 * ARM_EVERY_NS)} == {ArmingInhibit.NONE}
 
 
 def test_what_found_nothing_or_let_go_leaves_nothing_holding(robot: RobotConfig) -> None:
