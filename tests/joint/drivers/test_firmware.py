@@ -153,7 +153,6 @@ def test_while_the_dialect_is_not_known_the_state_is_believed() -> None:
 
 def test_a_failed_motor_of_0_5_is_an_error_even_before_its_dialect_is_known() -> None:
     failed = old(IDLE, motor=True, done=False)
-    assert dialect_of(failed) == ""
     assert report_of((0, failed), (1, old(IDLE, done=False))).status is DriveStatus.ERROR
 
 

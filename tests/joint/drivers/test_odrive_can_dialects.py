@@ -45,7 +45,9 @@ def test_the_driver_finds_out_the_firmware(driver: OdriveCan, dialect: DialectNa
 
 
 @pytest.mark.parametrize("fault", ["DISARM", "OVERSPEED", "DRV_FAULT", "ESTOP", "WATCHDOG"])
-def test_a_disarmed_axis_is_an_error(rig: Rig, driver: OdriveCan, fault: str) -> None:
+def test_a_disarmed_axis_is_an_error_and_armed_again(
+    rig: Rig, driver: OdriveCan, fault: str
+) -> None:
     arm(rig, driver, onboard=True)
     rig.bank.inject("hip_right.axis1", fault)
     reading = rig.cycle(driver)
@@ -54,6 +56,7 @@ def test_a_disarmed_axis_is_an_error(rig: Rig, driver: OdriveCan, fault: str) ->
     assert bool(reading.error & AxisError.WATCHDOG_TIMER_EXPIRED) == (fault == "WATCHDOG")
     goes_on = fault != "DRV_FAULT"  # the gate drivers share their fault line
     assert (rig.bank.state[AXES[0]] == CLOSED) == goes_on, "the joint service idles it"
+    arm(rig, driver, onboard=True)
 
 
 def test_a_drive_found_armed_tells_its_torques(rig: Rig, driver: OdriveCan, shed: Shed) -> None:

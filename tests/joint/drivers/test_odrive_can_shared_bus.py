@@ -48,9 +48,13 @@ def leg(shed: Shed) -> Leg:
 
 def test_each_driver_reads_its_own_two_axes(leg: Leg) -> None:
     leg.bank.connected[:] = 1.0  # as after a first closed loop: before it 0.5.6 says zeros
-    readings = leg.cycles()
+    leg.vel = -0.5 * leg.pos
+    leg.step()
+    readings = [read(driver) for driver in leg.drivers]
     assert [reading.pos_turns for reading in readings] == [(0.0, 1.0), (2.0, 3.0), (4.0, 5.0)]
-    assert [reading.status for reading in readings] == [DriveStatus.IDLE] * MODULES
+    vels = np.ravel([reading.vel_turns for reading in readings])
+    assert vels == pytest.approx(leg.vel[: 2 * MODULES])
+    assert [reading.status for reading in leg.cycles()] == [DriveStatus.IDLE] * MODULES
 
 
 def test_arming_one_module_leaves_its_neighbours_alone(leg: Leg) -> None:

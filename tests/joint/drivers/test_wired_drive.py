@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.joint.drivers.base import Drive, DriveReading, DriveStatus, MotorTarget
-from services.joint.drivers.wired_drive import MotorFrame, WiredDrive
+from services.joint.drivers.wired_drive import MotorFrame, Signs, WiredDrive
 from shared.bus.messages import Pair
 
 MARK = 64.0
@@ -34,6 +34,9 @@ class Recorder:
 
     def arm(self, *, onboard: bool) -> None:
         self.sent.append(("arm", onboard))
+
+    def clear_errors(self) -> None:
+        self.sent.append("clear_errors")
 
     def idle(self) -> None:
         self.sent.append("idle")
@@ -62,32 +65,22 @@ def status_by(inner: Recorder, frame: MotorFrame, reading: DriveReading) -> Driv
     return found.status
 
 
-def test_positions_are_counted_from_the_mark_both_ways(inner: Recorder) -> None:
-    drive: Drive = WiredDrive(inner, MotorFrame(MARK))
-    inner.reading = at((MARK + 3.0, MARK - 4.0))
-    reading = drive.read(0.0)
-    assert reading == DriveReading(7, (3.0, -4.0), (0.5, -0.5), DriveStatus.ARMED, 0x40, (0.1, 0.2))
-    drive.write(TARGET)
-    drive.set_position((3.0, -4.0))
-    sent = inner.sent[0]
-    assert isinstance(sent, MotorTarget)
-    assert sent.pos_turns == (MARK + 0.5, MARK - 1.5)
-    assert (sent.vel_turns, sent.torque) == (TARGET.vel_turns, TARGET.torque)
-    assert (sent.pos_gain, sent.vel_gain) == (TARGET.pos_gain, TARGET.vel_gain)
-    assert inner.sent[1] == (MARK + 3.0, MARK - 4.0)
-
-
-@pytest.mark.parametrize("pos", [(0.0, MARK), (MARK, 0.97), (31.9, MARK), (MARK, 96.1)])
+@pytest.mark.parametrize(
+    ("pos", "signs"),
+    [
+        ((0.0, MARK), (1, 1)),
+        ((MARK, 0.97), (1, 1)),
+        ((31.9, MARK), (1, 1)),
+        ((MARK, 96.1), (1, 1)),
+        ((0.97, 0.5), (-1, 1)),
+        ((0.97, 0.5), (-1, -1)),
+    ],
+)
 @pytest.mark.parametrize("status", [DriveStatus.IDLE, DriveStatus.ARMED, DriveStatus.ERROR])
 def test_a_count_far_from_the_mark_is_no_zero(
-    inner: Recorder, pos: Pair, status: DriveStatus
+    inner: Recorder, pos: Pair, signs: Signs, status: DriveStatus
 ) -> None:
-    assert status_by(inner, MotorFrame(MARK), at(pos, status)) is DriveStatus.UNZEROED
-
-
-@pytest.mark.parametrize("signs", [(-1, 1), (-1, -1)])
-def test_so_it_is_with_signs(inner: Recorder, signs: tuple[int, int]) -> None:
-    assert status_by(inner, MotorFrame(MARK, signs), at((0.97, 0.5))) is DriveStatus.UNZEROED
+    assert status_by(inner, MotorFrame(MARK, signs), at(pos, status)) is DriveStatus.UNZEROED
 
 
 def test_a_lost_drive_is_lost_wherever_it_was_and_silence_stays_silence(inner: Recorder) -> None:
@@ -102,25 +95,20 @@ def test_without_a_mark_any_drive_is_taken_for_zeroed(inner: Recorder) -> None:
     assert WiredDrive(inner, MotorFrame(0.0)).read(0.0) == inner.reading
 
 
-def test_everything_else_goes_through(inner: Recorder) -> None:
-    drive = WiredDrive(inner, MotorFrame(MARK))
-    drive.write_torque((0.1, 0.2))
-    drive.arm(onboard=True)
-    drive.idle()
-    drive.close()
-    assert inner.sent == [(0.1, 0.2), ("arm", True), "idle", "close"]
-
-
-def test_a_read_only_drive_is_sent_nothing_at_all(inner: Recorder) -> None:
-    drive: Drive = WiredDrive(inner, MotorFrame(), read_only=True)
+@pytest.mark.parametrize("read_only", [True, False])
+def test_every_order_goes_through_to_a_drive_that_is_not_read_only(
+    inner: Recorder, read_only: bool
+) -> None:
+    drive = WiredDrive(inner, MotorFrame(), read_only=read_only)
     drive.write_torque((0.1, 0.2))
     drive.write(TARGET)
     drive.arm(onboard=True)
+    drive.clear_errors()
     drive.idle()
-    drive.set_position((0.0, 0.0))
-    assert inner.sent == []
+    drive.set_position((0.5, 0.25))
     drive.close()
-    assert inner.sent == ["close"]
+    orders = [(0.1, 0.2), TARGET, ("arm", True), "clear_errors", "idle", (0.5, 0.25)]
+    assert inner.sent == [*([] if read_only else orders), "close"]
 
 
 @pytest.mark.parametrize("status", DriveStatus)
@@ -144,13 +132,10 @@ def test_a_motor_that_counts_down_is_the_same_joint(pos: Pair, signs: tuple[int,
     drive.set_position(pos)
     target = inner.sent.pop()
     assert target == (signs[0] * (pos[0] + MARK), signs[1] * (pos[1] + MARK))
-    inner.reading = DriveReading(7, target, (0.5, -0.5), DriveStatus.ARMED, 0, (0.1, 0.2))  # type: ignore[arg-type]
-    reading = drive.read(0.0)
-    assert reading is not None
-    assert reading.status is DriveStatus.ARMED
-    assert reading.pos_turns == pytest.approx(pos)
-    assert reading.vel_turns == (signs[0] * 0.5, signs[1] * -0.5)
-    assert reading.torque == (signs[0] * 0.1, signs[1] * 0.2)
+    inner.reading = at(target)  # type: ignore[arg-type]
+    vel, torque = (signs[0] * 0.5, signs[1] * -0.5), (signs[0] * 0.1, signs[1] * 0.2)
+    expected = DriveReading(7, pytest.approx(pos), vel, DriveStatus.ARMED, 0x40, torque)
+    assert drive.read(0.0) == expected
     drive.write(TARGET)
     drive.write_torque((0.1, 0.2))
     sent, torque = inner.sent
