@@ -30,39 +30,35 @@ def rows(**changes: NeighbourRow | None) -> list[NeighbourRow | None]:
     return [changes.get(name, row) for name, row in known.items()]
 
 
-def test_a_hip_knows_how_its_own_leg_has_turned() -> None:
-    assert view_of("hip_right", rows(), T0) == NeighbourView(pytest.approx((0.0 + 0.1, 0.0 + 0.01)))
-    assert view_of("hip_left", rows(), T0) == NeighbourView(pytest.approx((0.3 + 0.4, 0.03 + 0.04)))
+NEVER = NeighbourRow(0, 0.0, 0.0, 0)
+DEAD = NeighbourRow(T0 - GONE_NS - 1, 0.0, 0.0, Mode.DAMP)
+CAUGHT = NeighbourRow(T0, 0.0, 0.0, Mode.DAMP, caught=1)
+LIMP = NeighbourRow(T0, 0.0, 0.0, Mode.FAULT)
+AHEAD = NeighbourRow(T0 + STALE_NS + 1, 0.0, 0.0, Mode.HOLD)
+"""By a clock far ahead, which is another host's."""
 
 
-@pytest.mark.parametrize("age_ns", [0, STALE_NS, STALE_NS + 1, -STALE_NS - 1])
-def test_an_ankle_knows_how_its_own_knee_has_turned_lately(age_ns: int) -> None:
-    knee = NeighbourRow(T0 - age_ns, -0.7, -0.1, Mode.DAMP)
-    known = abs(age_ns) <= STALE_NS
-    assert view_of("ankle_left", rows(knee_left=knee), T0).leg == ((-0.7, -0.1) if known else None)
-    assert view_of("ankle_right", rows(knee_left=knee), T0).leg == pytest.approx((0.1, 0.01))
-    assert view_of("ankle_left", rows(knee_left=None), T0).leg is None
+def test_a_hip_and_an_ankle_know_how_their_own_leg_has_turned() -> None:
+    for module, theta, rate in (
+        ("hip_right", 0.0 + 0.1, 0.0 + 0.01),
+        ("hip_left", 0.3 + 0.4, 0.03 + 0.04),
+        ("ankle_right", 0.1, 0.01),
+        ("ankle_left", 0.4, 0.04),
+    ):
+        assert view_of(module, rows(), T0) == NeighbourView(pytest.approx((theta, rate)))
 
 
-@pytest.mark.parametrize("age_ns", [-STALE_NS - 1, STALE_NS + 1])
-@pytest.mark.parametrize("kind", ["ankle", "knee"])
-def test_what_is_old_or_of_another_clock_is_not_known(kind: str, age_ns: int) -> None:
-    name = f"{kind}_left"
-    old = rows(**{name: NeighbourRow(T0 - age_ns, 0.5, 0.0, Mode.DAMP)})
-    assert view_of("hip_left", old, T0).leg is None
-    assert view_of("hip_right", old, T0).leg is not None, "it is no business of the other leg"
-    just = rows(**{name: NeighbourRow(T0 - STALE_NS, 0.5, 0.0, Mode.DAMP)})
-    assert view_of("hip_left", just, T0).leg is not None
-
-
-@pytest.mark.parametrize("kind", ["ankle", "knee"])
-def test_what_is_being_written_or_never_was_is_not_known(kind: str) -> None:
-    for row in (None, NeighbourRow(0, 0.0, 0.0, 0)):
-        found = view_of("hip_left", rows(**{f"{kind}_left": row}), T0)
-        assert found == UNKNOWN
-    assert view_of("knee_right", rows(knee_left=NeighbourRow(0, 0.0, 0.0, 0)), T0).sinks, (
-        "on another host"
-    )
+@pytest.mark.parametrize("age_ns", [0, STALE_NS, STALE_NS + 1, -STALE_NS, -STALE_NS - 1])
+@pytest.mark.parametrize(("asks", "of"), [("hip", "ankle"), ("hip", "knee"), ("ankle", "knee")])
+def test_a_row_that_is_old_being_written_or_never_was_is_not_known(
+    asks: str, of: str, age_ns: int
+) -> None:
+    aged = rows(**{f"{of}_left": NeighbourRow(T0 - age_ns, 0.5, 0.0, Mode.DAMP)})
+    known = view_of(f"{asks}_left", aged, T0) != UNKNOWN
+    assert known is (abs(age_ns) <= STALE_NS)
+    assert view_of(f"{asks}_right", aged, T0) != UNKNOWN, "it is no business of the other leg"
+    for row in (None, NEVER):
+        assert view_of(f"{asks}_left", rows(**{f"{of}_left": row}), T0) == UNKNOWN
 
 
 def test_which_module_holds_beside_which() -> None:
@@ -82,21 +78,35 @@ def test_which_module_holds_beside_which() -> None:
         assert found.stiffen is stiffens, (asks, other, mode, age_ns)
 
 
-def test_a_knee_whose_like_is_on_another_host_sinks_on_with_it() -> None:
-    """The other leg knows nothing: to stop alone would tip the robot for sure."""
-    dead = NeighbourRow(T0 - GONE_NS - 1, 0.0, 0.0, Mode.DAMP)
-    assert not view_of("knee_left", rows(hip_left=dead), T0).sinks
-    limp = NeighbourRow(T0, 0.0, 0.0, Mode.FAULT)
-    for elsewhere in (NeighbourRow(0, 0.0, 0.0, 0), NeighbourRow(T0 + STALE_NS + 1, 0.0, 0.0, 3)):
-        assert view_of("knee_left", rows(hip_left=dead, knee_right=elsewhere), T0).sinks
-        assert view_of("knee_left", rows(ankle_left=limp, knee_right=elsewhere), T0).stiffen
+@pytest.mark.parametrize(
+    "others",
+    [
+        {"knee_left": CAUGHT},
+        {"hip_right": None},
+        {"hip_right": NEVER},
+        {"knee_right": NEVER},
+        {"knee_right": AHEAD},
+        {"hip_left": DEAD, "knee_right": NEVER},
+        {"hip_left": DEAD, "knee_right": AHEAD},
+    ],
+)
+def test_a_knee_waits_neither_for_itself_nor_for_what_is_not_known(
+    others: dict[str, NeighbourRow | None],
+) -> None:
+    """Its like on another host makes it blind to that leg: to stop alone would tip the robot."""
+    assert view_of("knee_left", rows(**others), T0).sinks
 
 
-def test_a_knee_waits_neither_for_itself_nor_for_what_is_not_known() -> None:
-    caught = NeighbourRow(T0, 0.0, 0.0, Mode.DAMP, caught=1)
-    never = NeighbourRow(0, 0.0, 0.0, 0)
-    for known in ({"knee_left": caught}, {"hip_right": None}, {"hip_right": never}):
-        assert view_of("knee_left", rows(**known), T0).sinks
+def test_a_knee_stiffens_for_its_own_ankle_whatever_is_known_of_the_other_leg() -> None:
+    for elsewhere in (NEVER, AHEAD):
+        assert view_of("knee_left", rows(ankle_left=LIMP, knee_right=elsewhere), T0).stiffen
+
+
+def test_a_drive_that_never_sent_a_state_is_not_limp() -> None:
+    for asks, other in (("hip_right", "knee_left"), ("knee_right", "ankle_left")):
+        for t_ns in (0, 1):
+            limp = rows(**{other: NeighbourRow(t_ns, 0.0, 0.0, Mode.FAULT)})
+            assert view_of(asks, limp, T0).stiffen is (t_ns > 0)
 
 
 @pytest.mark.parametrize("own_age_ns", [0, STALE_NS, STALE_NS + 1])
@@ -107,20 +117,9 @@ def test_a_drive_that_is_silent_beside_one_that_is_heard_may_be_limp(own_age_ns:
         silent[other] = NeighbourRow(T0 - own_age_ns, 0.0, 0.0, Mode.HOLD, silent=1)
         found = view_of(asks, rows(**silent), T0)
         if asks != other:
-            limp = rows(**{other: NeighbourRow(T0, 0.0, 0.0, Mode.FAULT)})
+            limp = rows(**{other: LIMP})
             wanted = own_age_ns <= STALE_NS and view_of(asks, limp, T0).stiffen
             assert found.stiffen is wanted, (asks, other)
-
-
-def test_a_drive_that_never_sent_a_state_is_not_limp() -> None:
-    for asks, other in (("hip_right", "knee_left"), ("knee_right", "ankle_left")):
-        assert not view_of(asks, rows(**{other: NeighbourRow(0, 0.0, 0.0, Mode.FAULT)}), T0).stiffen
-        assert view_of(asks, rows(**{other: NeighbourRow(1, 0.0, 0.0, Mode.FAULT)}), T0).stiffen
-
-
-def test_a_clock_far_ahead_is_of_another_host() -> None:
-    ahead = rows(knee_left=NeighbourRow(T0 + STALE_NS + 1, 0.0, 0.0, Mode.HOLD))
-    assert view_of("knee_right", ahead, T0).sinks
 
 
 def test_a_row_half_written_is_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
