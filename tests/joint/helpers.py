@@ -12,6 +12,7 @@ from services.joint.differential import joint_torque, motor_from_joint
 from services.joint.drive_manager import DriveAction, DriveCommand, DriveManager
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.neighbours import UNKNOWN, NeighbourView
+from services.joint.pd_law import Setpoint
 from services.joint.rearm_guard import LastState
 from shared.bus.messages import JointCommand, Mode, Pair
 from shared.can.cansimple import AxisError
@@ -22,6 +23,10 @@ from shared.config.robot_config import RobotConfig
 T0 = 1_000 * NS_PER_S
 SESSION = 7
 LoopName = Literal["onboard", "service"]
+FULL = Setpoint(
+    (0.1, -1.0), (0.2, -0.4), (3.0, -20.0), (5.0, -6.0), (100.0, 800.0), (10.0, 50.0)
+)  # fmt: skip
+"""A setpoint of which no part is nought or like another."""
 
 
 def command(**changes: Any) -> JointCommand:

@@ -180,12 +180,14 @@ def test_hold_freezes_references_and_drops_the_coupled_torque_over_its_ramp(benc
     np.testing.assert_allclose(bench.controller.tau, before - np.array(COUPLED), atol=1e-9)
 
 
-@pytest.mark.parametrize(("module", "theta_rises"), [("ankle_left", True), ("knee_left", False)])
+@pytest.mark.parametrize(
+    ("module", "theta_rises"), [("ankle_left", True), ("knee_left", False), ("hip_left", False)]
+)
 def test_in_hold_ankles_and_every_phi_stiffen_and_the_rest_stays_as_it_was_certified(
     robot: RobotConfig, module: str, theta_rises: bool
 ) -> None:
     bench = Bench(robot, module)
-    bench.q = (0.02, -0.3)  # inside both kinds' limits
+    bench.q = (0.02, -0.3)  # inside each kind's limits
     sent = {"k_p": (100.0, 200.0), "k_d": (1.0, 1.0), "q_ref": bench.q}
     bench.to_track(**sent)
     bench.cycle(bench.fresh(hold=True, **sent))

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from services.joint import pd_law
 from services.joint.pd_law import Setpoint
 from shared.bus.messages import Pair
+from tests.joint.helpers import FULL
 
 shares = st.floats(0.0, 1.0)
 
@@ -35,11 +36,6 @@ setpoints = st.builds(Setpoint, angles, rates, torques, torques, pairs(gains), p
 
 
 SOFT = Setpoint((0.1, -1.0), (0.2, -0.4), (3.0, -20.0), (5.0, -6.0), (100.0, 0.0), (10.0, 0.0))
-
-
-FULL = Setpoint(
-    (0.1, -1.0), (0.2, -0.4), (3.0, -20.0), (5.0, -6.0), (100.0, 800.0), (10.0, 50.0)
-)  # fmt: skip
 
 
 @given(s=setpoints, q=angles, v=rates)

@@ -14,11 +14,7 @@ from services.joint.sinking import DOUBT_NS, LEVEL_MAX, Sinking, SinkingState
 from shared.bus.messages import Pair
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
-
-FULL = Setpoint(
-    (0.1, -1.0), (0.2, -0.4), (3.0, -20.0), (5.0, -6.0), (100.0, 800.0), (10.0, 50.0)
-)  # fmt: skip
-
+from tests.joint.helpers import FULL
 
 Q: Pair = (0.02, -0.4)
 

@@ -111,12 +111,6 @@ def test_a_service_that_begins_beside_a_limp_module_begins_with_the_torque_it_ta
     assert pd_law.torque(found, q, pd_law.ZERO) == pytest.approx(tau)
 
 
-def test_a_hip_without_the_flag_stays_as_soft_as_the_hand_needs_it(robot: RobotConfig) -> None:
-    bench = holding(robot, "hip_left")
-    bench.run(1000, fresh=True, hold=True)
-    assert bench.controller.setpoint.k_p[1] == SOFT_P[1]
-
-
 @settings(max_examples=25)
 @given(st.sampled_from(MODULES), st.tuples(gain, gain), st.tuples(damping, damping))
 def test_no_gain_is_ever_lowered_and_none_jumps(
