@@ -26,6 +26,7 @@ from shared.can.cansimple import (
 from shared.config.sections import CanConfig
 from tests.joint.drivers.rig import DRIVE, NODES
 
+COUNTS_PER_TURN = 1000
 FULL = can.CanOperationError("Failed to transmit: No buffer space available", errno.ENOBUFS)
 DOWN = OSError(errno.ENETDOWN, "Network is down")
 
@@ -89,7 +90,12 @@ class Bench:
             monkeypatch.setattr(module, "now_ns", lambda: self.now_ns)
         monkeypatch.setattr(time, "sleep", self.wait)
         monkeypatch.setattr(can, "Bus", self.open)
-        self.driver = OdriveCan(CanConfig(interface=interface, channel="can7"), NODES, DRIVE)
+        self.driver = OdriveCan(
+            CanConfig(interface=interface, channel="can7"),
+            NODES,
+            DRIVE,
+            encoder_counts_per_turn=COUNTS_PER_TURN,
+        )
 
     @property
     def bus(self) -> FakeBus:
@@ -143,11 +149,15 @@ class Bench:
         assert self.receive(AxisState.CLOSED_LOOP_CONTROL).status is DriveStatus.ARMED
         self.bus.sent.clear()
 
+    def sent(self) -> list[tuple[int, int]]:
+        """Return node and command of each frame that the bus has taken since the last look."""
+        ids = [split_id(message.arbitration_id) for message in self.bus.sent]
+        self.bus.sent.clear()
+        return ids
+
     def commands(self) -> list[int]:
         """Return the commands that the bus has taken since the last look."""
-        commands = [split_id(message.arbitration_id)[1] for message in self.bus.sent]
-        self.bus.sent.clear()
-        return commands
+        return [command for _, command in self.sent()]
 
 
 def frame(node: int, command: int, data: bytes = b"", **kwargs: bool) -> can.Message:

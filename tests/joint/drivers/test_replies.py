@@ -16,30 +16,13 @@ from services.simulator.fronts.cansimple_dialects import DialectName
 from shared.bus.messages import Pair
 from shared.can.cansimple import AxisState, Command, pack_two_floats, pack_two_ints
 from shared.clock import NS_PER_MS
-from shared.config.sections import CanConfig
-from tests.joint.drivers.can_bench import Bench, receiving_fails
+from tests.joint.drivers.can_bench import COUNTS_PER_TURN, Bench, receiving_fails
 from tests.joint.drivers.rig import DRIVE, NODES, Rig, Shed, arm
-
-COUNTS_PER_TURN = 1000
-
 
 ZERO = (0.0, 0.0)
 
 
 COUNTED = (0.5, -64.25)
-
-
-@pytest.fixture
-def counting(bench: Bench) -> Bench:
-    """Return the bench with a driver that knows the encoders' counts to a turn."""
-    bench.driver.close()
-    bench.driver = OdriveCan(
-        CanConfig(interface="fake", channel="can7"),
-        NODES,
-        DRIVE,
-        encoder_counts_per_turn=COUNTS_PER_TURN,
-    )
-    return bench
 
 
 def receive_estimates(bench: Bench, turns: Pair) -> DriveReading:
@@ -62,38 +45,38 @@ def receive_counts(bench: Bench) -> None:
         bench.send(node, Command.GET_ENCODER_COUNT, data)
 
 
-def test_a_drive_whose_estimates_are_zero_is_asked_for_its_counts(counting: Bench) -> None:
-    counting.commands()
-    assert receive_estimates(counting, ZERO).pos_turns == ZERO
-    assert counting.commands().count(Command.GET_ENCODER_COUNT) == 2
-    receive_counts(counting)
-    reading = receive_estimates(counting, ZERO)
+def test_a_drive_whose_estimates_are_zero_is_asked_for_its_counts(bench: Bench) -> None:
+    bench.commands()
+    assert receive_estimates(bench, ZERO).pos_turns == ZERO
+    assert bench.commands().count(Command.GET_ENCODER_COUNT) == 2
+    receive_counts(bench)
+    reading = receive_estimates(bench, ZERO)
     assert (reading.pos_turns, reading.vel_turns) == (COUNTED, (0.0, 0.0))
 
 
-def test_a_drive_with_other_estimates_is_asked_for_no_count(counting: Bench) -> None:
-    receive_estimates(counting, (0.25, 0.25))
-    counting.commands()
-    assert receive_estimates(counting, (0.25, 0.25)).pos_turns == (0.25, 0.25)
-    assert counting.commands() == []
+def test_a_drive_with_other_estimates_is_asked_for_no_count(bench: Bench) -> None:
+    receive_estimates(bench, (0.25, 0.25))
+    bench.commands()
+    assert receive_estimates(bench, (0.25, 0.25)).pos_turns == (0.25, 0.25)
+    assert bench.commands() == []
 
 
-def test_a_count_from_before_a_restart_is_not_believed_after_it(counting: Bench) -> None:
-    receive_counts(counting)
-    assert receive_estimates(counting, ZERO).pos_turns == COUNTED
-    receive_estimates(counting, (0.6, -64.0))
-    assert receive_estimates(counting, ZERO).pos_turns == ZERO
+def test_a_count_from_before_a_restart_is_not_believed_after_it(bench: Bench) -> None:
+    receive_counts(bench)
+    assert receive_estimates(bench, ZERO).pos_turns == COUNTED
+    receive_estimates(bench, (0.6, -64.0))
+    assert receive_estimates(bench, ZERO).pos_turns == ZERO
 
 
-def test_a_count_is_forgotten_with_the_link_and_in_a_long_silence(counting: Bench) -> None:
-    receive_counts(counting)
-    assert receive_estimates(counting, ZERO).pos_turns == COUNTED
-    renew_the_link(counting)
-    assert receive_estimates(counting, ZERO).pos_turns == ZERO
-    receive_counts(counting)
-    assert receive_estimates(counting, ZERO).pos_turns == COUNTED
-    counting.after(REBOOT_MS + 1)
-    assert receive_estimates(counting, ZERO).pos_turns == ZERO
+def test_a_count_is_forgotten_with_the_link_and_in_a_long_silence(bench: Bench) -> None:
+    receive_counts(bench)
+    assert receive_estimates(bench, ZERO).pos_turns == COUNTED
+    renew_the_link(bench)
+    assert receive_estimates(bench, ZERO).pos_turns == ZERO
+    receive_counts(bench)
+    assert receive_estimates(bench, ZERO).pos_turns == COUNTED
+    bench.after(REBOOT_MS + 1)
+    assert receive_estimates(bench, ZERO).pos_turns == ZERO
 
 
 def receive_currents(bench: Bench, *currents: float) -> Pair | None:

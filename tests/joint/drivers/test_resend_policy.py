@@ -41,9 +41,7 @@ def written(bench: Bench, target: MotorTarget) -> list[int]:
     """Write a target and return the commands to the second node."""
     bench.driver.write(target)
     bench.wait(0.002)
-    ids = [split_id(message.arbitration_id) for message in bench.bus.sent]
-    bench.bus.sent.clear()
-    return [command for node, command in ids if node == NODES[1]]
+    return [command for node, command in bench.sent() if node == NODES[1]]
 
 
 def test_changed_gains_are_sent_twice_and_then_now_and_then(bench: Bench) -> None:
@@ -63,8 +61,7 @@ def test_gains_that_drift_are_not_sent_twice_as_often(bench: Bench) -> None:
 def test_an_axis_gets_its_gains_right_before_the_target_they_belong_to(bench: Bench) -> None:
     settled(bench)
     bench.driver.write(with_gain(10.0))
-    ids = [split_id(message.arbitration_id) for message in bench.bus.sent]
-    assert ids == [(node, command) for node in NODES for command in GAINS]
+    assert bench.sent() == [(node, command) for node in NODES for command in GAINS]
 
 
 def test_gains_that_change_while_the_drive_settles_are_sent_without_the_mode(bench: Bench) -> None:
@@ -82,10 +79,8 @@ def test_targets_that_a_full_queue_cuts_off_reach_both_axes_in_turn(bench: Bench
         bench.bus.room = 3
         bench.driver.write(with_gain(10.0 + step))
         bench.wait(0.002)
-        for message in bench.bus.sent:
-            node, command = split_id(message.arbitration_id)
+        for node, command in bench.sent():
             received[node] += command == Command.SET_INPUT_POS
-        bench.bus.sent.clear()
     assert list(received.values()) == [20, 20]
 
 
@@ -148,7 +143,7 @@ def test_an_axis_gets_its_target_right_after_its_mode(bench: Bench) -> None:
     """Firmware 0.5 takes where the motor is for the target when a mode is set."""
     bench.armed()
     bench.driver.write(TARGET)
-    ids = [split_id(message.arbitration_id) for message in bench.bus.sent]
+    ids = bench.sent()
     for node in NODES:
         at = ids.index((node, Command.SET_CONTROLLER_MODE))
         assert ids[at + 1] == (node, Command.SET_INPUT_POS)
