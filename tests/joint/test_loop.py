@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
 import pytest
@@ -217,23 +218,38 @@ def test_a_lost_drive_is_not_asked_to_arm(rig: Rig) -> None:
     assert rig.drive.armed == 0
 
 
-@pytest.mark.parametrize("sinks", [False, True], ids=["holds", "sinks"])
-def test_a_service_stopped_alone_leaves_its_drive_as_it_is(onboard: Rig, sinks: bool) -> None:
-    onboard.run(20)
-    if sinks:
-        onboard.estops.waiting.append(Estop(t_ns=0, seq=1, source="test"))
-        onboard.run(5)
-    assert onboard.mode is (Mode.DAMP if sinks else Mode.HOLD)
-    onboard.end(interrupted=False)
-    assert onboard.drive.idled == 0
-
-
-@pytest.mark.parametrize("armed", [True, False])
-def test_a_fleet_that_goes_down_leaves_its_drives_idle(rig: Rig, armed: bool) -> None:
-    rig.drive.obeys = armed
-    rig.run(5)
-    rig.end(interrupted=True)
-    assert rig.drive.idled == 1
+@pytest.mark.parametrize("loop", ["onboard", "service"])
+@pytest.mark.parametrize("interrupted", [True, False])
+@pytest.mark.parametrize(
+    ("mode", "left"),
+    [
+        (Mode.DISARMED, LastState.NOTHING),
+        (Mode.HOLD, LastState.HELD),
+        (Mode.DAMP, LastState.DAMP),
+    ],
+)
+def test_a_fleet_that_goes_down_leaves_idle_drives_and_a_service_ended_alone_one_that_holds(
+    robot: RobotConfig,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    mode: Mode,
+    left: LastState,
+    interrupted: bool,
+    loop: str,
+) -> None:
+    """Of itself the fleet leaves nothing, the service that it held or sank."""
+    guard = RearmGuard(tmp_path, "knee_right")
+    rig = Rig(with_service(robot, loop=loop), monkeypatch, guard)
+    rig.drive.obeys = mode is not Mode.DISARMED
+    rig.run(20)
+    if mode is Mode.DAMP:
+        rig.estops.waiting.append(Estop(t_ns=0, seq=1, source="test"))
+        rig.run(5)
+    assert (rig.mode, guard.read()) == (mode, left)
+    rig.end(interrupted=interrupted)
+    goes_on = loop == "onboard" and mode is not Mode.DISARMED and not interrupted
+    assert rig.drive.idled == int(not goes_on)
+    assert guard.read() is (LastState.NOTHING if interrupted else left)
 
 
 def test_states_carry_the_stamp_of_the_drives_sample(rig: Rig) -> None:

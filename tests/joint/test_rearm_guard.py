@@ -215,19 +215,6 @@ def start(robot: RobotConfig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
     return lambda: Rig(robot, monkeypatch, RearmGuard(tmp_path, MODULE))
 
 
-@pytest.mark.parametrize(
-    ("interrupted", "left"), [(True, LastState.NOTHING), (False, LastState.HELD)]
-)
-def test_a_fleet_that_goes_down_leaves_nothing_and_a_service_ended_alone_that_it_held(
-    start: Start, tmp_path: Path, interrupted: bool, left: LastState
-) -> None:
-    process = start()
-    process.run(10)
-    assert RearmGuard(tmp_path, MODULE).read() is LastState.HELD
-    process.end(1, interrupted=interrupted)
-    assert RearmGuard(tmp_path, MODULE).read() is left
-
-
 @pytest.mark.parametrize("asked", [True, False])
 def test_a_crashed_service_arms_only_if_asked_to(start: Start, tmp_path: Path, asked: bool) -> None:
     dead = start()
