@@ -11,15 +11,12 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from services.joint.controller import ControllerSnapshot, CycleResult, JointController, row_of
+from services.joint.controller import CycleResult, JointController, row_of
 from services.joint.drivers.base import DriveReading, DriveStatus
 from services.joint.neighbours import SILENT_NS, NeighbourRow, NeighbourView
-from services.joint.sinking import SinkingState
 from services.joint.torque_limiter import limits_of
-from services.joint.trips import JointTrips
 from shared.bus.messages import Cause, JointCommand, Mode, Pair, Refusal
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config.gain_schedule import believing
 from shared.config.robot_config import RobotConfig
 from tests.joint.helpers import SESSION, T0, Bench, command, with_service
 
@@ -303,35 +300,6 @@ def test_an_event_holds_the_torque_on_both_sides_of_the_change(bench: Bench) -> 
     assert (event.mode_before, event.mode_after) == (Mode.TRACK, Mode.HOLD)
     assert event.cause == Cause.HOLD_ALL
     assert event.seq == 3
-
-
-def test_a_restored_controller_shares_nothing(bench: Bench, robot: RobotConfig) -> None:
-    bench.to_track(tau_coupled=COUPLED)
-    taken = bench.controller.snapshot()
-    state = msgspec.structs.replace(
-        taken.state, last_cycle_ns=12, initial_torque=(1.0, 2.0), cause=3, tau=(4.0, 5.0), cycle=6,
-        late=7, events=8, states=9, takeover_offset=(0.1, 0.2), resumed_ns=10,
-        trips=JointTrips(slow=(1.0, 2.0), mean=(3.0, 4.0), at_limit_ns=5, fast_ns=6),
-    )  # fmt: skip
-    sinking = SinkingState(-2.2, 0.1, -0.3, 0.4, caught=True, doubt_ns=7)
-    law = msgspec.structs.replace(taken.law, changed_ns=11, stiffened_ns=13, sinking=sinking)
-    snapshot = ControllerSnapshot(state=state, law=law)
-    before = msgspec.msgpack.encode(snapshot)
-    other = JointController(believing(robot), "knee_right")
-    other.restore(snapshot)
-    assert other.snapshot() == snapshot
-    other.step(bench.now_ns, None, bench.fresh(), True)
-    assert msgspec.msgpack.encode(snapshot) == before
-
-
-def test_a_snapshot_shares_nothing_with_the_controller_that_it_was_taken_from(bench: Bench) -> None:
-    bench.to_track(tau_coupled=COUPLED)
-    snapshot = bench.controller.snapshot()
-    before = msgspec.msgpack.encode(snapshot)
-    bench.run(3, fresh=True)
-    bench.run(60)
-    assert bench.controller.failsafe.dropouts.count == 1
-    assert msgspec.msgpack.encode(snapshot) == before
 
 
 @pytest.mark.parametrize("axis", [0, 1])
