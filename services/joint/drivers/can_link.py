@@ -79,14 +79,12 @@ class CanLink:
 
     Attributes:
         watch: what is known of the bus.
-        connections: how often the bus was opened.
         bus_offs: how often the controller went off the bus.
         error_frames: reports of any other trouble on the wire.
     """
 
     def __init__(self, config: CanConfig, node_ids: Sequence[int]) -> None:
         """Take the channel with `{run}` already expanded, and the nodes to listen to."""
-        self.connections = 0
         self.bus_offs = 0
         self.error_frames = 0
         self._config = config
@@ -140,7 +138,6 @@ class CanLink:
             ) from error
         except (can.CanError, OSError):
             return False
-        self.connections += 1
         self.watch.reopened()
         with suppress(OSError):
             limit_queue(self._bus)

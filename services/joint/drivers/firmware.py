@@ -123,13 +123,11 @@ class AxesReport:
 
     Attributes:
         dialect: "" until it is known.
-        firmware: (major, minor, revision) as 0.6 reports it; None: unknown.
         status: by the last heartbeats.
     """
 
     def __init__(self) -> None:
         self.dialect: Dialect = ""
-        self.firmware: tuple[int, int, int] | None = None
         self.status = DriveStatus.LOST
         self._wanted_armed = False
         self._unanswered = 0
@@ -146,7 +144,6 @@ class AxesReport:
     def forget(self) -> None:
         """Forget both axes until they have sent a heartbeat: it may be another drive by now."""
         self.dialect = ""
-        self.firmware = None
         self._unanswered = 0
         self._discard_reports()
         self.status = DriveStatus.LOST
@@ -173,9 +170,8 @@ class AxesReport:
         self._take(axis, heartbeat)
         self._judge()
 
-    def receive_version(self, data: bytes) -> None:
+    def receive_version(self) -> None:
         """Take an answer to 0x000; earlier heartbeats are judged again if needed."""
-        self.firmware = cansimple_06.unpack_version(data).firmware
         if self.dialect != "0.6":
             self._learn("0.6")
 

@@ -122,21 +122,6 @@ class OdriveCan:
         """The firmware's generation, "0.5" or "0.6"; "" while it is not known."""
         return self._report.dialect
 
-    @property
-    def firmware(self) -> tuple[int, int, int] | None:
-        """Firmware version as 0.6 reports it; None: unknown."""
-        return self._report.firmware
-
-    @property
-    def connections(self) -> int:
-        """How often the bus was opened."""
-        return self._link.connections
-
-    @property
-    def bus_offs(self) -> int:
-        """How often the CAN controller went off the bus."""
-        return self._link.bus_offs
-
     def read(self, timeout_s: float) -> DriveReading | None:
         """Wait for the next encoder sample of both axes; see `Drive.read`.
 
@@ -310,7 +295,7 @@ class OdriveCan:
 
     def _take_version(self, _axis: int, data: bytes) -> None:
         if len(data) == VERSION_BYTES:  # a request that we or others sent has none
-            self._report.receive_version(data)
+            self._report.receive_version()
 
     def _silence(self, now: int) -> DriveReading | None:
         """Return None while the drive may yet come back as it was, then that it is lost.

@@ -33,7 +33,7 @@ class Replies:
         ask_supply: request for the voltage of the supply.
         supply_v: the newest, V; 0: not known.
         counted: position in turns, without velocity, of an axis that sends no estimates; None: no
-    answer, or estimates have arrived.
+            answer, or estimates have arrived.
     """
 
     def __init__(

@@ -42,7 +42,7 @@ class MotorFrame(NamedTuple):
             (vel_a * sign_a, vel_b * sign_b),
             status,
             reading.error,
-            None if torque is None else self._signed(torque),
+            None if torque is None else self.torque(torque),
             None
             if zero is None
             else ((zero[0] * sign_a - mark) % 1.0, (zero[1] * sign_b - mark) % 1.0),
@@ -66,14 +66,12 @@ class MotorFrame(NamedTuple):
 
     def position(self, turns: Pair) -> Pair:
         """Return motor turns from the joint's zero as the drive counts them."""
-        return self._signed((turns[0] + self.mark_turns, turns[1] + self.mark_turns))
+        mark, (sign_a, sign_b) = self
+        return ((turns[0] + mark) * sign_a, (turns[1] + mark) * sign_b)
 
     def torque(self, torque: Pair) -> Pair:
-        """Return motor torques, N m, as the drive counts them."""
-        return self._signed(torque)
-
-    def _signed(self, pair: Pair) -> Pair:
-        return (pair[0] * self.signs[0], pair[1] * self.signs[1])
+        """Return motor torques, N m, as the drive counts them, and the other way round."""
+        return (torque[0] * self.signs[0], torque[1] * self.signs[1])
 
 
 class WiredDrive:

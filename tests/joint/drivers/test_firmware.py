@@ -15,15 +15,11 @@ from services.joint.drivers.firmware import (
     judged,
 )
 from services.joint.drivers.odrive_v3 import AxesStatus
-from services.simulator.fronts.cansimple_dialects import VERSION_06
 from shared.can import cansimple, cansimple_06
 from shared.can.cansimple import AxisError, AxisState, Heartbeat
 from shared.can.cansimple_06 import DriveError06, Heartbeat06, ProcedureResult
 
 CLOSED, IDLE = AxisState.CLOSED_LOOP_CONTROL, AxisState.IDLE
-
-
-VERSION = cansimple_06.pack_version(VERSION_06)
 
 
 def old(state: int, error: int = 0, *, motor: bool = False, done: bool = True) -> bytes:
@@ -65,11 +61,11 @@ def test_a_heartbeat_only_one_dialect_can_send_shows_it(heartbeat: bytes, dialec
     assert dialect_of(heartbeat) == dialect
 
 
-def test_a_version_is_an_answer_of_0_6_and_names_the_firmware() -> None:
+def test_a_version_is_an_answer_of_0_6() -> None:
     report = report_of((0, new(IDLE)))
-    assert (report.dialect, report.firmware) == ("", None)
-    report.receive_version(VERSION)
-    assert (report.dialect, report.firmware) == ("0.6", (0, 6, 10))
+    assert report.dialect == ""
+    report.receive_version()
+    assert report.dialect == "0.6"
 
 
 def test_a_drive_that_never_replies_counts_as_0_5_after_many_requests() -> None:
@@ -88,7 +84,7 @@ def test_0_6_taken_for_0_5_looks_like_an_error_until_its_answer_comes() -> None:
         for axis in (0, 1):
             report.receive(axis, busy)
     assert (report.dialect, report.status) == ("0.5", DriveStatus.ERROR)
-    report.receive_version(VERSION)  # and what was heard is judged again
+    report.receive_version()  # and what was heard is judged again
     assert (report.dialect, report.status) == ("0.6", DriveStatus.ARMED)
 
 
