@@ -63,6 +63,7 @@ class ControllerState(msgspec.Struct, kw_only=True):
     """Joint torque of the last cycle (phi, theta), N m."""
     cycle: int = 0
     late: int = 0
+    """Cycles that came later than twice the period after the one before."""
     clock: SampleClock = msgspec.field(default_factory=SampleClock)
     events: int = 0
     states: int = 0
@@ -186,11 +187,6 @@ class JointController:
     @cycle.setter
     def cycle(self, cycle: int) -> None:
         self._state.cycle = cycle
-
-    @property
-    def late(self) -> int:
-        """Cycles that came later than twice the period after the one before."""
-        return self._state.late
 
     @property
     def samples(self) -> JointEstimate:

@@ -58,8 +58,7 @@ class SetpointLaw:
     @property
     def stiffened(self) -> bool:
         """True while it holds with all of its support gains."""
-        s = self.state
-        return s.stiffened_ns > 0
+        return self.state.stiffened_ns > 0
 
     def age_s(self, command: JointCommand, now_ns: int) -> float:
         """Return a command's age, s, as far as it is extrapolated: docs/law.md (22)."""
@@ -67,8 +66,7 @@ class SetpointLaw:
 
     def is_settled(self, now_ns: int) -> bool:
         """Return True if the blend after the last change of mode is over."""
-        s = self.state
-        return now_ns - s.changed_ns >= self._blend_ns
+        return now_ns - self.state.changed_ns >= self._blend_ns
 
     def start(self, mode: Mode, now_ns: int, setpoint: Setpoint) -> None:
         """Start a mode from a given setpoint: until now the module was DISARMED."""

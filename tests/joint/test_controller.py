@@ -217,7 +217,7 @@ def test_late_cycles_are_counted_beyond_twice_the_period(bench: Bench) -> None:
     late = []
     for after_ns in (period_ns, 2 * period_ns, 2 * period_ns + 1, 1, 10 * period_ns, period_ns):
         bench.cycle(after_ns=after_ns)
-        late.append(bench.controller.late)
+        late.append(bench.controller.state(bench.now_ns).late)
     assert late == [0, 0, 1, 1, 2, 2]
 
 
