@@ -4,22 +4,29 @@ from __future__ import annotations
 
 from collections import deque
 from pathlib import Path
-from typing import Any, Generic, TypeVar, cast
+from typing import Any, Generic, cast
 
 import pytest
 
-from services.joint import loop as joint_loop
 from services.joint.differential import motor_from_joint
 from services.joint.drive_manager import ARM_EVERY_NS, IDLE_EVERY_NS, DriveManager
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.loop import JointLoop, JointPorts
 from services.joint.rearm_guard import LastState, RearmGuard
-from shared.bus.messages import Cause, Estop, JointEvent, JointState, Mode, Pair, Refusal
+from shared.bus.messages import (
+    Cause,
+    Estop,
+    JointCommand,
+    JointEvent,
+    JointState,
+    Mode,
+    Pair,
+    Refusal,
+)
+from shared.bus.ports import M
 from shared.bus.traces import JointTrace
 from shared.config.robot_config import RobotConfig
 from tests.joint.helpers import SESSION, T0, command, with_service
-
-M = TypeVar("M")
 
 
 class Inbox(Generic[M]):
@@ -93,30 +100,27 @@ class FakeDrive:
 class Rig:
     """A service's loop over one drive, and the file that outlives it, if there is one."""
 
-    def __init__(
-        self, robot: RobotConfig, monkeypatch: pytest.MonkeyPatch, file: RearmGuard | None = None
-    ) -> None:
+    def __init__(self, robot: RobotConfig, file: RearmGuard | None = None) -> None:
         self.now_ns = T0
         self.onboard = robot.joint_service.loop == "onboard"
         self.gear_ratio = robot.joint.gear_ratio
         self.zero_mark_turns = robot.drive.zero_mark_turns
         self.period_ns = round(1e9 / robot.joint_service.rate_hz)
-        monkeypatch.setattr(joint_loop, "now_ns", lambda: self.now_ns)
         self.drive = FakeDrive(self)
         module = DriveManager(robot, "knee_right", file.read() if file else LastState.NOTHING)
         self.controller = module.controller
-        self.commands, self.estops = Inbox[Any](), Inbox[Estop]()
+        self.commands, self.estops = Inbox[JointCommand](), Inbox[Estop]()
         self.states, self.events = Outbox[JointState](), Outbox[JointEvent]()
         self.traces = Outbox[JointTrace]()
         ports = JointPorts(
-            commands=cast("Any", self.commands),
-            estops=cast("Any", self.estops),
-            states=cast("Any", self.states),
-            events=cast("Any", self.events),
-            traces=cast("Any", self.traces),
+            commands=self.commands,
+            estops=self.estops,
+            states=self.states,
+            events=self.events,
+            traces=self.traces,
             planner=self,
         )
-        self.loop = JointLoop(robot, module, self.drive, ports, file)
+        self.loop = JointLoop(robot, module, self.drive, ports, file, clock=lambda: self.now_ns)
 
     ended_session = 0
 
@@ -153,13 +157,13 @@ class Rig:
 
 
 @pytest.fixture(params=["onboard", "service"])
-def rig(robot: RobotConfig, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Rig:
-    return Rig(with_service(robot, loop=request.param), monkeypatch)
+def rig(robot: RobotConfig, request: pytest.FixtureRequest) -> Rig:
+    return Rig(with_service(robot, loop=request.param))
 
 
 @pytest.fixture
-def onboard(robot: RobotConfig, monkeypatch: pytest.MonkeyPatch) -> Rig:
-    return Rig(with_service(robot, loop="onboard"), monkeypatch)
+def onboard(robot: RobotConfig) -> Rig:
+    return Rig(with_service(robot, loop="onboard"))
 
 
 class Stop:
@@ -191,9 +195,9 @@ def test_errors_are_cleared_and_have_stayed_away_before_the_drive_is_armed(rig: 
 
 
 def test_a_torque_drive_armed_by_another_is_armed_by_us_before_it_is_held(
-    robot: RobotConfig, monkeypatch: pytest.MonkeyPatch
+    robot: RobotConfig,
 ) -> None:
-    rig = Rig(with_service(robot, loop="service"), monkeypatch)
+    rig = Rig(with_service(robot, loop="service"))
     rig.drive.status = DriveStatus.ARMED
     for mode in (Mode.DISARMED, Mode.HOLD):
         rig.run(1)
@@ -230,7 +234,6 @@ def test_a_lost_drive_is_not_asked_to_arm(rig: Rig) -> None:
 )
 def test_a_fleet_that_goes_down_leaves_idle_drives_and_a_service_ended_alone_one_that_holds(
     robot: RobotConfig,
-    monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
     mode: Mode,
     left: LastState,
@@ -239,7 +242,7 @@ def test_a_fleet_that_goes_down_leaves_idle_drives_and_a_service_ended_alone_one
 ) -> None:
     """Of itself the fleet leaves nothing, the service that it held or sank."""
     guard = RearmGuard(tmp_path, "knee_right")
-    rig = Rig(with_service(robot, loop=loop), monkeypatch, guard)
+    rig = Rig(with_service(robot, loop=loop), guard)
     rig.drive.obeys = mode is not Mode.DISARMED
     rig.run(20)
     if mode is Mode.DAMP:

@@ -210,9 +210,9 @@ Start = Callable[[], Rig]
 
 
 @pytest.fixture
-def start(robot: RobotConfig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Start:
+def start(robot: RobotConfig, tmp_path: Path) -> Start:
     """Return how a service of MODULE is started, over a new drive."""
-    return lambda: Rig(robot, monkeypatch, RearmGuard(tmp_path, MODULE))
+    return lambda: Rig(robot, RearmGuard(tmp_path, MODULE))
 
 
 @pytest.mark.parametrize("asked", [True, False])
