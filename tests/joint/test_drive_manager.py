@@ -199,19 +199,26 @@ def marked(robot: RobotConfig, mark_turns: float = 40.0) -> ModuleBench:
 
 @pytest.mark.parametrize("mark_turns", [0.0, 0.5, 40.0])
 @pytest.mark.parametrize(
-    ("status", "error", "lacks"),
+    ("status", "error", "jump", "lacks"),
     [
-        (DriveStatus.UNZEROED, 0, True),
-        (DriveStatus.ERROR, AxisError.ENCODER_FAILED, True),
-        (DriveStatus.ERROR, AxisError.MOTOR_FAILED, False),
+        (DriveStatus.UNZEROED, 0, 0.0, True),
+        (DriveStatus.ERROR, AxisError.ENCODER_FAILED, 0.0, True),
+        (DriveStatus.ERROR, AxisError.MOTOR_FAILED, 0.0, False),
+        (DriveStatus.ERROR, 0, 0.1, True),
     ],
 )
 def test_a_drive_that_may_lack_turns_is_idled_and_forgets_its_zero_after_a_heartbeat(
-    robot: RobotConfig, mark_turns: float, status: DriveStatus, error: AxisError, lacks: bool
+    robot: RobotConfig,
+    mark_turns: float,
+    status: DriveStatus,
+    error: AxisError,
+    jump: float,
+    lacks: bool,
 ) -> None:
+    """An encoder that reads 0 disarms its axis by overspeed, before three samples are rejected."""
     bench = marked(robot, mark_turns)
     bench.to(Mode.HOLD)
-    bench.status, bench.error = status, error
+    bench.status, bench.error, bench.q = status, error, (bench.q[0] + jump, bench.q[1])
     orders = [step.command for step in bench.run(FORGET_EVERY_NS)]
     assert (bench.mode, orders[0]) == (Mode.FAULT, DriveCommand.IDLE)
     assert DriveCommand.CLEAR_ZERO not in orders
@@ -229,17 +236,6 @@ def test_an_order_to_forget_is_repeated_until_the_drive_shows_that_it_has_no_zer
     assert orders.count(DriveCommand.CLEAR_ZERO) == 4
     bench.status, bench.error = DriveStatus.UNZEROED, AxisError.NONE
     assert not [s for s in bench.run(NS_PER_S) if s.command is DriveCommand.CLEAR_ZERO]
-
-
-def test_the_first_error_does_not_save_a_zero_from_the_jump_that_came_with_it(
-    robot: RobotConfig,
-) -> None:
-    """An encoder that reads 0 disarms its axis by overspeed, before three samples are rejected."""
-    bench = marked(robot)
-    bench.to(Mode.HOLD)
-    bench.status, bench.q = DriveStatus.ERROR, (bench.q[0] + 0.1, bench.q[1])
-    orders = [step.command for step in bench.run(2 * FORGET_EVERY_NS)]
-    assert DriveCommand.CLEAR_ZERO in orders
 
 
 def test_a_disarmed_drive_whose_encoder_fails_forgets_its_zero_too(robot: RobotConfig) -> None:
