@@ -98,38 +98,33 @@ def view_of(module: str, rows: Sequence[NeighbourRow | None], now_ns: int) -> Ne
     """
     kind, own = kind_of(module), MODULE_INDEX[module]
     mine = rows[own]
-    heard = mine is not None and _is_fresh(mine, now_ns)  # else all may stand still
+    heard = _fresh(mine, now_ns) is not None  # else all may stand still
     limp = [
         wanted
         for row, wanted in zip(rows, SUPPORT_FOR, strict=True)
         if row is not None and row.t_ns > 0 and (row.mode == Mode.FAULT or (heard and row.silent))
     ]
     stiffen = bool(limp) and max(limp).includes(module)
+    leg, sinks = None, True
     if kind == "hip":
-        ankle, knee = rows[own - 2], rows[own - 1]
-        if (
-            ankle is None
-            or knee is None
-            or not (_is_fresh(ankle, now_ns) and _is_fresh(knee, now_ns))
-        ):
-            return NeighbourView(stiffen=stiffen)
-        return NeighbourView((ankle.theta + knee.theta, ankle.rate + knee.rate), stiffen=stiffen)
-    if kind == "knee":
+        ankle, knee = _fresh(rows[own - 2], now_ns), _fresh(rows[own - 1], now_ns)
+        if ankle is not None and knee is not None:
+            leg = (ankle.theta + knee.theta, ankle.rate + knee.rate)
+    elif kind == "ankle":
+        knee = _fresh(rows[own + 1], now_ns)
+        if knee is not None:
+            leg = (knee.theta, knee.rate)
+    else:
         other = rows[(own + _LEG) % N_MODULES]
-        if other is None or _is_elsewhere(other, now_ns):
-            return NeighbourView(stiffen=stiffen)  # to stop alone would tip the robot for sure
-        others = (row for at, row in enumerate(rows) if at != own and row is not None)
-        stays = any(_stays(row, now_ns) for row in others)
-        return NeighbourView(sinks=not stays, stiffen=stiffen)
-    knee = rows[own + 1]
-    if knee is None or not _is_fresh(knee, now_ns):
-        return NeighbourView(stiffen=stiffen)
-    return NeighbourView((knee.theta, knee.rate), stiffen=stiffen)
+        if other is not None and not _is_elsewhere(other, now_ns):  # to stop alone would tip it
+            others = (row for at, row in enumerate(rows) if at != own and row is not None)
+            sinks = not any(_stays(row, now_ns) for row in others)
+    return NeighbourView(leg, sinks, stiffen)
 
 
-def _is_fresh(row: NeighbourRow, now_ns: int) -> bool:
-    """Return True if a row is recent; it may be newer than the clock reading."""
-    return abs(now_ns - row.t_ns) <= STALE_NS
+def _fresh(row: NeighbourRow | None, now_ns: int) -> NeighbourRow | None:
+    """Return a row if it is recent; it may be newer than the clock reading."""
+    return row if row is not None and abs(now_ns - row.t_ns) <= STALE_NS else None
 
 
 def _is_elsewhere(row: NeighbourRow, now_ns: int) -> bool:
