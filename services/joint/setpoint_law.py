@@ -66,7 +66,8 @@ class SetpointLaw:
 
     def is_settled(self, now_ns: int) -> bool:
         """Return True if the blend after the last change of mode is over."""
-        return now_ns - self.state.changed_ns >= self._blend_ns
+        s = self.state
+        return now_ns - s.changed_ns >= self._blend_ns
 
     def start(self, mode: Mode, now_ns: int, setpoint: Setpoint) -> None:
         """Start a mode from a given setpoint: until now the module was DISARMED."""
