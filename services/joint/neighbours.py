@@ -97,15 +97,15 @@ def view_of(module: str, rows: Sequence[NeighbourRow | None], now_ns: int) -> Ne
         now_ns: the host's monotonic clock.
     """
     kind, own = kind_of(module), MODULE_INDEX[module]
-    mine = rows[own]
-    heard = _fresh(mine, now_ns) is not None  # else all may stand still
+    heard = _fresh(rows[own], now_ns) is not None  # else all may stand still
     limp = [
         wanted
         for row, wanted in zip(rows, SUPPORT_FOR, strict=True)
         if row is not None and row.t_ns > 0 and (row.mode == Mode.FAULT or (heard and row.silent))
     ]
     stiffen = bool(limp) and max(limp).includes(module)
-    leg, sinks = None, True
+    leg: Pair | None = None
+    sinks = True
     if kind == "hip":
         ankle, knee = _fresh(rows[own - 2], now_ns), _fresh(rows[own - 1], now_ns)
         if ankle is not None and knee is not None:
