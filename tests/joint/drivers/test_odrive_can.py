@@ -55,7 +55,8 @@ def test_a_drive_that_was_never_armed_is_where_its_count_shows(rig: Rig, shed: S
     rig.step()
     driver = shed.driver()
     first = rig.cycle(driver)
-    assert (first.pos_turns, first.status) == ((64.5, -2.25), DriveStatus.IDLE)
+    assert (first.pos_turns, first.vel_turns) == ((64.5, -2.25), (0.0, 0.0))
+    assert first.status is DriveStatus.IDLE
     rig.pos[4] = 64.75
     rig.cycle(driver)
     assert rig.cycle(driver).pos_turns == (64.75, -2.25)

@@ -39,10 +39,6 @@ def rig(shed: Shed, dialect: DialectName) -> Rig:
     return shed.rig(dialect=dialect)
 
 
-def test_the_driver_finds_out_the_firmware(driver: OdriveCan, dialect: DialectName) -> None:
-    assert driver.dialect == dialect
-
-
 @pytest.mark.parametrize("fault", ["DISARM", "OVERSPEED", "DRV_FAULT", "ESTOP", "WATCHDOG"])
 def test_a_disarmed_axis_is_an_error_and_armed_again(
     rig: Rig, driver: OdriveCan, fault: str

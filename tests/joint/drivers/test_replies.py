@@ -45,15 +45,6 @@ def receive_counts(bench: Bench) -> None:
         bench.send(node, Command.GET_ENCODER_COUNT, data)
 
 
-def test_a_drive_whose_estimates_are_zero_is_asked_for_its_counts(bench: Bench) -> None:
-    bench.commands()
-    assert receive_estimates(bench, ZERO).pos_turns == ZERO
-    assert bench.commands().count(Command.GET_ENCODER_COUNT) == 2
-    receive_counts(bench)
-    reading = receive_estimates(bench, ZERO)
-    assert (reading.pos_turns, reading.vel_turns) == (COUNTED, (0.0, 0.0))
-
-
 def test_a_drive_with_other_estimates_is_asked_for_no_count(bench: Bench) -> None:
     receive_estimates(bench, (0.25, 0.25))
     bench.commands()
