@@ -190,25 +190,12 @@ def damp(
     )
 
 
-def hold_theta(setpoint: Setpoint, q_ref: float, v_ref: float, k_p: float) -> Setpoint:
-    """Return DAMP's law with theta held to a reference that moves: rad, rad/s, N m/rad."""
+def hold_theta(setpoint: Setpoint, q_ref: float, v_ref: float, k_p: float, k_d: float) -> Setpoint:
+    """Return DAMP's law with theta held: rad, rad/s, N m/rad, N m s/rad."""
     s = setpoint
     return Setpoint(
         (s.q_ref[0], q_ref),
         (s.v_ref[0], v_ref),
-        s.tau_ff,
-        s.tau_coupled,
-        (s.k_p[0], k_p),
-        s.k_d,
-    )
-
-
-def add_stop(setpoint: Setpoint, stop: float, k_p: float, k_d: float) -> Setpoint:
-    """Return DAMP's law with theta caught by a spring at a stop, rad, N m/rad, N m s/rad."""
-    s = setpoint
-    return Setpoint(
-        (s.q_ref[0], stop),
-        s.v_ref,
         s.tau_ff,
         s.tau_coupled,
         (s.k_p[0], k_p),

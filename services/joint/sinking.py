@@ -130,7 +130,7 @@ class Sinking:
         if holds and not s.caught:
             s.caught, s.stop = True, max(s.stop, q[1])
         if q[1] < s.stop:
-            return pd_law.add_stop(sunk, s.stop, self._k_p[1], self._k_d[1])
+            return pd_law.hold_theta(sunk, s.stop, sunk.v_ref[1], self._k_p[1], self._k_d[1])
         return sunk
 
     def _sunk(self, frozen_setpoint: Setpoint, since_ns: int) -> Setpoint:
@@ -176,7 +176,7 @@ class Sinking:
             s.upright = s.below + theta
         wanted = s.upright - s.below
         wanted = clamp(wanted, theta - LEVEL_MAX, theta + LEVEL_MAX)
-        return pd_law.hold_theta(sunk, wanted, -rate, risen * self._k_p[1])
+        return pd_law.hold_theta(sunk, wanted, -rate, risen * self._k_p[1], sunk.k_d[1])
 
     def _placed(self, sunk: Setpoint, theta: float, near: NeighbourView) -> Setpoint:
         """Return the law of an ankle; if its knee is no longer seen, its last angle holds."""
@@ -200,4 +200,4 @@ class Sinking:
         up = self._thigh * math.cos(place + s.below)
         height = self._shank * math.cos(place) + up
         v_ref = -rate * up / height if height > LOW_M else 0.0
-        return pd_law.hold_theta(sunk, wanted, v_ref, sunk.k_p[1])
+        return pd_law.hold_theta(sunk, wanted, v_ref, sunk.k_p[1], sunk.k_d[1])

@@ -142,9 +142,6 @@ def test_each_axis_that_is_to_sink_carries_its_own_load_on(sinks: tuple[bool, bo
 
 
 def test_a_theta_that_is_levelled_or_caught_leaves_phi_as_it_was() -> None:
-    assert pd_law.hold_theta(FULL, -0.7, 0.3, 900.0) == Setpoint(
-        (0.1, -0.7), (0.2, 0.3), FULL.tau_ff, FULL.tau_coupled, (100.0, 900.0), FULL.k_d
-    )
-    assert pd_law.add_stop(FULL, -2.5, 900.0, 60.0) == Setpoint(
-        (0.1, -2.5), FULL.v_ref, FULL.tau_ff, FULL.tau_coupled, (100.0, 900.0), (10.0, 60.0)
+    assert pd_law.hold_theta(FULL, -0.7, 0.3, 900.0, 60.0) == Setpoint(
+        (0.1, -0.7), (0.2, 0.3), FULL.tau_ff, FULL.tau_coupled, (100.0, 900.0), (10.0, 60.0)
     )
