@@ -244,6 +244,12 @@ class Cut:
     def ms(self) -> float:
         return self.shed.now_s * 1e3
 
+    @property
+    def status(self) -> DriveStatus:
+        """Status by the reading of the last cycle, which had one."""
+        assert self.reading is not None
+        return self.reading.status
+
     def power(self, *, on: bool) -> None:
         self.rig.bank.conditions.link(AXES[0] >> 1, up=on)
 
@@ -283,47 +289,45 @@ def cut(shed: Shed, monkeypatch: pytest.MonkeyPatch) -> Cut:
     return cut
 
 
-def armed(cut: Cut) -> None:
+@pytest.fixture
+def armed(cut: Cut) -> Cut:
     cut.driver.arm(onboard=True)
     cut.run(40, write=False)
     assert cut.rig.states == [AxisState.CLOSED_LOOP_CONTROL] * 2
     cut.run(40)
     assert cut.oldest_ms() <= CYCLE_MS
+    return cut
 
 
 @pytest.mark.parametrize("lasts_ms", [7, 22, 35, 48, 60, 90, 130, 300, 3000])
 def test_no_old_frame_reaches_a_drive_after_a_power_cut_of_any_length(
-    cut: Cut, lasts_ms: int
+    armed: Cut, lasts_ms: int
 ) -> None:
-    armed(cut)
-    cut.power(on=False)
-    cut.run(lasts_ms)
-    cut.power(on=True)
-    cut.run(100)
-    assert cut.oldest_ms() < OLD_MS - 5
-    assert cut.restarts == (1 if lasts_ms > RESTART_MS + 2 * CYCLE_MS else cut.restarts)
-    assert cut.reading is not None
-    assert cut.reading.status is DriveStatus.ARMED
-    before = cut.driver.write_failures
-    cut.run(50)
-    assert cut.driver.write_failures == before, "it is written to as before"
+    armed.power(on=False)
+    armed.run(lasts_ms)
+    armed.power(on=True)
+    armed.run(100)
+    assert armed.oldest_ms() < OLD_MS - 5
+    assert armed.restarts == (1 if lasts_ms > RESTART_MS + 2 * CYCLE_MS else armed.restarts)
+    assert armed.status is DriveStatus.ARMED
+    before = armed.driver.write_failures
+    armed.run(50)
+    assert armed.driver.write_failures == before, "it is written to as before"
 
 
-def test_a_bus_without_acknowledgements_is_told_within_a_fifth_of_a_second(cut: Cut) -> None:
-    armed(cut)
-    cut.power(on=False)
-    start = cut.ms
-    while cut.reading is None or cut.reading.status is not DriveStatus.UNACKNOWLEDGED:
-        cut.cycle()
-    assert cut.ms - start < 200
+def test_a_bus_without_acknowledgements_is_told_within_a_fifth_of_a_second(armed: Cut) -> None:
+    armed.power(on=False)
+    start = armed.ms
+    while armed.reading is None or armed.reading.status is not DriveStatus.UNACKNOWLEDGED:
+        armed.cycle()
+    assert armed.ms - start < 200
 
 
 def test_nothing_is_sent_into_a_dead_bus_and_it_is_told_there_too(cut: Cut) -> None:
     """A service that is not armed sends nothing: one probe shows that nobody is there."""
     cut.power(on=False)
     cut.run(190, write=False)
-    assert cut.reading is not None
-    assert cut.reading.status is DriveStatus.UNACKNOWLEDGED
+    assert cut.status is DriveStatus.UNACKNOWLEDGED
     assert (cut.restarts, STAMPS) == (1, [])
     cut.driver.arm(onboard=True)
     cut.driver.idle()
@@ -360,48 +364,41 @@ def test_no_arming_request_from_before_a_power_cut_reaches_the_drive(
     assert cut.oldest_ms() < OLD_MS
 
 
-def test_frames_of_a_service_that_died_in_the_cut_are_thrown_away_by_the_next(cut: Cut) -> None:
-    armed(cut)
-    cut.power(on=False)
-    cut.driver.write(TARGET)
-    cut.driver.write(TARGET)
-    cut.driver.close()
+def test_frames_of_a_service_that_died_in_the_cut_are_thrown_away_by_the_next(armed: Cut) -> None:
+    armed.power(on=False)
+    armed.driver.write(TARGET)
+    armed.driver.write(TARGET)
+    armed.driver.close()
     assert STAMPS != []
-    cut.driver = cut.shed.driver()
-    cut.run(200, write=False)
+    armed.driver = armed.shed.driver()
+    armed.run(200, write=False)
     assert STAMPS == []
-    assert cut.reading is not None
-    assert cut.reading.status is DriveStatus.UNACKNOWLEDGED
+    assert armed.status is DriveStatus.UNACKNOWLEDGED
 
 
-def test_a_bus_that_is_full_in_bursts_is_written_to_between_them(cut: Cut) -> None:
-    armed(cut)
+def test_a_bus_that_is_full_in_bursts_is_written_to_between_them(armed: Cut) -> None:
     for _ in range(20):
         for choked in (True, False):
-            cut.choke(full=choked)
-            cut.run(40)
-            assert cut.reading is not None
-            assert cut.reading.status is DriveStatus.ARMED
-    assert cut.oldest_ms() <= CYCLE_MS
-    assert cut.restarts == 0
-    assert 300 < cut.driver.write_failures < 500, "two of five were refused"
+            armed.choke(full=choked)
+            armed.run(40)
+            assert armed.status is DriveStatus.ARMED
+    assert armed.oldest_ms() <= CYCLE_MS
+    assert armed.restarts == 0
+    assert 300 < armed.driver.write_failures < 500, "two of five were refused"
 
 
-def test_a_bus_that_stays_full_counts_as_one_that_carries_nothing(cut: Cut) -> None:
-    armed(cut)
-    cut.choke(full=True)
-    cut.run(BLOCKED_MS + 20)
-    assert cut.reading is not None
-    assert cut.reading.status is DriveStatus.UNACKNOWLEDGED
+def test_a_bus_that_stays_full_counts_as_one_that_carries_nothing(armed: Cut) -> None:
+    armed.choke(full=True)
+    armed.run(BLOCKED_MS + 20)
+    assert armed.status is DriveStatus.UNACKNOWLEDGED
 
 
-def test_a_bus_that_flaps_brings_no_old_frame(cut: Cut) -> None:
-    armed(cut)
+def test_a_bus_that_flaps_brings_no_old_frame(armed: Cut) -> None:
     dice = random.Random(0)
     for _ in range(60):
-        cut.power(on=False)
-        cut.run(dice.uniform(1.0, 90.0))
-        cut.power(on=True)
-        cut.run(dice.uniform(1.0, 90.0))
-    assert Command.SET_AXIS_STATE not in {command for command, _ in cut.hub.ages_ms}
-    assert cut.oldest_ms() < OLD_MS
+        armed.power(on=False)
+        armed.run(dice.uniform(1.0, 90.0))
+        armed.power(on=True)
+        armed.run(dice.uniform(1.0, 90.0))
+    assert Command.SET_AXIS_STATE not in {command for command, _ in armed.hub.ages_ms}
+    assert armed.oldest_ms() < OLD_MS

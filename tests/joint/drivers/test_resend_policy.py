@@ -27,7 +27,8 @@ def with_gain(pos_gain: float) -> MotorTarget:
     )
 
 
-def settled(bench: Bench) -> None:
+@pytest.fixture
+def settled(bench: Bench) -> Bench:
     bench.armed()
     for _ in range(SETTLE_MS // GAINS_MS + 1):
         bench.driver.write(TARGET)
@@ -35,6 +36,7 @@ def settled(bench: Bench) -> None:
     bench.driver.write(TARGET)
     bench.wait(2e-3 * DRIFT_MS)
     bench.commands()
+    return bench
 
 
 def written(bench: Bench, target: MotorTarget) -> list[int]:
@@ -44,24 +46,21 @@ def written(bench: Bench, target: MotorTarget) -> list[int]:
     return [command for node, command in bench.sent() if node == NODES[1]]
 
 
-def test_changed_gains_are_sent_twice_and_then_now_and_then(bench: Bench) -> None:
-    settled(bench)
-    sent = [written(bench, with_gain(10.0)) for _ in range(GAINS_MS // 2 + 4)]
+def test_changed_gains_are_sent_twice_and_then_now_and_then(settled: Bench) -> None:
+    sent = [written(settled, with_gain(10.0)) for _ in range(GAINS_MS // 2 + 4)]
     assert sent[:3] == [GAINS, GAINS, INPUTS]
     assert 3 <= sent.count(GAINS) <= 4
 
 
-def test_gains_that_drift_are_not_sent_twice_as_often(bench: Bench) -> None:
+def test_gains_that_drift_are_not_sent_twice_as_often(settled: Bench) -> None:
     """A blend changes them every few cycles: one bus of all six modules would be full of them."""
-    settled(bench)
-    sent = [written(bench, with_gain(10.0 + step // 3)) for step in range(60)]
+    sent = [written(settled, with_gain(10.0 + step // 3)) for step in range(60)]
     assert 20 <= sent.count(GAINS) <= 22
 
 
-def test_an_axis_gets_its_gains_right_before_the_target_they_belong_to(bench: Bench) -> None:
-    settled(bench)
-    bench.driver.write(with_gain(10.0))
-    assert bench.sent() == [(node, command) for node in NODES for command in GAINS]
+def test_an_axis_gets_its_gains_right_before_the_target_they_belong_to(settled: Bench) -> None:
+    settled.driver.write(with_gain(10.0))
+    assert settled.sent() == [(node, command) for node in NODES for command in GAINS]
 
 
 def test_gains_that_change_while_the_drive_settles_are_sent_without_the_mode(bench: Bench) -> None:
@@ -72,27 +71,25 @@ def test_gains_that_change_while_the_drive_settles_are_sent_without_the_mode(ben
     assert modes == SETTLE_MS // GAINS_MS
 
 
-def test_targets_that_a_full_queue_cuts_off_reach_both_axes_in_turn(bench: Bench) -> None:
-    settled(bench)
+def test_targets_that_a_full_queue_cuts_off_reach_both_axes_in_turn(settled: Bench) -> None:
     received = dict.fromkeys(NODES, 0)
     for step in range(40):
-        bench.bus.room = 3
-        bench.driver.write(with_gain(10.0 + step))
-        bench.wait(0.002)
-        for node, command in bench.sent():
+        settled.bus.room = 3
+        settled.driver.write(with_gain(10.0 + step))
+        settled.wait(0.002)
+        for node, command in settled.sent():
             received[node] += command == Command.SET_INPUT_POS
     assert list(received.values()) == [20, 20]
 
 
-def test_targets_that_were_cut_off_are_not_followed_by_gains(bench: Bench) -> None:
+def test_targets_that_were_cut_off_are_not_followed_by_gains(settled: Bench) -> None:
     """A queue that is full for two frames is not helped by six."""
-    settled(bench)
-    bench.bus.room = 1
-    bench.driver.write(TARGET)
-    bench.wait(0.002)
-    bench.bus.sent.clear()
-    bench.bus.room = 100
-    assert written(bench, TARGET) == INPUTS
+    settled.bus.room = 1
+    settled.driver.write(TARGET)
+    settled.wait(0.002)
+    settled.bus.sent.clear()
+    settled.bus.room = 100
+    assert written(settled, TARGET) == INPUTS
 
 
 def test_gains_that_the_queue_had_no_room_for_are_sent_again(bench: Bench) -> None:
