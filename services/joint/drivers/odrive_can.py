@@ -19,7 +19,7 @@ from services.joint.drivers.base import (
     DriveStatus,
     MotorTarget,
 )
-from services.joint.drivers.can_link import RETRY_MS, CanLink, message
+from services.joint.drivers.can_link import CanLink, message
 from services.joint.drivers.firmware import (
     HEARTBEAT_BYTES,
     VERSION_BYTES,
@@ -38,8 +38,6 @@ from shared.can.unix_can import ERROR_FLAG
 from shared.clock import NS_PER_MS, NS_PER_S, machine_s, now_ns
 from shared.config.sections import CanConfig, DriveConfig
 from shared.exceptions import DriveError
-
-__all__ = ["RETRY_MS", "OdriveCan"]
 
 FRESH_S: Final = 0.05
 """Time for which `set_position` waits for a frame of the drive, which is not sent to unheard."""

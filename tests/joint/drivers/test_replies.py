@@ -9,8 +9,9 @@ import pytest
 
 from services.joint.drivers import odrive_can
 from services.joint.drivers.base import DriveReading
+from services.joint.drivers.can_link import RETRY_MS
 from services.joint.drivers.frame_times import REBOOT_MS, EncoderPair
-from services.joint.drivers.odrive_can import RETRY_MS, OdriveCan
+from services.joint.drivers.odrive_can import OdriveCan
 from services.joint.drivers.replies import Replies
 from services.simulator.fronts.cansimple_dialects import DialectName
 from shared.bus.messages import Pair
