@@ -16,9 +16,10 @@ import math
 import numpy as np
 from scipy.linalg import solve_continuous_are
 
-from services.planner.controller import Action, Array, Observation
+from services.planner.controller import Action, Observation
 from services.planner.law.kinematics import Kinematics
 from services.planner.law.model import BodyInertia
+from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
 from shared.robot.robot_model import stand_pose
 

@@ -11,14 +11,10 @@ from __future__ import annotations
 
 from typing import NamedTuple, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from services.planner.intents import OperatorRequest
 from services.planner.law.hocca import LawOutput
+from shared.arrays import Array
 from shared.bus.messages import Wrench
-
-Array = NDArray[np.float64]
 
 
 class Action(NamedTuple):

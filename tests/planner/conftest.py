@@ -11,10 +11,10 @@ import pytest
 from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.kinematics import Kinematics
 from services.planner.planner import Planner
+from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
 from shared.robot.robot_model import stand_pose
 from tests.planner import oracle
-from tests.planner.oracle import Array
 from tests.planner.states import SESSION, with_law
 
 Closed = Callable[..., Array]

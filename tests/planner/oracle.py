@@ -11,11 +11,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
-
-Array = NDArray[np.float64]
 
 GRAVITY = 9.81
 RIGHT, LEFT = 0, 1

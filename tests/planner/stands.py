@@ -8,9 +8,9 @@ from services.planner.law.certificate import Certificate
 from services.planner.law.gains import GainLaw, JointGains
 from services.planner.law.kinematics import Kinematics
 from services.planner.law.split import GainSplit, LocalGains
+from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
-from tests.planner.oracle import Array
 
 STEP = 1e-4
 

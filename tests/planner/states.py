@@ -9,6 +9,7 @@ import numpy as np
 
 from services.planner.law.kinematics import Kinematics
 from services.planner.planner import Planner
+from shared.arrays import Array
 from shared.bus.messages import JointState, PlannerMode, Wrench
 from shared.clock import NS_PER_MS
 from shared.config import files as config_file
@@ -17,7 +18,6 @@ from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.joints import N_MODULES
 from tests import messages
 from tests.conftest import ROBOT_FILE
-from tests.planner.oracle import Array
 
 SESSION = 4711
 START_NS = 10**12

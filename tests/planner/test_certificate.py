@@ -15,10 +15,10 @@ from services.planner.law.certificate import DIRECTIONS, UNITS, Certificate, mot
 from services.planner.law.gains import GainLaw
 from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.split import GainSplit
+from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
 from shared.robot.robot_model import stand_pose
 from tests.planner.conftest import Closed, at_pose, p_at
-from tests.planner.oracle import Array
 from tests.planner.stands import Stand
 from tests.planner.states import with_law
 

@@ -18,7 +18,7 @@ from services.planner.law.height import (
     HeightReference,
     Toward,
 )
-from tests.planner.oracle import Array
+from shared.arrays import Array
 from tests.planner.states import DT
 
 DOWN, UP, PERSON = Toward.DOWN, Toward.UP, Toward.PERSON

@@ -12,10 +12,11 @@ from services.planner.law.hocca import Hocca, LawOutput
 from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.kinematics import Kinematics
 from services.planner.law.probe import NO_ROW
+from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
 from tests.planner.conftest import Closed, at_pose
-from tests.planner.oracle import LEFT, RIGHT, Array
+from tests.planner.oracle import LEFT, RIGHT
 from tests.planner.states import DT, STILL, with_law
 
 OPEN = {"z": 2, "pitch": 4}

@@ -14,6 +14,7 @@ from services.planner.intents import Intents, OperatorRequest
 from services.planner.law.probe import NO_ROW, PROBE_S, ReferenceProbe
 from services.planner.law.shift import ROWS, SHIFT_S, ShiftReference
 from services.simulator.physics.plant import PlantConfig
+from shared.arrays import Array
 from shared.bus import topics
 from shared.bus.messages import (
     STRAIGHT,
@@ -27,7 +28,6 @@ from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Scenario
-from tests.planner.oracle import Array
 from tests.planner.states import DT
 from tools.bringup.tune.excitation import Excitation, SinePart
 from tools.bringup.tune.pose_probe import DIRECTIONS, ProbedLockstep, course_of

@@ -10,11 +10,11 @@ import pytest
 
 from services.planner.law.inverse_kinematics import TOLERANCE, IkEnding, InverseKinematics, describe
 from services.planner.law.kinematics import Kinematics
+from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
 from shared.robot.robot_model import stand_pose
 from tests.planner import oracle
 from tests.planner.conftest import Closed, com_height, p_at
-from tests.planner.oracle import Array
 
 KNEES = (3, 9)
 

@@ -10,12 +10,13 @@ import pytest
 
 from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.kinematics import Kinematics
+from shared.arrays import Array
 from shared.config.gain_schedule import inputs_of
 from shared.config.robot_config import RobotConfig
 from shared.robot.robot_model import stand_pose
 from tests.planner import oracle
 from tests.planner.conftest import SQUAT, Closed
-from tests.planner.oracle import LEFT, RIGHT, Array
+from tests.planner.oracle import LEFT, RIGHT
 from tests.planner.stands import Stand
 from tests.planner.states import WEIGHT
 from tools.lab.design.push_limit import LoadedStand

@@ -20,12 +20,12 @@ from services.planner.planner import Planner, PlannerState
 from services.planner.state_phases import StatePhases
 from services.planner.watch.trips import PlannerTrips
 from services.planner.watch.unattended import HAND_LOST_NS, Unattended
+from shared.arrays import Array
 from shared.bus.messages import STRAIGHT, DriveStatus, Mode, Trip
 from shared.config.robot_config import RobotConfig
 from shared.joints import N_MODULES
 from shared.robot.trip_table import PLANNER_TRIPS
 from tests.planner.conftest import Closed
-from tests.planner.oracle import Array
 from tests.planner.states import DT, SESSION, START_NS, TICK_NS, receive_all, state
 
 UP = np.array((0.0, 0.0, 1.0, 0.0, 0.0, 0.0))

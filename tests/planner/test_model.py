@@ -9,11 +9,11 @@ import pinocchio as pin
 import pytest
 
 from services.planner.law.model import leg_geometry, load_pinocchio, q_tree
+from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
 from shared.joints import JOINTS, SIDES
 from shared.robot.robot_model import mjcf
 from tests.planner import oracle
-from tests.planner.oracle import Array
 
 
 def random_q(count: int) -> Array:

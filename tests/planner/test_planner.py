@@ -11,13 +11,13 @@ from services.planner.intents import OperatorRequest
 from services.planner.law.certificate import Margins
 from services.planner.planner import EARLY_FRACTION, LATE_FRACTION, TICK_GAP_MAX_S, Planner
 from services.planner.watch.engagement_fsm import WAITS_NS
+from shared.arrays import Array
 from shared.bus.messages import Attitude, JointCommand, Mode, PlannerMode, SplitSource
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.joints import N_MODULES
 from tests.imu.robots import with_imu
 from tests.planner.conftest import Closed
-from tests.planner.oracle import Array
 from tests.planner.states import (
     SESSION,
     START_NS,

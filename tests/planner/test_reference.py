@@ -9,9 +9,9 @@ from services.planner.law.hocca import Hocca
 from services.planner.law.inverse_kinematics import TOLERANCE, InverseKinematics
 from services.planner.law.kinematics import Kinematics
 from services.planner.law.reference import Reference
+from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
 from tests.planner.conftest import Closed
-from tests.planner.oracle import Array
 from tests.planner.states import DT
 
 NOWHERE = np.tile([-4.0, 4.0], (12, 1))

@@ -9,10 +9,11 @@ import pytest
 from services.planner.law.hocca import Hocca
 from services.planner.law.kinematics import Kinematics, Measured
 from services.planner.law.stance import FOLLOW_S, Stance
+from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
 from tests.planner.conftest import Closed
-from tests.planner.oracle import LEFT, RIGHT, Array
+from tests.planner.oracle import LEFT, RIGHT
 from tests.planner.states import DT, STILL
 from tools.lab.design.poses import Poses
 from tools.lab.design.push_limit import stand_at

@@ -14,13 +14,13 @@ from services.joint.failsafe import Failsafe, timing_of
 from services.planner.planner import Planner
 from services.planner.watch.limp_leg_watch import DISARMED_NS, LimpLegWatch
 from services.planner.watch.rival_watch import AGAIN_NS, RivalWatch
+from shared.arrays import Array
 from shared.bus.messages import DriveStatus, JointState, Mode, PlannerMode, Refusal
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULE_INDEX, MODULES, N_MODULES, kind_of
 from shared.robot.hold_rules import Support
 from tests.planner.conftest import Closed
-from tests.planner.oracle import Array
 from tests.planner.states import SESSION, START_NS, TICK_NS, lead, receive_all, receive_but, state
 
 OWN, OTHER = 7, 9

@@ -18,10 +18,10 @@ from services.planner.law.gains import GainLaw
 from services.planner.law.inverse_kinematics import TOLERANCE, InverseKinematics
 from services.planner.law.kinematics import Kinematics
 from services.planner.law.split import GainSplit
+from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
 from tests.planner.conftest import Closed
-from tests.planner.oracle import Array
 from tests.planner.states import WEIGHT, with_law
 
 KNEES = [3, 9]

@@ -7,17 +7,15 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from services.simulator.physics.body import body_of
 from services.simulator.physics.plant import IDEAL, changed
 from services.simulator.physics.world import World
+from shared.arrays import Array
 from shared.bus.traces import SimTruth
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.config.scenarios import Keyframe, Push, Scenario
 from shared.joints import JOINTS, SIDES
-
-Array = NDArray[np.float64]
 
 IDLE = np.zeros(12)
 STAND = Scenario(

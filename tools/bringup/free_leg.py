@@ -10,12 +10,10 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shared.arrays import Array
 from shared.bus.messages import Pair, Vector3
 from shared.config.robot_config import GRAVITY, RobotConfig
-
-Array = NDArray[np.float64]
 
 FRICTION: Final = 1.0
 """N m of dry friction and cogging that may hold a joint off its balance; the simulated robot has

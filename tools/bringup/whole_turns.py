@@ -27,15 +27,13 @@ from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from services.joint.differential import joint_from_motor
+from shared.arrays import Array
 from shared.bus.messages import Pair
 from shared.config.robot_config import RobotConfig
 from shared.joints import KINDS, SIDES, kind_of, side_of
 from tools.bringup.free_leg import BEYOND, Upright, angle, implied_up, leg_scores, not_swung
-
-Array = NDArray[np.float64]
 
 CLEAR: Final = 1.5
 """Times what is explained that the second best pose must take."""

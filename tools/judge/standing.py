@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.joint.trips import AT_LIMIT, SHAKE_ABOVE_HZ, SHAKE_S
+from shared.arrays import Array
 from shared.bus import topics
 from shared.bus.messages import JointState, Mode
 from shared.bus.traces import SimTruth
@@ -89,8 +90,6 @@ def is_tipping(row: SimTruth, robot: RobotConfig) -> bool:
     """Return True if the robot does not stand, or cannot recover."""
     return bool(why_not_standing(row, robot))
 
-
-Array = NDArray[np.float64]
 
 BREAK_S: Final = 0.05
 """Longest gap between states; within a longer one nothing is known."""

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.law.shift import ROWS
+from shared.arrays import Array
 from shared.bus import topics
 from shared.bus.messages import JointEvent, JointState, Mode, PlannerStatus, RunEvent, RunEventKind
 from shared.bus.traces import SimTruth
@@ -37,7 +38,6 @@ from tools.judge.standing import BY_KEY, soundness, why_not_sound, why_not_stand
 from tools.logs.impairment_intervals import Impaired, impairments, touches
 from tools.logs.run_log import RunLog, robot_of
 
-Array = NDArray[np.float64]
 Summary = dict[str, Any]
 
 KILLED, RESTARTED, FAULTED = (

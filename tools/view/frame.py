@@ -8,11 +8,11 @@ from typing import Any, Final
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from services.planner.law.kinematics import DETERMINANT_MIN, Kinematics
 from services.planner.law.model import LegGeometry, leg_geometry
 from services.simulator.physics.posture import SoleLoad
+from shared.arrays import Array
 from shared.bus import topics
 from shared.bus.messages import (
     JointCommand,
@@ -36,8 +36,6 @@ from tools.fleet.fleet_status import module_status
 from tools.judge.reports import scene
 from tools.judge.stalls import STALL_SHOWN_NS, stalls_of
 from tools.topic_keys import every_key
-
-Array = NDArray[np.float64]
 
 LEAST_N: Final = 20.0
 """A sole that bears less has no centre of pressure worth showing."""

@@ -19,14 +19,12 @@ from typing import Final
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from services.simulator.physics.body import Body
 from services.simulator.physics.plant import RIGID, Drivetrain
+from shared.arrays import Array
 from shared.joints import N_JOINTS
 from shared.robot.compiled_graph import CompiledGraph
-
-Array = NDArray[np.float64]
 
 NOISE_ROWS: Final = 4093
 """Samples of noise drawn at the start and then repeated: 4 s at 1 kHz, and a prime."""

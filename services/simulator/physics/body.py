@@ -11,9 +11,9 @@ import math
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from services.simulator.physics.plant import RIGID, PlantConfig
+from shared.arrays import Array
 from shared.bus.messages import Vector3
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.config.sections import OperatorConfig
@@ -25,9 +25,6 @@ if TYPE_CHECKING:
     import mujoco
 else:
     mujoco = late("mujoco")
-
-Array = NDArray[np.float64]
-
 
 MINOR_FRICTION = (0.005, 0.0001)
 """m; of a contact's torsion and rolling."""

@@ -7,15 +7,13 @@ from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from services.simulator.physics.body import Body
 from services.simulator.physics.led_hand import LedHand
 from services.simulator.physics.operator import HandForce, Operator, Wearer
+from shared.arrays import Array
 from shared.bus.messages import Vector3, Vector4
 from shared.config.scenarios import Lead, Scenario, lead, push_at
-
-Array = NDArray[np.float64]
 
 HOIST_STIFFNESS: Final = (2e4, 2e3)
 """N/m and N m/rad of the hoist while it holds the torso."""

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shared.arrays import Array
 from shared.bus.messages import Pair, Vector3
 from shared.clamp import clamp
 from shared.extras import late
@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     import mujoco
 else:
     mujoco = late("mujoco")
-
-Array = NDArray[np.float64]
 
 FALLEN_HEIGHT: Final = 0.60
 """m; a crawl goes down to 0.79."""

@@ -17,6 +17,7 @@ from services.simulator.physics.body import Body, FootPlacement
 from services.simulator.physics.led_hand import LedHand
 from services.simulator.physics.outside import OutsideForces, Torso
 from services.simulator.physics.posture import as_vector, measure_posture, sole_loads
+from shared.arrays import Array
 from shared.bus.messages import HandLead
 from shared.bus.traces import SimState, SimTruth
 from shared.config.scenarios import Lead, Scenario
@@ -26,8 +27,6 @@ if TYPE_CHECKING:
     import mujoco
 else:
     mujoco = late("mujoco")
-
-Array = NDArray[np.float64]
 
 
 class Joints(NamedTuple):

@@ -10,16 +10,14 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from services.joint.differential import motor_from_joint
+from shared.arrays import Array
 from shared.bus.messages import Pair
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.joints import MODULES, SIDES, kind_of, side_of
 from tools.bringup.free_leg import Upright
 from tools.bringup.whole_turns import MEASURED, ModuleEvidence
-
-Array = NDArray[np.float64]
 
 EVENTS: Final = (
     "nothing", "nothing", "payload", "leg by hand", "both legs by hand", "power cut at work",

@@ -21,15 +21,13 @@ from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.joints import AXES, JOINTS, N_JOINTS, SIDES
 from tools.bringup.identify.body_statics import BodyStatics
 from tools.bringup.identify.quasi_static import SLOT_S, Moments
-
-Array = NDArray[np.float64]
 
 
 class Prior(NamedTuple):

@@ -18,13 +18,11 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from services.planner.law.model import LegGeometry, leg_geometry
+from shared.arrays import Array
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.joints import N_LEG
-
-Array = NDArray[np.float64]
 
 _KNEE_AFTER: Final = 2
 """Joints between foot and knee: those of the ankle."""

@@ -11,10 +11,10 @@ from typing import Any, Final, Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from shared.arrays import Array
 from shared.bus.messages import JointState, Mode, Wrench
 from shared.clock import NS_PER_S
 
-Array = NDArray[np.float64]
 M = TypeVar("M")
 
 SLOT_S: Final = 0.2

@@ -22,13 +22,11 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shared.arrays import Array
 from shared.bus.messages import Pair
 from tools.bringup.hanging_leg import HEAVY, HangingJoint
 from tools.bringup.motion import MotionPlan, Sample
-
-Array = NDArray[np.float64]
 
 TONES: Final = ((0.4, 5), (1.0, 8), (2.0, 12))
 """Hz and cycles of each tone; the first cycle and the last swell and fade, and are not used."""

@@ -6,13 +6,13 @@ from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from services.planner.intents import OperatorRequest
 from services.planner.law.kinematics import Kinematics
 from services.planner.law.model import BodyInertia
 from services.planner.law.probe import NO_ROW
 from services.simulator.physics.plant import PlantConfig
+from shared.arrays import Array
 from shared.bus import topics
 from shared.bus.messages import Message, PlannerMode, PlannerStatus
 from shared.bus.session import Session
@@ -26,8 +26,6 @@ from tools.bringup.tune.excitation import Excitation
 from tools.fleet.led_planner import LedPlanner
 from tools.sim.lockstep import Lockstep
 from tools.sim.standing_start import begin_standing
-
-Array = NDArray[np.float64]
 
 DIRECTIONS: Final = ("x", "y", "z", "roll", "pitch", "yaw")
 """Rows of p."""

@@ -22,9 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from shared.arrays import Array
 from tools.bringup.tune.excitation import HOLD_S, REST_S, Excitation, SinePart
-
-Array = NDArray[np.float64]
 
 RISE: Final = (0.1, 0.9)
 SETTLED: Final = 0.05

@@ -13,6 +13,7 @@ from typing import Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from shared.arrays import Array
 from shared.bus import topics
 from shared.bus.messages import PlannerMode
 from shared.config.robot_config import RobotConfig
@@ -20,7 +21,6 @@ from shared.joints import JOINTS, MODULES
 from tools.judge import stalls
 from tools.judge.reports.page_model import TimelineEvent
 from tools.judge.reports.run_data import RunData
-from tools.judge.reports.signals import Array
 from tools.judge.stalls import together
 from tools.judge.standing import BY_KEY
 from tools.judge.verdict import leading

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
+from shared.arrays import Array
 from shared.atomic_file import atomic_file
 from shared.bus import topics
 from shared.bus.messages import Mode, RunEvent, RunEventKind
@@ -70,8 +70,6 @@ class Canvas:
 def _scaled(points: Sequence[Point]) -> list[Point]:
     return [(x * SCALE, y * SCALE) for x, y in points]
 
-
-Array = NDArray[np.float64]
 
 FRAMES_S: Final = 12.5
 """Frames per second; a GIF counts in hundredths of a second."""

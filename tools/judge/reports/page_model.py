@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
+from shared.arrays import Array
 from shared.bus.messages import name_of
-from tools.judge.reports.signals import GAP_S, Array, Span, encode_signal, segments, thinned
+from tools.judge.reports.signals import GAP_S, Span, encode_signal, segments, thinned
 
 
 class Line(NamedTuple):

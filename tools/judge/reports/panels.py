@@ -10,6 +10,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from shared.arrays import Array
 from shared.bus import topics
 from shared.bus.messages import DriveStatus, Mode, PlannerMode, SplitSource
 from shared.bus.topics import Topic
@@ -19,7 +20,7 @@ from shared.joints import MODULES
 from shared.links import GROUPS
 from tools.judge.reports.page_model import BarRow, Bars, LevelLine, Line, Panel, Plot
 from tools.judge.reports.run_data import RunData
-from tools.judge.reports.signals import GAP_S, Array
+from tools.judge.reports.signals import GAP_S
 from tools.judge.standing import BY_KEY
 
 NO_WORLD: Final = "no sim/truth in this log"

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from shared.arrays import Array
 from shared.bus import topics
 from shared.bus.messages import DriveStatus
 from shared.bus.topics import Topic
@@ -16,7 +17,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import XrlError
 from shared.joints import MODULES
 from tools.judge import verdict
-from tools.judge.reports.signals import Array, Span, message_times
+from tools.judge.reports.signals import Span, message_times
 from tools.judge.verdict import Course
 from tools.logs.run_log import RunLog, robot_of
 

@@ -13,9 +13,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from shared.arrays import Array
 from shared.clock import NS_PER_S
-
-Array = NDArray[np.float64]
 
 BINS: Final = 4500
 """Bins over the whole run: 13 ms each in a run of a minute. A bin has two places: for two

@@ -7,6 +7,7 @@ from typing import Final
 
 import numpy as np
 
+from shared.arrays import Array
 from shared.bus import topics
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS
@@ -14,7 +15,7 @@ from shared.joints import MODULES
 from tools.judge.reports.page_model import LevelLine, Line, Panel, Plot
 from tools.judge.reports.panels import NO_PLANNER, NO_STATES
 from tools.judge.reports.run_data import RunData, module_of
-from tools.judge.reports.signals import Array, message_times
+from tools.judge.reports.signals import message_times
 
 RATE_WINDOW_S: Final = 0.25
 AGE_REACH: Final = 4.0

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 
 from services.joint import pd_law
+from shared.arrays import Array
 from shared.bus import topics
 from shared.bus.messages import JointCommand, JointState, Mode
 from shared.clock import NS_PER_MS, NS_PER_S
@@ -17,7 +18,6 @@ from shared.joints import AXES, MODULES
 from tools.judge.reports.page_model import Choice, LevelLine, Line, Lines, Panel, Plot
 from tools.judge.reports.panels import NO_STATES
 from tools.judge.reports.run_data import RunData
-from tools.judge.reports.signals import Array
 
 ORIGINS_NOTE: Final = (
     "The origins belong to the command in use, while the service is in TRACK. In HOLD the "

@@ -15,9 +15,9 @@ from typing import Annotated, Any, Final, NamedTuple, TypeAlias
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 from rich.progress import track
 
+from shared.arrays import Array
 from shared.bus import topics
 from shared.bus.messages import JointCommand
 from shared.bus.traces import JointTrace
@@ -43,8 +43,6 @@ from tools.lab.bench.table import (
 )
 from tools.logs.run_log import RunLog, read_run
 from tools.terminal import Console
-
-Array = NDArray[np.float64]
 
 ROUNDS: Final = 3
 PATIENCE_S: Final = 600.0

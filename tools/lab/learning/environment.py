@@ -17,8 +17,9 @@ import msgspec
 import numpy as np
 from gymnasium import spaces
 
-from services.planner.controller import Action, Array, Observation
+from services.planner.controller import Action, Observation
 from services.simulator.physics.plant import PlantConfig
+from shared.arrays import Array
 from shared.bus.messages import Mode
 from shared.bus.traces import SimTruth
 from shared.config.files import load

@@ -11,7 +11,8 @@ from typing import Final
 
 import numpy as np
 
-from services.planner.controller import Action, Array, Observation
+from services.planner.controller import Action, Observation
+from shared.arrays import Array
 from shared.joints import N_JOINTS
 
 Policy = Callable[[Array], Array]

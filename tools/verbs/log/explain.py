@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from rich import box
 from rich.table import Table
 from rich.text import Text
@@ -18,6 +17,7 @@ from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.inverse_kinematics import describe as in_words_of_reach
 from services.planner.law.kinematics import Kinematics
 from shared import places
+from shared.arrays import Array
 from shared.bus import topics
 from shared.bus.messages import (
     JointCommand,
@@ -45,8 +45,6 @@ from tools.logs.impairment_intervals import impairments
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import RunLog, RunPart, refuse_own_controller, robot_of
 from tools.terminal import Console, marked
-
-Array = NDArray[np.float64]
 
 POSE_MAX: Final = 10.0
 """m and rad; no pose of such a robot is beyond."""

@@ -10,12 +10,12 @@ import pytest
 
 from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.kinematics import Kinematics
+from shared.arrays import Array
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.exceptions import RunError
 from shared.joints import JOINTS
 from shared.robot.robot_model import stand_pose
 from tests.conftest import ROBOT_FILE
-from tests.planner.oracle import Array
 from tools.bringup.identify import report
 from tools.bringup.identify.body_fit import (
     COM,

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from services.planner.law.kinematics import Kinematics
+from shared.arrays import Array
 from shared.config.robot_config import GRAVITY, RobotConfig
 from tests.planner.conftest import Closed, closed, ik, limits  # noqa: F401 - fixtures
-from tests.planner.oracle import Array
 from tools.bringup.identify.body_statics import Balance, BodyStatics, rotation_vector
 
 UP = np.array([0.0, 0.0, 1.0])

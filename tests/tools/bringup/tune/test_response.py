@@ -6,13 +6,12 @@ import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy import signal
 
+from shared.arrays import Array
 from tools.bringup.tune.excitation import FREQUENCIES_HZ, Excitation, excitation
 from tools.bringup.tune.response import ResponseFit, SecondOrder, answer_of, propose
 
-Array = NDArray[np.float64]
 DT = 0.004
 
 

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from shared.arrays import Array
 from shared.bus import topics
 from shared.clock import NS_PER_S
 from tests.shared.mcap_log.runs import Queue, writer_like
@@ -125,9 +125,6 @@ def _moved(
     if hasattr(message, "scenario_s"):
         changes["scenario_s"] = message.scenario_s + by / NS_PER_S
     return key, msgspec.json.encode(msgspec.structs.replace(message, **changes)), t_ns + by
-
-
-Array = NDArray[np.float64]
 
 
 def data_of(page: str) -> dict[str, Any]:

@@ -17,8 +17,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
-from numpy.typing import NDArray
 
+from shared.arrays import Array
 from shared.bus import codec, topics
 from shared.config.robot_config import RobotConfig
 from shared.joints import JOINTS, MODULES, SIDES
@@ -35,7 +35,6 @@ from tools.judge.reports.foxglove import Arrow, Entity, Solid
 from tools.judge.reports.scene import RobotPose
 from tools.logs.run_log import RunLog, read_run
 
-Array = NDArray[np.float64]
 BODIES = {"hip": "thigh", "knee": "shin", "ankle": "foot"}
 
 

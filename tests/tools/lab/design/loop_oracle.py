@@ -36,9 +36,8 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from shared.arrays import Array
 
 N_POSE = 6
 N_JOINTS = 12

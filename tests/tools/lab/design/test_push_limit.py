@@ -9,20 +9,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from services.planner.law.split import ScheduledGains
 from services.simulator.physics.body import body_of
 from services.simulator.physics.plant import NAMED, changed
 from services.simulator.physics.world import World
+from shared.arrays import Array
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.config.scenarios import Keyframe, Push, Scenario
 from shared.joints import MODULES, N_JOINTS, N_LEG
 from tools.lab.design.poses import Poses
 from tools.lab.design.push_limit import DIRECTIONS, RIGID, LoadedStand, equivalent_slope, stand_at
 from tools.lab.studies.sweeps.push_range import com_height
-
-Array = NDArray[np.float64]
 
 HEIGHTS = (0.7, 0.8, 0.9)
 STIFF = np.tile([900.0, 1500.0, 900.0, 1500.0, 900.0, 900.0], 2)

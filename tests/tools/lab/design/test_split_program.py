@@ -8,12 +8,12 @@ import pytest
 
 from services.planner.law.certificate import Margins
 from services.planner.law.inverse_kinematics import InverseKinematics
+from shared.arrays import Array
 from shared.config.gain_table import GainSchedule
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.robot.robot_model import stand_pose
 from tests.planner.conftest import at_pose, com_height
-from tests.planner.oracle import Array
 from tests.planner.stands import Stand
 from tools.lab.design import design_program, split_program
 from tools.lab.design.dynamic_certificate import TRACK, DynamicCertificate

@@ -17,7 +17,6 @@ from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from services.joint import differential
 from services.joint.pd_law import ZERO, Setpoint, torque
@@ -29,6 +28,7 @@ from services.planner.law.kinematics import Kinematics
 from services.simulator.physics.body import body_of
 from services.simulator.physics.plant import IDEAL, PlantConfig, changed
 from services.simulator.physics.world import World
+from shared.arrays import Array
 from shared.bus.messages import Pair
 from shared.bus.traces import SimTruth
 from shared.config.robot_config import GRAVITY, RobotConfig
@@ -37,8 +37,6 @@ from shared.exceptions import RunError
 from shared.joints import MODULES, N_JOINTS, N_LEG
 from shared.robot.robot_model import stand_pose
 from tools.lab.studies.sweeps.figures import sole_tilt_max_rad, with_payload
-
-Array = NDArray[np.float64]
 
 HEIGHTS: Final = (0.79, 1.25)
 """m; the torso's in a level stand: from the crawl to nearly straight legs."""
