@@ -8,6 +8,7 @@ numbers to the last bit. Without libraries all runs, slower.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import os
 import sys
@@ -59,11 +60,12 @@ class CompiledGraph:
         self._call()
 
 
+@functools.lru_cache(maxsize=64)
 def library_of(function: ca.Function) -> Path:
     """Return the path of a graph's library, whether it was built or not.
 
     Its name is a hash of the graph with all its constants, of CasADi's version and the compiler's
-    flags: another robot or another law has another library.
+    flags: another robot or another law has another library. Writing one down takes milliseconds.
     """
     content = f"{ca.CasadiMeta.version()}\n{FLAGS}\n{function.serialize()}"
     return FOLDER / f"{function.name()}-{hashlib.sha256(content.encode()).hexdigest()[:32]}.so"

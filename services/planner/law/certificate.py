@@ -16,6 +16,7 @@ joints' stiffnesses (docs/drives.md). D is therefore averaged per module.
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import casadi as ca
@@ -62,6 +63,7 @@ def motor_mean(D: Array) -> Array:
     return mean
 
 
+@functools.cache
 def stiffness_graph() -> ca.Function:
     """Return the graph (T, H, D, scale) -> K_fail scaled (6, 12), K_fail (6, 6): docs/law.md (19).
 
