@@ -9,6 +9,7 @@ from typing import Final, NamedTuple, Protocol
 
 from shared.can.cansimple import AxisError, ControllerError, EncoderError, MotorError
 from shared.can.drive_settings import AXES
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
 
 Value = bool | int | float | str | None
@@ -88,6 +89,12 @@ class FoundBoards(NamedTuple):
     """By serial number: why a requested one is missing."""
     strangers: tuple[str, ...]
     """Serial numbers found that were not requested."""
+
+    def in_no_module(self, robot: RobotConfig) -> str:
+        """Return what to say of the strangers that are no module's of the robot; "": none is."""
+        known = {module.serial_number.upper() for module in robot.module}
+        strangers = ", ".join(serial for serial in self.strangers if serial not in known)
+        return f"; plugged in and in no [[module]]: {strangers}" if strangers else ""
 
 
 def equal(one: Value, other: Value) -> bool:

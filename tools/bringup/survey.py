@@ -132,8 +132,7 @@ class _Usb:
 
     def _why_not(self, serial: str, found: FoundBoards) -> tuple[str, str]:
         """Return why a module's board was not reached, and what to do."""
-        strangers = ", ".join(found.strangers)
-        there = f"; plugged in and in no [[module]]: {strangers}" if strangers else ""
+        there = found.in_no_module(self._robot)
         if not serial:
             return f"no serial_number{there}", "`serial_number` in its [[module]], by `odrivetool`"
         trouble = f"{serial}: {found.troubles.get(serial, 'not there')}{there}"

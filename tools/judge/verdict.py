@@ -173,7 +173,7 @@ def _in_real_time(last: SimTruth, stalls: Sequence[Stall]) -> bool:
 def _across(
     summary: Summary, events: Sequence[RunEvent], disturbed: Sequence[Disturbance]
 ) -> list[str]:
-    """Return the keys of the figures that would be within their limits but for a stall."""
+    """Return the keys of figures over their limits that would be within them but for a stall."""
     found = []
     for kind, key, unit_s in ((KILLED, "handover_max_ms", 1e-3), (RESTARTED, "reengage_s", 1.0)):
         begins_ns = [event.t_ns for event in events if event.kind == kind]
@@ -184,7 +184,8 @@ def _across(
             max(0.0, min(end_ns, row.stall.end_ns) - max(begin_ns, row.begin_ns))
             for row in disturbed
         ]
-        if summary[key] - sum(overlaps_ns) / NS_PER_S / unit_s <= BY_KEY[key].limit:
+        without = summary[key] - sum(overlaps_ns) / NS_PER_S / unit_s
+        if without <= BY_KEY[key].limit < summary[key]:
             found.append(key)
     return found + _lost_in_stalls(summary)
 

@@ -156,8 +156,9 @@ def test_a_backup_of_another_firmware_is_refused(robot: RobotConfig) -> None:
 
 
 def test_a_board_that_is_not_there_or_not_known_is_refused(robot: RobotConfig) -> None:
-    absent = FoundBoards({}, {SERIAL: "not plugged in"}, ("0000000000AA",))
-    with pytest.raises(DriveError, match=r"not plugged in; .*0000000000AA"):
+    other = next(row.serial_number for row in robot.module if row.name != MODULE)
+    absent = FoundBoards({}, {SERIAL: "not plugged in"}, (other, "0000000000AA"))
+    with pytest.raises(DriveError, match=r"plugged in; plugged in and in no .*: 0000000000AA\."):
         configure.boards_of(robot, [MODULE], absent)
     board = BoardInMemory({})
     for board.firmware in ((0, 6, 10), (0, 5, 1)):  # newer, and older than its settings' names

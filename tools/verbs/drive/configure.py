@@ -208,10 +208,9 @@ def boards_of(robot: RobotConfig, modules: Sequence[str], found: FoundBoards) ->
         serial = robot.module_named(module).serial_number.upper()
         board = found.boards.get(serial)
         if board is None:
-            there = f"; plugged in and in no [[module]]: {', '.join(found.strangers)}"
             raise DriveError(
                 f"{module}: {serial or 'no serial_number in its [[module]]'}: "
-                f"{found.troubles.get(serial, 'not known')}{there if found.strangers else ''}. "
+                f"{found.troubles.get(serial, 'not known')}{found.in_no_module(robot)}. "
                 "Settings are written over USB; `xrl doctor` says what is missing"
             )
         if not is_known(board.firmware):

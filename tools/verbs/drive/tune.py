@@ -47,6 +47,14 @@ STATUSES_MIN: Final = 1000
 """Fewer are no course: four seconds of the planner's."""
 UNITS: Final = ("N/m", "N/m", "N/m", "N m/rad", "N m/rad", "N m/rad")
 
+PLANNER_DID_NOT: Final = (
+    "the planner did not offset its reference as requested: the robot moved too much for a led "
+    "direction to be held, or the planner was started before law.probe_max was set"
+)
+JOINT_DID_NOT: Final = (
+    "the joint's reference was not offset as planned, or too few of its samples came: is its bus "
+    "sound? `xrl drive can test`"
+)
 
 EXAMPLES: Final = """
 xrl drive tune x                                    # the running robot: step and sines
@@ -228,17 +236,14 @@ def _size(flags: TuneFlags, robot: RobotConfig, row: int) -> float:
     return size
 
 
-def _answer(course: ProbeCourse, plan: Excitation) -> Probed:
+def _answer(course: ProbeCourse, plan: Excitation, why_not: str = PLANNER_DID_NOT) -> Probed:
     """Return a course with how its reference was answered.
 
     Raises:
-        RunError: it was not offset, or hardly answered.
+        RunError: it was not offset (`why_not`), or hardly answered.
     """
     if len(course.t_s) < STATUSES_MIN or float(np.ptp(course.r)) < plan.size:
-        raise RunError(
-            "the planner did not offset its reference as requested: the robot moved too much for a "
-            "led direction to be held, or the planner was started before law.probe_max was set"
-        )
+        raise RunError(why_not)
     answer = answer_of(course.t_s, course.r, course.y, plan)
     if answer is None:
         raise RunError("the response to the offset is hardly measurable; try a larger one (--size)")
@@ -322,7 +327,8 @@ def _tune_module(flags: TuneFlags, console: Console) -> int:
         module_motion.exit_if_interrupted(interrupts)
         return code
     plan, hung = moved.plan, hanging_joint(robot, moved.q, module, axis)
-    measured = _answer(module_probe.course_of_samples(moved.samples, plan), plan.course)
+    course = module_probe.course_of_samples(moved.samples, plan)
+    measured = _answer(course, plan.course, JOINT_DID_NOT)
     model = module_probe.predicted(robot, module, axis, hung)
     _tell(flags, {"measured": measured}, console, closed=False)
     console.print(
