@@ -184,13 +184,17 @@ class ModuleBench(BenchJoint):
         self.robot = with_service(robot, loop=loop)
         super().__init__(self.robot, status)
         self.module = DriveManager(self.robot, module, last_state)
-        self.controller = self.module.controller
         self.carries, self.obeys = carries, obeys
         self.error = AxisError.NONE
         self.zero: Pair | None = None
         """Where the drive answers that its encoders read 0."""
         self.target: MotorTarget | None = None
         self.torque: Pair = (0.0, 0.0)
+
+    @property
+    def controller(self) -> JointController:
+        """Return that of the module, which may be another one by now."""
+        return self.module.controller
 
     def carried(self) -> Pair:
         """Return the joint torques that the drive gives now, N m, by the firmware's law."""

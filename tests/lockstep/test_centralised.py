@@ -102,7 +102,7 @@ class Bench(ModuleBench):
 
     def torque_of(self, step: DriveAction) -> Pair:
         assert step.command is DriveCommand.TORQUE
-        return joint_torque(step.torque, self.ratio)
+        return joint_torque(step.torque, self.gear_ratio)
 
 
 @pytest.fixture

@@ -114,7 +114,7 @@ def stop(
     since = outcome._replace(rows=rows)
     pitch, height = since.angles[:, 1], since.height
     turned = np.abs(pitch - pitch[0]).max()
-    return Stopped(turned, height[0] - height[-1], since.sinking, set(outcome.modes))
+    return Stopped(turned, float(height[0] - height[-1]), since.sinking, set(outcome.modes))
 
 
 @pytest.mark.sampled(2)

@@ -50,8 +50,8 @@ class Judged:
 
         def watching(own: PlannerTrips, *rest: Any, **more: Any) -> None:
             advance(own, *rest, **more)
-            if own.tripped and own.tripped not in (Trip.EDGE, Trip.TIPPING):
-                self.tripped.append(own.why)
+            if own.state.tripped and own.state.tripped not in (Trip.EDGE, Trip.TIPPING):
+                self.tripped.append(own.state.why)
 
         def hearing(own: Failsafe, *rest: Any, **more: Any) -> Cause | None:
             cause = seen(own, *rest, **more)
