@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from collections.abc import Callable
+from typing import Any, Literal, TypeVar
 
 import msgspec
 
@@ -23,6 +24,7 @@ from shared.config.robot_config import RobotConfig
 T0 = 1_000 * NS_PER_S
 SESSION = 7
 LoopName = Literal["onboard", "service"]
+T = TypeVar("T")
 FULL = Setpoint(
     (0.1, -1.0), (0.2, -0.4), (3.0, -20.0), (5.0, -6.0), (100.0, 800.0), (10.0, 50.0)
 )  # fmt: skip
@@ -88,6 +90,16 @@ class BenchJoint:
         pos = motor_from_joint(self.q, self.gear_ratio)
         vel = motor_from_joint(self.v, self.gear_ratio)
         return DriveReading(self.now_ns, pos, vel, self.status, 0)
+
+    def until(self, mode: Mode, cycle: Callable[[], T]) -> T | None:
+        """Run cycles until it is in a mode, for ten seconds at most; return what the last gave."""
+        last = None
+        for _ in range(10 * NS_PER_S // self.cycle_ns):
+            if self.mode is mode:
+                break
+            last = cycle()
+        assert self.mode is mode
+        return last
 
 
 class Bench(BenchJoint):
@@ -247,8 +259,7 @@ class ModuleBench(BenchJoint):
     def to(self, mode: Mode) -> None:
         """Bring the module into HOLD, TRACK or DAMP, settled there."""
         coupled = {"tau_coupled": (3.0, -4.0)}
-        while self.mode is not Mode.HOLD:
-            self.cycle()
+        self.until(Mode.HOLD, self.cycle)
         if mode in (Mode.TRACK, Mode.DAMP):
             self.lead(2000, **coupled)
         if mode is Mode.DAMP:

@@ -80,8 +80,9 @@ def test_track_blends_in_over_its_blend_time(robot: RobotConfig, share: float) -
     bench = Bench(robot)
     bench.to_hold()
     bench.q = (0.03, -1.02)
-    while bench.mode is Mode.HOLD:
-        held = bench.cycle(bench.fresh()).tau
+    first = bench.until(Mode.TRACK, lambda: bench.cycle(bench.fresh()))
+    assert first is not None
+    held = first.tau
     entered_ns, blend_ns = bench.now_ns, robot.joint_service.blend_ms * NS_PER_MS
     while bench.now_ns - entered_ns < share * blend_ns:
         bench.cycle(bench.fresh())

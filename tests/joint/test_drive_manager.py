@@ -315,8 +315,7 @@ def soft_in_track(robot: RobotConfig, module: str) -> ModuleBench:
     """Bring a module to TRACK on gains far below HOLD's, off its reference and moving."""
     bench = ModuleBench(robot, module=module)
     bench.q = (0.02, -1.0) if module.startswith("knee") else (0.02, 0.1)
-    while bench.mode is not Mode.HOLD:
-        bench.cycle()
+    bench.until(Mode.HOLD, bench.cycle)
     soft = {"q_ref": (bench.q[0] + OFF[0], bench.q[1] + OFF[1]), "k_p": SOFT_P, "k_d": SOFT_D}
     bench.lead(800, **soft)
     assert bench.mode is Mode.TRACK

@@ -140,9 +140,7 @@ def test_it_stays_stiff_until_it_tracks_again(robot: RobotConfig, after: str) ->
     bench.run(500, fresh=after == "told so no more", hold=True)
     assert bench.is_stiffened
     assert bench.controller.setpoint.k_p == robot.support_gains("hip_right")[0]
-    while bench.mode is Mode.HOLD:
-        bench.run(1, fresh=True, **soft)
-    assert bench.mode is Mode.TRACK
+    bench.until(Mode.TRACK, lambda: bench.run(1, fresh=True, **soft))
     assert not bench.is_stiffened
     bench.run(400, fresh=True, **soft)
     assert bench.controller.setpoint.k_p == SOFT_P
