@@ -534,3 +534,19 @@ def test_what_leads_a_live_fleet_is_where_the_script_looks_for_it() -> None:
     ]
     assert marked
     assert {path.parent.as_posix() for path in marked} == {"tests/system"}
+
+
+def test_only_simulations_know_the_centralised_baseline_and_no_robot_file_names_it() -> None:
+    users = {
+        file
+        for file, imports in IMPORTS.items()
+        if any(f"{one.full}.".startswith("tools.sim.centralised.") for one in imports)
+    }
+    assert {file for file in users if not file.startswith("tests/")} == {
+        "tools/sim/recorded_lockstep.py",
+        "tools/verbs/sim.py",
+        "tools/lab/studies/sweeps/latency_trial.py",
+        "tools/sim/centralised/fleet.py",
+    }
+    for file in (ROOT / "deploy").rglob("*.toml"):
+        assert "centralised" not in file.read_text(encoding="utf-8"), file

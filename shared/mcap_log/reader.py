@@ -220,7 +220,7 @@ class LogReader:
             if size:
                 channels.add(number)
             following = end
-        if end > self._end:  # the data ends here: an index of it may be missing
+        if opcode in (0, Opcode.MESSAGE_INDEX) and end > self._end:  # one of its indices is cut
             channels.clear()
         return ChunkPlace(at, first_ns, last_ns, frozenset(channels) or None), following
 

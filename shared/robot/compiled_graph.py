@@ -65,7 +65,8 @@ def library_of(function: ca.Function) -> Path:
     """Return the path of a graph's library, whether it was built or not.
 
     Its name is a hash of the graph with all its constants, of CasADi's version and the compiler's
-    flags: another robot or another law has another library. Writing one down takes milliseconds.
+    flags: another robot or another law has another library. Finding it takes
+    milliseconds; of a graph that is kept it is looked up once.
     """
     content = f"{ca.CasadiMeta.version()}\n{FLAGS}\n{function.serialize()}"
     return FOLDER / f"{function.name()}-{hashlib.sha256(content.encode()).hexdigest()[:32]}.so"

@@ -367,6 +367,18 @@ def test_a_lost_drive_that_is_back_disarmed_is_idled(held: ModuleBench, back: Dr
     assert held.mode is Mode.FAULT
 
 
+@pytest.mark.parametrize("status", [DriveStatus.ERROR, DriveStatus.UNZEROED])
+def test_a_drive_that_let_go_is_idled_again_and_again_and_never_armed(
+    held: ModuleBench, status: DriveStatus
+) -> None:
+    """Its other axis may pull alone, and the frame may have been lost."""
+    held.status = status
+    orders = [step.command for step in held.run(3 * IDLE_EVERY_NS)]
+    assert held.mode is Mode.FAULT
+    assert orders.count(DriveCommand.IDLE) == 3
+    assert DriveCommand.ARM not in orders
+
+
 @pytest.mark.parametrize("back", [DriveStatus.ARMED, DriveStatus.HOLDING])
 def test_a_lost_drive_that_is_back_holding_is_left(held: ModuleBench, back: DriveStatus) -> None:
     """It must find no torque of zero and no order to go idle."""

@@ -296,6 +296,9 @@ def test_a_pendant_of_before_is_missed_unless_it_was_laid_down(
         process.run(2 * silent_cycles)
     process.run(2)
     assert process.mode is mode
+    pendant.beat()
+    process.run(10)
+    assert process.mode is mode, "nor does it rise again by itself"
 
 
 # ---- when a pendant is lost: a rule for each joint service

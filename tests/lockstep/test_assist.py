@@ -29,7 +29,7 @@ def with_keys(robot: RobotConfig, section: str, **changes: object) -> RobotConfi
 
 @pytest.mark.parametrize(
     ("weighed", "integrates", "duration", "comes_true"),
-    [(False, True, 9.0, True), (True, False, 5.5, True), (False, False, 5.5, False)],
+    [(False, True, 9.0, True), (True, False, 5.5, True), (False, False, 9.0, False)],
     ids=["by its integral", "by the load found", "by neither"],
 )
 def test_the_assist_comes_true_with_a_payload_the_planner_does_not_know(

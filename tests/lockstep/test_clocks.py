@@ -200,7 +200,7 @@ class Sent:
 
 
 @pytest.mark.sampled(2)
-@pytest.mark.parametrize("skewed", [(1,), (0, 2, 4)])
+@pytest.mark.parametrize("skewed", [(1,), (0, 2, 4), (1, 2, 3, 4, 5)])
 def test_after_one_comparison_all_are_in_step(robot: RobotConfig, skewed: tuple[int, ...]) -> None:
     """Joint services that began to count at different times send in the same period."""
     sent = Sent()

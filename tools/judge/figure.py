@@ -12,12 +12,13 @@ import numpy as np
 from shared.bus import topics
 from shared.bus.messages import JointState, Mode, PlannerMode, RunEvent, RunEventKind
 from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config import files as config_file
 from shared.exceptions import ConfigError, RunError
 from shared.extras import late
 from shared.joints import MODULES
 from tools.judge.verdict import Summary, course, fell
 from tools.logs.impairment_intervals import Impaired, impairments
-from tools.logs.run_log import RunLog, robot_of
+from tools.logs.run_log import RunLog, text_of
 from tools.output import new_figure, save_figure
 
 if TYPE_CHECKING:
@@ -144,7 +145,8 @@ def _ages(axis: Any, log: RunLog, zero_ns: int) -> None:
 def _greatest_age_ms(log: RunLog) -> float:
     """Return the age from which on a command is not used, by the robot file in the log, ms."""
     with contextlib.suppress(ConfigError, RunError):
-        return robot_of(log).joint_service.max_command_age_ms
+        robot = config_file.parse(text_of(log, "robot.toml"), "robot.toml")
+        return robot.joint_service.max_command_age_ms
     return AGE_MOST_MS
 
 

@@ -63,7 +63,6 @@ def motor_mean(D: Array) -> Array:
     return mean
 
 
-@functools.cache
 def stiffness_graph() -> ca.Function:
     """Return the graph (T, H, D, scale) -> K_fail scaled (6, 12), K_fail (6, 6): docs/law.md (19).
 
@@ -84,13 +83,17 @@ def stiffness_graph() -> ca.Function:
     return ca.Function("stiffness", [T, H, D, scale], [both, service / (scale @ scale.T)])
 
 
+_graph = functools.cache(stiffness_graph)
+"""Made once; under a decorator the graph itself would have no mutants."""
+
+
 class Certificate:
     """Certificate at one configuration; `at` sets the configuration."""
 
     def __init__(self, config: RobotConfig) -> None:
         """Set the required stiffness."""
         self.K_required: Array = np.array(config.certificate.K_required)
-        self._graph = CompiledGraph(stiffness_graph())
+        self._graph = CompiledGraph(_graph())
         self._T, self._hessian_O, self._D, self._scale = self._graph.arguments
         self._scale[:] = 1.0 / np.sqrt(self.K_required)
         self._K_scaled, self._K_fail = self._graph.results

@@ -75,12 +75,19 @@ def test_a_straight_leg_that_its_shin_pulls_straight_bears_nothing(robot: RobotC
 
 
 def asked(
-    law: Descent, states: States, status: PlannerStatus | None, seconds: float, begin_s: float = 0.0
+    law: Descent,
+    states: States,
+    status: PlannerStatus | None,
+    seconds: float,
+    begin_s: float = 0.0,
+    asks: set[Ask] | None = None,
 ) -> Ask:
-    """Show the same for some seconds; return what is asked for at the end."""
+    """Show the same for some seconds; return what is asked for at the end, and add all `asks`."""
     ask = Ask.NOTHING
     for at in np.arange(begin_s, begin_s + seconds, 0.1):
         ask = law.step(float(at), states, status)
+        if asks is not None:
+            asks.add(ask)
     return ask
 
 
@@ -89,6 +96,15 @@ def test_what_hangs_or_is_limp_is_idled_and_not_before_it_is_sure(robot: RobotCo
         law = Descent(robot, 1.0)
         assert asked(law, states, planner_status(), LIGHT_S - 0.2) is Ask.NOTHING
         assert asked(law, states, None, 0.6, LIGHT_S - 0.2) is Ask.IDLE
+
+
+def test_a_robot_that_becomes_light_is_idled_without_a_lead_or_a_stop_before(
+    robot: RobotConfig,
+) -> None:
+    law, asks = Descent(robot, 1.0), set[Ask]()
+    asked(law, stand(robot), planner_status(), 0.5, asks=asks)
+    asked(law, limp(robot), planner_status(), LIGHT_S + 1.0, 0.5, asks)
+    assert asks == {Ask.NOTHING, Ask.IDLE}
 
 
 def test_a_moment_of_lightness_is_none(robot: RobotConfig) -> None:
@@ -131,6 +147,10 @@ def test_each_reason_to_give_up_says_what_helps(robot: RobotConfig) -> None:
     ):
         assert words in said
         assert "--limp" in said or "take the hand off" in said
+    asks = set[Ask]()
+    with pytest.raises(FleetError):
+        asked(law(), faulty, None, 3.0, asks=asks)
+    assert asks <= {Ask.NOTHING}, "a stop would have it sink beside a limp leg"
 
 
 def test_down_refuses_where_nobody_knows_and_leaves_a_simulator_as_it_was(
