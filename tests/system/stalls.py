@@ -8,6 +8,7 @@ by a real-time thread that does nothing else (`tools.fleet.stall_watch`).
 from __future__ import annotations
 
 import atexit
+import json
 import os
 import subprocess
 import tempfile
@@ -18,6 +19,7 @@ from typing import Final
 from shared.bus import topics
 from shared.bus.messages import Mode
 from shared.clock import NS_PER_S
+from shared.exceptions import FAULT_EXIT_CODE
 from shared.joints import MODULES
 from tools.fleet import stall_watch
 from tools.fleet.stall_watch import Gap
@@ -70,6 +72,23 @@ def stalled_before_it_began(code: int, said: str, out: Path) -> bool:
         return False
     tracked = any(map(_has_tracked, out.rglob("*.mcap")))
     return tracked and has_stalled(time.monotonic_ns() - LONGEST_RUN_NS)
+
+
+def stood(code: int, out: Path) -> bool:
+    """Return True if a led robot stood, and soundly unless a measured stall made modules hold.
+
+    A hand that leads on against HOLD keeps motors at their limits, and the planner waits for longer
+    before it leads again than the verdict judges apart.
+
+    Args:
+        code: exit code of the verb.
+        out: where its `summary.json` is.
+    """
+    if code == 0:
+        return True
+    summary = json.loads((out / "summary.json").read_text())
+    held = any(row["modules_held"] for row in summary["stalls"])
+    return code == FAULT_EXIT_CODE and bool(summary["unsound"]) and held
 
 
 def _has_tracked(record: Path) -> bool:
