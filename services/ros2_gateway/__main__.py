@@ -56,8 +56,8 @@ def main() -> int:
 
     def joined() -> RosSession:
         ros = RosSession(ros2.router, arguments.domain, types, namespace=ros2.namespace)
-        known = inbound_topics(ros2.namespace)
         try:
+            known = inbound_topics(ros2.namespace)
             ros.show_node()
             ros.publish(gateway.sent_topics)
             ros.subscribe([getattr(known, name) for name in arguments.accept])

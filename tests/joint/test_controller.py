@@ -266,6 +266,17 @@ def test_a_state_holds_what_the_cycle_saw_and_did(bench: Bench) -> None:
     assert state.cycle == bench.controller.cycle > 400
 
 
+def test_a_state_tells_heat_supply_and_the_phase_that_was_asked_for(bench: Bench) -> None:
+    bench.to_track()
+    heat = bench.controller.heat.state
+    heat.shown, heat.left_s = (61.5, 48.0), 93.5
+    reading = msgspec.structs.replace(bench.reading(), supply_v=23.7)
+    bench.controller.step(bench.now_ns, reading, bench.fresh(state_phase=1), estop=False)
+    state = bench.controller.state(bench.now_ns)
+    assert (state.celsius, state.heat_left_s) == ((61.5, 48.0), 93.5)
+    assert (state.supply_v, state.state_phase) == (23.7, 1)
+
+
 def test_a_state_before_any_command_is_marked_so_and_states_count_up(bench: Bench) -> None:
     first = bench.controller.state(bench.now_ns)
     assert (first.seq, first.cause, first.stiffened) == (1, 0, False)

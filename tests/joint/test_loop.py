@@ -240,7 +240,7 @@ def test_a_fleet_that_goes_down_leaves_idle_drives_and_a_service_ended_alone_one
     interrupted: bool,
     loop: str,
 ) -> None:
-    """Of itself the fleet leaves nothing, the service that it held or sank."""
+    """A fleet that goes down leaves nothing, a service that ends alone that it held or sank."""
     guard = RearmGuard(tmp_path, "knee_right")
     rig = Rig(with_service(robot, loop=loop), guard)
     rig.drive.obeys = mode is not Mode.DISARMED

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from services.joint.drivers.base import DriveReading, DriveStatus
 from services.joint.failsafe import Event
 from services.joint.joint_estimate import REJECTED_MAX, JointEstimate
-from services.joint.turn_watch import ACCELERATION, FADES, GAP_NS
+from services.joint.turn_watch import ACCELERATION, AT_ZERO, FADES, GAP_NS, TurnWatch
 from shared.bus.messages import Pair
 from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_MS, NS_PER_S
@@ -146,6 +146,14 @@ def test_an_encoder_that_rests_elsewhere_than_at_its_0_does_not_read_0() -> None
     axis.sample(DriveStatus.IDLE, armed=False, zero=(0.0, 0.5))
     axis.goes(0.0, 500)
     assert not axis.samples.turns_lost
+
+
+@pytest.mark.parametrize("turns", [0.0, 3.0, -2.0])
+def test_a_position_is_at_the_encoders_0_within_three_counts_on_either_side(turns: float) -> None:
+    watch = TurnWatch(encoder_zero=0.3)
+    for off, at_zero in ((-2.0, False), (-0.5, True), (0.5, True), (2.0, False), (2500.0, False)):
+        assert watch.is_zero(turns + 0.3 + off * AT_ZERO) is at_zero
+    assert not TurnWatch().is_zero(-1.0), "it is not known where"
 
 
 @pytest.mark.parametrize("armed", [True, False])

@@ -43,7 +43,7 @@ class Run(NamedTuple):
 
     @property
     def height(self) -> NDArray[np.float64]:
-        """Of the torso, m."""
+        """Height of the torso, m."""
         return np.array([row.torso[2] for row in self.rows])
 
     @property

@@ -17,6 +17,7 @@ from shared.extras import require
 from tools.lab.bench import bus as bus_bench
 from tools.lab.bench import fleet as fleet_bench
 from tools.lab.bench.parts import LOCKSTEP, LOCKSTEP_RECORDED, PARTS
+from tools.lab.bench.revisions import trees as trees_of
 from tools.lab.bench.revisions import worker
 from tools.lab.bench.table import AgainstFlags, PartRow, cell, compared_columns, print_table, row_of
 from tools.lab.bench.timing import ASLEEP_S, SWEPT_BYTES, YARDSTICK_CALLS
@@ -78,7 +79,7 @@ def measure(flags: AgainstFlags, console: Console) -> tuple[list[PartRow], list[
     """Return the table's rows, and what could not be measured; two trees measure in turn."""
     rounds = flags.rounds or ROUNDS
     with ExitStack() as stack:
-        trees = stack.enter_context(flags.trees())
+        trees = stack.enter_context(trees_of(flags))
         asks = [stack.enter_context(worker(tree, config)) for tree, config in trees]
         for ask in asks:  # the machine is then this measurement's alone
             ask(READY)

@@ -9,7 +9,9 @@ so b_0 = K / M, a_1 = B / M, a_0 = (K + K_geo) / M. The loop itself, cut at its 
 
     L(s) = (K + B s) / (M s^2 + K_geo) = T / (1 - T),      T = H (1 + a_1 s / b_0)
 
-and its phase margin is taken from the measured H, so that every delay is in it.
+and its phase margin is taken from the measured H, so that every delay is in it. Only B / K is the
+model's, which takes up part of a delay: a loop 40 ms late is told 1 to 4 degrees better than it is,
+one 10 ms late no better.
 """
 
 from __future__ import annotations

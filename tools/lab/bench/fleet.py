@@ -33,6 +33,7 @@ from tools.fleet.pace import PACE_MIN
 from tools.fleet.status_table import warn_of_others
 from tools.judge.verdict_table import digits
 from tools.lab.bench.revisions import environment
+from tools.lab.bench.revisions import trees as trees_of
 from tools.lab.bench.table import (
     AgainstFlags,
     Row,
@@ -189,7 +190,7 @@ def run(flags: FleetFlags) -> int:
     gain_schedule.require(robot, flags.config)
     console = Console()
     warn_of_others(console)
-    with flags.trees() as trees:
+    with trees_of(flags) as trees:
         runs = [tree for _ in range(flags.rounds or ROUNDS) for tree in trees]
         led = [
             measure(tree, its, flags.scenario, flags.pace)

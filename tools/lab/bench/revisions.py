@@ -22,6 +22,7 @@ import msgspec
 
 from shared.exceptions import RunError
 from shared.places import CHECKOUT, need_checkout
+from tools.lab.bench.table import AgainstFlags
 from tools.lab.bench.worker import Answer, Request
 
 _BENCH: Final = "tools/lab/bench"
@@ -67,6 +68,17 @@ def unpacked(revision: str) -> Iterator[Path]:
 def its_config(config: Path, tree: Path) -> Path:
     """Return the robot file for another tree: its own version of one that lies in this checkout."""
     return tree / config.relative_to(CHECKOUT) if config.is_relative_to(CHECKOUT) else config
+
+
+@contextmanager
+def trees(flags: AgainstFlags) -> Iterator[list[tuple[Path, Path]]]:
+    """Yield this tree and the other, each with its own version of the robot file."""
+    here = (CHECKOUT, flags.config.resolve())
+    if flags.against is None:
+        yield [here]
+        return
+    with unpacked(flags.against) as other:
+        yield [here, (other, its_config(here[1], other))]
 
 
 def environment(tree: Path) -> dict[str, str]:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from statistics import median
-from typing import Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from rich import box
 from rich.table import Table
@@ -16,12 +15,12 @@ from rich.text import Text
 
 from shared.atomic_file import replace_file
 from shared.exceptions import FAULT_EXIT_CODE
-from shared.places import CHECKOUT
 from tools.flags import Arg, ConfigFlags, Count, Flags, parsed
 from tools.judge.verdict_table import digits
-from tools.lab.bench import revisions
-from tools.lab.bench.worker import Answer, Request
 from tools.terminal import Console, marked
+
+if TYPE_CHECKING:  # it imports all parts of a robot
+    from tools.lab.bench.worker import Answer, Request
 
 
 class Row(NamedTuple):
@@ -146,16 +145,6 @@ class AgainstFlags(BenchFlags, ConfigFlags):
     """also measure a git revision, in turn with this tree, and print the ratios; both run in this
     environment"""
     strict: Annotated[bool, Arg(help=f"exit code {FAULT_EXIT_CODE} if a target is missed")] = False
-
-    @contextmanager
-    def trees(self) -> Iterator[list[tuple[Path, Path]]]:
-        """Yield this tree and the other, each with its own version of the robot file."""
-        here = (CHECKOUT, self.config.resolve())
-        if self.against is None:
-            yield [here]
-            return
-        with revisions.unpacked(self.against) as other:
-            yield [here, (other, revisions.its_config(here[1], other))]
 
     def finish(self, rows: Sequence[Row], more: Iterable[Mapping[str, object]]) -> int:
         """Write each row, and what more there is of it; return the exit code."""

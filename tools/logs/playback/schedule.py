@@ -92,7 +92,7 @@ class Playhead:
         self.rate = min(max(rate, RATE_MIN), RATE_MAX)
 
     def _lay(self, now_ns: int) -> None:
-        """Begin the line anew where it is now."""
+        """Count the time from the present position on."""
         self._since_ns, self._from_ns = now_ns, self.position(now_ns)
 
 

@@ -153,7 +153,7 @@ class Study(msgspec.Struct, Generic[C], frozen=True, kw_only=True):
     counts: Callable[[Row], bool] = lambda _row: True
     """True for a row of the study that decides its exit code."""
     exit_code: Callable[[Row], int] = lambda row: EXIT_CODES[row["ending"]]
-    """Of a row alone; of several the `worst` one counts."""
+    """Exit code of one row; the study's is the `worst` of all."""
 
     @property
     def code(self) -> tuple[str, ...]:
@@ -198,9 +198,9 @@ def run(study: Study[C], flags: Any) -> int:
             raise
         finished = begun._replace(rows=table.rows)
     pace = f"; {case_s:.2f} s a {study.case}" if case_s else ""
+    study.report(finished)
     for name, draw in study.pictures.items():
         save_figure(draw(finished), out / name)
-    study.report(finished)
     files = ", ".join((study.table, *study.pictures))
     finished.console.print(f"{out}/{files}{pace}", style="dim", soft_wrap=True)
     return worst(study.exit_code(row) for row in finished.rows if study.counts(row))
