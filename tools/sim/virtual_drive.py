@@ -126,7 +126,7 @@ class VirtualDrive:
         """Start with a new service, which reads the torques that an armed drive carries."""
         self._written = False
         self._watch = BusWatch(echoes=True)
-        self._put(self._feed)  # its first request
+        self._put(self._clock(), self._feed)  # its first request
 
     def read(self, timeout_s: float) -> DriveReading | None:  # noqa: ARG002 - it is there at once
         """Return what a driver would: None during a short silence, then LOST."""
@@ -151,6 +151,9 @@ class VirtualDrive:
         if self._heat_at_ns is not None and is_responding and now_ns >= self._heat_at_ns:
             self._heat_at_ns = now_ns + HEAT_EVERY_NS
             fet, motor = self.thermistors()
+        if now_ns >= self._supply_at_ns:  # a driver asks for it now and then
+            self._supply_at_ns = now_ns + SUPPLY_EVERY_NS
+            self._supply_v = bank.bus.state(a // 2)[0]
         return DriveReading(
             self._sampled_ns,
             (float(pos[a]), float(pos[b])),
@@ -161,7 +164,7 @@ class VirtualDrive:
             None if armed or not is_responding else self._encoder_zero(now_ns),
             fet,
             motor,
-            supply_v=self._supply(now_ns),
+            supply_v=self._supply_v,
         )
 
     def _encoder_zero(self, now_ns: int) -> Pair | None:
@@ -185,13 +188,6 @@ class VirtualDrive:
         heat, (a, b) = self._bank.heat, self._axes
         fet = real_readings(float(heat.fet[a]), float(heat.fet[b]))
         return fet, real_readings(float(heat.motor[a]), float(heat.motor[b]))
-
-    def _supply(self, now_ns: int) -> float:
-        """Return the supply's voltage, V, as a driver asks for it now and then."""
-        if now_ns >= self._supply_at_ns:
-            self._supply_at_ns = now_ns + SUPPLY_EVERY_NS
-            self._supply_v = self._bank.bus.state(self._axes[0] // 2)[0]
-        return self._supply_v
 
     def write_torque(self, torque: Pair) -> None:
         """See `Drive.write_torque`."""
@@ -268,21 +264,22 @@ class VirtualDrive:
 
     def _send(self, apply: Apply) -> None:
         """Send a row of frames if it would not have to wait, as the CAN link does."""
-        if self._watch.may_send(self._clock()):
+        now_ns = self._clock()
+        if self._watch.may_send(now_ns):
             self._written = True
-            self._put(apply)
+            self._put(now_ns, apply)
 
-    def _put(self, apply: Apply) -> None:
+    def _put(self, now_ns: int, apply: Apply) -> None:
         """Hand a row to the bus; the drive takes it if it is there, and feeds its watchdogs."""
-        now_ns, bus = self._clock(), self._bus
+        bus = self._bus
         if bus.choked:
             self._watch.refused(now_ns)
-            return
-        if bus.acknowledged:
+        elif bus.acknowledged:
             self._watch.carried(now_ns)
+            self._receive(apply)
         else:
             self._watch.sent(now_ns)
-        bus.put(now_ns, lambda: self._receive(apply))
+            bus.put(now_ns, lambda: self._receive(apply))
 
     def _receive(self, apply: Apply) -> None:
         bank, (a, _) = self._bank, self._axes
@@ -291,14 +288,15 @@ class VirtualDrive:
             apply()
 
     def _feed(self) -> None:
-        for axis in self._axes:
-            self._bank.feed(axis)
+        self._bank.feed(*self._axes)
 
     def _look_after(self, now_ns: int, *, is_responding: bool) -> None:
         """Watch the bus as the CAN link does, whose own frames come back once they are carried."""
         watch, bus = self._watch, self._bus
         if is_responding:
             watch.heard(now_ns)
+            if bus.acknowledged and not (watch.waits or watch.unacknowledged):
+                return  # nothing can be due
         if bus.acknowledged and watch.waits:
             watch.carried(now_ns)
         elif watch.restart_due(now_ns):

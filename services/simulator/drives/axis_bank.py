@@ -168,9 +168,10 @@ class AxisBank:
 
     # ---- requests of a front
 
-    def feed(self, axis: int) -> None:
-        """Feed an axis's watchdog: any CAN frame to it does."""
-        self._watchdogs.feed(axis, self.now_s)
+    def feed(self, *axes: int) -> None:
+        """Feed the watchdogs of axes: any CAN frame to one does."""
+        for axis in axes:
+            self._watchdogs.feed(axis, self.now_s)
 
     def request_state(self, axis: int, state: int) -> None:
         """Ask for a state: IDLE, CLOSED_LOOP_CONTROL or a calibration; its low byte counts.
