@@ -66,6 +66,8 @@ class HandModel(NamedTuple):
 
 MOVES_MIN: Final = 1e-9
 """Largest gain of an integral that is none."""
+RANK: Final = 1e-12
+"""Singular values below so much of the largest are rounding."""
 NO_HAND: Final = HandModel(0.0, 0.0, 0.0, 0.0)
 
 
@@ -176,6 +178,8 @@ class _Laws(NamedTuple):
     D_m: Array
     D_Bm: Array
     """Means over the motors of a module, as in the drives' law."""
+    coupled: Array
+    """(n, n_c) orthonormal basis of tau_coupled, in which the planner's part of it is carried."""
     C_q: Array
     C_v: Array
     H: Array
@@ -187,6 +191,8 @@ class _Laws(NamedTuple):
     """Torques that ease the hand's force, per p and p'."""
     integral: Array
     """(1, n): the row of J that is integrated; (0, n) where there is none."""
+    integrated: Array
+    """(n_c, 1), or (n_c, 0): tau_coupled per F_I."""
 
 
 class _State(NamedTuple):
@@ -295,8 +301,9 @@ class SampledLoop:
         steps = round(t.joint_period / t.drive_step)
         late = round(t.write_delay / t.drive_step)
         slots = max(0, math.ceil(t.delay / t.planner_period - 1e-9))
-        command = 2 * len(laws.J_open) + n
-        sizes = [len(self.A), n, n, n, n, len(laws.integral), *[command] * slots]
+        n_c = laws.coupled.shape[1]
+        command = 2 * len(laws.J_open) + n_c
+        sizes = [len(self.A), n, n_c, n_c, n_c, len(laws.integral), *[command] * slots]
         ends = np.cumsum(sizes)
         width = int(ends[-1])
         X = np.eye(width, width + self._n_p)
@@ -353,7 +360,7 @@ class SampledLoop:
         r, rate = laws.J_open @ q, laws.J_open @ v
         e_q, e_v = laws.T_open @ r - q, laws.T_open @ rate - v
         F_I = F_I + period * self.feedback.integral_gain * (laws.integral @ e_q)
-        raw = laws.C_q @ e_q + laws.C_v @ e_v + laws.integral.T @ F_I
+        raw = laws.C_q @ e_q + laws.C_v @ e_v + laws.integrated @ F_I
         gain = pole_gain(self.feedback.bandwidth_hz, period)
         f_1 = f_1 + gain * (raw - f_1)
         f_2 = f_2 + gain * (f_1 - f_2)
@@ -368,7 +375,8 @@ class SampledLoop:
         q, v = x[self._at.q], x[self._at.v]
         r, rate, coupled = np.split(entry, (n_open, 2 * n_open))
         q_ref, v_ref = laws.T_open @ (r + age * rate), laws.T_open @ rate
-        tau = laws.D @ (q_ref - q) + laws.D_B @ (v_ref - v) + gains.coupling * coupled
+        tau = laws.D @ (q_ref - q) + laws.D_B @ (v_ref - v)
+        tau = tau + gains.coupling * laws.coupled @ coupled
         # a gain on all feedback does not scale the weight's feedforward
         tau = tau + laws.H @ q_ref / gains.torque
         return np.asarray(tau + laws.D_m @ q + laws.D_Bm @ v, float)
@@ -386,17 +394,23 @@ def _laws(
     integral = (feedback.integral @ V)[np.newaxis]
     if np.abs(integral).max() * feedback.integral_gain < MOVES_MIN:
         integral = integral[:0]  # it would stay as it is: a motion that does not decay
+    C_q, C_v = V.T @ feedback.C_q @ V, V.T @ feedback.C_v @ V
+    ease_p = -alpha * (hand.k_z * easing[0] + hand.k_pitch * easing[1])
+    ease_v = -alpha * (hand.b_z * easing[0] + hand.b_pitch * easing[1])
+    coupled = scipy.linalg.orth(np.hstack((C_q, C_v, integral.T, ease_p, ease_v)), rcond=RANK)
     return _Laws(
         D=D,
         D_B=D_B,
         D_m=D_m,
         D_Bm=D_Bm,
-        C_q=V.T @ feedback.C_q @ V,
-        C_v=V.T @ feedback.C_v @ V,
+        coupled=coupled,
+        C_q=coupled.T @ C_q,
+        C_v=coupled.T @ C_v,
         H=V.T @ stand.H @ V,
         J_open=(P.T @ stand.J @ V)[opened],
         T_open=(V.T @ stand.T @ P)[:, opened],
-        ease_p=-alpha * (hand.k_z * easing[0] + hand.k_pitch * easing[1]),
-        ease_v=-alpha * (hand.b_z * easing[0] + hand.b_pitch * easing[1]),
+        ease_p=coupled.T @ ease_p,
+        ease_v=coupled.T @ ease_v,
         integral=integral,
+        integrated=coupled.T @ integral.T,
     )
