@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+import gc
 import signal
+import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import Phase, settings
@@ -52,6 +55,18 @@ def short_dir() -> Iterator[Path]:
 def run_dir(short_dir: Path) -> Path:
     """Return where a fleet may run."""
     return short_dir / "r"
+
+
+def pytest_sessionstart() -> None:
+    """Forget what is made once in a process: mutants are tried in forks of one that ran tests."""
+    made: Any = sys.modules.get("services.planner.law.certificate")
+    if made is not None:
+        made._graph.cache_clear()
+
+
+def pytest_collection_finish() -> None:
+    """Spare the collector a million objects that stay."""
+    gc.freeze()
 
 
 @pytest.hookimpl(tryfirst=True)  # before `-m` chooses

@@ -52,9 +52,11 @@ def test_without_an_intent_nothing_is_requested(robot: RobotConfig) -> None:
 
 def test_a_message_is_given_until_it_is_stale(robot: RobotConfig) -> None:
     intents = Intents(robot.assist)
-    intents.receive(intent(80.0, (0.01, 0.0, 0.0, -0.02)), T0)
+    intents.receive(intent(80.0, (0.01, 0.0, 0.0, -0.02), sit=True), T0)
     for now in (T0, T0 + 1, late_ns(robot, 0.0)):
-        assert intents.request(now) == OperatorRequest(80.0, (0.01, 0.0, 0.0, -0.02), "a test")
+        assert intents.request(now) == OperatorRequest(
+            80.0, (0.01, 0.0, 0.0, -0.02), "a test", sit=True
+        )
 
 
 @pytest.mark.parametrize("share", [0.25, 0.5, 1.0, 1.5, 1000.0])

@@ -118,12 +118,13 @@ def test_without_a_harness_what_was_found_stands(
     assert law.load.state.kg == law.load.state.a == law.load.state.b == 0.0
 
 
+@pytest.mark.parametrize("newtons", [-50.0, 50.0])
 @pytest.mark.parametrize(("led", "seconds"), [(True, 2.0), (False, 0.25)])
 def test_while_it_is_led_it_is_found_eight_times_as_slowly(
-    load: Load, led: bool, seconds: float
+    load: Load, led: bool, seconds: float, newtons: float
 ) -> None:
-    bears(load, 1.0 + 50.0 / WEIGHT, DT + seconds, led=led)
-    assert load.state.kg == pytest.approx((1.0 - math.exp(-1.0)) * 50.0 / GRAVITY, rel=0.02)
+    bears(load, 1.0 + newtons / WEIGHT, DT + seconds, led=led)
+    assert load.state.kg == pytest.approx((1.0 - math.exp(-1.0)) * newtons / GRAVITY, rel=0.02)
 
 
 def test_after_a_long_gap_it_is_found_at_once_and_no_more(load: Load) -> None:
@@ -136,6 +137,11 @@ def test_a_robot_that_is_led_and_falls_shows_nothing(load: Load) -> None:
     bears(load, 1.0, 1.0)
     bears(load, 0.2, 4.0, led=True)
     assert (load.state.kg, load.state.a, load.state.b) == pytest.approx((0.0, 0.0, 0.0))
+    assert not load.refused
+
+
+def test_one_that_is_led_already_does_not_hang(load: Load) -> None:
+    bears(load, 0.3, DT, led=True)
     assert not load.refused
 
 
@@ -183,6 +189,21 @@ def test_one_that_hangs_without_a_harness_is_not_led(load: Load, led: bool) -> N
     assert (load.state.kg, load.state.a, load.state.b) == (0.0, 0.0, 0.0), (
         "a hand may lift it: nothing is known"
     )
+
+
+def test_without_a_harness_one_that_hangs_is_weighed_until_it_stands(load: Load) -> None:
+    for share in (0.3, 0.3):
+        load.advance_without_harness(share * WEIGHT, DT, led=False)
+        assert load.refused
+    load.advance_without_harness(0.2 * WEIGHT, 10.0, led=False)
+    assert load.state.kg == pytest.approx(-0.8 * WEIGHT / GRAVITY), "at once after a gap"
+    load.advance_without_harness(WEIGHT, DT, led=False)
+    assert load.refused, "a moment on its feet is none"
+    for _ in range(250):
+        load.advance_without_harness(WEIGHT, DT, led=False)
+    for _ in range(250):
+        load.advance_without_harness(0.1 * WEIGHT, DT, led=False)
+    assert (load.refused, load.state.kg) == (False, 0.0), "what a hand lifts afterwards"
 
 
 @pytest.mark.parametrize("rates", [(0.06, 0.0), (-0.06, 0.0), (0.0, 0.11), (0.0, -0.11)])
@@ -245,3 +266,32 @@ def test_each_reason_is_reported_and_no_other(
     assert reason.count("carries") + reason.count("lies") == len(words)
     assert [reason.index(said) for said in words] == sorted(reason.index(said) for said in words)
     assert "; the load" in reason or len(words) == 1
+
+
+@pytest.mark.parametrize(
+    ("kg", "a", "text"),
+    [
+        (
+            9.0, 0.0,
+            ("the robot carries 9.0 kg more than its file says: at most 8 kg are accepted "
+            "(6.4 once refused); set mass.payload, then `xrl gains`"),
+        ),
+        (
+            -9.0, 25.0,
+            ("the robot carries 9.0 kg less than its file says: at most 8 kg are accepted "
+            "(6.4 once refused); if nothing holds it up, set mass.payload, then `xrl gains`; "
+            "the load lies too far behind, by 25 N m: at most 20 N m are accepted "
+            "(16 once refused)"),
+        ),
+        (
+            -50.0, 0.0,
+            ("it hangs: lower it until its feet bear its weight; or, on its feet, it carries "
+            "50 kg less than its file says: set mass.payload, then `xrl gains`"),
+        ),
+    ],
+)  # fmt: skip
+def test_a_refusal_says_what_is_and_what_would_be_right(
+    load: Load, kg: float, a: float, text: str
+) -> None:
+    load.state = LoadState(kg, a, refused=True)
+    assert load.refusal() == text

@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from services.planner.planner import Planner
-from services.planner.watch.plausible import BEYOND_RAD, SPEED_MAX, Plausible
+from services.planner.watch.plausible import BEYOND_RAD, SPEED_MAX, TURN_MAX, Plausible
 from shared.bus.messages import Attitude, PlannerMode, Vector3
 from shared.config.robot_config import RobotConfig
 from shared.joints import N_JOINTS
@@ -84,8 +84,11 @@ def test_a_wrench_is_taken_up_to_what_the_cells_together_can_carry(robot: RobotC
     plausible, most = Plausible(robot), 6.0 * robot.harness.leg_force_max
     for force, taken in ((most, True), (-most, True), (1.001 * most, False), (-1e300, False)):
         assert plausible.is_wrench(wrench(force)) is taken
-    assert not plausible.is_wrench(wrench(moment=(0.0, -1e300, 0.0)))
-    assert plausible.refused == 3
+    harness = robot.harness
+    most *= harness.base_radius + harness.platform_radius + harness.height
+    for moment, taken in ((most, True), (-1.001 * most, False), (-1e300, False)):
+        assert plausible.is_wrench(wrench(moment=(0.0, moment, 0.0))) is taken
+    assert plausible.refused == 4
 
 
 @pytest.mark.parametrize(
@@ -96,7 +99,9 @@ def test_a_wrench_is_taken_up_to_what_the_cells_together_can_carry(robot: RobotC
         ((0.0, 0.0, 1.2), 0.0, True, False),
         ((0.0, 0.0, 0.0), 0.0, True, False),
         ((0.0, 0.0, 0.0), 0.0, False, True),
+        ((0.0, 0.0, 1.2), 0.0, False, False),
         ((1e300, 0.0, 0.0), 0.0, False, False),
+        ((0.0, 0.0, 1.0), TURN_MAX, True, True),
         ((0.0, 0.0, 1.0), 1e300, True, False),
     ],
 )

@@ -67,8 +67,9 @@ def test_each_trips_once_it_has_lasted(robot: RobotConfig, trip: Trip) -> None:
     for at_ns, tripped in ((0, Trip.NONE), (lasted_ns - 1, Trip.NONE), (lasted_ns, trip)):
         trips.advance(T0 + at_ns, values, leads=True)
         assert trips.state.tripped is tripped
-    assert PLANNER_TRIPS[trip].measured in trips.state.why
-    assert PLANNER_TRIPS[trip].unit in trips.state.why
+    row, limit = PLANNER_TRIPS[trip], getattr(robot.trips, PLANNER_TRIPS[trip].key).limit
+    value = f"{values[TRIPS.index(trip)]:.3g} {row.unit}"
+    assert trips.state.why == f"{row.measured}: {value} (limit {limit:g})"
 
 
 @pytest.mark.parametrize("trip", TRIPS)
@@ -244,12 +245,23 @@ def test_each_value_is_the_tables(joint: int, sign: float) -> None:
     assert values == pytest.approx([expected[trip] for trip in TRIPS], nan_ok=True)
 
 
+def test_while_the_planner_moves_it_for_heat_nothing_sags_and_nothing_drifts() -> None:
+    given = output_of(0.0), np.zeros(12), (90.0, 80.0), 0.6, -300.0, -0.2, 0.07
+    led, moved = (values_of(*given, leads=True, moves=moves) for moves in (False, True))
+    apart = {
+        TRIPS[i]: pair for i, pair in enumerate(zip(led, moved, strict=True)) if len({*pair}) > 1
+    }
+    assert set(apart) == {Trip.SAGGING, Trip.UNATTENDED}
+    assert {now for _, now in apart.values()} == {0.0}
+
+
 def test_a_watch_restored_from_before_there_was_a_trip_counts_it_from_now_on(
     robot: RobotConfig,
 ) -> None:
     trips, old = PlannerTrips(robot), led(robot).state
     old.since_ns = old.since_ns[:-1]
     trips.restore(old)
+    assert set(trips.state.since_ns) == {0}
     assert go_on(trips, beyond(robot, Trip.TIPPING), range(1000)).state.tripped is Trip.TIPPING
 
 
