@@ -11,7 +11,16 @@ from hypothesis import strategies as st
 from services.joint.drivers.base import DriveReading, DriveStatus
 from services.joint.failsafe import Event
 from services.joint.joint_estimate import REJECTED_MAX, JointEstimate
-from services.joint.turn_watch import ACCELERATION, AT_ZERO, FADES, GAP_NS, TurnWatch
+from services.joint.turn_watch import (
+    ACCELERATION,
+    AT_ZERO,
+    FADES,
+    GAP_NS,
+    SETTLES_S,
+    STILL,
+    STILL_NS,
+    TurnWatch,
+)
 from shared.bus.messages import Pair
 from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_MS, NS_PER_S
@@ -165,3 +174,83 @@ def test_a_failed_encoder_lacks_turns_until_the_drive_has_no_zero(armed: bool) -
     axis.sample(DriveStatus.UNZEROED, armed=False)
     axis.sample(DriveStatus.IDLE, armed=False)
     assert not axis.samples.turns_lost
+
+
+# ---- one watch by itself
+
+T_NS = NS_PER_S
+
+
+def rested(slowest: float, fastest: float, rested_ns: int) -> TurnWatch:
+    """Return a watch of an axis that has rested at 0, its newest sample a period before T_NS."""
+    newest_ns = T_NS - PERIOD_NS
+    since_ns = newest_ns - rested_ns
+    return TurnWatch(0.0, since_ns, slowest, fastest, newest_ns)
+
+
+def goes_on(watch: TurnWatch, jump: float) -> bool:
+    """Return True if the watch says that the motor may have gone so far, unseen, in its rest."""
+    return watch.take(T_NS, jump, 0.0, jump, -1.0)  # seen, it cannot have gone at all
+
+
+def reach(slowest: float, fastest: float, blind_s: float) -> tuple[float, float]:
+    """Return the ends of where a motor may be: no words came for so long, or a settling more.
+
+    Its speed was within the bounds a settling ago, which it may have left by `FADES` meanwhile; by
+    `ACCELERATION` it changes evenly, so half of that counts.
+    """
+    longest_s = blind_s + SETTLES_S
+    room = ACCELERATION * longest_s / 2.0 + FADES * SETTLES_S
+    ways = [v * s for v in (slowest - room, fastest + room) for s in (blind_s, longest_s)]
+    return min(ways), max(ways)
+
+
+@pytest.mark.parametrize("rested_ms", [4, 10, 24, 50])
+@pytest.mark.parametrize("bounds", [(-40.0, -20.0), (-1.0, 1.0), (0.0, 0.0), (20.0, 40.0), "slow"])
+def test_a_jump_after_a_rest_is_possible_as_far_as_the_motor_can_have_gone(
+    rested_ms: int, bounds: tuple[float, float] | str
+) -> None:
+    blind_s = 1e-3 * rested_ms + PERIOD_NS / NS_PER_S
+    if isinstance(bounds, str):  # half a turn a second at least, or at most: nearly no way at all
+        room = ACCELERATION * (blind_s + SETTLES_S) / 2.0 + FADES * SETTLES_S
+        several = [(room + 0.5, room + 0.6), (-room - 0.6, -room - 0.5)]
+    else:
+        several = [bounds]
+    for slowest, fastest in several:
+        ends = reach(slowest, fastest, blind_s)
+        for end, inwards in zip(ends, (1e-4, -1e-4), strict=True):
+            for jump, possible in ((end + inwards, True), (end - inwards, False)):
+                watch = rested(slowest, fastest, rested_ms * NS_PER_MS)
+                assert goes_on(watch, jump) is possible
+                others = (jump - 1.0, jump + 1.0)
+                assert watch.lost is any(ends[0] <= other <= ends[1] for other in others)
+
+
+@pytest.mark.parametrize(
+    ("rested_ns", "explained"),
+    [(STILL_NS - 1, False), (STILL_NS, True), (GAP_NS, True), (GAP_NS + 1, False)],
+)
+def test_a_rest_is_a_gap_from_two_periods_on_up_to_what_the_drive_reports_itself(
+    rested_ns: int, explained: bool
+) -> None:
+    assert goes_on(rested(-9.0, 9.0, rested_ns), 0.05) is explained
+
+
+@pytest.mark.parametrize(("jump", "possible"), [(0.25, True), (-0.25, True), (0.26, False)])
+def test_an_axis_that_is_seen_goes_as_far_as_it_is_free_to(jump: float, possible: bool) -> None:
+    assert TurnWatch().take(T_NS, jump, 0.0, jump, 0.25) is possible
+
+
+def test_an_estimate_that_moves_by_a_third_of_a_count_rests() -> None:
+    watch = TurnWatch(0.0, 5)
+    watch.take(T_NS, STILL, 0.0, STILL, 1.0)
+    assert (watch.pos, watch.changed_ns) == (0.0, 5)
+
+
+def test_the_bounds_of_the_speed_follow_it_no_faster_than_a_motor_can() -> None:
+    """Outwards by its largest acceleration, inwards by half of it; after a long rest it is 0."""
+    watch = TurnWatch(0.0, T_NS, 10.0, 10.0, T_NS)
+    watch.take(T_NS + PERIOD_NS, 0.02, -10.0, 0.02, 1.0)
+    assert (watch.slowest, watch.fastest) == pytest.approx((9.2, 9.6))
+    watch.take(T_NS + 2 * GAP_NS, 0.02, 0.0, 0.0, 1.0)
+    assert (watch.slowest, watch.fastest) == (0.0, 0.0)
