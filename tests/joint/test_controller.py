@@ -277,6 +277,17 @@ def test_a_state_tells_heat_supply_and_the_phase_that_was_asked_for(bench: Bench
     assert (state.supply_v, state.state_phase) == (23.7, 1)
 
 
+def test_what_the_drive_tells_of_its_heat_is_heard(bench: Bench) -> None:
+    bench.to_hold()
+    told = msgspec.structs.replace(
+        bench.reading(), fet_celsius=(71.0, 35.0), motor_celsius=(30.0, 90.0)
+    )
+    heat, before = bench.controller.heat.state, bench.controller.heat.state.winding
+    bench.controller.step(bench.now_ns + bench.cycle_ns, told, None, estop=False)
+    assert heat.stage == (71.0, 35.0)
+    assert heat.winding[0] < before[0] == before[1] < heat.winding[1]
+
+
 def test_a_state_before_any_command_is_marked_so_and_states_count_up(bench: Bench) -> None:
     first = bench.controller.state(bench.now_ns)
     assert (first.seq, first.cause, first.stiffened) == (1, 0, False)

@@ -14,13 +14,14 @@ from services.joint.controller import JointController
 from services.joint.envelope import ASTRAY_S, ROUNDING, Envelope
 from services.joint.failsafe import Event, Failsafe, timing_of
 from shared.bus.messages import JointCommand, Mode, Outside, Pair, Refusal
+from shared.clock import NS_PER_S
 from shared.config import files as config_file
 from shared.config.gain_schedule import believing
 from shared.config.gain_table import Bounds, ModuleBounds
 from shared.config.robot_config import RobotConfig
 from shared.joints import kind_of
 from tests.conftest import ROBOT_FILE
-from tests.joint.helpers import SESSION, T0, command
+from tests.joint.helpers import SESSION, T0, Bench, command
 
 Q: Pair = (0.02, -1.0)
 
@@ -286,6 +287,30 @@ def test_an_ankles_reference_is_believed_up_to_its_bound_astray(
         judged = Envelope(robot, "ankle_left").judge(told, None, Q, V, astray=astray)
         assert judged is outside
     assert astray_after(robot, 50, (0.0, 0.0), (0.3, 0.3), module=MODULE) == pd_law.ZERO
+
+
+@pytest.mark.parametrize("goes", [0.0, 0.3])
+def test_a_controller_remembers_how_far_astray_its_reference_is(
+    robot: RobotConfig, goes: float
+) -> None:
+    """A third of a second: at 0.3 rad/s that the commands do not tell, twice the bound."""
+    bench, refused = Bench(robot, ANKLE), set[Outside]()
+    bench.q, bench.controller = Q, JointController(robot, ANKLE)
+
+    def send(q_ref: Pair) -> None:
+        told = middle(robot, ANKLE, q_ref=q_ref, t_ns=bench.now_ns, echo_t_ns=bench.now_ns)
+        bench.seq += 1
+        bench.cycle(msgspec.structs.replace(told, seq=bench.seq))
+        refused.add(bench.controller.failsafe.outside)
+
+    bench.until(Mode.TRACK, lambda: send(Q))
+    for _ in range(400):
+        send(Q)
+    began_ns = bench.now_ns
+    for _ in range(166):
+        along = goes * (bench.now_ns - began_ns) / NS_PER_S
+        send((Q[0], Q[1] + along))
+    assert (Outside.Q_REF_ASTRAY in refused) is (goes > 0.0)
 
 
 def test_where_nothing_of_this_planner_is_tracked_nothing_is_astray(robot: RobotConfig) -> None:

@@ -237,10 +237,13 @@ def test_a_signal_stops_a_service_whose_file_is_gone(tmp_path: Path, file: Rearm
     before = signal.getsignal(signal.SIGUSR1)
     try:
         file.stop_on(signal.SIGUSR1)
-        path_of(tmp_path, MODULE).unlink()
+        path = path_of(tmp_path, MODULE)
+        elsewhere = path.rename(tmp_path / "elsewhere")
         assert not file.stop_requested
         os.kill(os.getpid(), signal.SIGUSR1)
         assert file.stop_requested
+        elsewhere.rename(path)
+        assert stop_source(tmp_path, MODULE) == "signal SIGUSR1"
     finally:
         signal.signal(signal.SIGUSR1, before)
 
@@ -249,14 +252,20 @@ def test_the_first_named_source_of_a_stop_is_kept_until_asked_for(tmp_path: Path
     guard = RearmGuard(tmp_path, MODULE)
     assert stop_source(tmp_path, MODULE) == ""
     guard.note_stop("")
-    request_stop(tmp_path, MODULE, "xrl estop by anna")
-    guard.note_stop("somebody else")
-    assert stop_source(tmp_path, MODULE) == "xrl estop by anna"
-    clear(tmp_path, MODULE)
-    guard.note_stop("é" * SOURCE_MAX)
-    assert stop_source(tmp_path, MODULE) == "é" * (SOURCE_MAX // 2)
-    assert not guard.stop_requested, "a long name reaches nothing else"
-    assert guard.beats == 0
+    request_stop(tmp_path, MODULE, "Xaver")
+    request_stop(tmp_path, MODULE, "somebody else")
+    guard.note_stop("a third")
+    assert stop_source(tmp_path, MODULE) == "Xaver"
+    for given, kept in (
+        ("é" * SOURCE_MAX, "é" * (SOURCE_MAX // 2)),
+        ("a" + "é" * SOURCE_MAX, "a" + "é" * (SOURCE_MAX // 2 - 1) + "\ufffd"),
+        ("l\udce9a", "l?a"),
+    ):
+        clear(tmp_path, MODULE)
+        guard.note_stop(given)
+        assert stop_source(tmp_path, MODULE) == kept
+        assert not guard.stop_requested, "a long name reaches nothing else"
+        assert guard.beats == 0
 
 
 @pytest.mark.parametrize("name", [KeyError("uid not found: 12345"), "l\udce9a"])
