@@ -71,7 +71,14 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(tryfirst=True)  # before `-m` chooses
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the slowest files, the order within a file stays; mark what is wide."""
+    """Begin with the slowest files, the order within a file stays; mark what is wide.
+
+    Raises:
+        UsageError: a file does not say itself that its tests are `system`; see `tools.dev.checks`.
+    """
+    for path in {item.path for item in items if item.get_closest_marker("system")}:
+        if "pytest.mark.system" not in path.read_text("utf-8"):
+            raise pytest.UsageError(f"{path} has tests marked system, and no pytest.mark.system")
     met: Counter[str] = Counter()
     for item in items:
         mark = item.get_closest_marker("sampled")

@@ -48,12 +48,17 @@ TRIES = 3
 R = TypeVar("R", LeadRecord, ProbeCourse)
 
 
-def undisturbed(go: Callable[[], R]) -> R:
-    """Return what comes of it; it is done again if the machine stalled, which ends it as well."""
+def undisturbed(
+    go: Callable[[], R], is_done: Callable[[R], bool] = lambda found: not found.ended
+) -> R:
+    """Return what comes of it; if it is not done and the machine stalled, it is tried again.
+
+    A stall ends a lead or a probe as well.
+    """
     for _ in range(TRIES):
         began_ns = time.monotonic_ns()
         found = go()
-        if not found.ended or not has_stalled(began_ns):
+        if is_done(found) or not has_stalled(began_ns):
             break
     return found
 
@@ -105,14 +110,15 @@ def test_a_live_robot_is_led_for_a_fit_and_probed_and_leads_on(
     status = xrl("status", run_dir=place)
     assert "LEADING" in status.stdout
     with open_session(robot, "tune", place) as session:
-        probe = LiveProbe(session)
         killed: list[int] = []
 
         def kill(t_s: float) -> None:
             if t_s > 1.5 and not killed:
                 killed.append(xrl("kill", "planner", run_dir=place).returncode)
 
-        course = probe.go(0, STEP, kill, lambda: False)
+        course = undisturbed(
+            lambda: LiveProbe(session).go(0, STEP, kill, lambda: False), lambda _: bool(killed)
+        )
         assert killed == [0]
         assert course.ended != "", "a planner that is gone leads nothing"
 

@@ -12,6 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
+from pathlib import Path
 from typing import IO, Final, NamedTuple
 
 import msgspec
@@ -27,7 +28,7 @@ LIVE: Final = (*PYTEST, "-m", "live and not wide", "tests/system")
 WAITING: Final = (
     *PYTEST, "-m", "system and not live", "--numprocesses", str(2 * CORES), "--dist", "loadfile",
 )  # fmt: skip
-"""They wait, mostly."""
+"""They wait, mostly. `_everything` adds the files in which the mark stands."""
 PATIENT: Final = (
     (
         *PYTEST, "-m", "not system and not wide", "--numprocesses", "auto", "--dist", "loadfile",
@@ -46,7 +47,6 @@ class Plan(NamedTuple):
     """Begun before these, and followed after them."""
 
 
-ALL: Final = Plan((LIVE, WAITING), beside=PATIENT)
 CHANGED: Final = "--changed"
 INTERRUPTED: Final = 128 + signal.SIGINT
 ENDS_BY: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -107,7 +107,7 @@ def main(argv: Sequence[str]) -> int:
     for number in ENDS_BY:
         signal.signal(number, signal.default_int_handler)
     begun_s = time.monotonic()
-    plan = Plan((PYTEST + tuple(argv),)) if argv else ALL
+    plan = Plan((PYTEST + tuple(argv),)) if argv else _everything()
     if CHANGED in argv[:1]:
         try:
             plan = Plan(_touched(*argv[1:]))
@@ -132,6 +132,17 @@ def main(argv: Sequence[str]) -> int:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 128 + signal.SIGPIPE
     return _tell(done, time.monotonic() - begun_s)
+
+
+def _everything() -> Plan:
+    """Return all parts.
+
+    Each worker of the waiting tests would import every test there is: it is given the files with
+    their mark (tests/conftest.py sees to it that it stands there).
+    """
+    files = sorted(Path("tests").rglob("test_*.py"))
+    marked = [str(file) for file in files if "pytest.mark.system" in file.read_text("utf-8")]
+    return Plan((LIVE, (*WAITING, *marked)), beside=PATIENT)
 
 
 def _touched(revision: str = "HEAD", *others: str) -> tuple[tuple[str, ...], ...]:

@@ -67,7 +67,10 @@ class VirtualBus:
                 apply()
 
     def put(self, now_ns: int, apply: Apply) -> None:
-        """Send a row; one that the socket has no room for is dropped."""
+        """Send a row that may have to wait; one that the socket has no room for is dropped.
+
+        A probe is put on a bus that may have come back.
+        """
         if self.acknowledged:
             apply()
         elif len(self._waiting) < QUEUED_MAX:

@@ -66,8 +66,8 @@ class HandModel(NamedTuple):
 
 MOVES_MIN: Final = 1e-9
 """Largest gain of an integral that is none."""
-RANK: Final = 1e-12
-"""Singular values below so much of the largest are rounding."""
+ROUNDING: Final = 1e-12
+"""Singular values below so much of the largest are none."""
 NO_HAND: Final = HandModel(0.0, 0.0, 0.0, 0.0)
 
 
@@ -179,16 +179,17 @@ class _Laws(NamedTuple):
     D_Bm: Array
     """Means over the motors of a module, as in the drives' law."""
     coupled: Array
-    """(n, n_c) orthonormal basis of tau_coupled, in which the planner's part of it is carried."""
+    """(n, n_c) orthonormal basis of tau_coupled: filters and commands hold its coordinates."""
     C_q: Array
     C_v: Array
+    """(n_c, n)"""
     H: Array
     J_open: Array
     T_open: Array
     """J and T of the coordinates that the planner takes as measured."""
     ease_p: Array
     ease_v: Array
-    """Torques that ease the hand's force, per p and p'."""
+    """(n_c, n_p): part of tau_coupled that eases the hand's force, per p and p'."""
     integral: Array
     """(1, n): the row of J that is integrated; (0, n) where there is none."""
     integrated: Array
@@ -397,7 +398,7 @@ def _laws(
     C_q, C_v = V.T @ feedback.C_q @ V, V.T @ feedback.C_v @ V
     ease_p = -alpha * (hand.k_z * easing[0] + hand.k_pitch * easing[1])
     ease_v = -alpha * (hand.b_z * easing[0] + hand.b_pitch * easing[1])
-    coupled = scipy.linalg.orth(np.hstack((C_q, C_v, integral.T, ease_p, ease_v)), rcond=RANK)
+    coupled = scipy.linalg.orth(np.hstack((C_q, C_v, integral.T, ease_p, ease_v)), rcond=ROUNDING)
     return _Laws(
         D=D,
         D_B=D_B,
