@@ -117,14 +117,14 @@ def test_damping_begins_with_the_torque_before(s: Setpoint, q: Pair, v: Pair, k_
 @pytest.mark.parametrize("away_theta", [-0.063, -0.0625, 0.0, 0.0625, 0.063])
 def test_too_far_for_a_stiffer_spring_it_holds_here(away_phi: float, away_theta: float) -> None:
     """50 N m more are allowed: phi rises by 400 N m/rad, theta by 800."""
-    s = msgspec.structs.replace(FULL, q_ref=(0.0, 0.0))
-    q = (-away_phi, -away_theta)
+    s = msgspec.structs.replace(FULL, q_ref=(0.25, -1.0))
+    q = (0.25 - away_phi, -1.0 - away_theta)
     near = pd_law.limit_stiffening(s, q, (500.0, 1600.0), 50.0)
     far = abs(away_phi) > 0.1255, abs(away_theta) > 0.06275
-    carried = (3.0 + 100.0 * away_phi, -20.0 + 800.0 * away_theta)
+    carried = (3.0 + 100.0 * (0.25 - q[0]), -20.0 + 800.0 * (-1.0 - q[1]))
     expected = msgspec.structs.replace(
         s,
-        q_ref=(q[0] if far[0] else 0.0, q[1] if far[1] else 0.0),
+        q_ref=(q[0] if far[0] else 0.25, q[1] if far[1] else -1.0),
         tau_ff=(carried[0] if far[0] else 3.0, carried[1] if far[1] else -20.0),
     )
     assert near == expected

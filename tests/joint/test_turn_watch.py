@@ -25,6 +25,7 @@ from shared.bus.messages import Pair
 from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_MS, NS_PER_S
 
+T_NS = NS_PER_S
 PERIOD_NS = 2 * NS_PER_MS
 BANDWIDTH = 2000.0
 
@@ -165,6 +166,24 @@ def test_a_position_is_at_the_encoders_0_within_three_counts_on_either_side(turn
     assert not TurnWatch().is_zero(-1.0), "it is not known where"
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_an_idle_axis_that_jumps_has_moved_until_its_encoders_0_is_told(axis: int) -> None:
+    samples, at = JointEstimate(17.5), [0.0, 0.0]
+
+    def take(t_ns: int, zero: Pair | None = None) -> bool:
+        pos = (at[0], at[1])
+        reading = DriveReading(t_ns, pos, (0.0, 0.0), DriveStatus.IDLE, 0, None, zero)
+        samples.take(reading, armed=False)
+        return samples.moved
+
+    assert not take(T_NS, (0.1, 0.1))
+    assert not take(T_NS + PERIOD_NS)
+    at[axis] = 3.0
+    for cycle in (2, 3):
+        assert take(T_NS + cycle * PERIOD_NS), "as long as it is not known why"
+    assert not take(T_NS + 4 * PERIOD_NS, (0.4, 0.4))
+
+
 @pytest.mark.parametrize("armed", [True, False])
 def test_a_failed_encoder_lacks_turns_until_the_drive_has_no_zero(armed: bool) -> None:
     axis = Axis(0.0, 0.0)
@@ -177,8 +196,6 @@ def test_a_failed_encoder_lacks_turns_until_the_drive_has_no_zero(armed: bool) -
 
 
 # ---- one watch by itself
-
-T_NS = NS_PER_S
 
 
 def rested(slowest: float, fastest: float, rested_ns: int) -> TurnWatch:
@@ -213,7 +230,7 @@ def test_a_jump_after_a_rest_is_possible_as_far_as_the_motor_can_have_gone(
     blind_s = 1e-3 * rested_ms + PERIOD_NS / NS_PER_S
     if isinstance(bounds, str):  # half a turn a second at least, or at most: nearly no way at all
         room = ACCELERATION * (blind_s + SETTLES_S) / 2.0 + FADES * SETTLES_S
-        several = [(room + 0.5, room + 0.6), (-room - 0.6, -room - 0.5)]
+        several = [(room + 0.5, room + 0.6), (-room - 0.6, 0.5 - room)]
     else:
         several = [bounds]
     for slowest, fastest in several:

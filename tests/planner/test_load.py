@@ -140,8 +140,11 @@ def test_a_robot_that_is_led_and_falls_shows_nothing(load: Load) -> None:
     assert not load.refused
 
 
-def test_one_that_is_led_already_does_not_hang(load: Load) -> None:
-    bears(load, 0.3, DT, led=True)
+@pytest.mark.parametrize(("share", "led"), [(0.3, True), (0.5, False)])
+def test_one_that_is_led_already_or_bears_half_of_it_does_not_hang(
+    load: Load, share: float, led: bool
+) -> None:
+    bears(load, share, DT, led=led)
     assert not load.refused
 
 
@@ -162,6 +165,24 @@ def test_weighing_is_reported_while_it_lasts(load: Load) -> None:
         bears(load, 1.0, DT)
     bears(load, 1.0, DT)
     assert load.refusal() == "its load is being weighed"
+
+
+def test_its_load_is_weighed_from_when_it_is_within_the_limits(load: Load) -> None:
+    bears(load, 0.3, DT)
+    bears(load, 0.85, 3.0)
+    while load.state.refused:
+        bears(load, 1.0, DT)
+    bears(load, 1.0, WEIGHING_S - 2 * DT)
+    assert load.refused
+    bears(load, 1.0, 2 * DT)
+    assert not load.refused
+
+
+def test_a_refused_load_of_a_robot_that_never_hung_is_accepted_without_weighing(load: Load) -> None:
+    found(load, 10.0)
+    while load.state.refused:
+        found(load, 0.0, seconds=DT)
+    assert not load.refused
 
 
 def test_one_that_is_taken_up_while_it_holds_is_weighed_again(load: Load) -> None:
@@ -201,8 +222,8 @@ def test_without_a_harness_one_that_hangs_is_weighed_until_it_stands(load: Load)
     assert load.refused, "a moment on its feet is none"
     for _ in range(250):
         load.advance_without_harness(WEIGHT, DT, led=False)
-    for _ in range(250):
-        load.advance_without_harness(0.1 * WEIGHT, DT, led=False)
+    for dt in (DT, 10.0):
+        load.advance_without_harness(0.1 * WEIGHT, dt, led=False)
     assert (load.refused, load.state.kg) == (False, 0.0), "what a hand lifts afterwards"
 
 

@@ -99,6 +99,7 @@ def test_a_wrench_is_taken_up_to_what_the_cells_together_can_carry(robot: RobotC
         ((0.0, 0.0, 1.2), 0.0, True, False),
         ((0.0, 0.0, 0.0), 0.0, True, False),
         ((0.0, 0.0, 0.0), 0.0, False, True),
+        ((0.0, 0.0, 1.1), 0.0, False, True),
         ((0.0, 0.0, 1.2), 0.0, False, False),
         ((1e300, 0.0, 0.0), 0.0, False, False),
         ((0.0, 0.0, 1.0), TURN_MAX, True, True),

@@ -225,6 +225,10 @@ def test_the_first_trip_is_reported(robot: RobotConfig) -> None:
     go_on(trips, beyond(robot, Trip.REACH), range(100, 200))
     assert trips.state.tripped is Trip.LEGS
     assert PLANNER_TRIPS[Trip.LEGS].measured in trips.state.why
+    trips = go_on(led(robot), beyond(robot, TRIPS[-1]), range(100))
+    for tick in range(100, 200):  # it should lead no more, and what comes is first in the table
+        trips.advance(T0 + tick * TICK_NS, beyond(robot, TRIPS[0]), leads=True)
+    assert trips.state.tripped is TRIPS[-1]
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
