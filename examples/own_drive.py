@@ -1,4 +1,4 @@
-"""Write your own drive driver: the six methods of `Drive`, here on a motor simulated in place.
+"""Write your own drive driver: the methods of `Drive`, here on a motor simulated in place.
 
 A joint service needs nothing else (docs/drives.md#add-a-drive). `read` waits for the next sample
 and never raises; a lost link is `DriveStatus.LOST`. Run it: python examples/own_drive.py
@@ -52,6 +52,9 @@ class BenchDrive:
         """Close the loop on both axes; this motor knows one kind of loop."""
         del onboard
         self._armed = True
+
+    def clear_errors(self) -> None:
+        """Clear errors; this motor has none."""
 
     def idle(self) -> None:
         """Open the loop: the motors give no torque."""

@@ -16,7 +16,7 @@ from shared.exceptions import RunError
 from shared.mcap_log.writer import FilePlace, MessageSource, RunWriter
 
 CAPACITY: Final = 65_536
-"""Messages that may wait while the disk is slow: 13 s of the fleet."""
+"""Messages that may wait while the disk is slow: 16 s of the fleet."""
 
 SLICE: Final = 8_192
 """Messages of a snapshot written in one cycle; the bus is emptied in between."""

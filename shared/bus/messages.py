@@ -308,7 +308,8 @@ class JointState(Message, frozen=True):
     drive_error: Int64
     """Error bits of both axes, or-ed; 0 if none."""
     stiffened: bool = False
-    """True while this module holds with all of its support gains because another may be limp."""
+    """True while this module holds with, or rises to, all of its support gains: another may be
+    limp."""
     outside: Int64 = 0
     """Part of the newest command that lies outside the envelope; 0 if none."""
     state_phase: Int64 = 0

@@ -25,6 +25,7 @@ class MassConfig(Section, frozen=True):
     battery: Mass
     payload: Mass
     payload_max: Mass
+    """The largest `payload` that the file may name."""
     payload_com: tuple[PayloadPlace, PayloadPlace, PayloadPlace] = (0.0, 0.0, 0.0)
     """Centre of the payload, m, torso axes, from the torso's origin: `xrl drive identify`."""
 
@@ -409,13 +410,15 @@ class SupplyConfig(Section, frozen=True):
     low_v: SupplyVoltage = 0.0
     """Below it the person is told."""
     sit_v: SupplyVoltage = 0.0
-    """Below it the robot goes down by itself: well above `config.dc_bus_undervoltage_trip_level` of
-    the drives, and above what the battery's own electronics switch off at."""
+    """Below it a robot that is led goes down by itself, if its supply was once above `low_v`: well
+    above `config.dc_bus_undervoltage_trip_level` of the drives, and above what the battery's own
+    electronics switch off at."""
 
 
 LOST_S: Final = 0.1
-"""Silence after which a drive without a watchdog is lost, s. In DAMP a knee whose fellow has been
-silent for that time holds, whatever the watchdog (`services.joint.neighbours`)."""
+"""Silence after which a drive without a watchdog is lost, s. In DAMP a knee holds beside any module
+of its host that has been silent for that time, whatever the watchdog
+(`services.joint.neighbours`)."""
 
 
 class DriveConfig(Section, frozen=True):

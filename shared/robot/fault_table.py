@@ -161,8 +161,9 @@ LOSSES: Final[dict[str, LossRow]] = {
         "automatic: a new file; the old one is readable as far as it was flushed",
     ),
     "emergency stop": LossRow(
-        "DAMP: knees sink slowly, hips keep the torso's attitude, ankles and frontal axes hold; "
-        "beside a dead or limp knee or a limp ankle all hold where they are",
+        "DAMP: knees sink slowly, hips keep the torso's attitude, ankles keep the hips above the "
+        "feet, frontal axes hold; beside any module of the host that does not go down with them "
+        "all hold where they are",
         "the same",
         "`xrl status`: DAMP because ESTOP",
         "restart the joint services",

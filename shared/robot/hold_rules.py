@@ -13,14 +13,14 @@ from shared.joints import MODULES, kind_of
 class Support(IntEnum):
     """Which modules stiffen when another one is limp.
 
-    HOLD leaves the theta of hips and knees as soft as the planner had them, because the hand leads
-    on (`RobotConfig.hold_gains`). On these gains a leg with a limp knee folds: it fell at every
-    phase of the squat. With every gain at its stand gain the thigh is fixed to the torso and the
-    leg stands as a strut: none fell (`tests/lockstep/test_faults.py`), nor through pushes of 30 N.
-    In the crawl, under the hand's 60 N m of pitch, it stands, with little left for a push forwards:
-    20 N stood, 30 N fell. The hips then have gains of their own
-    (`joint_service.limp_leg_hip_theta`): on their stand gains the torso turned by up to 0.9 rad
-    once the hand let go, and straight legs fell.
+    HOLD leaves the theta of hips as soft as the planner had them, because the hand leads on
+    (`RobotConfig.hold_gains`); before it stiffened the knees it left theirs, too. On those gains a
+    leg with a limp knee folds: it fell at every phase of the squat. With every gain at its stand
+    gain the thigh is fixed to the torso and the leg stands as a strut: none fell
+    (`tests/lockstep/test_faults.py`), nor through pushes of 30 N. In the crawl, under the hand's 60
+    N m of pitch, it stands, with little left for a push forwards: 20 N stood, 30 N fell. The hips
+    then have gains of their own (`joint_service.limp_leg_hip_theta`): on their stand gains the
+    torso turned by up to 0.9 rad once the hand let go, and straight legs fell.
 
     A limp ankle leaves one sole to stand on. Stiff hips would hand it the hand's 60 N m of pitch;
     stiff knees alone keep the legs from giving. Fell, of 12 each with and without pushes of 30 N:

@@ -3,7 +3,8 @@
 Firmware 0.5.6: a filter of the motor's electrical power less its copper losses goes on with the
 last value of before, while that of the mechanical power follows the torque that the controller
 would give. So an axis that was lifting, and sinks now, brakes with power: a spinout, in IDLE. Armed
-emulated motors have both powers equal, because their windings do not warm: none spins out. Pure.
+emulated motors have both powers equal, as both are taken without the copper loss: none spins out.
+Pure.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Dynamic certificate: the sampled-data loop is stable on flexible joints. Offline and pure.
 
 The static certificate (`services.planner.law.certificate`) requires stiffness. This one requires
-that no motion of `tools.lab.design.sampled_loop` grows. It covers every pose of the schedule, and
-every drivetrain (`robustness.stiffness`), hand and delay of the robot file:
+that no motion of `tools.lab.design.sampled_loop` grows. It covers thirteen heights of the schedule,
+upright and pitched by 1.2 rad, and every drivetrain (`robustness.stiffness`), hand and delay of the
+robot file:
 
 - with every feedback torque, and with tau_coupled alone, scaled by `gain_margin`;
 - with the delay scaled by `delay_margin`, also while F_I is at its limit;

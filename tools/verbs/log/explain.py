@@ -298,9 +298,11 @@ def show(robot: RobotConfig, found: TorqueBreakdown, console: Console) -> None:
     console.print(f"K_q's eigenvalues: {eigenvalues[0]:.0f} .. {eigenvalues[-1]:.0f} N m/rad")
     console.print()
     console.print(_gains(found))
+    onboard = robot.joint_service.loop == "onboard"
     console.print(
-        "The drive gets torques only; what its own loop would hold with is D averaged over "
-        "each module.",
+        "Each drive's own loop holds with D averaged over its module; the rest goes in as torque."
+        if onboard
+        else "The drives get torques only.",
         style="dim",
     )
     console.print(f"local gains: {SPLIT_DESCRIPTION[found.local.source]}")

@@ -76,10 +76,10 @@ your own clock. Late messages go at once.
 
 Keys: xrl/<robot>/x becomes {PREFIX}/xrl/<robot>/x, which no service subscribes to. With
 --prefix "" it is xrl/<robot>/x itself. What a robot acts on (joint states and commands,
-harness wrench and tare, attitude, operator intent, estop, sim/control) is then refused while a
-joint service is on the bus. --force puts tare, intent, estop and sim/control anyway;
-states, commands, wrenches and attitudes would move the robot, and are never put beside a live
-drive.
+harness wrench and tare, attitude, operator intent and hand, estop, sim/control) is then
+refused while a joint service is on the bus. --force puts tare, intent, hand, estop and
+sim/control anyway; states, commands, wrenches and attitudes would move the robot, and are
+never put beside a live drive.
 
 Subscribers dial the player at --listen:
   open_session(robot, "mine", run_dir, connect=["{LISTEN}"])
