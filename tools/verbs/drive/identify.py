@@ -107,7 +107,7 @@ class JointFlags(MotionFlags):
     axis: Annotated[str | None, Arg(choices=AXES)] = None
     """only this one (default: both)"""
     torque: Annotated[float, Range(1e-3, FINITE_MAX, "N m")] = 15.0
-    """of the sines; the torque that holds a bent leg is added to it"""
+    """amplitude of the sine motions; a bent leg's static load is added"""
     apply: bool = False
     """write what changes into the robot file, after a backup of it"""
     out: Folder | None = None
