@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.fleets import command
+from tests.system.fleets import command, wait_for
 from tools import cli
 
 pytestmark = pytest.mark.system
@@ -26,6 +26,9 @@ def test_a_fleet_that_was_started_with_umask_0_leaves_nothing_to_others(
     script = 'umask 0; exec "$@"'
     try:
         subprocess.run(["bash", "-c", script, "-", *words], check=True, timeout=90)
+        # "up" is a service that listens; what else it opens follows, on a busy machine later
+        opened = (run_dir / "ankle_right.rearm", run_dir / "joints.near")
+        assert wait_for(lambda: all(path.exists() for path in opened) and any(out.glob("*.mcap")))
         found = [run_dir, *run_dir.rglob("*"), *(set(SHARED_MEMORY.iterdir()) - before)]
         modes = {str(path): stat.S_IMODE(path.lstat().st_mode) for path in found}
         assert {path.suffix for path in found} >= {".rearm", ".near", ".log"}
