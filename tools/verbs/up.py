@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 from pathlib import Path
@@ -152,24 +153,27 @@ def run(flags: UpFlags) -> int:
         overrides["ros2_gateway"] = _ros2_words(flags, robot)
     if services is not None:
         overrides = {name: words for name, words in overrides.items() if name in services}
-    recorders = {"recorder", HOST_RECORDER}
+    recorders, made = {"recorder", HOST_RECORDER}, not out.exists()
     if services is None or recorders & set(services):
         _make_record_folder(out, must=not flags.disarmed)
     not_started = flags.no_planner and (services is None or "planner" in services)
-    fleet = SupervisedFleet.start(
-        flags.config,
-        flags.run_dir,
-        FleetOptions(
-            overrides=overrides,
-            services=services,
-            not_started=("planner",) if not_started else (),
-            simulation=not flags.no_sim,
-            injected=flags.injectable,
-            ros2=flags.ros2,
-            pace=flags.pace,
-            disarmed=flags.disarmed,
-        ),
+    options = FleetOptions(
+        overrides=overrides,
+        services=services,
+        not_started=("planner",) if not_started else (),
+        simulation=not flags.no_sim,
+        injected=flags.injectable,
+        ros2=flags.ros2,
+        pace=flags.pace,
+        disarmed=flags.disarmed,
     )
+    try:
+        fleet = SupervisedFleet.start(flags.config, flags.run_dir, options)
+    except BaseException:
+        if made:
+            with contextlib.suppress(OSError):  # it has a record, or was never made
+                out.rmdir()
+        raise
     warn_of_others(Console(), own=fleet.run.path)
     up = len(fleet.manifest.services) - not_started
     record = f", record: {out}" if recorders & set(fleet.manifest.services) else ""

@@ -64,13 +64,20 @@ def test_where_nobody_looks_on_a_robot_starts_without_its_record(
 
 
 @pytest.mark.parametrize(("service", "recorded"), [("recorder", True), ("planner", False)])
-def test_a_host_without_a_recorder_gets_no_folder_for_a_record(
+def test_a_host_without_a_recorder_gets_no_folder_for_a_record_and_no_failed_start_leaves_one(
     service: str, recorded: bool, run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    out, made = tmp_path / "out", []
+
     def fail(*_: object) -> None:
+        made.append(out.exists())
         raise FleetError("it is not to be started here")
 
     monkeypatch.setattr(SupervisedFleet, "start", fail)
-    out = tmp_path / "out"
-    assert exit_code(["up", "--run-dir", run_dir, "--out", out, "--only", service]) == 2
-    assert out.exists() is recorded
+    words = ["up", "--run-dir", run_dir, "--out", out, "--only", service]
+    assert exit_code(words) == 2
+    assert made == [recorded]
+    assert not out.exists()
+    out.mkdir()  # somebody else's stays
+    assert exit_code(words) == 2
+    assert out.exists()
