@@ -6,6 +6,7 @@ from pathlib import Path
 
 from services.harness.filter import WrenchFilter
 from services.harness.loop import HarnessLoop
+from services.harness.zero_file import ZeroFile
 from shared import process
 from shared.bus import topics
 from shared.bus.messages import TareRequest, Wrench
@@ -29,7 +30,8 @@ def made(config: RobotConfig, run_dir: Path) -> SensorService:
 
     def loop_on(session: Session) -> HarnessLoop:
         wrenches = session.publisher(topics.WRENCH, Wrench)
-        return HarnessLoop(sensor, law, wrenches, session.latest(topics.HARNESS_TARE, TareRequest))
+        requests = session.latest(topics.HARNESS_TARE, TareRequest)
+        return HarnessLoop(sensor, law, wrenches, requests, ZeroFile(run_dir))
 
     return SensorService(harness.rate_hz, sensor, loop_on, "finite")
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from services.harness.filter import FilterState, WrenchFilter, start_tare
-from shared.bus.messages import TareRequest, Vector6, Wrench
+from services.harness.filter import FilterState, WrenchFilter, start_tare, tared_state
+from services.harness.zero_file import ZeroFile
+from shared.bus.messages import Tare, TareRequest, Vector6, Wrench
 from shared.bus.ports import Inbox, Outbox
 from shared.can.sensor_loop import Sensor, SensorLoop
 
 
 class HarnessLoop(SensorLoop[Vector6, Wrench]):
-    """One cycle of the service; begins with a tare."""
+    """One cycle of the service; begins with a tare, or with the zero of the service before it."""
 
     def __init__(
         self,
@@ -17,10 +18,13 @@ class HarnessLoop(SensorLoop[Vector6, Wrench]):
         law: WrenchFilter,
         publisher: Outbox[Wrench],
         requests: Inbox[TareRequest],
+        zero: ZeroFile | None = None,
     ) -> None:
         super().__init__(sensor, publisher)
-        self.state = FilterState()
-        self._law, self._requests = law, requests
+        self._law, self._requests, self._zero = law, requests, zero
+        kept = None if zero is None else zero.read(law.force_max)
+        self.state = FilterState() if kept is None else tared_state(kept)
+        self._kept = kept is not None
 
     @property
     def refused(self) -> int:
@@ -35,6 +39,10 @@ class HarnessLoop(SensorLoop[Vector6, Wrench]):
         if self._requests.take() is not None:
             self.state = start_tare(self.state)
         self.state, reading = self._law.step(self.state, now_ns, sample)
+        done = self.state.tare is Tare.DONE
+        if self._zero is not None and done is not self._kept:
+            self._kept = done
+            self._zero.write(self.state.offset if done else None)
         fx, fy, fz, mx, my, mz = reading.wrench.tolist()
         return Wrench(
             t_ns=now_ns,

@@ -100,6 +100,8 @@ class Trip(IntEnum):
     """A sole is loaded near its edge: the robot is leaned on from the side."""
     TIPPING = 11
     """A sole is loaded at its edge: the robot is shoved from the side."""
+    OFF_BALANCE = 12
+    """The COM is far ahead of or behind where the law holds it."""
 
 
 class Outside(IntEnum):

@@ -305,6 +305,7 @@ class TripsConfig(Section, frozen=True):
     unattended: TripLimit = TripLimit(limit=0.03, after_ms=20.0)
     edge: TripLimit = TripLimit(limit=0.8, after_ms=200.0)
     tipping: TripLimit = TripLimit(limit=0.95, after_ms=20.0)
+    balance: TripLimit = TripLimit(limit=0.045, after_ms=20.0)
 
 
 Celsius = Annotated[float, Range(-40.0, 200.0, "C")]

@@ -87,6 +87,10 @@ PLANNER_TRIPS: Final[dict[Trip, TripRow]] = {
         "tipping", "a sole is loaded at its edge, sideways", "of its half width",
         "do not shove it from the side: it leads again a second later",
     ),
+    Trip.OFF_BALANCE: TripRow(
+        "balance", "its COM is ahead of or behind where it is held", "m",
+        "do not push it: it leads again a second later; if nobody pushes, xrl kill planner",
+    ),
 }  # fmt: skip
 """By the planner, while it leads. It leads again once all is within its limits for a second."""
 

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from services.harness.filter import WrenchFilter
 from services.harness.loop import HarnessLoop
+from services.harness.zero_file import ZeroFile
 from shared.bus.codec import encode
 from shared.bus.messages import TareRequest, Vector6, Wrench
 from shared.clock import NS_PER_MS, NS_PER_S
@@ -72,9 +73,11 @@ class Asked:
         return TareRequest(t_ns=0, seq=0, source="a test") if asked else None
 
 
-def make_loop(asked: Asked | None = None) -> tuple[HarnessLoop, ScriptedSensor, Sink]:
+def make_loop(
+    asked: Asked | None = None, zero: ZeroFile | None = None
+) -> tuple[HarnessLoop, ScriptedSensor, Sink]:
     sensor, sink = ScriptedSensor(), Sink()
-    return HarnessLoop(sensor, WrenchFilter(HARNESS), sink, asked or Asked()), sensor, sink
+    return HarnessLoop(sensor, WrenchFilter(HARNESS), sink, asked or Asked(), zero), sensor, sink
 
 
 def cycles(loop: HarnessLoop, t_ns: int, count: int) -> tuple[Wrench, int]:

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from services.harness.zero_file import ZeroFile
 from services.simulator.fronts.sensor_fronts import BIAS_MAX, HarnessFront
 from shared.bus.codec import Decoder
 from shared.bus.messages import Tare, Wrench
@@ -74,6 +75,44 @@ def test_a_tare_on_request_makes_the_present_wrench_the_zero_and_is_reported_unt
     assert (message.valid, message.tare) == (True, Tare.DONE)
     message, _ = cycles(loop, t_ns, 10)
     np.testing.assert_allclose([*message.force, *message.moment], 0.0, atol=1e-9)
+
+
+def test_a_service_that_restarts_under_a_load_goes_on_from_the_zero_before_it(
+    tmp_path: Path,
+) -> None:
+    load = (3.0, 0.0, -100.0, 0.0, 5.0, 0.0)
+    loop, sensor, _ = make_loop(zero=ZeroFile(tmp_path))
+    sensor.forces = legs((0.0, 0.0, 12.0, 0.0, 0.0, 0.0))  # the cells' own zero
+    _, t_ns = cycles(loop, T0, TARE_CYCLES + 1)
+    successor, sensor, _ = make_loop(zero=ZeroFile(tmp_path))
+    sensor.forces = legs(np.add(load, (0.0, 0.0, 12.0, 0.0, 0.0, 0.0)))
+    message, _ = cycles(successor, t_ns, 200)
+    assert (message.valid, message.tare) == (True, Tare.DONE)
+    np.testing.assert_allclose([*message.force, *message.moment], load, atol=1e-3)
+
+
+def test_a_service_that_ends_in_a_tare_that_was_asked_for_leaves_it_to_the_next(
+    tmp_path: Path,
+) -> None:
+    asked = Asked()
+    loop, _, _ = make_loop(asked, ZeroFile(tmp_path))
+    _, t_ns = cycles(loop, T0, TARE_CYCLES + 1)
+    asked.asked = True
+    _, t_ns = cycles(loop, t_ns, 10)
+    successor, sensor, _ = make_loop(zero=ZeroFile(tmp_path))
+    sensor.forces = legs((0.0, 0.0, 30.0, 0.0, 0.0, 0.0))
+    message, t_ns = cycles(successor, t_ns, TARE_CYCLES)
+    assert (message.valid, message.tare) == (False, Tare.RUNNING)
+    message, _ = cycles(successor, t_ns, 10)
+    np.testing.assert_allclose([*message.force, *message.moment], 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, 1.01 * HARNESS.leg_force_max])
+def test_a_zero_that_no_cell_can_have_read_is_none(tmp_path: Path, wrong: float) -> None:
+    zero = ZeroFile(tmp_path)
+    assert zero.read(HARNESS.leg_force_max) is None, "an empty file has none"
+    zero.write(np.array((0.0, 1.0, 2.0, 3.0, 4.0, wrong)))
+    assert ZeroFile(tmp_path).read(HARNESS.leg_force_max) is None
 
 
 def test_a_repeated_request_does_not_delay_the_running_tare() -> None:

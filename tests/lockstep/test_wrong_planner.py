@@ -123,6 +123,15 @@ def test_it_stands_though_a_planner_whose_reference_drifts_leads_again_and_again
     assert not end(robot, begins[moment], f"q_ref of {module} theta drifts", 3.0).fell
 
 
+@pytest.mark.parametrize(("rate", "moment"), [("+0.1", 1), ("-0.1", 2)])
+def test_a_reference_that_drifts_as_its_rate_says_trips_before_the_com_is_over_the_toes(
+    robot: RobotConfig, begins: list[Begin], rate: str, moment: int
+) -> None:
+    """Without `trips.balance` both fall: no module can see what is wrong."""
+    name = f"q_ref of ankle_right theta drifts and says so, {rate} rad/s"
+    assert not end(robot, begins[moment], name, 3.0).fell
+
+
 def test_without_the_envelope_it_falls(robot: RobotConfig, begins: list[Begin]) -> None:
     """A robot that stands here would prove nothing above, where this planner is the first."""
     assert NAMES[0] == "q_ref of all negative"

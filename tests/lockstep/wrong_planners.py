@@ -66,6 +66,8 @@ def _all() -> Iterator[tuple[str, Fault]]:
             for offset in OFFSETS if index < N_MODULES // 2 else OFFSETS[1::2]:
                 yield f"q_ref of {module} {joint} off by {offset:g} rad", _off(index, axis, offset)
             yield f"q_ref of {module} {joint} drifts", _drifting(index, axis, 0.3)
+    for rate in (0.1, -0.1):
+        yield f"q_ref of ankle_right theta drifts and says so, {rate:+g} rad/s", _told(0, 1, rate)
     for a, b in ((0, 3), (1, 4), (2, 5), (0, 1), (1, 2), (0, 2)):
         yield f"{MODULES[a]} and {MODULES[b]} swapped", _swapped(a, b)
     yield "legs swapped", lambda commands, _tick: [*commands[3:], *commands[:3]]
@@ -138,6 +140,18 @@ def _drifting(module: int, axis: int, rate: float, most: float = 2.0) -> Fault:
         return (pair[0], pair[1] + away) if axis else (pair[0] + away, pair[1])
 
     return _each("q_ref", change)
+
+
+def _told(module: int, axis: int, rate: float) -> Fault:
+    """Move a reference away, and add the rate to that of the command."""
+
+    def change(index: int, pair: Pair, _tick: int) -> Pair:
+        if index != module:
+            return pair
+        return (pair[0], pair[1] + rate) if axis else (pair[0] + rate, pair[1])
+
+    away = _drifting(module, axis, abs(rate), math.copysign(2.0, rate))
+    return _both(away, _each("v_ref", change))
 
 
 def _swapped(a: int, b: int) -> Fault:

@@ -238,13 +238,15 @@ def test_each_value_is_the_tables(joint: int, sign: float) -> None:
     q[joint] = 0.2 * sign
     pdot = np.array((0.1, 0.2, 0.3 * sign, 0.4, 0.5 * sign, 0.6))
     output = output_of(0.0)._replace(
-        closure=np.array((0.01, -0.02, 0.02, 9.0, 9.0, 9.0)), ik_residual=0.004, pdot=pdot
-    )
+        closure=np.array((0.01, -0.02, 0.02, 9.0, 9.0, 9.0)), ik_residual=0.004, pdot=pdot,
+        p=np.array((0.02 * sign, *5 * [0.3])), p_ref=np.array((-0.01 * sign, *5 * [9.0])),
+    )  # fmt: skip
     values = values_of(output, q, (90.0, 80.0), 0.6, None, 0.0, 0.07, leads=True)
     expected = {
         Trip.LEGS: 0.03, Trip.REACH: 0.004, Trip.TRACKING: 0.2, Trip.UNLOADED: 80.0,
         Trip.SINKING: 0.3, Trip.TURNING: 0.5, Trip.HARNESS: math.nan, Trip.SAGGING: math.nan,
         Trip.UNATTENDED: 0.07, Trip.EDGE: 0.6, Trip.TIPPING: 0.6,
+        Trip.OFF_BALANCE: 0.03,
     }  # fmt: skip
     assert values == pytest.approx([expected[trip] for trip in TRIPS], nan_ok=True)
 
@@ -266,7 +268,7 @@ def test_a_watch_restored_from_before_there_was_a_trip_counts_it_from_now_on(
     old.since_ns = old.since_ns[:-1]
     trips.restore(old)
     assert set(trips.state.since_ns) == {0}
-    assert go_on(trips, beyond(robot, Trip.TIPPING), range(1000)).state.tripped is Trip.TIPPING
+    assert go_on(trips, beyond(robot, TRIPS[-1]), range(1000)).state.tripped is TRIPS[-1]
 
 
 # ---- how far out its soles bear it

@@ -14,6 +14,7 @@ from typing import Final
 
 import msgspec
 
+from services.harness import zero_file
 from services.joint import neighbours, rearm_guard
 from services.joint.rearm_guard import LastState, RearmGuard
 from services.simulator.fronts import usb_standin
@@ -198,10 +199,13 @@ class RunDir:
                     guard.write(LastState.HELD)
 
     def _remove_shared_memory(self, *, keep_stops: bool) -> None:
-        """Remove what an earlier fleet shared; its rearm guards only where a person asks."""
-        for module in () if keep_stops else MODULES:
-            rearm_guard.path_of(self.path, module).unlink(missing_ok=True)
+        """Remove what an earlier fleet shared; what outlives a crash only where a person asks."""
         neighbours.path_of(self.path).unlink(missing_ok=True)
+        if keep_stops:
+            return
+        zero_file.path_of(self.path).unlink(missing_ok=True)
+        for module in MODULES:
+            rearm_guard.path_of(self.path, module).unlink(missing_ok=True)
 
     def read_manifest(self) -> Manifest | None:
         """Return the manifest of the fleet that is or was up here, or None."""

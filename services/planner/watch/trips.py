@@ -16,6 +16,8 @@ robot file):
     edge       a sole's centre of pressure is near its edge (`services.planner.watch.soles`)
     tipping    it is at its edge: a shove of 110 N for 0.3 s, on the way into the crawl, had tipped
                the sole before `edge` counted
+    balance    the COM is ahead of or behind where it is held: references that drift take it there,
+               each as its rate says, so that no joint service sees what is wrong
 
 The trips are checked while the planner is engaged. `unloaded` counts only once both legs have
 carried the torso, because on the hoist neither does. `sagging` counts only after the person has
@@ -167,6 +169,7 @@ def values_of(
         0.0 if moves else drift,
         edge,
         edge,
+        abs(float(output.p_ref[0] - output.p[0])),
     )
 
 
