@@ -31,7 +31,7 @@ from tools.bringup.boards import FoundBoards
 from tools.bringup.can_monitor import bus_config, listen
 from tools.flags import Arg, Flags, FleetRobotFlags
 from tools.fleet import procfs
-from tools.fleet.process_table import SIMULATED_CAN, FleetOptions, is_simulated
+from tools.fleet.process_table import FleetOptions, is_simulated, refuse_half_emulated
 from tools.fleet.run_dir import RunDir
 from tools.fleet.supervise import SupervisedFleet
 
@@ -146,24 +146,6 @@ def check_plants(robot: RobotConfig, run_dir: Path, plants: Sequence[str]) -> No
     scratch = Settings()
     for words in plants:
         preset(scratch, words)
-
-
-def refuse_half_emulated(robot: RobotConfig) -> None:
-    """Refuse a robot file some of whose buses are emulated and others real.
-
-    One bus that was forgotten would make its USB the emulated one: emulated drives are as wanted.
-    """
-    emulated = {name: robot.can[name].interface == SIMULATED_CAN for name in sorted(robot.buses)}
-    if len(set(emulated.values())) > 1:
-        some, real = (
-            ", ".join(f"[can.{name}]" for name, is_so in emulated.items() if is_so == wanted)
-            for wanted in (True, False)
-        )
-        raise FleetError(
-            f"robot file: {some} {'are' if ',' in some else 'is'} emulated "
-            f'(interface = "{SIMULATED_CAN}"), {real} not: which drives are meant? Make '
-            "all of them real ones, or all emulated"
-        )
 
 
 @contextlib.contextmanager

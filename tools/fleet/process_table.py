@@ -149,6 +149,8 @@ def make_plan(config_path: Path, run_dir: Path, options: FleetOptions) -> FleetP
     """Return the processes to start; refuse what cannot be started here."""
     path = Path(os.path.abspath(config_path))  # noqa: PTH100 - symlinks stay as they were given
     config = load(path)
+    if options.simulation:
+        refuse_half_emulated(config)
     table = load_table(options.table_path)
     rows = _selected(table, config, options)
     _check_lengths(run_dir, _listeners(table.process, config, run_dir))
@@ -251,6 +253,24 @@ def is_simulated(config: RobotConfig) -> bool:
     is started with `simulation=False` (`xrl up --no-sim`). Then a service looks on the real USB.
     """
     return any(config.can[name].interface == SIMULATED_CAN for name in config.buses)
+
+
+def refuse_half_emulated(robot: RobotConfig) -> None:
+    """Refuse a robot file some of whose buses are emulated and others real.
+
+    One bus that was forgotten would make its USB the emulated one: emulated drives are as wanted.
+    """
+    emulated = {name: robot.can[name].interface == SIMULATED_CAN for name in sorted(robot.buses)}
+    if len(set(emulated.values())) > 1:
+        some, real = (
+            ", ".join(f"[can.{name}]" for name, is_so in emulated.items() if is_so == wanted)
+            for wanted in (True, False)
+        )
+        raise FleetError(
+            f"robot file: {some} {'are' if ',' in some else 'is'} emulated "
+            f'(interface = "{SIMULATED_CAN}"), {real} not: which drives are meant? Make '
+            "all of them real ones, or all emulated"
+        )
 
 
 def check_known(names: Iterable[str], known: Collection[str]) -> None:

@@ -21,5 +21,3 @@ def test_a_robot_file_with_one_bus_forgotten_never_finds_emulated_drives_right(
     with pytest.raises(FleetError, match=r"\[can\.harness\] is emulated"), drives:
         pass
     assert not (tmp_path / "r").exists()
-    drive_access.refuse_half_emulated(robot)
-    drive_access.refuse_half_emulated(real)

@@ -83,6 +83,17 @@ def test_drives_on_socketcan_are_no_simulation(tmp_path: Path) -> None:
     assert not is_simulated(load(robot_file(tmp_path, *but_imu)))
 
 
+def test_no_fleet_is_started_on_buses_of_which_one_is_emulated_and_another_real(
+    run_dir: Path, tmp_path: Path
+) -> None:
+    """Its simulator would stand beside real drives."""
+    one = "[can.harness]\ninterface = "
+    half = robot_file(tmp_path, REAL, (one + REAL[1], one + REAL[0]))
+    with pytest.raises(FleetError, match=r"\[can\.harness\] is emulated"):
+        plan(run_dir, half)
+    assert "knee_left" in plan(run_dir, half, simulation=False).commands
+
+
 def test_drives_on_usb_are_not_looked_for_without_their_package(
     run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
