@@ -55,6 +55,8 @@ class ControllerState(msgspec.Struct, kw_only=True):
     """Torque of the drive beyond the law's when the service resumed after a gap, N m."""
     astray: Pair = (0.0, 0.0)
     """How far the tracked reference has gone another way than its rate says, rad."""
+    energy: float = 0.0
+    """Work that the coupled torque has done lately, J."""
     resumed_ns: int = 0
     last_cycle_ns: int = 0
     cause: int = 0
@@ -305,6 +307,7 @@ class JointController:
         s = self._state
         tracked = s.failsafe.command if s.failsafe.mode is _TRACK else None
         astray = self._envelope.astray(command, tracked, s.astray)
+        energy = self._envelope.energy(command, tracked, s.energy, s.estimate.v)
         outside = self._envelope.judge(
             command,
             tracked,
@@ -313,10 +316,11 @@ class JointController:
             age_s=self._law.age_s(command, now_ns),
             settled=tracked is not None and self._law.is_settled(now_ns),
             astray=astray,
+            energy=energy,
         )
         s.failsafe.offer(command, now_ns, self.timing, outside)
         if s.failsafe.command is command:
-            s.astray = astray
+            s.astray, s.energy = astray, energy
 
     def _tripped(self, now_ns: int) -> Event:
         """Return the trip of this cycle; only a module in TRACK trips."""

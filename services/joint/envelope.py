@@ -8,7 +8,9 @@ the module holds.
 
 The coupled torque answers to what the body's pose lacks, so in each module it pulls the way the
 local spring pulls. One that drives the joint away from its reference is wrong however small it is:
-ramped up together inside their bounds, those of knees and hips made the robot fall.
+ramped up together inside their bounds, those of knees and hips made the robot fall. And it acts
+where the body is held, not where it is led, so it does hardly any work on a joint that moves. One
+that does takes the robot along: ramped up in 0.3 s, knees and hips threw it off the floor.
 
 A reference comes with its rate, so an ankle's goes the way its rate says: to 0.3 mrad while a
 person leads, 20 mrad while the height follows a reference of its own or is probed. One that goes
@@ -41,6 +43,8 @@ UNSETTLED: Final = 0.5
 held off centre still moves to the reference."""
 ASTRAY_S: Final = 0.5
 """s; a way that the rate does not explain is forgotten with this time constant."""
+ENERGY_S: Final = 0.3
+"""s; work of the coupled torque is forgotten with this time constant."""
 _INSIDE: Final = Outside.NOTHING  # returned in each cycle: docs/contributing.md
 
 
@@ -60,7 +64,7 @@ class Envelope:
         self._distance, self._spring = own.q_ref_distance, own.spring_torque
         self._astray = own.q_ref_astray if kind_of(module) == "ankle" else math.inf
         self._coupled, self._dtau_ff = own.tau_coupled, own.dtau_ff
-        self._work = -own.coupled_work
+        self._work, self._energy = -own.coupled_work, own.coupled_energy
         self._step, self._rate = own.torque_step, own.torque_rate
         self._gap_s = GAP_TICKS / config.planner.rate_hz
         self._margin = (1.0 - ROUNDING) * least.margin_min
@@ -76,6 +80,7 @@ class Envelope:
         age_s: float = 0.0,
         settled: bool = True,
         astray: Pair = pd_law.ZERO,
+        energy: float = 0.0,
     ) -> Outside:
         """Return the first part of a command that lies outside.
 
@@ -89,6 +94,7 @@ class Envelope:
             age_s: time by which the reference is extrapolated, s.
             settled: True if TRACK has blended in.
             astray: `astray` of this command, rad.
+            energy: `energy` of this command, J.
         """
         bounds, c = self._bounds, command
         if bounds is None:
@@ -120,6 +126,8 @@ class Envelope:
                 return Outside.Q_REF_ASTRAY
         if not work >= self._work:
             return Outside.COUPLED_WORK
+        if not energy <= self._energy:
+            return Outside.COUPLED_ENERGY
         if last is None or last.hold or last.session != c.session:
             return _INSIDE
         most = self._step + self._rate * clamp(1e-9 * (c.t_ns - last.t_ns), 0.0, self._gap_s)
@@ -148,6 +156,24 @@ class Envelope:
             kept * before[0] + phi - last_phi - 0.5 * dt * (rate_phi + last_rate_phi),
             kept * before[1] + theta - last_theta - 0.5 * dt * (rate_theta + last_rate_theta),
         )
+
+    def energy(
+        self, command: JointCommand, last: JointCommand | None, before: float, v: Pair
+    ) -> float:
+        """Return the work that the coupled torque has done lately, J; what it took counts as none.
+
+        Args:
+            command: the received command.
+            last: the command that the module tracks; None if it does not track.
+            before: the same of the last command.
+            v: joint rates, rad/s.
+        """
+        if last is None or last.hold or last.session != command.session:
+            return 0.0
+        dt = 1e-9 * (command.t_ns - last.t_ns)
+        phi, theta = command.tau_coupled
+        kept = max(0.0, 1.0 - dt / ENERGY_S)
+        return max(0.0, kept * before + dt * (phi * v[0] + theta * v[1]))
 
     @staticmethod
     def _tau_ff_at(bounds: ModuleBounds, theta: float) -> Bounds:

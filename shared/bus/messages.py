@@ -125,6 +125,8 @@ class Outside(IntEnum):
     """The coupled torque drives the joint away from its reference."""
     Q_REF_ASTRAY = 11
     """The reference goes another way than its rate says."""
+    COUPLED_ENERGY = 12
+    """The coupled torque drives the joint along."""
 
 
 class Refusal(IntEnum):

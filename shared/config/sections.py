@@ -78,7 +78,8 @@ class ModuleConfig(Section, frozen=True):
     motor_signs: tuple[Literal[-1, 1], Literal[-1, 1]] = (1, 1)
     """-1: that motor counts down where the differential's equations have it count up."""
     serial_number: str = ""
-    """12 hexadecimal digits, as USB shows them; for `joint_service.driver = "odrive_usb"`."""
+    """12 hexadecimal digits, as USB shows them: for the driver over USB, and for what `xrl drive`
+    and `xrl doctor` read or write there."""
 
 
 LinearStiffness = Annotated[float, Range(0.0, 1e5, "N/m")]
@@ -268,6 +269,9 @@ class EnvelopeConfig(Section, frozen=True):
     coupled_work: Annotated[float, Range(0.01, 1e3, "J")] = 1.0
     """Work of the coupled torque against the joint's way to its reference. The law's is 0.1 J on
     drawn plants pushed as hard as soles and motors bear, and 0.6 J in a fall."""
+    coupled_energy: Annotated[float, Range(0.01, 1e3, "J")] = 4.0
+    """Work of the coupled torque on a module's moving joints, within some 0.3 s. The law's is 2 J
+    on drawn plants pushed with 75 % of what soles and motors bear."""
     dtau_ff: Annotated[float, Range(1.0, 1e5, "N m/s")] = 300.0
     """Largest rate of the feedforward."""
     v_ref: Annotated[float, Range(0.1, 100.0, "rad/s")] = 6.0

@@ -18,6 +18,7 @@ from services.joint.drive_manager import (
     LISTEN_NS,
     ArmingInhibit,
     DriveCommand,
+    DriveManager,
     DriveManagerState,
 )
 from services.joint.drive_setpoint import INPUT_TORQUE_SHARE
@@ -229,10 +230,26 @@ def test_an_order_to_forget_is_repeated_until_the_drive_shows_that_it_has_no_zer
     bench = marked(robot)
     bench.to(Mode.HOLD)
     bench.status, bench.error = DriveStatus.ERROR, AxisError.ENCODER_FAILED
-    orders = [step.command for step in bench.run(5 * FORGET_EVERY_NS)]
-    assert orders.count(DriveCommand.CLEAR_ZERO) == 4
+    steps = bench.run(5 * FORGET_EVERY_NS)
+    forgets = [at for at, step in enumerate(steps) if step.command is DriveCommand.CLEAR_ZERO]
+    every = FORGET_EVERY_NS // bench.cycle_ns
+    assert forgets == [every, 2 * every, 3 * every, 4 * every]
+    assert steps[every].torque == (0.0, 0.0)
     bench.status, bench.error = DriveStatus.UNZEROED, AxisError.NONE
     assert not [s for s in bench.run(NS_PER_S) if s.command is DriveCommand.CLEAR_ZERO]
+
+
+def test_a_stop_is_obeyed_at_once_where_no_drive_is_to_be_taken_over(bench: ModuleBench) -> None:
+    bench.obeys = False
+    bench.run(10 * bench.cycle_ns)
+    assert bench.mode is Mode.DISARMED
+    bench.cycle(estop=True)
+    assert bench.mode is Mode.DAMP
+
+
+def test_it_knows_on_which_bus_its_drive_is(robot: RobotConfig) -> None:
+    for row in robot.module:
+        assert DriveManager(robot, row.name).bus == row.bus
 
 
 def test_a_disarmed_drive_whose_encoder_fails_forgets_its_zero_too(robot: RobotConfig) -> None:

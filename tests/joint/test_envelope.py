@@ -11,7 +11,7 @@ import pytest
 
 from services.joint import pd_law
 from services.joint.controller import JointController
-from services.joint.envelope import ASTRAY_S, ROUNDING, Envelope
+from services.joint.envelope import ASTRAY_S, ENERGY_S, ROUNDING, Envelope
 from services.joint.failsafe import Event, Failsafe, timing_of
 from shared.bus.messages import JointCommand, Mode, Outside, Pair, Refusal
 from shared.clock import NS_PER_S
@@ -200,6 +200,41 @@ def test_the_work_of_a_coupled_torque_is_about_the_aged_reference(robot: RobotCo
     assert envelope.judge(told, None, Q, V, age_s=0.03) is Outside.COUPLED_WORK
 
 
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_the_work_of_a_coupled_torque_on_a_joint_that_moves_is_what_it_puts_in_within_its_time(
+    robot: RobotConfig, sign: float, axis: int
+) -> None:
+    """100 W: the limit of 4 J after 43 ms, and 30 J in the end; what it takes out is not banked."""
+    envelope, found = Envelope(robot, MODULE), [0.0]
+    v, tau = ((sign * 2.0, 0.0), (sign * 50.0, 0.0)) if axis == 0 else ((0.0, 2.0), (0.0, 50.0))
+    last = command(t_ns=T0, tau_coupled=tau)
+    for tick in range(1, 1000):
+        after = command(t_ns=T0 + tick * 4_000_000, seq=tick, tau_coupled=tau)
+        found.append(envelope.energy(after, last, found[-1], v))
+        last = after
+    most = robot.envelope.coupled_energy
+    assert np.searchsorted(found, most) == pytest.approx(0.043 / 4e-3, abs=1.0)
+    assert found[-1] == pytest.approx(100.0 * ENERGY_S, rel=1e-3)
+    against = (-2.0 * v[0], -2.0 * v[1])
+    assert envelope.energy(last, command(t_ns=T0), 0.0, against) == 0.0
+    late = command(t_ns=T0 + NS_PER_S, tau_coupled=pd_law.ZERO)
+    assert envelope.energy(late, command(t_ns=T0), 9.0, v) == 0.0
+    for last in (None, command(hold=True), command(session=SESSION + 1)):
+        assert envelope.energy(after, last, 9.0, v) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("share", "outside"),
+    [(1.0, Outside.NOTHING), (1.001, Outside.COUPLED_ENERGY), (math.nan, Outside.COUPLED_ENERGY)],
+)
+def test_a_coupled_torque_is_believed_up_to_its_bound_of_work(
+    robot: RobotConfig, share: float, outside: Outside
+) -> None:
+    energy = share * robot.envelope.coupled_energy
+    assert Envelope(robot, MODULE).judge(middle(robot), None, Q, V, energy=energy) is outside
+
+
 @pytest.mark.parametrize("change", [{"session": SESSION + 1}, {"hold": True}])
 def test_the_step_is_from_this_planners_lead(robot: RobotConfig, change: dict[str, Any]) -> None:
     last = msgspec.structs.replace(middle(robot), **change)
@@ -311,6 +346,33 @@ def test_a_controller_remembers_how_far_astray_its_reference_is(
         along = goes * (bench.now_ns - began_ns) / NS_PER_S
         send((Q[0], Q[1] + along))
     assert (Outside.Q_REF_ASTRAY in refused) is (goes > 0.0)
+
+
+@pytest.mark.parametrize("rate", [0.0, 2.0, -2.0])
+def test_a_controller_remembers_what_the_coupled_torque_has_put_into_its_joint(
+    robot: RobotConfig, rate: float
+) -> None:
+    """80 W for 80 ms, which is beyond its limit; in between nothing that a command alone shows."""
+    bench, refused = Bench(robot, MODULE), set[Outside]()
+    bench.q, bench.controller = Q, JointController(robot, MODULE)
+
+    def send() -> None:
+        told = middle(
+            robot, q_ref=bench.q, v_ref=bench.v, tau_coupled=(0.0, 40.0),
+            t_ns=bench.now_ns, echo_t_ns=bench.now_ns,
+        )  # fmt: skip
+        bench.seq += 1
+        bench.cycle(msgspec.structs.replace(told, seq=bench.seq))
+        refused.add(bench.controller.failsafe.outside)
+
+    bench.until(Mode.TRACK, send)
+    for _ in range(400):
+        send()
+    bench.v = (0.0, rate)
+    for _ in range(40):
+        bench.q = (bench.q[0], bench.q[1] + rate * bench.cycle_ns / NS_PER_S)
+        send()
+    assert (Outside.COUPLED_ENERGY in refused) is (rate > 0.0)
 
 
 def test_where_nothing_of_this_planner_is_tracked_nothing_is_astray(robot: RobotConfig) -> None:

@@ -118,6 +118,22 @@ def test_a_position_that_is_old_or_means_nothing_is_not_taken(
     assert samples.status is status
 
 
+@pytest.mark.parametrize("armed", [True, False])
+def test_a_drive_without_a_zero_may_lack_turns_on_both_axes_if_it_was_controlled(
+    samples: JointEstimate, armed: bool
+) -> None:
+    samples.take(reading(T0 + PERIOD, status=DriveStatus.UNZEROED), armed=armed)
+    assert (samples.first.lost, samples.second.lost, samples.accepted_ns) == (armed, armed, 0)
+
+
+@pytest.mark.parametrize("armed", [True, False])
+def test_only_a_joint_that_nobody_controls_has_moved_by_a_jump(
+    samples: JointEstimate, armed: bool
+) -> None:
+    samples.take(reading(T0 + PERIOD, (9.0, 9.0)), armed=armed)
+    assert (samples.first.moved, samples.second.moved) == (not armed, not armed)
+
+
 @given(speed=st.floats(-40.0, 40.0), gained=st.floats(-8.0, 8.0), gap_ms=st.integers(1, 100))
 def test_a_joint_that_moves_as_legs_do_is_right(speed: float, gained: float, gap_ms: int) -> None:
     samples = JointEstimate(N)

@@ -36,6 +36,8 @@ setpoints = st.builds(Setpoint, angles, rates, torques, torques, pairs(gains), p
 
 
 SOFT = Setpoint((0.1, -1.0), (0.2, -0.4), (3.0, -20.0), (5.0, -6.0), (100.0, 0.0), (10.0, 0.0))
+SLACK = msgspec.structs.replace(SOFT, k_p=(0.5, 0.4), k_d=(0.3, 0.2))
+OFF = msgspec.structs.replace(SLACK, q_ref=(0.7, 0.8), v_ref=(-0.6, 0.5))
 
 
 @given(s=setpoints, q=angles, v=rates)
@@ -48,6 +50,7 @@ def test_torque_is_pd_plus_feedforward_plus_coupled(s: Setpoint, q: Pair, v: Pai
 
 @given(a=setpoints, b=setpoints, share=shares, q=angles, v=rates)
 @example(a=SOFT, b=SOFT, share=0.5, q=(0.0, 0.0), v=(0.0, 0.0))
+@example(a=SLACK, b=OFF, share=0.5, q=(0.0, 0.0), v=(0.0, 0.0))
 def test_blend_of_two_laws_gives_the_blended_torque_everywhere_and_no_negative_gain(
     a: Setpoint, b: Setpoint, share: float, q: Pair, v: Pair
 ) -> None:

@@ -52,6 +52,11 @@ class Run(NamedTuple):
         return float(-np.gradient(self.height, 0.01).min())  # it is seen at 100 Hz
 
     @property
+    def rising(self) -> float:
+        """Fastest way up of the torso, m/s."""
+        return float(np.gradient(self.height, 0.01).max())
+
+    @property
     def angles(self) -> NDArray[np.float64]:
         return np.array([row.angles for row in self.rows])
 

@@ -77,7 +77,7 @@ class _Shipped:
                 above.append(line.lstrip("# "))
                 continue
             header = re.match(r"\[+([\w.]+)\]+\s*(?:#\s*(.*))?$", line)
-            entry = re.match(r"([\w.]+)\s*=\s*(.*?)(?:\s+#\s*([^\"]*))?$", line)
+            entry = re.match(r'([\w.]+)\s*=\s*((?:"[^"]*"|[^"#])*?)\s*(?:#\s*(.*))?$', line)
             if header:
                 table = header[1] + "."
                 self._comment(header[1], above, header[2])
