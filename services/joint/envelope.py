@@ -173,7 +173,7 @@ class Envelope:
         dt = 1e-9 * (command.t_ns - last.t_ns)
         phi, theta = command.tau_coupled
         kept = max(0.0, 1.0 - dt / ENERGY_S)
-        return max(0.0, kept * before + dt * (phi * v[0] + theta * v[1]))
+        return max(kept * before + dt * (phi * v[0] + theta * v[1]), 0.0)  # NaN stays NaN
 
     @staticmethod
     def _tau_ff_at(bounds: ModuleBounds, theta: float) -> Bounds:

@@ -218,6 +218,7 @@ def test_the_work_of_a_coupled_torque_on_a_joint_that_moves_is_what_it_puts_in_w
     assert found[-1] == pytest.approx(100.0 * ENERGY_S, rel=1e-3)
     against = (-2.0 * v[0], -2.0 * v[1])
     assert envelope.energy(last, command(t_ns=T0), 0.0, against) == 0.0
+    assert math.isnan(envelope.energy(last, command(t_ns=T0), 0.0, (math.nan, 0.0)))
     late = command(t_ns=T0 + NS_PER_S, tau_coupled=pd_law.ZERO)
     assert envelope.energy(late, command(t_ns=T0), 9.0, v) == 0.0
     for last in (None, command(hold=True), command(session=SESSION + 1)):
