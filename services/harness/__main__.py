@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from services.harness.filter import WrenchFilter
@@ -15,6 +16,7 @@ from shared.can.can_sensor import sensor_of
 from shared.can.loadcell_can import SampleAssembler
 from shared.can.sensor_service import SensorService, serve
 from shared.config.robot_config import RobotConfig
+from shared.run_directory import FLEET_VARIABLE
 
 
 def main() -> int:
@@ -27,11 +29,13 @@ def made(config: RobotConfig, run_dir: Path) -> SensorService:
     harness = config.harness
     sensor = sensor_of(config, harness, SampleAssembler(), run_dir)
     law = WrenchFilter(harness)
+    # one that was started by hand keeps no zero: nothing would ever remove it
+    zero = ZeroFile(run_dir) if FLEET_VARIABLE in os.environ else None
 
     def loop_on(session: Session) -> HarnessLoop:
         wrenches = session.publisher(topics.WRENCH, Wrench)
         requests = session.latest(topics.HARNESS_TARE, TareRequest)
-        return HarnessLoop(sensor, law, wrenches, requests, ZeroFile(run_dir))
+        return HarnessLoop(sensor, law, wrenches, requests, zero)
 
     return SensorService(harness.rate_hz, sensor, loop_on, "finite")
 

@@ -93,18 +93,14 @@ def start_tare(state: FilterState) -> FilterState:
 
 
 class WrenchFilter:
-    """The constants of the filter and its one step.
-
-    Attributes:
-        force_max: a raw leg force from which on a cell is saturated, N.
-    """
+    """The constants of the filter and its one step."""
 
     def __init__(self, config: HarnessConfig) -> None:
         """Derive the constants; ConfigError if the sensor's geometry is singular."""
         self._G = geometry_matrix(config.base_radius, config.platform_radius, config.height)
         self._cutoff = 2.0 * math.pi * config.low_pass_hz  # rad/s
         # A cell at the end of its range reads this after its trip through float32.
-        self.force_max = as_sent(config.leg_force_max)
+        self._force_limit = as_sent(config.leg_force_max)
         self._stale_ns = round(config.stale_ms * NS_PER_MS)
         self._tare_ns = round(config.tare_s * NS_PER_S)
 
@@ -128,7 +124,7 @@ class WrenchFilter:
     def _add(self, state: FilterState, t_ns: int, sample: Vector6) -> FilterState:
         if not all(map(math.isfinite, sample)):
             return msgspec.structs.replace(state, refused=state.refused + 1)
-        saturated = max(map(abs, sample)) >= self.force_max
+        saturated = max(map(abs, sample)) >= self._force_limit
         forces = np.array(sample)
         if state.tare is not Tare.DONE:
             state = self._tare(state, t_ns, forces, saturated)

@@ -22,7 +22,7 @@ class HarnessLoop(SensorLoop[Vector6, Wrench]):
     ) -> None:
         super().__init__(sensor, publisher)
         self._law, self._requests, self._zero = law, requests, zero
-        kept = None if zero is None else zero.read(law.force_max)
+        kept = None if zero is None else zero.read()
         self.state = FilterState() if kept is None else tared_state(kept)
         self._kept = kept is not None
 

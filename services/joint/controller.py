@@ -57,6 +57,8 @@ class ControllerState(msgspec.Struct, kw_only=True):
     """How far the tracked reference has gone another way than its rate says, rad."""
     energy: float = 0.0
     """Work that the coupled torque has done lately, J."""
+    accepted_ns: int = 0
+    """When the newest accepted command came."""
     resumed_ns: int = 0
     last_cycle_ns: int = 0
     cause: int = 0
@@ -307,7 +309,8 @@ class JointController:
         s = self._state
         tracked = s.failsafe.command if s.failsafe.mode is _TRACK else None
         astray = self._envelope.astray(command, tracked, s.astray)
-        energy = self._envelope.energy(command, tracked, s.energy, s.estimate.v)
+        dt = (now_ns - s.accepted_ns) / NS_PER_S
+        energy = self._envelope.energy(command, tracked, s.energy, s.estimate.v, dt)
         outside = self._envelope.judge(
             command,
             tracked,
@@ -320,7 +323,7 @@ class JointController:
         )
         s.failsafe.offer(command, now_ns, self.timing, outside)
         if s.failsafe.command is command:
-            s.astray, s.energy = astray, energy
+            s.astray, s.energy, s.accepted_ns = astray, energy, now_ns
 
     def _tripped(self, now_ns: int) -> Event:
         """Return the trip of this cycle; only a module in TRACK trips."""

@@ -269,9 +269,10 @@ class EnvelopeConfig(Section, frozen=True):
     coupled_work: Annotated[float, Range(0.01, 1e3, "J")] = 1.0
     """Work of the coupled torque against the joint's way to its reference. The law's is 0.1 J on
     drawn plants pushed as hard as soles and motors bear, and 0.6 J in a fall."""
-    coupled_energy: Annotated[float, Range(0.01, 1e3, "J")] = 4.0
+    coupled_energy: Annotated[float, Range(0.01, 1e3, "J")] = 10.0
     """Work of the coupled torque on a module's moving joints, within some 0.3 s. The law's is 2 J
-    on drawn plants pushed with 75 % of what soles and motors bear."""
+    on drawn plants pushed with 75 % of what soles and motors bear, and 6 J when a hand of 150 N
+    leads up."""
     dtau_ff: Annotated[float, Range(1.0, 1e5, "N m/s")] = 300.0
     """Largest rate of the feedforward."""
     v_ref: Annotated[float, Range(0.1, 100.0, "rad/s")] = 6.0

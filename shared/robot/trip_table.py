@@ -89,7 +89,7 @@ PLANNER_TRIPS: Final[dict[Trip, TripRow]] = {
     ),
     Trip.OFF_BALANCE: TripRow(
         "balance", "its COM is ahead of or behind where it is held", "m",
-        "do not push it: it leads again a second later; if nobody pushes, xrl kill planner",
+        "do not push it: it leads again a second later; if nobody does, `xrl kill planner`",
     ),
 }  # fmt: skip
 """By the planner, while it leads. It leads again once all is within its limits for a second."""

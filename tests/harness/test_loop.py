@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from services.harness.zero_file import ZeroFile
+from services.harness.zero_file import ZeroFile, path_of
 from services.simulator.fronts.sensor_fronts import BIAS_MAX, HarnessFront
 from shared.bus.codec import Decoder
 from shared.bus.messages import Tare, Wrench
@@ -107,12 +107,21 @@ def test_a_service_that_ends_in_a_tare_that_was_asked_for_leaves_it_to_the_next(
     np.testing.assert_allclose([*message.force, *message.moment], 0.0, atol=1e-9)
 
 
-@pytest.mark.parametrize("wrong", [math.nan, math.inf, 1.01 * HARNESS.leg_force_max])
-def test_a_zero_that_no_cell_can_have_read_is_none(tmp_path: Path, wrong: float) -> None:
+def test_a_zero_that_is_damaged_or_of_an_earlier_boot_is_none(tmp_path: Path) -> None:
+    zero, offset = ZeroFile(tmp_path), np.array((0.0, 1.0, 2.0, 3.0, 4.0, -5.0))
+    assert zero.read() is None, "an empty file has none"
+    zero.write(offset)
+    assert np.array_equal(ZeroFile(tmp_path).read(), offset)
+    assert ZeroFile(tmp_path, b"another boot").read() is None
+    file = path_of(tmp_path)
+    whole = file.read_bytes()
+    for at in range(len(whole)):
+        file.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+        assert ZeroFile(tmp_path).read() is None
+    file.write_bytes(whole)
     zero = ZeroFile(tmp_path)
-    assert zero.read(HARNESS.leg_force_max) is None, "an empty file has none"
-    zero.write(np.array((0.0, 1.0, 2.0, 3.0, 4.0, wrong)))
-    assert ZeroFile(tmp_path).read(HARNESS.leg_force_max) is None
+    zero.write(None)
+    assert zero.read() is None
 
 
 def test_a_repeated_request_does_not_delay_the_running_tare() -> None:

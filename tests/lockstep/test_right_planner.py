@@ -87,6 +87,12 @@ def test_while_the_hand_leads_into_the_crawl(robot: RobotConfig, judged: Judged)
     led(judged, robot, variant("crawl", duration=3.5, kill=(), push=pushes))
 
 
+def test_while_a_strong_hand_leads_up_within_a_second(robot: RobotConfig, judged: Judged) -> None:
+    low = 1.188 - 0.45
+    outcome = led(judged, robot, led_to((2.5, low), (3.0, low), (3.7, 1.188), duration=5.0))
+    assert outcome.rising > 1.0, "it is led fast"
+
+
 def test_a_killed_planners_successor_takes_over_without_a_step(
     robot: RobotConfig, judged: Judged
 ) -> None:

@@ -132,10 +132,10 @@ def test_it_stands_though_a_planner_whose_reference_drifts_leads_again_and_again
 def test_coupled_torques_that_take_the_robot_along_do_not_throw_it(
     robot: RobotConfig, begins: list[Begin], moment: int
 ) -> None:
-    """Without `envelope.coupled_energy` it left the floor at 2 m/s from the way into the crawl."""
+    """Without `envelope.coupled_energy` it left the floor on its way into the crawl, and fell."""
     ended = end(robot, begins[moment], "tau_coupled of all ramps up in 0.3 s, +0 +0 +0 +1 +0 -1")
     assert not ended.fell
-    assert ended.rise < 1.0
+    assert ended.rise < 1.5
 
 
 @pytest.mark.parametrize(("rate", "moment"), [("+0.1", 1), ("-0.1", 2)])

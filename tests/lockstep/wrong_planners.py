@@ -89,6 +89,9 @@ def _all() -> Iterator[tuple[str, Fault]]:
         for ramp_s in (0.3, 1.0, 3.0):
             words = " ".join(f"{axis:+d}" for axis in signs)
             yield f"tau_coupled of all ramps up in {ramp_s:g} s, {words}", _ramped(signs, ramp_s)
+    ramp = _ramped((0, 0, 0, 1, 0, -1), 0.3)
+    yield "stamps stand still, tau_coupled ramps up in 0.3 s", _both(ramp, _stamped(0.0))
+    yield "stamps at half speed, tau_coupled ramps up in 0.3 s", _both(ramp, _stamped(0.5))
     for margin in (0.0, -1.0, math.nan):
         yield f"margin {margin:g}", _told_margin(margin)
 
@@ -232,6 +235,20 @@ def _noisy(name: str, size: float) -> Fault:
         return pair[0] + dice.gauss(0.0, size), pair[1] + dice.gauss(0.0, size)
 
     return _each(name, change)
+
+
+def _stamped(speed: float) -> Fault:
+    """Let the commands' own time go by at another speed."""
+    first: list[int] = []
+
+    def fault(commands: Commands, _tick: int) -> Commands:
+        first.extend(command.t_ns for command in commands[: 1 - len(first)])
+        return [
+            msgspec.structs.replace(c, t_ns=first[0] + round(speed * (c.t_ns - first[0])))
+            for c in commands
+        ]
+
+    return fault
 
 
 def _told_margin(margin: float) -> Fault:

@@ -149,10 +149,10 @@ def make_plan(config_path: Path, run_dir: Path, options: FleetOptions) -> FleetP
     """Return the processes to start; refuse what cannot be started here."""
     path = Path(os.path.abspath(config_path))  # noqa: PTH100 - symlinks stay as they were given
     config = load(path)
-    if options.simulation:
-        refuse_half_emulated(config)
     table = load_table(options.table_path)
     rows = _selected(table, config, options)
+    if any(row.name == "simulator" for row in rows):
+        refuse_half_emulated(config)
     _check_lengths(run_dir, _listeners(table.process, config, run_dir))
     on_usb = config.joint_service.driver == "odrive_usb"
     for row in rows:
@@ -269,7 +269,7 @@ def refuse_half_emulated(robot: RobotConfig) -> None:
         raise FleetError(
             f"robot file: {some} {'are' if ',' in some else 'is'} emulated "
             f'(interface = "{SIMULATED_CAN}"), {real} not: which drives are meant? Make '
-            "all of them real ones, or all emulated"
+            "all of them real ones, or all emulated; `xrl up --no-sim` starts no simulator"
         )
 
 

@@ -34,8 +34,10 @@ MARKER: Final = ".xrl-run"
 ENDING_S: Final = 0.5
 """Longest wait for the lock of a fleet whose processes were killed, and are no longer found."""
 
-_BY_HAND: Final = ("*.zenoh.lock", "*.rearm", "*.near", PACE_FILE, usb_standin.FOLDER,
-                   usb_standin.BUILT)  # fmt: skip
+_BY_HAND: Final = (
+    "*.zenoh.lock", "*.rearm", "*.near", "*.heat", "*.zero", PACE_FILE, usb_standin.FOLDER,
+    usb_standin.BUILT,
+)  # fmt: skip
 """Names that services started by hand leave in a run directory, beside sockets."""
 _LOGGED: Final = (*SERVICES, "network_proxy", "ros2_gateway", "supervisord", "view")
 """What has a log in a run directory."""
@@ -179,6 +181,8 @@ class RunDir:
         if not disarmed:
             self._remove_logs()
         self._remove_shared_memory(keep_stops=disarmed)
+        if not disarmed:  # after a crash of the supervisor somebody may rest on the harness
+            zero_file.path_of(self.path).unlink(missing_ok=True)
         self.logs.mkdir(exist_ok=True)
         sockets = [item.endpoint for item in plan.listeners if item.endpoint.startswith(UNIX)]
         manifest = Manifest(
@@ -199,12 +203,9 @@ class RunDir:
                     guard.write(LastState.HELD)
 
     def _remove_shared_memory(self, *, keep_stops: bool) -> None:
-        """Remove what an earlier fleet shared; what outlives a crash only where a person asks."""
+        """Remove what an earlier fleet shared; its rearm guards only where a person asks."""
         neighbours.path_of(self.path).unlink(missing_ok=True)
-        if keep_stops:
-            return
-        zero_file.path_of(self.path).unlink(missing_ok=True)
-        for module in MODULES:
+        for module in () if keep_stops else MODULES:
             rearm_guard.path_of(self.path, module).unlink(missing_ok=True)
 
     def read_manifest(self) -> Manifest | None:
@@ -226,6 +227,7 @@ class RunDir:
             _remove_socket(Path(path))
         _remove_socket(self.supervisor_socket)
         self._remove_shared_memory(keep_stops=keep_stops)
+        zero_file.path_of(self.path).unlink(missing_ok=True)
         for file in (self.supervisor_config, self.supervisor_pid, self.manifest, self.pace):
             file.unlink(missing_ok=True)
         if not keep_logs:

@@ -21,11 +21,12 @@ robot file):
 
 The trips are checked while the planner is engaged. `unloaded` counts only once both legs have
 carried the torso, because on the hoist neither does. `sagging` counts only after the person has
-once not pressed, because a hand held up in HOLD first catches up. A trip ends when every value has
-been within its limit for `CALM_NS` and the value that tripped was known all the while: a harness
-that falls silent does not end a trip on its force. It counts as a drop-out
-(`services.planner.watch.engagement_fsm`): after repeated trips the planner re-engages after ever
-longer waits.
+once not pressed, because a hand held up in HOLD first catches up. `balance` counts only while the
+planner leads, which brings back a COM that HOLD left off its place, and then only what is worse
+than that. A trip ends when every value has been within its limit for `CALM_NS` and the value that
+tripped was known all the while: a harness that falls silent does not end a trip on its force. It
+counts as a drop-out (`services.planner.watch.engagement_fsm`): after repeated trips the planner
+re-engages after ever longer waits.
 """
 
 from __future__ import annotations
@@ -50,12 +51,15 @@ ASSUMED_SINK_RATE: Final = 1.0
 """m/s; rate at which a load beyond that would sink if the planner engaged again."""
 SINK_RATE_MIN: Final = 1e-3
 """m/s; least sink rate used for a robot that does not sink."""
+ROOM: Final = 0.02
+"""m; so much farther than it was at the least since it is led a COM beyond the limit may be."""
 LOADED_FACTOR: Final = 3.0
 """Multiple of the `unloaded` limit. A robot whose two legs both carry this much stands."""
 
 _TRIPS: Final = tuple(PLANNER_TRIPS)
 _UNLOADED: Final = _TRIPS.index(Trip.UNLOADED)
 _SAGGING: Final = _TRIPS.index(Trip.SAGGING)
+_OFF_BALANCE: Final = _TRIPS.index(Trip.OFF_BALANCE)
 
 
 class TripsState(msgspec.Struct):
@@ -73,6 +77,8 @@ class TripsState(msgspec.Struct):
     """Both legs have carried the torso since the planner engaged."""
     light: bool = False
     """The person has stopped pressing on the robot since the planner engaged."""
+    off: float = -1.0
+    """How far off its COM was at the least since the planner engaged, m; -1: it does not lead."""
 
 
 class PlannerTrips:
@@ -109,6 +115,9 @@ class PlannerTrips:
         beyond[_UNLOADED] &= state.stands
         state.light = leads and (state.light or values[_SAGGING] == 0.0)
         beyond[_SAGGING] &= state.light or not leads
+        off = values[_OFF_BALANCE]
+        state.off = (off if state.off < 0.0 else min(state.off, off)) if leads else -1.0
+        beyond[_OFF_BALANCE] &= leads and off > state.off + ROOM
         state.since_ns = tuple(
             (since or now_ns) if is_beyond and leads else 0
             for since, is_beyond in zip(state.since_ns, beyond, strict=True)

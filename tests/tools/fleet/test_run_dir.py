@@ -113,7 +113,8 @@ def test_what_services_started_by_hand_or_an_earlier_version_left_is_no_obstacle
     with closing(socket.socket(socket.AF_UNIX)) as dead:
         dead.bind(str(run_dir / "play.zenoh"))
     (run_dir / "play.zenoh.lock").touch()
-    (run_dir / "knee_left.rearm").touch()
+    for name in ("knee_left.rearm", "knee_left.heat", "joints.near", "harness.zero"):
+        (run_dir / name).touch()
     (tmp_path / "logs").mkdir()
     (tmp_path / "logs/supervisord.log").touch()
     for used in (run_dir, tmp_path):
