@@ -12,7 +12,7 @@ from services.joint.neighbours import UNKNOWN, NeighbourView
 from services.joint.pd_law import Setpoint
 from services.joint.sinking import DOUBT_NS, LEVEL_MAX, Sinking, SinkingState
 from shared.bus.messages import Pair
-from shared.clock import NS_PER_S
+from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from tests.joint.helpers import FULL
 
@@ -119,8 +119,20 @@ def test_a_leg_of_equal_links_that_folds_onto_itself_divides_by_nothing(robot: R
     alike = msgspec.structs.replace(robot.geometry, l1=robot.geometry.l2)
     sinking, frozen = begun(msgspec.structs.replace(robot, geometry=alike), "ankle_left")
     for knee in (-math.pi, -3.0):
-        found = sinking.law(frozen, frozen, LONG_NS, Q, NeighbourView((knee, 0.0)))
+        found = sinking.law(frozen, frozen, LONG_NS, Q, NeighbourView((knee, 1.0)))
         assert all(map(math.isfinite, (*found.q_ref, *found.v_ref)))
+        assert (found.v_ref[1] == 0.0) is (knee == -math.pi), "from a hip so low no rate follows"
+
+
+def test_an_ankle_reaches_as_far_as_its_leg_does(robot: RobotConfig) -> None:
+    """The hip was farther ahead than a leg that has folded since can bring it."""
+    sinking, frozen = begun(robot, "ankle_left", (0.02, 0.6))
+    sinking.law(frozen, frozen, LONG_NS, (0.02, 0.6), NeighbourView((0.0, 0.0)))
+    assert sinking.state.ahead is not None
+    assert sinking.state.ahead > 0.3
+    found = sinking.law(frozen, frozen, LONG_NS, (0.02, 0.6), NeighbourView((-3.0, 0.0)))
+    low, high = robot.limits.ankle.theta
+    assert low <= found.q_ref[1] - frozen.q_ref[1] + 0.6 <= max(high, 0.6)
 
 
 BELOW_ITS_STOP = -2.6
@@ -255,4 +267,6 @@ def test_what_sinks_lets_go_of_its_feedforward_and_holds_the_rest(robot: RobotCo
     assert found.tau_ff == pytest.approx((3.0, 0.5 * frozen.tau_ff[1]))
     assert found.k_p == pytest.approx((100.0 + 0.5 * (stand.k_p[0] - 100.0), 0.0))
     assert found.k_d[1] == service.damp_k_d
+    early = sinking.law(frozen, frozen, round(0.5 * service.blend_ms * NS_PER_MS), Q, UNKNOWN)
+    assert early.k_d[1] == pytest.approx(0.5 * (frozen.k_d[1] + service.damp_k_d))
     assert found.v_ref == found.tau_coupled == (0.0, 0.0)
