@@ -126,13 +126,13 @@ def test_a_leg_of_equal_links_that_folds_onto_itself_divides_by_nothing(robot: R
 
 def test_an_ankle_reaches_as_far_as_its_leg_does(robot: RobotConfig) -> None:
     """The hip was farther ahead than a leg that has folded since can bring it."""
-    sinking, frozen = begun(robot, "ankle_left", (0.02, 0.6))
-    sinking.law(frozen, frozen, LONG_NS, (0.02, 0.6), NeighbourView((0.0, 0.0)))
+    sinking, frozen = begun(robot, "ankle_left", (0.02, 0.9))
+    sinking.law(frozen, frozen, LONG_NS, (0.02, 0.9), NeighbourView((0.0, 0.0)))
     assert sinking.state.ahead is not None
-    assert sinking.state.ahead > 0.3
-    found = sinking.law(frozen, frozen, LONG_NS, (0.02, 0.6), NeighbourView((-3.0, 0.0)))
+    assert sinking.state.ahead > 0.8
+    found = sinking.law(frozen, frozen, LONG_NS, (0.02, 0.9), NeighbourView((-3.0, 0.0)))
     low, high = robot.limits.ankle.theta
-    assert low <= found.q_ref[1] - frozen.q_ref[1] + 0.6 <= max(high, 0.6)
+    assert low <= found.q_ref[1] - frozen.q_ref[1] + 0.9 <= max(high, 0.9)
 
 
 BELOW_ITS_STOP = -2.6
