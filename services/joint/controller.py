@@ -58,7 +58,7 @@ class ControllerState(msgspec.Struct, kw_only=True):
     energy: float = 0.0
     """Work that the coupled torque has done lately, J."""
     accepted_ns: int = 0
-    """When the newest accepted command came."""
+    """When the newest accepted command came; 0 before the first, and in logs that do not say it."""
     resumed_ns: int = 0
     last_cycle_ns: int = 0
     cause: int = 0
@@ -309,7 +309,7 @@ class JointController:
         s = self._state
         tracked = s.failsafe.command if s.failsafe.mode is _TRACK else None
         astray = self._envelope.astray(command, tracked, s.astray)
-        dt = (now_ns - s.accepted_ns) / NS_PER_S
+        dt = (now_ns - s.accepted_ns) / NS_PER_S if s.accepted_ns else 0.0
         energy = self._envelope.energy(command, tracked, s.energy, s.estimate.v, dt)
         outside = self._envelope.judge(
             command,

@@ -12,8 +12,11 @@ from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from services.harness.zero_file import ZeroFile
+from services.harness.zero_file import path_of as zero_of
 from services.joint.rearm_guard import LastState, RearmGuard, request_stop, stop_source
 from shared.exceptions import FleetError
 from shared.joints import MODULES
@@ -225,3 +228,18 @@ def test_a_persons_start_forgets_a_stop_and_so_does_down_unless_it_is_told_not_t
     assert stop_source(claimed.path, "knee_left") == "anna"
     claimed.prepare(plan(claimed.path))
     assert stop_source(claimed.path, "knee_left") == ""
+
+
+@pytest.mark.parametrize(
+    ("what", "kept"), [("a start", False), ("a disarmed start", True), ("a clean end", False)]
+)
+def test_the_harness_keeps_its_zero_where_only_the_supervisor_has_crashed(
+    claimed: RunDir, what: str, kept: bool
+) -> None:
+    """A person may rest on it then; after any other end it tares anew."""
+    ZeroFile(claimed.path).write(np.ones(6))
+    if what == "a clean end":
+        claimed.clear(keep_logs=True, keep_stops=True)
+    else:
+        claimed.prepare(plan(claimed.path, disarmed=what == "a disarmed start"))
+    assert zero_of(claimed.path).exists() is kept
