@@ -189,6 +189,8 @@ class ExperimentFlags(LawFlags, PlantFlags, ControllerFlags):
 
 ROW_FIELDS: Final = ("kill", "restart", "push", "fault", "inject")
 """Rows of a scenario that flags of the same name give."""
+SHOWN: Final = 12
+"""Kills, faults, impairments and pushes that the first line of a run names."""
 
 
 def scenario_file(name: str, config: Path = DEFAULT_CONFIG) -> Path:
@@ -234,6 +236,8 @@ def describe(scenario: Scenario) -> str:
     done += [f"{row.module} {row.kind} at {row.at:g} s" for row in scenario.fault]
     done += [in_words_of(row) for row in scenario.inject]
     done += ["push {:g},{:g},{:g} N at {:g} s".format(*row.force, row.at) for row in scenario.push]
+    if len(done) > SHOWN:
+        done[SHOWN:] = [f"and {len(done) - SHOWN} more"]
     return f"; {', '.join(done)}" if done else ""
 
 

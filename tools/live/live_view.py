@@ -59,7 +59,7 @@ class LiveView:
         words = (
             snapshot.note,
             active(self._injects, snapshot.truth.scenario_s),
-            waiting(self._hear(now)),
+            *said_by(self._hear(now)),
         )
         note = "; ".join(word for word in words if word)
         self._print(Text(_line(snapshot.truth, snapshot.modes, note)))
@@ -77,11 +77,14 @@ def active(injects: Sequence[Inject], scenario_s: float) -> str:
     return ", ".join(f"{row.link} {row.describe()}" for row in found)
 
 
-def waiting(status: PlannerStatus | None) -> str:
-    """Return when a planner that waits after drop-outs leads again; empty if it does not wait."""
-    if status is None or status.wait_s <= 0.0:
-        return ""
-    return f"leads again in {status.wait_s:.0f} s" if status.wait_s >= 1.0 else "leads again soon"
+def said_by(planner: PlannerStatus | None) -> tuple[str, str]:
+    """Return what a person must know, and when a planner that waits after drop-outs leads again."""
+    if planner is None:
+        return "", ""
+    if planner.wait_s <= 0.0:
+        return planner.why, ""
+    soon = planner.wait_s < 1.0
+    return planner.why, "leads again soon" if soon else f"leads again in {planner.wait_s:.0f} s"
 
 
 def _line(truth: SimTruth, modes: Sequence[str], note: str) -> str:

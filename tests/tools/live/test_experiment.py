@@ -44,6 +44,13 @@ def test_every_kind_of_fault_can_be_asked_for(kind: str) -> None:
     assert f"ankle_left {kind} at 1 s" in experiment.describe(scenario)
 
 
+def test_of_many_things_that_happen_the_first_line_names_some_and_counts_the_rest() -> None:
+    pushes = [word for at in range(1, 16) for word in ("--push", f"{at}:0.1:10,0,0")]
+    words = experiment.describe(experiment.make_scenario(parse("--kill", "planner@1", *pushes)))
+    assert words.count("push") == experiment.SHOWN - 1
+    assert words.endswith(", and 4 more")
+
+
 @pytest.mark.parametrize(
     "text", ["toe:encoder@1", "knee_left:fire@1", "knee_left@1", "knee_left.2:encoder@1", "x"]
 )

@@ -18,7 +18,7 @@ from tests.shared.mcap_log.runs import sample
 from tools.judge import verdict_table
 from tools.judge.standing import LIMITS
 from tools.judge.verdict import Summary
-from tools.live.live_view import LiveView, active, waiting
+from tools.live.live_view import LiveView, active, said_by
 from tools.live.scenario_runner import LiveSnapshot
 from tools.logs.impairment_intervals import impairments, touches
 from tools.terminal import Console
@@ -157,34 +157,37 @@ def test_only_what_is_done_now_is_named(scenario_s: float, words: str) -> None:
     assert active(INJECTS, scenario_s) == words
 
 
-def waits(wait_s: float) -> PlannerStatus:
+def waits(wait_s: float, why: str = "") -> PlannerStatus:
     found: PlannerStatus = sample(
-        PlannerStatus, seq=1, t_ns=1, mode=int(PlannerMode.ALIGNING), wait_s=wait_s
+        PlannerStatus, seq=1, t_ns=1, mode=int(PlannerMode.ALIGNING), wait_s=wait_s, why=why
     )
     return found
 
 
 def test_a_planner_that_waits_after_drop_outs_reports_how_long() -> None:
-    assert waiting(waits(3.4)) == "leads again in 3 s"
-    assert waiting(waits(0.3)) == "leads again soon"
-    assert waiting(waits(0.0)) == waiting(None) == ""
+    assert said_by(waits(3.4)) == ("", "leads again in 3 s")
+    assert said_by(waits(0.3)) == ("", "leads again soon")
+    assert said_by(waits(0.0, "knee_left is hot")) == ("knee_left is hot", "")
+    assert said_by(None) == ("", "")
 
 
 class Planner:
     """Says one thing once."""
 
     def __init__(self) -> None:
-        self.said: list[PlannerStatus] = [waits(3.4)]
+        self.said: list[PlannerStatus] = [waits(3.4, "knee_left is hot")]
 
     def take(self) -> PlannerStatus | None:
         return self.said.pop() if self.said else None
 
 
-def test_the_line_shows_what_is_done_and_how_long_the_planner_waits() -> None:
+def test_the_line_shows_what_is_done_what_the_planner_says_and_how_long_it_waits() -> None:
     text = io.StringIO()
-    view = LiveView(Console(file=text, width=200), INJECTS, Planner())
+    view = LiveView(Console(file=text, width=300), INJECTS, Planner())
     truth = sample(SimTruth, seq=1, t_ns=1, scenario_s=3.5)
     with view:
         view.show(LiveSnapshot(truth, ("T",) * 6, "push"))
     line = text.getvalue().strip()
-    assert line.endswith("TTTTTT  push; planner->joints delay=30ms; leads again in 3 s")
+    assert line.endswith(
+        "TTTTTT  push; planner->joints delay=30ms; knee_left is hot; leads again in 3 s"
+    )
