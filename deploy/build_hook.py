@@ -18,6 +18,7 @@ FILES = (
     "scenarios",
     "plants",
     "foxglove",
+    "sysctl",
     "udev",
 )
 """Names in `deploy/`. A wheel installs them into `shared/files/`; `shared/places.py` knows both."""

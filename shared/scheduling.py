@@ -11,6 +11,7 @@ import platform
 import resource
 import struct
 from collections.abc import Collection
+from contextlib import suppress
 from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
@@ -25,8 +26,8 @@ class ProcessSchedule(NamedTuple):
     """A process's row."""
 
     fifo: int
-    """SCHED_FIFO priority, 1 .. 99."""
-    half: Literal["first", "second", "by leg"]
+    """SCHED_FIFO priority, 1 .. 99; 0: `NICE`, off the control path."""
+    half: Literal["first", "second", "by leg", "any"]
     """Half of the processors: a leg and who feeds it share their caches."""
 
 
@@ -37,9 +38,12 @@ TABLE: Final[dict[str, ProcessSchedule]] = {
     "network_proxy": ProcessSchedule(15, "first"),
     "harness": ProcessSchedule(10, "first"),
     "imu": ProcessSchedule(10, "first"),
-    "recorder": ProcessSchedule(5, "second"),
+    "recorder": ProcessSchedule(0, "any"),
 }
-"""By kind of process. The right leg is on the first half, the left leg on the second."""
+"""By kind of process. The right leg is on the first half, the left leg on the second. With the
+recorder in real time, too, that half was full more often (`real_time_pause_ms`)."""
+NICE: Final = -11
+"""Of a process without real time: others get a twelfth of its share."""
 
 _PR_SET_TIMERSLACK: Final = 29
 _SCHED_SETATTR: Final = {"x86_64": 314, "aarch64": 274, "armv7l": 380}
@@ -49,6 +53,8 @@ SLICE_NS: Final = 100_000
 """The shortest slice that the kernel gives: a short slice is a near deadline (EEVDF)."""
 TIMER_SLACK_NS: Final = 1_000
 """Sleeps end so close to their time; the default is 50 us."""
+NO_PAUSE: Final = "kernel.sched_rt_runtime_us=-1"
+"""The kernel's setting without `real_time_pause_ms`."""
 _CAP_IPC_LOCK: Final = 14
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
@@ -69,6 +75,8 @@ def apply(kind: str, module: str = "") -> str:
 def half_of(processors: Collection[int], kind: str, module: str = "") -> set[int]:
     """Return the processors of a process, out of those that there are; a single one is for all."""
     half = TABLE[kind].half
+    if half == "any":
+        return set(processors)
     if half == "by leg":
         half = "first" if side_of(module) == SIDES[0] else "second"
     ordered = sorted(processors, key=_core_of)
@@ -98,6 +106,10 @@ def _pin(processors: set[int]) -> str:
 
 def raise_priority(fifo: int) -> str:
     """Set SCHED_FIFO, or what needs no privilege; return what was granted."""
+    if not fifo:
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, 0, NICE)
+        return f"nice {os.getpriority(os.PRIO_PROCESS, 0)}, {short_slice()}"
     limit_us = _real_time_limit_us()
     if limit_us is not None:
         return f"{short_slice()}, no real time: RLIMIT_RTTIME of {limit_us} us would kill it"
@@ -114,6 +126,21 @@ def has_real_time(pid: int) -> bool | None:
         return os.sched_getscheduler(pid) in (os.SCHED_FIFO, os.SCHED_RR)
     except OSError:
         return None
+
+
+def real_time_pause_ms(root: Path = Path("/")) -> float:
+    """Return how long the kernel stops real-time processes that have filled a processor, ms.
+
+    By default 50 ms of each second. 0: never, or this kernel does not say it.
+    """
+    kernel = root / "proc/sys/kernel"
+    try:
+        period_us, runtime_us = (
+            int((kernel / f"sched_rt_{name}_us").read_text()) for name in ("period", "runtime")
+        )
+    except (OSError, ValueError):
+        return 0.0
+    return max(0.0, (period_us - runtime_us) / 1e3) if runtime_us >= 0 else 0.0
 
 
 def _real_time_limit_us() -> int | None:

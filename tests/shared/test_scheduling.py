@@ -6,11 +6,13 @@ import os
 import resource
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from shared import scheduling
 from shared.joints import MODULES
+from shared.places import FILES
 from shared.scheduling import SLICE_NS, TABLE, TIMER_SLACK_NS, half_of
 from tools.fleet.process_table import TABLE as PROCESSES
 from tools.fleet.process_table import load_table
@@ -45,7 +47,7 @@ def test_every_process_of_the_fleet_has_a_row() -> None:
 
 
 def test_what_a_step_needs_first_has_the_higher_priority() -> None:
-    order = ("simulator", "joint", "planner", "harness", "recorder")
+    order = ("simulator", "joint", "planner", "harness", "recorder")  # the last is off its path
     priorities = [TABLE[kind].fifo for kind in order]
     assert priorities == sorted(priorities, reverse=True)
     assert len(set(priorities)) == len(order)
@@ -61,7 +63,7 @@ def test_the_halves_are_the_legs_and_no_processor_is_left_out(count: int) -> Non
     for module in MODULES:
         half = half_of(processors, "joint", module)
         assert half == (right if module.endswith("right") else left)
-    assert half_of(processors, "planner") == half_of(processors, "recorder") == left
+    assert half_of(processors, "planner") == left
     assert half_of(processors, "simulator") == half_of(processors, "harness") == right
 
 
@@ -103,6 +105,26 @@ def test_a_process_is_pinned_only_where_the_fleets_table_says_so(pinned: str) ->
     assert (same == "True") == (pinned == "1" or count == "1")
 
 
+@pytest.mark.parametrize("allowed", [True, False])
+def test_the_recorder_takes_no_real_time_and_may_run_anywhere(
+    monkeypatch: pytest.MonkeyPatch, allowed: bool
+) -> None:
+    nice = [0]
+
+    def set_nice(_which: int, _who: int, wanted: int) -> None:
+        if not allowed:
+            raise PermissionError
+        nice.append(wanted)
+
+    monkeypatch.setattr(os, "setpriority", set_nice)
+    monkeypatch.setattr(os, "getpriority", lambda *_: nice[-1])
+    monkeypatch.setattr(os, "sched_setscheduler", lambda *_: pytest.fail("no real time"))
+    monkeypatch.setattr(scheduling, "short_slice", lambda: "a short slice")
+    wanted = scheduling.NICE if allowed else 0
+    assert scheduling.raise_priority(TABLE["recorder"].fifo) == f"nice {wanted}, a short slice"
+    assert half_of({3, 4, 5}, "recorder") == {3, 4, 5}
+
+
 @pytest.mark.parametrize("first", ["services.planner.planner", "tools.sim.lockstep", "tools.cli"])
 def test_linear_algebra_runs_in_one_thread_whatever_is_imported_first(first: str) -> None:
     script = (
@@ -134,6 +156,34 @@ def test_no_real_time_is_taken_that_the_kernel_would_kill_for(
     monkeypatch.setattr(os, "sched_setscheduler", lambda *_: taken.append(1))
     assert granted in scheduling.raise_priority(20)
     assert bool(taken) == may
+
+
+@pytest.mark.parametrize(
+    ("period", "runtime", "pause_ms"),
+    [
+        ("1000000", "950000", 50.0),
+        ("100000", "95000", 5.0),
+        ("1000000", "-1", 0.0),
+        ("1000000", "1000000", 0.0),
+        ("1000000", "?", 0.0),
+    ],
+)
+def test_how_long_the_kernel_stops_what_fills_a_processor_is_read(
+    tmp_path: Path, period: str, runtime: str, pause_ms: float
+) -> None:
+    assert scheduling.real_time_pause_ms(tmp_path) == 0.0
+    kernel = tmp_path / "proc/sys/kernel"
+    kernel.mkdir(parents=True)
+    (kernel / "sched_rt_period_us").write_text(period + "\n", encoding="ascii")
+    (kernel / "sched_rt_runtime_us").write_text(runtime + "\n", encoding="ascii")
+    assert scheduling.real_time_pause_ms(tmp_path) == pause_ms
+
+
+def test_the_shipped_setting_is_the_one_that_the_doctor_asks_for() -> None:
+    lines = (FILES / "sysctl/90-xrl.conf").read_text(encoding="utf-8").splitlines()
+    assert [line.replace(" ", "") for line in lines if not line.startswith("#")] == [
+        scheduling.NO_PAUSE
+    ]
 
 
 def test_who_has_real_time_is_seen() -> None:

@@ -96,6 +96,7 @@ def _delays(root: Path, *, emulated: bool) -> list[Finding]:
     clock = _text(root / "sys/devices/system/clocksource/clocksource0/current_clocksource")
     may_lock, areas = scheduling.may_lock(), len(_text(root / "proc/swaps").splitlines()) - 1
     locked = f"refused: {resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] // 1024} KiB"
+    pause_ms = scheduling.real_time_pause_ms(root)
     rows = (
         (governor in ("", "performance"), "frequency governor", governor or "unknown here",
          "performance", "`sudo cpupower frequency-set -g performance`",
@@ -108,6 +109,9 @@ def _delays(root: Path, *, emulated: bool) -> list[Finding]:
         (areas <= 0, "swap", "none" if areas <= 0 else f"{areas} in use", "none",
          "`sudo swapoff -a`",
          "a service that may not lock its memory stops for a page that was swapped out"),
+        (pause_ms <= 0.0, "real-time limit", f"{pause_ms:g} ms" if pause_ms else "none", "none",
+         f"`sudo sysctl {scheduling.NO_PAUSE}`; for good: deploy/sysctl/90-xrl.conf",
+         "where services fill a processor the kernel stops them all for so long: modules hold"),
     )  # fmt: skip
     return [advised(good or emulated, SUBJECT, *row) for good, *row in rows]
 

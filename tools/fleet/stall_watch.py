@@ -1,5 +1,8 @@
 """Idle real-time threads, one a core: what delays them is the machine, and nothing that runs on it.
 
+But where real-time processes fill a core, the kernel stops these with them
+(`shared.scheduling.real_time_pause_ms`).
+
 Run as a program (`python stall_watch.py FILE PID`) it appends a line for each gap, and ends with
 PID, the process that started it. It imports the standard library alone, so that it is up at once.
 """
@@ -57,6 +60,11 @@ class StallWatch:
             command(self._path), stdin=subprocess.DEVNULL, start_new_session=True
         )
         return self
+
+    @property
+    def pid(self) -> int:
+        """The program's process."""
+        return self._process.pid
 
     def __exit__(self, *_: object) -> None:
         """End the program."""

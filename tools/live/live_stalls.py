@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from services.joint.loop import READ_TIMEOUT_S
+from shared import scheduling
 from shared.bus import topics
 from shared.bus.messages import JointState, Mode
 from shared.bus.traces import SimTruth
@@ -25,6 +26,8 @@ ALIVE_NS: Final = NS_PER_S
 """A module that was silent for longer before a stall has no part in it."""
 MERGE_NS: Final = 50 * NS_PER_MS
 """Two ways of finding one stall report it within this time of each other."""
+FULL_CORE: Final = 0.25
+"""With less idle time beside the fleet one of the cores may be full."""
 
 
 class Silence:
@@ -239,11 +242,19 @@ class LiveStalls:
         words = f"{self.cores} cores, {100 * idle:.0f} % idle beside the fleet"
         if idle < least:
             words += f": too little, modules may hold; `--pace {pace() / 2:g}` asks for half of it"
+        pause_ms = self._pause_ms() if idle < FULL_CORE else 0.0
+        if pause_ms:
+            words += f"; a core that it fills is stopped for {pause_ms:g} ms (`xrl doctor`)"
         if not self.found:
             return words
         most_ms = max(stall.lasted_ms for stall in self.found)
         so_far = f"{len(self.found)} stall{'s' * (len(self.found) > 1)} so far"
         return f"{words}; {so_far}, {most_ms:.0f} ms at most"
+
+    def _pause_ms(self) -> float:
+        """Return how long the kernel stops processes that fill a core, ms; 0: it does not."""
+        real_time = self._watch is not None and scheduling.has_real_time(self._watch.pid)
+        return scheduling.real_time_pause_ms() if real_time else 0.0
 
     def _gaps(self) -> list[Gap]:
         return self._watch.take() if self._watch is not None else []

@@ -17,6 +17,7 @@ from tools.bringup.findings import Finding, FindingKind
 
 ROOT = DEFAULT_CONFIG.parents[1]
 CPU = "sys/devices/system/cpu"
+KERNEL = "proc/sys/kernel"
 
 
 def write(root: Path, path: str, text: str) -> None:
@@ -35,11 +36,13 @@ def row_of(rows: list[Finding], what: str) -> Finding:
         (f"{CPU}/cpu0/cpufreq/scaling_governor", "powersave", "frequency governor"),
         ("sys/devices/system/clocksource/clocksource0/current_clocksource", "hpet", "clock source"),
         ("proc/swaps", "Filename Type\n/swapfile file", "swap"),
+        (f"{KERNEL}/sched_rt_runtime_us", "950000", "real-time limit"),
     ],
 )
 def test_a_slow_loop_is_a_warning_on_a_real_robot_and_a_note_on_an_emulated_one(
     robot: RobotConfig, real: RobotConfig, tmp_path: Path, path: str, text: str, what: str
 ) -> None:
+    write(tmp_path, f"{KERNEL}/sched_rt_period_us", "1000000")
     write(tmp_path, path, text)
     for config, verdict in ((real, FindingKind.WARNING), (robot, FindingKind.OK)):
         row = row_of(check_machine.machine_rows(config, tmp_path), what)

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
 
+from shared import scheduling
 from shared.bus import topics
 from shared.bus.messages import (
     Cause,
@@ -266,6 +268,20 @@ def test_how_the_machine_carries_the_fleet_is_told_with_its_stalls() -> None:
     words = live.describe_machine(0.031, 0.08)
     assert "3 % idle beside the fleet: too little, modules may hold; `--pace 0.5`" in words
     assert words.endswith("; 2 stalls so far, 41 ms at most")
+
+
+@pytest.mark.parametrize(
+    ("real_time", "idle", "told"), [(True, 0.24, True), (True, 0.25, False), (False, 0.1, False)]
+)
+def test_a_nearly_full_machine_says_that_the_kernel_stops_a_core_that_real_time_fills(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, real_time: bool, idle: float, told: bool
+) -> None:
+    monkeypatch.setattr(scheduling, "has_real_time", lambda _pid: real_time)
+    monkeypatch.setattr(scheduling, "real_time_pause_ms", lambda: 50.0)
+    live = LiveStalls()
+    with live.watched(tmp_path / "gaps"):
+        words = live.describe_machine(idle, 0.08)
+    assert ("a core that it fills is stopped for 50 ms (`xrl doctor`)" in words) == told
 
 
 @given(
