@@ -91,7 +91,7 @@ def test_turns_missed_in_a_gap_without_an_error_are_noticed(
     pos: float, speed: float, acceleration: float, gap_ms: int
 ) -> None:
     axis = Axis(pos, speed)
-    axis.goes(0.0, 20)
+    axis.goes(0.0, 70)  # from its first word on, which rests: bounds of the speed follow by FADES
     for _ in range(gap_ms * NS_PER_MS // PERIOD_NS):
         axis.move(acceleration, None)
     events = axis.goes(0.0, 2 + REJECTED_MAX)
