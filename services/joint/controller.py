@@ -13,7 +13,7 @@ import msgspec
 from services.joint import pd_law
 from services.joint.differential import joint_torque, motor_torque
 from services.joint.drivers.base import DriveReading
-from services.joint.envelope import Envelope
+from services.joint.envelope import NOTHING_YET, Envelope, Lately
 from services.joint.failsafe import Event, Failsafe, timing_of
 from services.joint.heat import HeatEstimate, HeatState
 from services.joint.joint_estimate import JointEstimate
@@ -53,12 +53,8 @@ class ControllerState(msgspec.Struct, kw_only=True):
     """Torque of a drive that was found armed, N m: it is taken over without a step."""
     takeover_offset: Pair = (0.0, 0.0)
     """Torque of the drive beyond the law's when the service resumed after a gap, N m."""
-    astray: Pair = (0.0, 0.0)
-    """How far the tracked reference has gone another way than its rate says, rad."""
-    energy: float = 0.0
-    """Work that the coupled torque has done lately, J."""
-    accepted_ns: int = 0
-    """When the newest accepted command came; 0 before the first, and in logs that do not say it."""
+    lately: Lately = NOTHING_YET
+    """Of the newest accepted command."""
     resumed_ns: int = 0
     last_cycle_ns: int = 0
     cause: int = 0
@@ -308,9 +304,7 @@ class JointController:
         """Let the age rule and the envelope decide about a command."""
         s = self._state
         tracked = s.failsafe.command if s.failsafe.mode is _TRACK else None
-        astray = self._envelope.astray(command, tracked, s.astray)
-        dt = (now_ns - s.accepted_ns) / NS_PER_S if s.accepted_ns else 0.0
-        energy = self._envelope.energy(command, tracked, s.energy, s.estimate.v, dt)
+        lately = self._envelope.lately(command, tracked, s.lately, s.estimate.v, now_ns)
         outside = self._envelope.judge(
             command,
             tracked,
@@ -318,12 +312,11 @@ class JointController:
             s.estimate.v,
             age_s=self._law.age_s(command, now_ns),
             settled=tracked is not None and self._law.is_settled(now_ns),
-            astray=astray,
-            energy=energy,
+            lately=lately,
         )
         s.failsafe.offer(command, now_ns, self.timing, outside)
         if s.failsafe.command is command:
-            s.astray, s.energy, s.accepted_ns = astray, energy, now_ns
+            s.lately = lately
 
     def _tripped(self, now_ns: int) -> Event:
         """Return the trip of this cycle; only a module in TRACK trips."""

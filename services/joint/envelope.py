@@ -27,9 +27,12 @@ from __future__ import annotations
 import math
 from typing import Final
 
+import msgspec
+
 from services.joint import pd_law
 from shared.bus.messages import JointCommand, Outside, Pair
 from shared.clamp import clamp
+from shared.clock import NS_PER_S
 from shared.config.gain_table import Bounds, ModuleBounds
 from shared.config.robot_config import RobotConfig
 from shared.joints import kind_of
@@ -47,6 +50,21 @@ ASTRAY_S: Final = 0.5
 ENERGY_S: Final = 0.3
 """s; work of the coupled torque is forgotten with this time constant."""
 _INSIDE: Final = Outside.NOTHING  # returned in each cycle: docs/contributing.md
+
+
+class Lately(msgspec.Struct, gc=False, frozen=True):
+    """What the tracked commands have done that none of them shows alone."""
+
+    astray: Pair = pd_law.ZERO
+    """How far the reference has gone another way than its rate says, rad."""
+    energy: float = 0.0
+    """Work of the coupled torque, J; what it took counts as none."""
+    at_ns: int = 0
+    """When the newest came, on this module's clock; 0 before the first, and in logs that do not say
+    it."""
+
+
+NOTHING_YET: Final = Lately()
 
 
 class Envelope:
@@ -80,8 +98,7 @@ class Envelope:
         *,
         age_s: float = 0.0,
         settled: bool = True,
-        astray: Pair = pd_law.ZERO,
-        energy: float = 0.0,
+        lately: Lately = NOTHING_YET,
     ) -> Outside:
         """Return the first part of a command that lies outside.
 
@@ -94,8 +111,7 @@ class Envelope:
             v: joint rates, rad/s.
             age_s: time by which the reference is extrapolated, s.
             settled: True if TRACK has blended in.
-            astray: `astray` of this command, rad.
-            energy: `energy` of this command, J.
+            lately: `lately` of this command.
         """
         bounds, c = self._bounds, command
         if bounds is None:
@@ -123,11 +139,11 @@ class Envelope:
             spring = c.k_p[axis] * distance * (1.0 if settled else UNSETTLED)
             if not (distance <= self._distance and spring <= self._spring):
                 return Outside.Q_REF
-            if not abs(astray[axis]) <= self._astray:
+            if not abs(lately.astray[axis]) <= self._astray:
                 return Outside.Q_REF_ASTRAY
         if not work >= self._work:
             return Outside.COUPLED_WORK
-        if not energy <= self._energy:
+        if not lately.energy <= self._energy:
             return Outside.COUPLED_ENERGY
         if last is None or last.hold or last.session != c.session:
             return _INSIDE
@@ -137,44 +153,27 @@ class Envelope:
             return Outside.TORQUE_STEP
         return _INSIDE
 
-    def astray(self, command: JointCommand, last: JointCommand | None, before: Pair) -> Pair:
-        """Return how far the reference has gone another way than its rate says, rad.
-
-        Args:
-            command: the received command.
-            last: the command that the module tracks; None if it does not track.
-            before: the same of the last command.
-        """
-        if self._astray == math.inf or last is None or last.hold or command.hold:
-            return pd_law.ZERO
-        if last.session != command.session:
-            return pd_law.ZERO
-        dt = 1e-9 * (command.t_ns - last.t_ns)
-        kept = max(0.0, 1.0 - dt / ASTRAY_S)
-        (phi, theta), (last_phi, last_theta) = command.q_ref, last.q_ref
-        (rate_phi, rate_theta), (last_rate_phi, last_rate_theta) = command.v_ref, last.v_ref
-        return (
-            kept * before[0] + phi - last_phi - 0.5 * dt * (rate_phi + last_rate_phi),
-            kept * before[1] + theta - last_theta - 0.5 * dt * (rate_theta + last_rate_theta),
-        )
-
-    def energy(
-        self, command: JointCommand, last: JointCommand | None, before: float, v: Pair, dt: float
-    ) -> float:
-        """Return the work that the coupled torque has done lately, J; what it took counts as none.
+    def lately(
+        self, command: JointCommand, last: JointCommand | None, before: Lately, v: Pair, now_ns: int
+    ) -> Lately:
+        """Return what this command adds to what the tracked ones have done.
 
         Args:
             command: the received command.
             last: the command that the module tracks; None if it does not track.
             before: the same of the last command.
             v: joint rates, rad/s.
-            dt: time since the last command was accepted, s, by this module's clock.
+            now_ns: this module's clock.
         """
         if last is None or last.hold or last.session != command.session:
-            return 0.0
+            return Lately(at_ns=now_ns)
         phi, theta = command.tau_coupled
-        kept = max(0.0, 1.0 - dt / ENERGY_S)
-        return max(kept * before + dt * (phi * v[0] + theta * v[1]), 0.0)  # NaN stays NaN
+        dt = (now_ns - before.at_ns) / NS_PER_S if before.at_ns else 0.0
+        energy = max(0.0, 1.0 - dt / ENERGY_S) * before.energy + dt * (phi * v[0] + theta * v[1])
+        astray = pd_law.ZERO
+        if self._astray < math.inf and not command.hold:
+            astray = _astray(command, last, before.astray)
+        return Lately(astray, max(energy, 0.0), now_ns)  # NaN stays NaN
 
     @staticmethod
     def _tau_ff_at(bounds: ModuleBounds, theta: float) -> Bounds:
@@ -182,6 +181,18 @@ class Envelope:
         (low, high), rows = bounds.theta, bounds.tau_ff
         part = int(len(rows) * (theta - low) / max(high - low, 1e-9))
         return rows[min(len(rows) - 1, max(0, part))]
+
+
+def _astray(command: JointCommand, last: JointCommand, before: Pair) -> Pair:
+    """Return how far a reference has gone another way than its rate says, rad."""
+    dt = 1e-9 * (command.t_ns - last.t_ns)
+    kept = max(0.0, 1.0 - dt / ASTRAY_S)
+    (phi, theta), (last_phi, last_theta) = command.q_ref, last.q_ref
+    (rate_phi, rate_theta), (last_rate_phi, last_rate_theta) = command.v_ref, last.v_ref
+    return (
+        kept * before[0] + phi - last_phi - 0.5 * dt * (rate_phi + last_rate_phi),
+        kept * before[1] + theta - last_theta - 0.5 * dt * (rate_theta + last_rate_theta),
+    )
 
 
 def _widened(gains: Bounds) -> Bounds:

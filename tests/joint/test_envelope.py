@@ -11,7 +11,7 @@ import pytest
 
 from services.joint import pd_law
 from services.joint.controller import JointController
-from services.joint.envelope import ASTRAY_S, ENERGY_S, ROUNDING, Envelope
+from services.joint.envelope import ASTRAY_S, ENERGY_S, ROUNDING, Envelope, Lately
 from services.joint.failsafe import Event, Failsafe, timing_of
 from shared.bus.messages import JointCommand, Mode, Outside, Pair, Refusal
 from shared.clock import NS_PER_S
@@ -206,22 +206,35 @@ def test_the_work_of_a_coupled_torque_on_a_joint_that_moves_is_what_it_puts_in_w
     robot: RobotConfig, sign: float, axis: int
 ) -> None:
     """100 W: the limit of 10 J after 122 ms, and 30 J in the end; what it takes out is lost."""
-    envelope, found = Envelope(robot, MODULE), [0.0]
     v, tau = ((sign * 2.0, 0.0), (sign * 50.0, 0.0)) if axis == 0 else ((0.0, 2.0), (0.0, 50.0))
-    last = command(tau_coupled=tau)
-    for tick in range(1, 1000):
-        after = command(seq=tick, tau_coupled=tau)
-        found.append(envelope.energy(after, last, found[-1], v, 4e-3))
-        last = after
+    envelope, last = Envelope(robot, MODULE), command(tau_coupled=tau)
+
+    def put(
+        before: float, v: Pair, dt: float = 4e-3, told: JointCommand = last,
+        after: JointCommand | None = last,
+    ) -> float:  # fmt: skip
+        lately = Lately(energy=before, at_ns=T0)
+        return envelope.lately(told, after, lately, v, T0 + round(dt * NS_PER_S)).energy
+
+    found = [0.0]
+    for _ in range(1000):
+        found.append(put(found[-1], v))
     most = robot.envelope.coupled_energy
     assert np.searchsorted(found, most) == pytest.approx(0.122 / 4e-3, abs=1.0)
     assert found[-1] == pytest.approx(100.0 * ENERGY_S, rel=1e-3)
-    against = (-2.0 * v[0], -2.0 * v[1])
-    assert envelope.energy(after, last, 0.0, against, 4e-3) == 0.0
-    assert math.isnan(envelope.energy(after, last, 0.0, (math.nan, 0.0), 4e-3))
-    assert envelope.energy(command(), last, 9.0, v, 1.0) == 0.0, "it is forgotten"
+    assert put(0.0, (-2.0 * v[0], -2.0 * v[1])) == 0.0
+    assert math.isnan(put(0.0, (math.nan, 0.0)))
+    assert put(9.0, v, dt=1.0, told=command()) == 0.0, "it is forgotten"
     for other in (None, command(hold=True), command(session=SESSION + 1)):
-        assert envelope.energy(after, other, 9.0, v, 4e-3) == 0.0
+        assert put(9.0, v, after=other) == 0.0
+
+
+def test_a_log_that_does_not_say_when_a_command_came_counts_no_work_for_it(
+    robot: RobotConfig,
+) -> None:
+    told = command(tau_coupled=(50.0, 0.0))
+    lately = Envelope(robot, MODULE).lately(told, told, Lately(energy=3.0), (2.0, 0.0), T0)
+    assert lately == Lately(energy=3.0, at_ns=T0)
 
 
 @pytest.mark.parametrize(
@@ -231,8 +244,8 @@ def test_the_work_of_a_coupled_torque_on_a_joint_that_moves_is_what_it_puts_in_w
 def test_a_coupled_torque_is_believed_up_to_its_bound_of_work(
     robot: RobotConfig, share: float, outside: Outside
 ) -> None:
-    energy = share * robot.envelope.coupled_energy
-    assert Envelope(robot, MODULE).judge(middle(robot), None, Q, V, energy=energy) is outside
+    lately = Lately(energy=share * robot.envelope.coupled_energy)
+    assert Envelope(robot, MODULE).judge(middle(robot), None, Q, V, lately=lately) is outside
 
 
 @pytest.mark.parametrize("change", [{"session": SESSION + 1}, {"hold": True}])
@@ -280,11 +293,11 @@ def going(tick: int, told: Pair, goes: Pair) -> JointCommand:
 def astray_after(
     robot: RobotConfig, ticks: int, told: Pair, goes: Pair, every: int = 1, module: str = ANKLE
 ) -> Pair:
-    envelope, astray, last = Envelope(robot, module), pd_law.ZERO, going(0, told, goes)
+    envelope, lately, last = Envelope(robot, module), Lately(), going(0, told, goes)
     for tick in range(every, ticks + 1, every):
         after = going(tick, told, goes)
-        astray, last = envelope.astray(after, last, astray), after
-    return astray
+        lately, last = envelope.lately(after, last, lately, V, T0), after
+    return lately.astray
 
 
 @pytest.mark.parametrize("every", [1, 10])
@@ -317,9 +330,9 @@ def test_an_ankles_reference_is_believed_up_to_its_bound_astray(
         (1.001 * most, Outside.Q_REF_ASTRAY),
         (math.nan, Outside.Q_REF_ASTRAY),
     ):
-        astray = (sign * far, 0.0) if axis == 0 else (0.0, sign * far)
+        lately = Lately(astray=(sign * far, 0.0) if axis == 0 else (0.0, sign * far))
         told = middle(robot, "ankle_left")
-        judged = Envelope(robot, "ankle_left").judge(told, None, Q, V, astray=astray)
+        judged = Envelope(robot, "ankle_left").judge(told, None, Q, V, lately=lately)
         assert judged is outside
     assert astray_after(robot, 50, (0.0, 0.0), (0.3, 0.3), module=MODULE) == pd_law.ZERO
 
@@ -377,10 +390,11 @@ def test_a_controller_remembers_what_the_coupled_torque_has_put_into_its_joint(
 
 def test_where_nothing_of_this_planner_is_tracked_nothing_is_astray(robot: RobotConfig) -> None:
     after = command(q_ref=(9.0, 9.0), seq=2)
-    for last in (None, command(hold=True), command(session=SESSION + 1)):
-        assert Envelope(robot, ANKLE).astray(after, last, (0.5, 0.5)) == pd_law.ZERO
     held = msgspec.structs.replace(after, hold=True)
-    assert Envelope(robot, ANKLE).astray(held, command(), (0.5, 0.5)) == pd_law.ZERO
+    pairs = [(after, None), (after, command(hold=True)), (after, command(session=SESSION + 1))]
+    for told, last in (*pairs, (held, command())):
+        lately = Envelope(robot, ANKLE).lately(told, last, Lately(astray=(0.5, 0.5)), V, T0)
+        assert lately.astray == pd_law.ZERO
 
 
 def test_without_bounds_everything_is_believed(robot: RobotConfig) -> None:
