@@ -17,6 +17,7 @@ import msgspec
 
 from services.recorder.disk_guard import MIB
 from services.recorder.loop import free_bytes_at
+from shared import scheduling
 from shared.bus.credentials import NAMES, keys_folder
 from shared.config import files as config_file
 from shared.config import gain_schedule
@@ -74,6 +75,12 @@ def probe(config: Path, run_dir: Path) -> Probe:
     free_mib = free_bytes_at(run_dir) // MIB
     if free_mib < FREE_MIB:
         warnings.append(f"{free_mib} MiB free for records: take old ones away")
+    pause_ms = scheduling.real_time_pause_ms()
+    if pause_ms:
+        warnings.append(
+            f"where services fill a processor the kernel stops them for {pause_ms:g} ms: "
+            f"`sysctl {scheduling.NO_PAUSE}`"
+        )
     return Probe(
         revision=_revision(),
         lock=_hash_of(CHECKOUT / "requirements.runtime.lock"),

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import tomli_w
 
+from shared import scheduling
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
@@ -21,6 +22,7 @@ from tests.tools.hosts.places import LEGS, SHARED, complaints_about, make_hosts
 from tools import cli
 from tools.hosts import hosts_file, layout
 from tools.hosts.hosts_file import Hosts, principals_on
+from tools.hosts.probe import probe
 from tools.keys.authority import principals_of
 
 
@@ -206,6 +208,15 @@ def test_update_brings_all_and_check_then_tells_what_somebody_changed(
     said = told_of(base, capsys)
     assert "another robot file" in said
     assert "another xrl.service" in said
+
+
+@pytest.mark.parametrize("pause_ms", [0.0, 50.0])
+def test_a_host_whose_kernel_stops_what_fills_a_processor_is_warned_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pause_ms: float
+) -> None:
+    monkeypatch.setattr(scheduling, "real_time_pause_ms", lambda: pause_ms)
+    warnings = " ".join(probe(tmp_path / "robot.toml", tmp_path).warnings)
+    assert ("stops them for 50 ms: `sysctl kernel." in warnings) is (pause_ms > 0.0)
 
 
 def test_a_host_that_is_not_reached_is_told_and_the_others_go_on(
