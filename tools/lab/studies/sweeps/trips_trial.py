@@ -23,8 +23,8 @@ from shared.config.scenarios import Keyframe, Push, Scenario
 from shared.exceptions import RunError
 from shared.places import SCENARIOS
 from shared.robot.trip_table import JOINT_TRIPS, untripped
-from tools.sim.lockstep import FleetMoment, Lockstep
-from tools.sim.standing_start import standing
+from tools.sim.lockstep import Lockstep
+from tools.sim.standing_start import begin_standing
 
 SMALL_ERRORS: Final[Mapping[str, Any]] = {
     "encoder.zero_errors": [math.radians(0.5) * (-1) ** i for i in range(12)],
@@ -186,15 +186,7 @@ TROUBLES: Final[Mapping[str, Trouble]] = {
 class TripRun:
     """A run and what tripped in it."""
 
-    def __init__(
-        self,
-        robot: RobotConfig,
-        trouble: Trouble,
-        plant: PlantConfig,
-        seed: int,
-        start: FleetMoment | None = None,
-    ) -> None:
-        """Run; it begins at `start`, or where this robot stands, unless it is never led so far."""
+    def __init__(self, robot: RobotConfig, trouble: Trouble, plant: PlantConfig, seed: int) -> None:
         self.trips: dict[str, int] = {}
         """By name, and when, virtual ns."""
         self.fell_at_s: float | None = None
@@ -206,11 +198,8 @@ class TripRun:
             plant=changed(plant, trouble.errors),
             record=self._record,
         )
-        if start is None and not trouble.unfiltered:  # what shakes may never be led so far
-            start = standing(robot, self.fleet.plant)
-        if start is not None:
-            self.fleet.resume(start)
-        self.start = start
+        if not trouble.unfiltered:  # what shakes may never be led so far
+            begin_standing(self.fleet)
         self._run(trouble.let_go_s)
         for _, event in self.fleet.events:
             if event.mode_before == Mode.TRACK and event.cause in JOINT_TRIPS:
@@ -251,7 +240,7 @@ def run_trial(trial: TripTrial, robot: RobotConfig, seed: int) -> TripResult:
     trouble, plant = TROUBLES[trial.trouble], PLANTS[trial.on]
     robot = unfiltered(robot) if trouble.unfiltered else robot
     seen = TripRun(robot, trouble, plant, seed)
-    without = TripRun(untripped(robot), trouble, plant, seed, seen.start)
+    without = TripRun(untripped(robot), trouble, plant, seed)
     return TripResult(
         led=seen.fleet.world.scenario_s > BEGINS_S,
         tripped=" ".join(sorted(seen.trips, key=lambda name: seen.trips[name])),
