@@ -19,7 +19,7 @@ CHECKOUT: Final = Path(__file__).resolve().parents[1]
 _INSTALLED: Final = Path(__file__).resolve().with_name("files")
 IS_CHECKOUT: Final = not _INSTALLED.is_dir()
 FILES: Final = CHECKOUT / "deploy" if IS_CHECKOUT else _INSTALLED
-"""Folder of the files as shipped: robot file, gain schedule, process table, scenarios, rules."""
+"""Folder of the files as shipped: robot file, gain schedule, process table, scenarios, settings."""
 DEFAULT_CONFIG: Final = FILES / "robot.toml"
 """The robot file as shipped."""
 SCENARIOS: Final = FILES / "scenarios"

@@ -11,7 +11,6 @@ import platform
 import resource
 import struct
 from collections.abc import Collection
-from contextlib import suppress
 from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
@@ -26,7 +25,7 @@ class ProcessSchedule(NamedTuple):
     """A process's row."""
 
     fifo: int
-    """SCHED_FIFO priority, 1 .. 99; 0: `NICE`, off the control path."""
+    """SCHED_FIFO priority, 1 .. 99; 0: none, it is off the control path."""
     half: Literal["first", "second", "by leg", "any"]
     """Half of the processors: a leg and who feeds it share their caches."""
 
@@ -40,10 +39,8 @@ TABLE: Final[dict[str, ProcessSchedule]] = {
     "imu": ProcessSchedule(10, "first"),
     "recorder": ProcessSchedule(0, "any"),
 }
-"""By kind of process. The right leg is on the first half, the left leg on the second. With the
-recorder in real time, too, that half was full more often (`real_time_pause_ms`)."""
-NICE: Final = -11
-"""Of a process without real time: others get a twelfth of its share."""
+"""By kind of process. The right leg is on the first half, the left leg on the second. A recorder in
+real time filled the second half more often (`real_time_pause_ms`)."""
 
 _PR_SET_TIMERSLACK: Final = 29
 _SCHED_SETATTR: Final = {"x86_64": 314, "aarch64": 274, "armv7l": 380}
@@ -54,7 +51,7 @@ SLICE_NS: Final = 100_000
 TIMER_SLACK_NS: Final = 1_000
 """Sleeps end so close to their time; the default is 50 us."""
 NO_PAUSE: Final = "kernel.sched_rt_runtime_us=-1"
-"""The kernel's setting without `real_time_pause_ms`."""
+"""The kernel's setting without `real_time_pause_ms`, before Linux 6.12: deploy/sysctl."""
 _CAP_IPC_LOCK: Final = 14
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
@@ -107,9 +104,7 @@ def _pin(processors: set[int]) -> str:
 def raise_priority(fifo: int) -> str:
     """Set SCHED_FIFO, or what needs no privilege; return what was granted."""
     if not fifo:
-        with suppress(OSError):
-            os.setpriority(os.PRIO_PROCESS, 0, NICE)
-        return f"nice {os.getpriority(os.PRIO_PROCESS, 0)}, {short_slice()}"
+        return short_slice()
     limit_us = _real_time_limit_us()
     if limit_us is not None:
         return f"{short_slice()}, no real time: RLIMIT_RTTIME of {limit_us} us would kill it"

@@ -60,8 +60,7 @@ class Lately(msgspec.Struct, gc=False, frozen=True):
     energy: float = 0.0
     """Work of the coupled torque, J; what it took counts as none."""
     at_ns: int = 0
-    """When the newest came, on this module's clock; 0 before the first, and in logs that do not say
-    it."""
+    """When the newest came, on this module's clock; 0 before the first."""
 
 
 NOTHING_YET: Final = Lately()

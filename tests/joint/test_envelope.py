@@ -229,12 +229,9 @@ def test_the_work_of_a_coupled_torque_on_a_joint_that_moves_is_what_it_puts_in_w
         assert put(9.0, v, after=other) == 0.0
 
 
-def test_a_log_that_does_not_say_when_a_command_came_counts_no_work_for_it(
-    robot: RobotConfig,
-) -> None:
+def test_a_command_after_none_has_done_no_work(robot: RobotConfig) -> None:
     told = command(tau_coupled=(50.0, 0.0))
-    lately = Envelope(robot, MODULE).lately(told, told, Lately(energy=3.0), (2.0, 0.0), T0)
-    assert lately == Lately(energy=3.0, at_ns=T0)
+    assert Envelope(robot, MODULE).lately(told, told, Lately(), (2.0, 0.0), T0) == Lately(at_ns=T0)
 
 
 @pytest.mark.parametrize(

@@ -109,9 +109,9 @@ def _delays(root: Path, *, emulated: bool) -> list[Finding]:
         (areas <= 0, "swap", "none" if areas <= 0 else f"{areas} in use", "none",
          "`sudo swapoff -a`",
          "a service that may not lock its memory stops for a page that was swapped out"),
-        (pause_ms <= 0.0, "real-time limit", f"{pause_ms:g} ms" if pause_ms else "none", "none",
-         f"`sudo sysctl {scheduling.NO_PAUSE}`; for good: deploy/sysctl/90-xrl.conf",
-         "where services fill a processor the kernel stops them all for so long: modules hold"),
+        (pause_ms <= 0.0, "real-time pause", f"{pause_ms:g} ms" if pause_ms else "none", "none",
+         f"`sudo cp {FILES}/sysctl/90-xrl.conf /etc/sysctl.d/ && sudo sysctl --system`",
+         "the kernel stops services that fill a processor so long in each second: modules hold"),
     )  # fmt: skip
     return [advised(good or emulated, SUBJECT, *row) for good, *row in rows]
 

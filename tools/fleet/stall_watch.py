@@ -1,6 +1,6 @@
 """Idle real-time threads, one a core: what delays them is the machine, and nothing that runs on it.
 
-But where real-time processes fill a core, the kernel stops these with them
+But where real-time processes fill a core, the kernel stops these threads too
 (`shared.scheduling.real_time_pause_ms`).
 
 Run as a program (`python stall_watch.py FILE PID`) it appends a line for each gap, and ends with
@@ -21,8 +21,8 @@ from typing import Final, NamedTuple, Self
 PERIOD_NS: Final = 4_000_000
 GAP_NS: Final = 20_000_000
 """A delay beyond the period that counts: with some milliseconds of network, an age of 50 ms."""
-PRIORITY: Final = 90
-"""Above every service (`shared.scheduling`)."""
+PRIORITY: Final = 30
+"""Above every service (`shared.scheduling`), and within the limit that docs/bring-up.md sets."""
 CORES_MAX: Final = 8
 """With more cores one thread wanders: so many wake-ups would be a load of their own."""
 ANY_CORE: Final = -1
@@ -35,7 +35,7 @@ _NS_PER_TICK: Final = 1_000_000_000 // os.sysconf("SC_CLK_TCK")
 
 
 class Gap(NamedTuple):
-    """Time in which a core ran nothing. All times are of CLOCK_MONOTONIC."""
+    """Time in which a core ran nothing in real time. All times are of CLOCK_MONOTONIC."""
 
     end_ns: int
     lasted_ns: int

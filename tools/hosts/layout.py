@@ -96,7 +96,6 @@ StateDirectoryMode=0750
 WorkingDirectory=/var/lib/xrl
 UMask=0027
 LimitRTPRIO=40
-LimitNICE=-11
 LimitMEMLOCK=infinity
 LimitCORE=0
 {processors}{of_service}NoNewPrivileges=yes

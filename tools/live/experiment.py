@@ -190,7 +190,7 @@ class ExperimentFlags(LawFlags, PlantFlags, ControllerFlags):
 ROW_FIELDS: Final = ("kill", "restart", "push", "fault", "inject")
 """Rows of a scenario that flags of the same name give."""
 SHOWN: Final = 12
-"""Kills, faults, impairments and pushes that the first line of a run names."""
+"""Happenings that the first line of a run names."""
 
 
 def scenario_file(name: str, config: Path = DEFAULT_CONFIG) -> Path:

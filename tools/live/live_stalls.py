@@ -26,8 +26,8 @@ ALIVE_NS: Final = NS_PER_S
 """A module that was silent for longer before a stall has no part in it."""
 MERGE_NS: Final = 50 * NS_PER_MS
 """Two ways of finding one stall report it within this time of each other."""
-FULL_CORE: Final = 0.25
-"""With less idle time beside the fleet one of the cores may be full."""
+FULL_CORE: Final = 0.2
+"""With less idle time beside the fleet one of two cores may be full; of four it fills none."""
 
 
 class Silence:
@@ -244,7 +244,10 @@ class LiveStalls:
             words += f": too little, modules may hold; `--pace {pace() / 2:g}` asks for half of it"
         pause_ms = self._pause_ms() if idle < FULL_CORE else 0.0
         if pause_ms:
-            words += f"; a core that it fills is stopped for {pause_ms:g} ms (`xrl doctor`)"
+            words += (
+                f"; a core that it fills the kernel stops for {pause_ms:g} ms in each second: "
+                f"`sudo sysctl {scheduling.NO_PAUSE}`"
+            )
         if not self.found:
             return words
         most_ms = max(stall.lasted_ms for stall in self.found)

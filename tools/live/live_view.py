@@ -11,6 +11,8 @@ from rich.text import Text
 from shared.bus.messages import PlannerStatus
 from shared.bus.traces import SimTruth
 from shared.config.scenarios import Inject
+from shared.robot.trip_table import reason_of
+from tools.guarded_streams import printable
 from tools.live.scenario_runner import LiveSnapshot
 from tools.terminal import Console, renewed
 
@@ -81,10 +83,11 @@ def said_by(planner: PlannerStatus | None) -> tuple[str, str]:
     """Return what a person must know, and when a planner that waits after drop-outs leads again."""
     if planner is None:
         return "", ""
+    why = printable(reason_of(planner))
     if planner.wait_s <= 0.0:
-        return planner.why, ""
+        return why, ""
     soon = planner.wait_s < 1.0
-    return planner.why, "leads again soon" if soon else f"leads again in {planner.wait_s:.0f} s"
+    return why, "leads again soon" if soon else f"leads again in {planner.wait_s:.0f} s"
 
 
 def _line(truth: SimTruth, modes: Sequence[str], note: str) -> str:

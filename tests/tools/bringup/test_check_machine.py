@@ -36,7 +36,7 @@ def row_of(rows: list[Finding], what: str) -> Finding:
         (f"{CPU}/cpu0/cpufreq/scaling_governor", "powersave", "frequency governor"),
         ("sys/devices/system/clocksource/clocksource0/current_clocksource", "hpet", "clock source"),
         ("proc/swaps", "Filename Type\n/swapfile file", "swap"),
-        (f"{KERNEL}/sched_rt_runtime_us", "950000", "real-time limit"),
+        (f"{KERNEL}/sched_rt_runtime_us", "950000", "real-time pause"),
     ],
 )
 def test_a_slow_loop_is_a_warning_on_a_real_robot_and_a_note_on_an_emulated_one(

@@ -14,6 +14,7 @@ from typing import Any, cast
 import msgspec
 import pytest
 
+from shared import scheduling
 from shared.bus.messages import (
     LOST_DRIVE,
     Cause,
@@ -30,7 +31,7 @@ from shared.clock import NS_PER_S, now_ns
 from shared.joints import MODULES
 from shared.robot.trip_table import JOINT_TRIPS
 from tests.messages import joint_state
-from tools.fleet import procfs
+from tools.fleet import fleet_status, procfs
 from tools.fleet.fleet_status import (
     FleetStatus,
     LeadStatus,
@@ -52,6 +53,7 @@ from tools.fleet.status_table import (
     tables,
     warn_of_others,
 )
+from tools.fleet.supervisor_client import ServiceInfo
 from tools.terminal import Console
 
 
@@ -256,6 +258,24 @@ def test_codes_that_this_version_does_not_know_are_told() -> None:
     said = (status.mode, status.cause, status.drive)
     assert said == ("unknown (99)", "unknown (98)", "unknown (97)")
     assert "another version" in status.way_out
+
+
+@pytest.mark.parametrize(
+    ("name", "state", "real_time"),
+    [
+        ("hip_left", "running", False),
+        ("planner", "running", False),
+        ("planner", "suspended", None),
+        ("recorder", "running", None),
+        ("ros2_gateway", "running", None),
+    ],
+)
+def test_real_time_is_expected_of_running_services_on_the_control_path(
+    monkeypatch: pytest.MonkeyPatch, name: str, state: str, real_time: bool | None
+) -> None:
+    monkeypatch.setattr(scheduling, "has_real_time", lambda _pid: False)
+    info = ServiceInfo(name, 7, state, 1.0)
+    assert fleet_status._service_status(info).real_time is real_time
 
 
 def test_services_without_real_time_are_told() -> None:

@@ -159,7 +159,7 @@ def test_only_what_is_done_now_is_named(scenario_s: float, words: str) -> None:
 
 def waits(wait_s: float, why: str = "") -> PlannerStatus:
     found: PlannerStatus = sample(
-        PlannerStatus, seq=1, t_ns=1, mode=int(PlannerMode.ALIGNING), wait_s=wait_s, why=why
+        PlannerStatus, seq=1, t_ns=1, mode=int(PlannerMode.ALIGNING), wait_s=wait_s, why=why, trip=0
     )
     return found
 
@@ -168,6 +168,7 @@ def test_a_planner_that_waits_after_drop_outs_reports_how_long() -> None:
     assert said_by(waits(3.4)) == ("", "leads again in 3 s")
     assert said_by(waits(0.3)) == ("", "leads again soon")
     assert said_by(waits(0.0, "knee_left is hot")) == ("knee_left is hot", "")
+    assert said_by(waits(0.0, "a controller's\ntrouble")) == ("a controller's\\ntrouble", "")
     assert said_by(None) == ("", "")
 
 

@@ -1,7 +1,7 @@
 """Logs of earlier versions stay readable; the newest is executed again.
 
 A change that is meant to change what the services put out makes a new golden log (see
-`make_golden`): the old one stays, and is read.
+`make_golden`): the old one stays, and is read, once somebody may have logs of its form.
 """
 
 from __future__ import annotations
