@@ -127,7 +127,8 @@ def _lost_frames(subject: str, traffic: BusTraffic) -> list[Finding]:
 def positions(robot: RobotConfig, module: str, traffic: BusTraffic) -> tuple[float, float] | None:
     """Return both motors' positions in turns, as the drive counts them; None without a reply.
 
-    From the count where the estimate is 0, as in firmware 0.5.6 until its first closed loop.
+    From the count where the estimate is 0, as in firmware 0.5.6 until its first closed loop: where
+    the count was not answered nothing is known.
     """
     first, second = (
         _turns(traffic.nodes.get(node, NodeTraffic()), robot.joint.encoder_counts_per_turn)
@@ -137,9 +138,9 @@ def positions(robot: RobotConfig, module: str, traffic: BusTraffic) -> tuple[flo
 
 
 def _turns(traffic: NodeTraffic, counts_per_turn: int) -> float | None:
-    if traffic.pos_turns == 0.0 and traffic.shadow_count is not None:
-        return traffic.shadow_count / counts_per_turn
-    return traffic.pos_turns
+    if traffic.pos_turns != 0.0 or traffic.version is not None:
+        return traffic.pos_turns
+    return None if traffic.shadow_count is None else traffic.shadow_count / counts_per_turn
 
 
 def _axis_rows(

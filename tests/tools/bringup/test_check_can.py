@@ -6,6 +6,7 @@ import errno
 import math
 import os
 from collections.abc import Callable
+from typing import Any
 
 import msgspec
 import pytest
@@ -100,6 +101,20 @@ def test_what_is_not_right_with_a_modules_axes_is_named(
     assert expected or len(rows) == 8
     told = " ".join(str(row) for row in rows if row.verdict is not OK)
     assert all(word in told for word in words)
+
+
+@pytest.mark.parametrize(
+    ("answered", "turns"),
+    [({}, None), ({"shadow_count": 64 * 16384}, 64.0), ({"version": NEW.version}, 0.0)],
+    ids=["nothing", "a count", "firmware 0.6"],
+)
+def test_an_estimate_of_0_is_believed_of_new_firmware_only(
+    robot: RobotConfig, answered: dict[str, Any], turns: float | None
+) -> None:
+    """On a full machine the count's answer came too late, and a zero was called lost."""
+    traffic = healthy(axis9=NodeTraffic(IDLE, pos_turns=0.0, **answered))
+    found = check_can.positions(robot, MODULE, traffic)
+    assert found == (None if turns is None else (64.0, turns))
 
 
 NO_CAN = f"[Errno {errno.EAFNOSUPPORT}] {os.strerror(errno.EAFNOSUPPORT)}"
