@@ -47,7 +47,7 @@ def test_every_process_of_the_fleet_has_a_row() -> None:
 
 
 def test_what_a_step_needs_first_has_the_higher_priority() -> None:
-    order = ("simulator", "joint", "planner", "harness", "recorder")  # the last is off its path
+    order = ("simulator", "joint", "planner", "harness", "recorder")
     priorities = [TABLE[kind].fifo for kind in order]
     assert priorities == sorted(priorities, reverse=True)
     assert len(set(priorities)) == len(order)
@@ -63,7 +63,7 @@ def test_the_halves_are_the_legs_and_no_processor_is_left_out(count: int) -> Non
     for module in MODULES:
         half = half_of(processors, "joint", module)
         assert half == (right if module.endswith("right") else left)
-    assert half_of(processors, "planner") == left
+    assert half_of(processors, "planner") == half_of(processors, "recorder") == left
     assert half_of(processors, "simulator") == half_of(processors, "harness") == right
 
 
@@ -103,15 +103,6 @@ def test_a_process_is_pinned_only_where_the_fleets_table_says_so(pinned: str) ->
     same, count = row.split()
     assert ("processors" in granted) == (pinned == "1")
     assert (same == "True") == (pinned == "1" or count == "1")
-
-
-def test_the_recorder_takes_no_real_time_and_may_run_anywhere(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(os, "sched_setscheduler", lambda *_: pytest.fail("no real time"))
-    monkeypatch.setattr(scheduling, "short_slice", lambda: "a short slice")
-    assert scheduling.raise_priority(TABLE["recorder"].fifo) == "a short slice"
-    assert half_of({3, 4, 5}, "recorder") == {3, 4, 5}
 
 
 @pytest.mark.parametrize("first", ["services.planner.planner", "tools.sim.lockstep", "tools.cli"])

@@ -309,8 +309,7 @@ def _trouble_of(fleet: SupervisedFleet, services: Iterable[ServiceInfo]) -> tupl
 
 def _real_time(service: ServiceInfo) -> bool | None:
     """Return whether a running service that is to have a real-time priority was given one."""
-    row = scheduling.TABLE.get("joint" if service.name in MODULES else service.name)
-    wanted = row is not None and row.fifo > 0
+    wanted = service.name in MODULES or service.name in scheduling.TABLE
     running = service.pid is not None and service.state == "running"
     return scheduling.has_real_time(service.pid) if wanted and running and service.pid else None
 

@@ -266,11 +266,11 @@ def test_codes_that_this_version_does_not_know_are_told() -> None:
         ("hip_left", "running", False),
         ("planner", "running", False),
         ("planner", "suspended", None),
-        ("recorder", "running", None),
+        ("recorder", "running", False),
         ("ros2_gateway", "running", None),
     ],
 )
-def test_real_time_is_expected_of_running_services_on_the_control_path(
+def test_real_time_is_expected_of_running_services_that_the_table_gives_it(
     monkeypatch: pytest.MonkeyPatch, name: str, state: str, real_time: bool | None
 ) -> None:
     monkeypatch.setattr(scheduling, "has_real_time", lambda _pid: False)
