@@ -54,7 +54,7 @@ class ControllerState(msgspec.Struct, kw_only=True):
     takeover_offset: Pair = (0.0, 0.0)
     """Torque of the drive beyond the law's when the service resumed after a gap, N m."""
     lately: Lately = NOTHING_YET
-    """Of the newest accepted command."""
+    """What the commands that were obeyed have done, up to the newest."""
     resumed_ns: int = 0
     last_cycle_ns: int = 0
     cause: int = 0

@@ -111,7 +111,7 @@ def _delays(root: Path, *, emulated: bool) -> list[Finding]:
          "a service that may not lock its memory stops for a page that was swapped out"),
         (pause_ms <= 0.0, "real-time pause", f"{pause_ms:g} ms" if pause_ms else "none", "none",
          f"`sudo cp {FILES}/sysctl/90-xrl.conf /etc/sysctl.d/ && sudo sysctl --system`",
-         "the kernel stops services that fill a processor so long in each second: modules hold"),
+         "for that time of each second the kernel stops what fills a processor: modules hold"),
     )  # fmt: skip
     return [advised(good or emulated, SUBJECT, *row) for good, *row in rows]
 

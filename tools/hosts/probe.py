@@ -78,7 +78,8 @@ def probe(config: Path, run_dir: Path) -> Probe:
     pause_ms = scheduling.real_time_pause_ms()
     if pause_ms:
         warnings.append(
-            f"where services fill a processor the kernel stops them for {pause_ms:g} ms: "
+            f"where services fill a processor the kernel stops them for {pause_ms:g} ms of each "
+            "second: "
             f"`sysctl {scheduling.NO_PAUSE}`"
         )
     return Probe(

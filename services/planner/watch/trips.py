@@ -52,7 +52,7 @@ ASSUMED_SINK_RATE: Final = 1.0
 SINK_RATE_MIN: Final = 1e-3
 """m/s; least sink rate used for a robot that does not sink."""
 ROOM: Final = 0.02
-"""m; so much farther than it was at the least since it is led a COM beyond the limit may be."""
+"""m; a COM beyond the limit trips once it is farther off by this than at its least while led."""
 LOADED_FACTOR: Final = 3.0
 """Multiple of the `unloaded` limit. A robot whose two legs both carry this much stands."""
 

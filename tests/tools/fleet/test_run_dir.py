@@ -236,7 +236,7 @@ def test_a_persons_start_forgets_a_stop_and_so_does_down_unless_it_is_told_not_t
 def test_the_harness_keeps_its_zero_where_only_the_supervisor_has_crashed(
     claimed: RunDir, what: str, kept: bool
 ) -> None:
-    """A person may rest on it then; after any other end it tares anew."""
+    """A person may rest on it then; after any other end it tares again."""
     ZeroFile(claimed.path).write(np.ones(6))
     if what == "a clean end":
         claimed.clear(keep_logs=True, keep_stops=True)
