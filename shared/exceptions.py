@@ -48,7 +48,11 @@ class BusError(XrlError):
     """The bus could not be opened, or a message could not be put on it."""
 
 
-class NonFiniteError(BusError):
+class EncodeError(BusError):
+    """A message holds a value that JSON has no form for; it was not sent."""
+
+
+class NonFiniteError(EncodeError):
     """A message holds a number that is not finite; it was not sent."""
 
 

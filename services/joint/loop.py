@@ -124,6 +124,7 @@ class JointLoop:
         self._reported = ArmingInhibit.NONE
         self._report_at_ns = 0
         self._malformed = 0
+        self._has_sent = False
         self._nowhere = (-config.drive.zero_mark_turns,) * 2
 
     def run(self, stop: StopFlag) -> None:
@@ -162,13 +163,16 @@ class JointLoop:
         if self._neighbours is not None and module.needs_neighbours:
             near = self._neighbours.view(now)
         step = module.step(now, reading, command, estop, near)
-        self._write(step)
         controller = module.controller
+        due = controller.is_state_due
+        if not self._has_sent:  # a module that cannot say where it is must not arm
+            self._has_sent, due = ports.states.put(controller.state(now)), False
+        self._write(step)
         if self._neighbours is not None:
             self._neighbours.write(row_of(controller, now))
         if step.event is not None:
             ports.events.put(step.event)
-        if controller.is_state_due:
+        if due:
             ports.states.put(controller.state(now))
         if self._rearm_guard is not None:
             self._rearm_guard.write(module.last_state)
@@ -198,7 +202,8 @@ class JointLoop:
         elif order is DriveCommand.TORQUE:
             drive.write_torque(step.torque)
         elif order is DriveCommand.ARM:
-            drive.arm(onboard=self.module.onboard)
+            if self._has_sent:
+                drive.arm(onboard=self.module.onboard)
         elif order is DriveCommand.CLEAR_ERRORS:
             drive.clear_errors()
         elif order is DriveCommand.IDLE:

@@ -7,20 +7,32 @@ from typing import Generic, TypeVar
 import msgspec
 
 from shared.bus.messages import Message
-from shared.exceptions import NonFiniteError
+from shared.exceptions import EncodeError, NonFiniteError
 
 M = TypeVar("M", bound=Message)
 
-_ENCODER = msgspec.json.Encoder()
+
+def _plain(value: object) -> object:
+    """Return the Python number of a NumPy scalar, which msgspec does not encode by itself."""
+    return value.item()  # type: ignore[attr-defined]  # raises what `encode` reports
+
+
+_ENCODER = msgspec.json.Encoder(enc_hook=_plain)
+_UNENCODABLE = (AttributeError, TypeError, ValueError, OverflowError, RecursionError)
 
 
 def encode(message: Message) -> bytes:
     """Return the JSON of a message.
 
-    Raises NonFiniteError for a number that is NaN or infinite: msgspec writes it as null, which no
-    message's type allows, since it has no optional field.
+    Raises:
+        NonFiniteError: a number is NaN or infinite. msgspec writes it as null, which no message's
+            type allows, since it has no optional field.
+        EncodeError: a value is no number, text or list, or an integer of more than 64 bits.
     """
-    payload = _ENCODER.encode(message)
+    try:
+        payload = _ENCODER.encode(message)
+    except _UNENCODABLE as error:
+        raise EncodeError(f"{_where(message)}; not sent") from error
     if b"null" in payload:  # or the word in a text: its own type tells
         try:
             msgspec.json.decode(payload, type=type(message))
@@ -29,6 +41,17 @@ def encode(message: Message) -> bytes:
                 f"{type(message).__name__} {message.seq}: a number is not finite; not sent"
             ) from None
     return payload
+
+
+def _where(message: Message) -> str:
+    """Return the field of a message that cannot be encoded, with its type."""
+    for name in message.__struct_fields__:
+        value = getattr(message, name)
+        try:
+            _ENCODER.encode(value)
+        except _UNENCODABLE as error:
+            return f"{type(message).__name__}.{name}: {type(value).__name__}: {error}"
+    return type(message).__name__
 
 
 class Decoder(Generic[M]):

@@ -5,8 +5,8 @@ with a fixed endpoint. There is no router, no scouting and no gossip, and a peer
 each pair of services has a link of its own, but for two joint services, and a tool has one with
 each service (`peers_of`).
 
-On the control path (`Publisher.put`, `Latest.take`) nothing blocks, logs or raises. A message that
-cannot be sent or decoded is counted, and its absence shows as age. RUST_LOG=info shows Zenoh's own
+On the control path (`Publisher.put`, `Latest.take`) nothing blocks or raises. A message that cannot
+be sent or decoded is counted, and its absence shows as age. RUST_LOG=info shows Zenoh's own
 log.
 """
 
@@ -36,7 +36,7 @@ from shared.bus.topics import Priority, Topic
 from shared.clock import keep_pace, now_ns
 from shared.config.endpoints import host_and_port
 from shared.config.robot_config import SERVICES, RobotConfig, expand
-from shared.exceptions import BusError, NonFiniteError
+from shared.exceptions import BusError, EncodeError
 from shared.joints import MODULES
 from shared.links import PAIRS, Pair, endpoint_through
 from shared.process import SOCKET_PATH_MAX
@@ -106,18 +106,26 @@ class Publisher(Generic[T]):
     def __init__(self, publisher: zenoh.Publisher, encoded: Callable[[T], bytes]) -> None:
         self._publisher, self._put, self._encoded = publisher, publisher.put, encoded
         self.failed = 0
-        """Messages that were not sent: not finite, or the session is closed."""
+        """Messages that were not sent: a value cannot be encoded, or the session is closed."""
+        self._has_reported = False
 
     def put(self, message: T) -> bool:
         """Send a message; return False and count it if it cannot be sent.
 
         Never blocks and never raises. Where a subscriber's queue is full the message is
-        dropped for that subscriber only, and that is not counted.
+        dropped for that subscriber only, and that is not counted. The first message that cannot be
+        encoded is logged, with its field: a bug of whoever made it, not a fault of the robot.
         """
         try:
             self._put(self._encoded(message))
-        except (NonFiniteError, zenoh.ZError):
+        except zenoh.ZError:
             self.failed += 1
+            return False
+        except EncodeError as error:
+            self.failed += 1
+            if not self._has_reported:
+                self._has_reported = True
+                log.get("xrl").error("%s", error)
             return False
         return True
 

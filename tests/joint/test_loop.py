@@ -25,6 +25,7 @@ from shared.bus.messages import (
 )
 from shared.bus.ports import M
 from shared.bus.traces import JointTrace
+from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from tests.joint.helpers import SESSION, T0, command, with_service
 
@@ -314,3 +315,13 @@ def test_the_end_of_the_planners_process_is_hold_in_that_cycle_and_traced(onboar
     cycles = [each for trace in onboard.traces.sent for each in trace.cycles]
     ended = {at: each.ended for at, each in enumerate(cycles, 1) if each.ended}
     assert ended == {cycle - 39: SESSION + 1, cycle + 1: SESSION}
+
+
+def test_a_module_whose_state_cannot_be_sent_does_not_arm(robot: RobotConfig) -> None:
+    rig = Rig(robot)
+    put, rig.states.put = rig.states.put, lambda _message: False  # type: ignore[method-assign]
+    rig.run_ns(NS_PER_S)
+    assert rig.drive.armed == 0
+    rig.states.put = put  # type: ignore[method-assign]
+    rig.run_ns(NS_PER_S)
+    assert rig.drive.armed > 0

@@ -5,14 +5,15 @@ from collections.abc import Callable
 from typing import Any, get_args, get_origin, get_type_hints
 
 import msgspec
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from shared.bus.codec import Decoder, encode
-from shared.bus.messages import JointCommand, Message
+from shared.bus.messages import JointCommand, Message, OperatorIntent
 from shared.bus.topics import JOINT_STATE, TOPICS, WRENCH, Topic, all_keys, keys
-from shared.exceptions import NonFiniteError
+from shared.exceptions import EncodeError, NonFiniteError
 from shared.joints import MODULES
 from tests.messages import filled
 
@@ -89,6 +90,20 @@ def test_a_number_that_is_not_finite_is_refused_wherever_it_stands(topic: Topic)
         for number in NOT_FINITE:
             with pytest.raises(NonFiniteError, match=f"{topic.type.__name__} 7: .*not finite"):
                 encode(with_float(message, place, number))
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32, np.int64])
+def test_a_numpy_scalar_is_sent_as_a_number(kind: type[np.generic]) -> None:
+    message = OperatorIntent(t_ns=1, seq=7, assist_n=kind(40))  # type: ignore[arg-type,call-arg]
+    decoded = Decoder(OperatorIntent).decode(encode(message))
+    assert decoded == OperatorIntent(t_ns=1, seq=7, assist_n=40.0)
+
+
+@pytest.mark.parametrize("value", [object(), np.zeros(2), {1j}])
+def test_a_value_without_json_is_refused_with_its_field_and_type(value: object) -> None:
+    message = OperatorIntent(t_ns=1, seq=7, assist_n=value)  # type: ignore[arg-type]
+    with pytest.raises(EncodeError, match=rf"OperatorIntent\.assist_n: {type(value).__name__}"):
+        encode(message)
 
 
 @pytest.mark.parametrize("word", [b"null", b"NaN", b"Infinity", b"1e999", b'"1.5"'])

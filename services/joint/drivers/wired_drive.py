@@ -28,27 +28,31 @@ class MotorFrame(NamedTuple):
     signs: Signs = (1, 1)
 
     def from_drive(self, reading: DriveReading) -> DriveReading:
-        """Return a reading in turns from the joint's zero; UNZEROED if the position is invalid."""
+        """Return a reading in turns from the joint's zero; UNZEROED if the position is invalid.
+
+        A driver may return NumPy scalars: `float` ends them here, for they are slow, compute in
+        single precision if they are of it, and no message may hold one.
+        """
         mark, (sign_a, sign_b) = self
         (a, b), (vel_a, vel_b), torque = reading.pos_turns, reading.vel_turns, reading.torque
-        a, b = a * sign_a - mark, b * sign_b - mark
+        a, b = float(a) * sign_a - mark, float(b) * sign_b - mark
         status, half, zero = reading.status, 0.5 * mark, reading.encoder_zero
         zeroed = mark == 0.0 or (-half < a < half and -half < b < half)
         if not zeroed and status not in LOST_DRIVE:
             status = DriveStatus.UNZEROED
         return DriveReading(
-            reading.t_ns,
+            int(reading.t_ns),
             (a, b),
-            (vel_a * sign_a, vel_b * sign_b),
+            (float(vel_a) * sign_a, float(vel_b) * sign_b),
             status,
-            reading.error,
-            None if torque is None else self.torque(torque),
+            int(reading.error),
+            None if torque is None else self.torque((float(torque[0]), float(torque[1]))),
             None
             if zero is None
-            else ((zero[0] * sign_a - mark) % 1.0, (zero[1] * sign_b - mark) % 1.0),
-            reading.fet_celsius,
-            reading.motor_celsius,
-            supply_v=reading.supply_v,
+            else ((float(zero[0]) * sign_a - mark) % 1.0, (float(zero[1]) * sign_b - mark) % 1.0),
+            _floats(reading.fet_celsius),
+            _floats(reading.motor_celsius),
+            supply_v=float(reading.supply_v),
         )
 
     def target(self, target: MotorTarget) -> MotorTarget:
@@ -72,6 +76,10 @@ class MotorFrame(NamedTuple):
     def torque(self, torque: Pair) -> Pair:
         """Return motor torques, N m, as the drive counts them, and the other way round."""
         return (torque[0] * self.signs[0], torque[1] * self.signs[1])
+
+
+def _floats(pair: Pair | None) -> Pair | None:
+    return None if pair is None else (float(pair[0]), float(pair[1]))
 
 
 class WiredDrive:

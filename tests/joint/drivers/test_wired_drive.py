@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import msgspec
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -147,3 +149,16 @@ def test_a_motor_that_counts_down_is_the_same_joint(pos: Pair, signs: tuple[int,
     )
     assert (sent.pos_gain, sent.vel_gain) == (TARGET.pos_gain, TARGET.vel_gain)
     assert torque == sent.torque
+
+
+def test_numpy_scalars_of_a_driver_become_numbers_of_python(inner: Recorder) -> None:
+    pair = (np.float32(0.5), np.float32(-0.25))
+    inner.reading = DriveReading(
+        np.int64(7), pair, pair, DriveStatus.ARMED, np.uint32(0x40), pair, pair, pair, pair,
+        np.float64(48.0),
+    )  # type: ignore[arg-type]  # fmt: skip
+    reading = WiredDrive(inner, MotorFrame()).read(0.0)
+    assert reading is not None
+    for value in msgspec.structs.astuple(reading):
+        for number in value if isinstance(value, tuple) else (value,):
+            assert type(number) in (int, float, DriveStatus), value
