@@ -209,6 +209,11 @@ class JointController:
         return self._law.state.current
 
     @property
+    def states(self) -> int:
+        """State messages made so far."""
+        return self._state.states
+
+    @property
     def is_state_due(self) -> bool:
         """True if this cycle sends a state: every nth does, in the planner's phase."""
         return self._state.clock.passed(self._state_every, self._state_phase)

@@ -165,15 +165,15 @@ class JointLoop:
         step = module.step(now, reading, command, estop, near)
         controller = module.controller
         due = controller.is_state_due
-        if not self._has_sent:  # a module that cannot say where it is must not arm
+        if controller.states == 0:  # a module that cannot say where it is must not arm
             self._has_sent, due = ports.states.put(controller.state(now)), False
         self._write(step)
         if self._neighbours is not None:
             self._neighbours.write(row_of(controller, now))
         if step.event is not None:
             ports.events.put(step.event)
-        if due:
-            ports.states.put(controller.state(now))
+        if due and ports.states.put(controller.state(now)):
+            self._has_sent = True
         if self._rearm_guard is not None:
             self._rearm_guard.write(module.last_state)
         if self._heat_file is not None:
