@@ -246,6 +246,8 @@ class Planner:
             shift_requested=request.shift,
             probe=(request.probe_row, request.probe),
             toward=self._toward(heat.toward),
+            released=self._state.unattended.released,
+            pitch_drive=self._state.unattended.pitch.drive,
             align=engagement.hold,
             wrench=self._usable_wrench(now_ns),
             up_torso=self._usable_up(now_ns),
@@ -266,7 +268,7 @@ class Planner:
         soles = self._soles.loads(loads)
         edge = self._soles.edge(self._tau, soles)
         rate = self._law.harness_rate(self._v)
-        drift = self._drift(now_ns, lifted)
+        drift = self._drift(now_ns, lifted, leads=leads)
         moves = self._heat.moves
         values = values_of(
             self._output, self._q, soles, edge, lifted, rate, drift, leads=leads, moves=moves
@@ -393,15 +395,16 @@ class Planner:
             return None
         return wrench
 
-    def _drift(self, now_ns: int, lifted: float | None) -> float:
+    def _drift(self, now_ns: int, lifted: float | None, *, leads: bool) -> float:
         """Return how far the robot has drifted since a hand was last felt, m."""
         wrench, output = self._usable_wrench(now_ns), self._output
-        if wrench is None or lifted is None or output is None or self._sits:
-            force = moment = math.nan
-        else:
-            force, moment = lifted, wrench.moment[1]
-        p = output.p.tolist() if output is not None else [0.0] * 6
-        return self._unattended.drift(now_ns, (p[2], p[4]), force, moment)
+        hand = math.nan, math.nan
+        p = pdot = [0.0] * 6
+        if output is not None:
+            p, pdot = output.p.tolist(), output.pdot.tolist()
+            if wrench is not None and lifted is not None and not self._sits:
+                hand = lifted + output.assist, wrench.moment[1]
+        return self._unattended.advance(now_ns, (p[2], p[4]), (pdot[2], pdot[4]), hand, leads=leads)
 
     def _toward(self, heat: Toward) -> Toward:
         """Return where the robot goes by itself; what is too warm goes first."""
@@ -457,6 +460,7 @@ class Planner:
             or self._law.load.refusal()
             or self._trips.state.why
             or self._heat.describe()
+            or self._unattended.describe()
             or (self._guard.state.why if self._guard is not None else "")
         )
         return "; ".join(filter(None, (self._supply.describe(), refusal)))

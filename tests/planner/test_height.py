@@ -14,13 +14,20 @@ from services.planner.law.height import (
     LEAD_ANGLE,
     LEAD_MAX,
     LEAD_PITCH,
+    MOMENT_FADE_RATE,
+    MOMENT_FIRST,
+    MOMENT_MAX,
     RATE_MAX,
+    RELEASED_S,
+    STOPPING,
     HeightReference,
+    Released,
     Toward,
 )
 from shared.arrays import Array
 from tests.planner.states import DT
 
+LED: Released = (False, False)
 DOWN, UP, PERSON = Toward.DOWN, Toward.UP, Toward.PERSON
 T_Z = np.full(12, 4.0)
 KNEES = (-2.5, -0.2)
@@ -41,13 +48,17 @@ class Body:
     def knee(self) -> float:
         return float(self.p[2] - 1.0) / SLOPE
 
-    def step(self, toward: Toward) -> tuple[Array, Array]:
+    def step(
+        self, toward: Toward, released: Released = LED, drive: float = 0.0
+    ) -> tuple[Array, Array]:
         knees = self.knee, self.knee + 0.02
-        self.force = self.law.advance(toward, self.p, self.pdot, T_Z, knees, DT)
+        self.force, self.moment = self.law.advance(
+            toward, released, drive, self.p, self.pdot, T_Z, knees, DT
+        )
         p_ref, pdot_ref = self.p.copy(), self.pdot.copy()  # open: the person leads
         self.law.apply(p_ref, pdot_ref)
         if not self.held:
-            self.pdot[2] = (p_ref[2] - self.p[2]) / DT if self.law.state.hold == 1.0 else 0.0
+            self.pdot[2] = (p_ref[2] - self.p[2]) / DT if self.law.state.hold[0] == 1.0 else 0.0
             self.p[2] = p_ref[2]
         return p_ref, pdot_ref
 
@@ -105,7 +116,7 @@ def test_the_planner_not_leading_ends_it_at_once() -> None:
     body = Body()
     body.step(DOWN)
     body.law.reset()
-    assert body.law.state.hold == 0.0
+    assert not body.law.is_active
 
 
 @pytest.mark.parametrize("T_z", [4.0, 10.0])
@@ -113,15 +124,18 @@ def test_the_reference_hardly_leads_a_robot_that_is_held_and_a_force_makes_up_fo
     T_z: float,
 ) -> None:
     law, p, rest = HeightReference(KNEES), np.zeros(6), (-1.0, -1.0)
-    forces = [law.advance(UP, p, np.zeros(6), np.full(12, T_z), rest, DT) for _ in range(2000)]
+    still = np.zeros(6)
+    forces = [
+        law.advance(UP, LED, 0.0, p, still, np.full(12, T_z), rest, DT)[0] for _ in range(2000)
+    ]
     assert law.state.height == pytest.approx(min(LEAD_MAX, LEAD_ANGLE / T_z))
     assert max(forces) == FORCE_MAX
     assert max(np.diff(forces)) <= 1.01 * FORCE_RATE * DT
     for _ in range(round(FORCE_MAX / FADE_RATE / DT) - 10):
-        law.advance(PERSON, p, np.zeros(6), T_Z, rest, DT)
+        law.advance(PERSON, LED, 0.0, p, still, T_Z, rest, DT)
     assert law.is_active, "the force fades, and is not dropped"
     for _ in range(20):
-        law.advance(PERSON, p, np.zeros(6), T_Z, rest, DT)
+        law.advance(PERSON, LED, 0.0, p, still, T_Z, rest, DT)
     assert not law.is_active
 
 
@@ -131,3 +145,44 @@ def test_going_down_presses_nobody_and_rising_freely_pushes_nobody() -> None:
         for _ in range(1000):
             body.step(toward)
         assert body.force < 3.0
+
+
+@pytest.mark.parametrize("released", [(True, False), (False, True), (True, True)])
+def test_what_nobody_leads_stays_where_it_is_and_the_rest_is_open(released: Released) -> None:
+    body = Body(rate=0.15)
+    for _ in range(round((RELEASED_S + 0.15 / STOPPING) / DT) + 1):
+        body.step(PERSON, released)
+    body.held = True
+    body.p[2] += 0.005
+    body.p[4] += 0.05
+    p_ref, pdot_ref = body.step(PERSON, released)
+    for row, closed, way in ((2, released[0], 0.005), (4, released[1], 0.05)):
+        assert body.p[row] - p_ref[row] == pytest.approx(way if closed else 0.0, abs=2e-4)
+    assert pdot_ref[2] == (0.0 if released[0] else body.pdot[2])
+
+
+def test_a_height_that_nobody_leads_stops_soon_and_lifts_nobody() -> None:
+    body = Body(rate=0.16)
+    body.held = True  # someone presses it down
+    start = body.p[2]
+    for _ in range(2000):
+        p_ref, _ = body.step(PERSON, (True, True))
+    assert body.law.state.height - start <= 0.16**2 / (2.0 * STOPPING) + 1e-3
+    assert body.law.state.rate == 0.0
+    assert body.force == 0.0
+    assert p_ref[2] >= body.p[2]
+
+
+@pytest.mark.parametrize("drive", [-4.0, 3.0, 50.0])
+def test_a_moment_holds_the_torso_that_nobody_leads_and_fades_under_a_hand(drive: float) -> None:
+    body = Body()
+    body.step(PERSON, (False, True), drive)
+    assert body.moment == pytest.approx(-min(drive, MOMENT_FIRST), abs=1e-6)
+    body.p[4] += 0.1
+    for _ in range(5000):
+        body.step(PERSON, (False, True), drive)
+    assert body.moment == -MOMENT_MAX
+    for _ in range(round(MOMENT_MAX / MOMENT_FADE_RATE / DT) + 30):
+        body.step(PERSON)
+    assert body.moment == 0.0
+    assert not body.law.is_active

@@ -80,7 +80,8 @@ def trip(trips: PlannerTrips, tick: int) -> Any:
 
 def drift(watch: Unattended, tick: int) -> Any:
     now_ns, hand_n = START_NS + tick * HAND_LOST_NS // 20, 50.0 * (tick < 5)
-    return watch.drift(now_ns, (0.8, 0.01 * tick), hand_n, 0.0)
+    drifted = watch.advance(now_ns, (0.8, 0.01 * tick), (0.0, 0.4), (hand_n, 0.0), leads=True)
+    return drifted, watch.state.released
 
 
 def phase(phases: StatePhases, tick: int) -> Any:

@@ -1,18 +1,22 @@
-"""Reference of a height that the robot goes to by itself, down or up, without a hand. Pure.
+"""Reference of a height and a pitch that no hand leads. Pure.
 
 Height and torso pitch are open: a hand leads them. To go down (`xrl down`, a low battery) or up
 (`services.planner.watch.heat`) the law closes both. The height's reference h moves at a bounded
-rate until a knee is at the end of its range; the pitch's stays where it was. It begins at the
-measured pose and rate, so nothing steps. z is the measured height.
+rate until a knee is at the end of its range; the pitch's stays where it was. When nobody leads
+(`services.planner.watch.unattended`), one of them or both are closed where they are. The reference
+begins at the measured pose, and h at its rate, so nothing steps. z is the measured height.
 
-    p_ref    = (1 - hold) p_ref    + hold (h, pitch)
+    p_ref    = (1 - hold) p_ref    + hold (h, pitch)             hold: of the height, of the pitch
     pdot_ref = (1 - hold) pdot_ref + hold (h', 0)
     |h'| <= RATE_MAX,  |h''| <= ACCELERATION,  |h' | <= APPROACH (distance of the knee from its end)
     |h - z| <= lead: a joint service accepts no more, and a hand that holds the robot stops it
     F_lift'  = FORCE_RATE (h - z) / lead,   0 <= F_lift <= FORCE_MAX, upwards only
+    M'       = MOMENT_GAIN (pitch_ref - pitch), |M| <= MOMENT_MAX, while nobody leads the pitch
 
-The force makes up for a hand that presses on a robot that is to rise. It acts at the COM: at the
-harness, ahead of the pitch axis, it would turn a torso that nobody holds.
+The local gains are soft along pitch (30 N m/rad are required): M holds a torso that the robot file
+describes wrongly. It starts from the moment that the torso's acceleration shows. The force makes
+up for a hand that presses on a robot that is to rise. It acts at the COM: at the harness, ahead of
+the pitch axis, it would turn a torso that nobody holds.
 """
 
 from __future__ import annotations
@@ -43,10 +47,14 @@ RATE_MAX: Final = 0.05
 """m/s; from the deepest squat to straight legs in 6 s."""
 ACCELERATION: Final = 0.1
 """m/s^2"""
+STOPPING: Final = 1.0
+"""m/s^2 with which a height that nobody leads stops: from 0.16 m/s within 13 mm."""
 APPROACH: Final = 0.2
 """m/s per rad of the knee: the last centimetres take seconds."""
 HOLD_S: Final = 0.5
 """Time in which the hold of height and pitch fades in, and out, s."""
+RELEASED_S: Final = 0.1
+"""The same for a direction that nobody leads, s: a torso gains up to 0.35 rad/s in this time."""
 LEAD_MAX: Final = 0.012
 """m; over the local springs that is 65 N of a hand, beyond the load that is estimated."""
 LEAD_ANGLE: Final = 0.08
@@ -61,10 +69,22 @@ FORCE_MAX: Final = 200.0
 no overload of the harness (500 N)."""
 FADE_RATE: Final = 30.0
 """N/s with which the force goes once the robot no longer rises."""
+MOMENT_GAIN: Final = 80.0
+"""N m/s per rad; with 200 a released torso swayed by 0.04 rad at 1 Hz."""
+MOMENT_FIRST: Final = 8.0
+"""N m at the release, a step of 4 N m at each hip."""
+MOMENT_MAX: Final = 30.0
+"""N m; `law.load_correction` accepts 20, and a person of 25 N at the harness adds 7."""
+MOMENT_FADE_RATE: Final = 30.0
+"""N m/s with which it goes once a hand leads the pitch."""
 _ROWS: Final = (2, 4)
 
 # Compared in each tick: docs/contributing.md, The control path.
 _DOWN, _UP, _PERSON = Toward.DOWN, Toward.UP, Toward.PERSON
+
+
+Released = tuple[bool, bool]
+"""True if nobody leads the height, the pitch."""
 
 
 class HeightState(msgspec.Struct, array_like=True):
@@ -76,10 +96,14 @@ class HeightState(msgspec.Struct, array_like=True):
     """h', m/s."""
     pitch: float = 0.0
     """rad"""
-    hold: float = 0.0
-    """How much of both is used, 0 .. 1; 0: the person leads."""
+    hold: Pair = (0.0, 0.0)
+    """How much of the height and of the pitch is used, 0 .. 1; 0: the person leads."""
+    fade_s: float = HOLD_S
+    """Time in which the hold fades, s."""
     force: float = 0.0
     """F_lift, N, upwards at the COM."""
+    moment: float = 0.0
+    """M, N m, about the torso's pitch."""
 
 
 class HeightReference:
@@ -92,16 +116,28 @@ class HeightReference:
 
     @property
     def is_active(self) -> bool:
-        """True while height and pitch are not wholly the person's, or some force is left."""
-        return self.state.hold > 0.0 or self.state.force > 0.0
+        """True while height and pitch are not wholly the person's, or a force or moment is left."""
+        s = self.state
+        return any(s.hold) or s.force > 0.0 or s.moment != 0.0
 
     def advance(
-        self, toward: Toward, p: Array, pdot: Array, T_z: Array, knees: Pair, dt: float
-    ) -> float:
-        """Advance by one tick; return the force, N.
+        self,
+        toward: Toward,
+        released: Released,
+        drive: float,
+        p: Array,
+        pdot: Array,
+        T_z: Array,
+        knees: Pair,
+        dt: float,
+    ) -> Pair:
+        """Advance by one tick; return the force, N, and the moment about pitch, N m.
 
         Args:
             toward: where to.
+            released: nobody leads the height, the pitch: closed where they are, if the robot goes
+                nowhere by itself.
+            drive: moment that turns a torso which nobody leads, N m.
             p: measured pose (6,), m and rad.
             pdot: its rate (6,).
             T_z: joint rates per unit of the height (12,), rad/m.
@@ -110,37 +146,56 @@ class HeightReference:
         """
         s, z, pitch = self.state, float(p[2]), float(p[4])
         wanted = 0.0
-        if toward is _PERSON:
-            s.hold = max(0.0, s.hold - dt / HOLD_S)
-        else:
-            if s.hold == 0.0:
-                s.height, s.rate, s.pitch = z, float(pdot[2]), pitch
-            s.hold = min(1.0, s.hold + dt / HOLD_S)
+        closed = released
+        if toward is not _PERSON:
+            closed, s.fade_s = (True, True), HOLD_S
             low, high = self._knees
             left = min(knees) - low if toward is _DOWN else high - max(knees)
             wanted = toward * min(RATE_MAX, APPROACH * max(0.0, left))
+        elif any(released):
+            s.fade_s = RELEASED_S
+        if s.hold[0] == 0.0:
+            s.height, s.rate = z, float(pdot[2])
+        if s.hold[1] == 0.0:
+            s.pitch = pitch
+            if closed[1] and toward is _PERSON:
+                s.moment -= clamp(drive, -MOMENT_FIRST, MOMENT_FIRST)
+        step = dt / s.fade_s
+        held_z, held_pitch = s.hold
+        s.hold = (
+            clamp(held_z + (step if closed[0] else -step), 0.0, 1.0),
+            clamp(held_pitch + (step if closed[1] else -step), 0.0, 1.0),
+        )
         lead = min(LEAD_MAX, LEAD_ANGLE / max(float(np.abs(T_z).max()), 1.0))
-        if s.hold > 0.0:
-            step = ACCELERATION * dt
+        if s.hold[0] > 0.0:
+            step = dt * (STOPPING if toward is _PERSON else ACCELERATION)
             s.rate += clamp(wanted - s.rate, -step, step)
             s.height = clamp(s.height + dt * s.rate, z - lead, z + lead)
-            s.pitch = clamp(s.pitch, pitch - LEAD_PITCH, pitch + LEAD_PITCH)
+        s.pitch = clamp(s.pitch, pitch - LEAD_PITCH, pitch + LEAD_PITCH)
         if toward is _DOWN or toward is _PERSON:
             s.force -= clamp(s.force, 0.0, FADE_RATE * dt)
         else:
-            s.force += s.hold * FORCE_RATE * dt * (s.height - z) / lead
+            s.force += s.hold[0] * FORCE_RATE * dt * (s.height - z) / lead
             s.force = clamp(s.force, 0.0, FORCE_MAX)
-        return s.force
+        if closed[1] and toward is _PERSON:
+            s.moment += MOMENT_GAIN * dt * (s.pitch - pitch)
+            s.moment = clamp(s.moment, -MOMENT_MAX, MOMENT_MAX)
+        else:
+            fade = MOMENT_FADE_RATE * dt
+            s.moment -= clamp(s.moment, -fade, fade)
+        return s.force, s.moment
 
     def apply(self, p_ref: Array, pdot_ref: Array) -> None:
         """Close height and pitch in a reference p_ref (6,) and its rate pdot_ref (6,)."""
         s = self.state
-        if s.hold == 0.0:
-            return
-        for row, at, rate in zip(_ROWS, (s.height, s.pitch), (s.rate, 0.0), strict=True):
-            p_ref[row] += s.hold * (at - p_ref[row])
-            pdot_ref[row] += s.hold * (rate - pdot_ref[row])
+        for row, hold, at, rate in zip(
+            _ROWS, s.hold, (s.height, s.pitch), (s.rate, 0.0), strict=True
+        ):
+            if hold > 0.0:
+                p_ref[row] += hold * (at - p_ref[row])
+                pdot_ref[row] += hold * (rate - pdot_ref[row])
 
     def reset(self) -> None:
         """End at once: the planner does not lead."""
-        self.state.hold = self.state.rate = self.state.force = 0.0
+        s = self.state
+        s.hold, s.rate, s.force, s.moment = (0.0, 0.0), 0.0, 0.0, 0.0

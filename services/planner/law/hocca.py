@@ -35,7 +35,7 @@ from services.planner.law.assist import (
 )
 from services.planner.law.coupling import CoupledTorque, PushIntegral, Y
 from services.planner.law.gains import GainLaw
-from services.planner.law.height import HeightReference, HeightState, Toward
+from services.planner.law.height import HeightReference, HeightState, Released, Toward
 from services.planner.law.kinematics import Measured
 from services.planner.law.law_terms import LawAtReference
 from services.planner.law.levelling import Levelling
@@ -144,11 +144,11 @@ class Hocca:
         self._weight = config.total_mass * GRAVITY
         self._F_O: Array = np.zeros(6)
         size = config.geometry.torso_size
-        inertia = config.torso_mass * (size[0] ** 2 + size[2] ** 2) / 12.0
+        self._inertia = config.torso_mass * (size[0] ** 2 + size[2] ** 2) / 12.0
         # the paper's split serves for comparison only: no load correction is added to it
         certified = config.law.split == "certified"
         correction_max = config.law.load_correction if certified else (0.0, 0.0)
-        self.load = Load(correction_max, self._weight, config.torso_mass, inertia)
+        self.load = Load(correction_max, self._weight, config.torso_mass, self._inertia)
         self._assist = AssistLaw(config.assist)
         self._easing = LeadEasing(config.law.lead_easing)
         self._recentre_s = config.law.recentre_s
@@ -172,6 +172,8 @@ class Hocca:
         shift_requested: Vector4 = STRAIGHT,
         probe: tuple[int, float] = (NO_ROW, 0.0),
         toward: Toward = Toward.PERSON,
+        released: Released = (False, False),
+        pitch_drive: float = 0.0,
         align: bool = False,
         wrench: Wrench | None = None,
         up_torso: Vector3 | None = None,
@@ -188,6 +190,8 @@ class Hocca:
             probe: row of p whose reference is offset, and by how much, m or rad
                 (`services.planner.law.probe`).
             toward: where to go without a hand (`services.planner.law.height`).
+            released: nobody leads the height, the pitch.
+            pitch_drive: acceleration of a pitch that nobody leads, rad/s^2.
             align: start from the measured pose, so that engaging makes no step. p_C starts at the
                 measured pose and returns to zero (COM over the ankles, no roll, no yaw; height and
                 pitch stay) during `law.recentre_s` of ticks without `align`. A planner that was
@@ -232,17 +236,24 @@ class Hocca:
             moment_pitch = wrench.moment[1]
         still = not align and is_still(pdot[2], pdot[4])
         height = self._height
-        if toward is not _PERSON or height.state.hold > 0.0:
-            force = None  # the hand leads nothing now, and what it does is no error of the assist
+        held_z, held_pitch = height.state.hold
+        if toward is not _PERSON or held_z > 0.0:
+            force = None  # the hand leads no height now, and its force is no error of the assist
+        if held_pitch > 0.0 and toward is _PERSON:
+            moment_pitch = 0.0
         measured_assist = None if force is None else -force
         assist_rate = self._assist.advance(assist_wanted, measured_assist, dt, still=still)
         assist, F_O = self._assist.assist, self._F_O
-        if not align and (toward is not _PERSON or height.is_active):
+        if not align and (toward is not _PERSON or any(released) or height.is_active):
             T_z, knees = reference.T[:, 2], (float(q[KNEES[0]]), float(q[KNEES[1]]))
-            lift_n = height.advance(toward, measured.p, pdot, T_z, knees, dt)
+            drive = self._inertia * pitch_drive
+            lift_n, moment = height.advance(
+                toward, released, drive, measured.p, pdot, T_z, knees, dt
+            )
             height.apply(p_ref, pdot_ref)
             F_O = F_O.copy()
             F_O[:3] += lift_n * up
+            F_O[4] += moment
         ease_z, ease_pitch = self._easing.ease(force, moment_pitch, assist, dt)
 
         reference.load(

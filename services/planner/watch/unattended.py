@@ -1,28 +1,75 @@
-"""Computes how far the robot has drifted with nobody's hand on it. Pure.
+"""Detects that nobody leads height and pitch, and how far they have drifted since. Pure.
 
-Height and pitch are open: only the person's hand holds them. With nobody there, any error of the
-feedforward carries the robot away, to straight or folded legs or a tipped torso. The planner
-therefore stays engaged only while a hand is felt, or while the robot stays in place by itself.
+Height and pitch are open: only the wearer's hand holds them. Without a hand, an error of the
+feedforward or weight on the harness accelerates the robot: a torso turned by 0.8 rad within a
+second of its release. The weight of a person who rests is no hand. The hand along z is the force
+beyond the assist, and the hand about pitch is the moment alone.
 
-    drift = max(|z - z0|, ARM |pitch - pitch0|)       z0, pitch0: when the hand was lost
+Without a hand, friction brakes a direction, and nothing may drive it. Its rate is therefore
+compared with c, the rate at which the hand left, which falls at least by `COAST_S`:
+
+    c        = rate, clamped between 0 and the last c;  c = rate while a hand is felt
+    excess'  = rate - c;                           excess = 0 while a hand is felt
+    released   if |excess + STOP_S (rate - c)| > RUNAWAY
+
+A released direction is closed (`services.planner.law.height`) until a hand is back. A hand that
+was there after all, too light to be felt, then feels a resistance and opens it. A pitch that stays
+released for `PROOF_NS` shows that nobody holds the robot: its height is then closed as well, and
+the weight of a person who rests no longer moves it. A hand on the pitch opens both. What moves
+nevertheless is drift, which trips:
+
+    drift    = max(|z - z0|, ARM |pitch - pitch0|)       z0, pitch0: when the hand was lost
 """
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import msgspec
 
+from services.planner.law.height import Released
 from shared.bus.messages import Pair
-from shared.clock import NS_PER_S
+from shared.clamp import clamp
+from shared.clock import NS_PER_MS, NS_PER_S
 
 HAND_MIN: Final = (3.0, 1.0)
 """N and N m; noise and zero errors are smaller, a leading hand is stronger (dry friction alone
 takes 6 N)."""
+TOUCH_MIN: Final = (3.0, 0.25)
+"""N and N m; twice the noise. A hand that guides a torso which the feedforward drives may need less
+than 1 N m for seconds: in 6 of 31 drawn leads."""
+COAST_S: Final = 0.5
+"""s; friction stops a torso of 0.4 rad/s, led and then left, in 0.3 s."""
 HAND_LOST_NS: Final = NS_PER_S // 2
 """ns; a hand that brakes the robot's inertia with its friction is not felt for up to 0.3 s."""
 ARM: Final = 0.25
 """m per rad of the torso's pitch."""
+RUNAWAY: Final = (0.0075, 0.04)
+"""m and rad; 30 of 31 drawn leads stayed within 0.002 m and 0.04 rad."""
+STOP_S: Final = 0.1
+"""s; the closed directions stop a drift of 1 rad/s within 0.1 rad."""
+HAND_BACK: Final = (25.0, 1.0)
+"""N and N m; a stronger hand opens a released direction. A person who rests on the robot asks for
+an assist, and differs from it by 24 N at most."""
+HAND_BACK_NS: Final = 50 * NS_PER_MS
+"""ns; a bump is shorter."""
+PROOF_NS: Final = 120 * NS_PER_MS
+"""ns; a hand that leads the pitch is felt within 100 ms after the pitch was closed."""
+
+
+class Direction(msgspec.Struct):
+    """State of one open direction, in m or rad."""
+
+    coast: float = 0.0
+    """c, the rate at which the hand left it; 1/s."""
+    excess: float = 0.0
+    drive: float = 0.0
+    """Acceleration that it showed when it was released, m/s^2 or rad/s^2."""
+    released_ns: int = 0
+    """Time since which nobody leads it; 0 if a hand does."""
+    back_ns: int = 0
+    """Time since which a hand has been back on it; 0 if it is not."""
 
 
 class UnattendedState(msgspec.Struct):
@@ -32,27 +79,77 @@ class UnattendedState(msgspec.Struct):
     """Time at which a hand was last felt."""
     left: Pair | None = None
     """Pose in which it left the robot: height of the COM, m, and the torso's pitch, rad."""
+    last_ns: int = 0
+    """Time of the last tick."""
+    height: Direction = msgspec.field(default_factory=Direction)
+    pitch: Direction = msgspec.field(default_factory=Direction)
+
+    @property
+    def released(self) -> Released:
+        """True if nobody leads the height, the pitch."""
+        return self.height.released_ns > 0, self.pitch.released_ns > 0
 
 
 class Unattended:
-    """Keeps the pose at which a hand was last felt."""
+    """Keeps the pose and the rates at which a hand was last felt."""
 
     def __init__(self) -> None:
         self.state = UnattendedState()
 
-    def drift(self, now_ns: int, pose: Pair, force: float, moment: float) -> float:
-        """Return the drift, m.
+    def describe(self) -> str:
+        """Return that nobody leads, in words; "" if somebody does."""
+        if not any(self.state.released):
+            return ""
+        return "nobody leads it: it stays where it is until a hand moves it"
+
+    def advance(self, now_ns: int, pose: Pair, rates: Pair, hand: Pair, *, leads: bool) -> float:
+        """Advance by one tick; return the drift, m.
 
         Args:
             now_ns: the planner's clock.
             pose: height of the COM, m, and the torso's pitch, rad.
-            force: upward, of the person on the robot, N; NaN if not known, which counts as a hand.
-            moment: of the person about pitch, N m.
+            rates: of both, m/s and rad/s.
+            hand: upward force of the person beyond the assist, N, and moment about pitch, N m; NaN
+                if not known, which counts as a hand.
+            leads: the planner is engaged; otherwise nothing is open, and nothing is released.
         """
-        state = self.state
-        felt = not (abs(force) < HAND_MIN[0] and abs(moment) < HAND_MIN[1])
-        if felt:
-            state.felt_ns = now_ns
-        if state.left is None or now_ns - state.felt_ns <= HAND_LOST_NS:
-            state.left = pose
-        return max(abs(pose[0] - state.left[0]), ARM * abs(pose[1] - state.left[1]))
+        s = self.state
+        dt = (now_ns - s.last_ns) / NS_PER_S if s.last_ns else 0.0
+        s.last_ns = now_ns
+        for i, direction in enumerate((s.height, s.pitch)):
+            _coast(direction, rates[i], dt, felt=not abs(hand[i]) < TOUCH_MIN[i])
+            beyond = rates[i] - direction.coast
+            if not leads or _is_back(direction, now_ns, hand[i], HAND_BACK[i]):
+                direction.released_ns = 0
+                if direction is s.pitch:  # the height was closed because nobody held the pitch
+                    s.height.released_ns = 0
+            elif not direction.released_ns and abs(direction.excess + STOP_S * beyond) > RUNAWAY[i]:
+                direction.released_ns = now_ns
+                direction.drive = 0.5 * beyond * beyond / (direction.excess or math.inf)
+        pitch_ns = s.pitch.released_ns
+        if pitch_ns and now_ns - pitch_ns >= PROOF_NS:
+            s.height.released_ns = s.height.released_ns or now_ns
+        if not (abs(hand[0]) < HAND_MIN[0] and abs(hand[1]) < HAND_MIN[1]):
+            s.felt_ns = now_ns
+        if s.left is None or now_ns - s.felt_ns <= HAND_LOST_NS:
+            s.left = pose
+        return max(abs(pose[0] - s.left[0]), ARM * abs(pose[1] - s.left[1]))
+
+
+def _coast(direction: Direction, rate: float, dt: float, *, felt: bool) -> None:
+    """Update c, and the way beyond it."""
+    if felt:
+        direction.coast, direction.excess = rate, 0.0
+        return
+    c = direction.coast * (1.0 - min(1.0, dt / COAST_S))
+    direction.coast = clamp(rate, min(0.0, c), max(0.0, c))
+    direction.excess += dt * (rate - direction.coast)
+
+
+def _is_back(direction: Direction, now_ns: int, hand: float, least: float) -> bool:
+    """Return True if a hand has been on a direction for `HAND_BACK_NS`, or is not known."""
+    if abs(hand) < least:
+        direction.back_ns = 0
+        return False
+    direction.back_ns = direction.back_ns or now_ns
+    return math.isnan(hand) or now_ns - direction.back_ns >= HAND_BACK_NS
