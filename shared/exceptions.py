@@ -69,7 +69,7 @@ class RunError(XrlError):
 
 
 class MissingPackageError(RunError):
-    """An optional package is not installed (`shared.extras`)."""
+    """An optional package is not installed or cannot be imported (`shared.extras`)."""
 
 
 _REMEDIES: Final = {

@@ -13,6 +13,7 @@ import platform
 import shutil
 import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Final
 
 from shared.exceptions import MissingPackageError
@@ -44,13 +45,16 @@ ON_ROBOTS: Final = frozenset({"ros2", "usb"})
 
 
 def require(extra: str, otherwise: str = "") -> None:
-    """Make sure that the packages of an extra are installed; imports none of them.
+    """Import the packages of an extra: after an upgrade in place one may be there and fail.
 
-    `otherwise` is what serves without them. Raises MissingPackageError if one is not.
+    `otherwise` is what serves without them. Raises MissingPackageError if one is not installed or
+    cannot be imported.
     """
     missing = [name for name in EXTRAS[extra] if not _is_there(name)]
     if missing:
         raise missing_package(extra, missing, otherwise)
+    for name in EXTRAS[extra]:
+        _imported(name, otherwise)
 
 
 def is_installed(extra: str) -> bool:
@@ -69,25 +73,49 @@ def _is_there(package: str) -> bool:
 
 def missing_package(extra: str, missing: list[str], otherwise: str = "") -> MissingPackageError:
     """Return the error that names packages, their extra and the command that brings it."""
+    *others, last = missing
+    are, them = ("are", "them") if others else ("is", "it")
+    names = f"{', '.join(others)} and {last}" if others else last
+    return _error(f"{names} {are} not installed", extra, them, otherwise)
+
+
+def _error(trouble: str, extra: str, them: str, otherwise: str) -> MissingPackageError:
     if extra not in UNLOCKED and (CHECKOUT / "requirements.lock").is_file():
         command = f"{CHECKOUT}/deploy/install{f' --runtime {extra}' * (extra in ON_ROBOTS)}"
     elif _is_there("pip"):
         command = f"{sys.executable} -m pip install 'xrl[{extra}]'"
     else:  # in an environment of uvx or pipx
         command = f"install 'xrl[{extra}]' in place of 'xrl'"
-    *others, last = missing
-    are, them = ("are", "them") if others else ("is", "it")
-    names = f"{', '.join(others)} and {last}" if others else last
     return MissingPackageError(
-        f"{names} {are} not installed; the extra `{extra}` brings {them}: "
+        f"{trouble}; the extra `{extra}` brings {them}: "
         f"{command}{'; or ' if otherwise else ''}{otherwise}"
     )
+
+
+def _imported(module: str, otherwise: str = "") -> ModuleType:
+    """Import a module such as `matplotlib.patches`.
+
+    Raises MissingPackageError if its package is not installed, or with the package's own words if
+    the import fails for another reason: files of two versions, or a library of the system missing.
+    """
+    package = module.partition(".")[0]
+    extra = next((extra for extra, names in EXTRAS.items() if package in names), None)
+    try:
+        return importlib.import_module(module)
+    except Exception as error:
+        if extra is None:
+            raise
+        if isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}."):
+            raise missing_package(extra, [package], otherwise) from None
+        said = " ".join(str(error).split()) or type(error).__name__
+        trouble = f"{package} is installed and cannot be imported: {said}"
+        raise _error(trouble, extra, "it", otherwise) from error
 
 
 def late(module: str) -> Any:
     """Return a stand-in for a module such as `matplotlib.patches`, imported when it is first used.
 
-    That use raises MissingPackageError where the package is not installed.
+    That use raises MissingPackageError if the package is not installed or cannot be imported.
     """
     return _LateModule(module)
 
@@ -99,14 +127,7 @@ class _LateModule:
         self._module = module
 
     def __getattr__(self, name: str) -> Any:
-        try:
-            found = getattr(importlib.import_module(self._module), name)
-        except ModuleNotFoundError as error:
-            package = self._module.partition(".")[0]
-            if not f"{self._module}.".startswith(f"{error.name}."):
-                raise  # another package, which it needs
-            extra = next(extra for extra, names in EXTRAS.items() if package in names)
-            raise missing_package(extra, [package]) from None
+        found = getattr(_imported(self._module), name)
         setattr(self, name, found)
         return found
 

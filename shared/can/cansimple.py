@@ -56,13 +56,14 @@ class Command(IntEnum):
 
 
 class AxisState(IntEnum):
-    """`axis.current_state` and `axis.requested_state`."""
+    """`axis.current_state` and `axis.requested_state`; from 14 on firmware 0.6 only."""
 
     UNDEFINED = 0
     IDLE = 1
     STARTUP_SEQUENCE = 2
     FULL_CALIBRATION_SEQUENCE = 3
     MOTOR_CALIBRATION = 4
+    SENSORLESS_CONTROL = 5
     ENCODER_INDEX_SEARCH = 6
     ENCODER_OFFSET_CALIBRATION = 7
     CLOSED_LOOP_CONTROL = 8
@@ -71,6 +72,9 @@ class AxisState(IntEnum):
     HOMING = 11
     ENCODER_HALL_POLARITY_CALIBRATION = 12
     ENCODER_HALL_PHASE_CALIBRATION = 13
+    ANTICOGGING_CALIBRATION = 14
+    HARMONIC_CALIBRATION = 15
+    HARMONIC_CALIBRATION_COMMUTATION = 16
 
 
 class ControlMode(IntEnum):

@@ -5,7 +5,10 @@ Heartbeat bytes 5 to 7, 0x000 (version), 0x003 (one pair of error words for the 
 counts), a byte in 0x018 (to blink), and the numbers of the errors: the watchdog's is 0x0100_0000
 where 0.5 has 0x800. Set-points, limits, gains and estimates are as in 0.5.
 
-Source: docs.odriverobotics.com, manual/can-protocol, and the published 0.6.10 .dbc.
+From 0.6.11 on a drive confirms each write of an endpoint by 0x005, as it answers a read.
+
+Source: docs.odriverobotics.com, manual/can-protocol, the published 0.6.10 .dbc, and the
+enumerations of the `odrive` package 0.6.11.
 """
 
 from __future__ import annotations
@@ -49,6 +52,7 @@ class DriveError06(IntFlag):
     INVERTER_OVER_TEMP = 0x0000_4000
     VELOCITY_LIMIT_VIOLATION = 0x0000_8000
     POSITION_LIMIT_VIOLATION = 0x0001_0000
+    REQUESTED_CURRENT_TOO_HIGH = 0x0002_0000
     WATCHDOG_TIMER_EXPIRED = 0x0100_0000
     ESTOP_REQUESTED = 0x0200_0000
     SPINOUT_DETECTED = 0x0400_0000
@@ -68,8 +72,15 @@ class ProcedureResult(IntEnum):
     POLE_PAIR_CPR_MISMATCH = 5
     PHASE_RESISTANCE_OUT_OF_RANGE = 6
     PHASE_INDUCTANCE_OUT_OF_RANGE = 7
+    UNBALANCED_PHASES = 8
+    INVALID_MOTOR_TYPE = 9
+    ILLEGAL_HALL_STATE = 10
+    TIMEOUT = 11
+    HOMING_WITHOUT_ENDSTOP = 12
     INVALID_STATE = 13
     NOT_CALIBRATED = 14
+    NOT_CONVERGING = 15
+    REQUESTED_CURRENT_TOO_HIGH = 16
 
 
 class Heartbeat06(NamedTuple):

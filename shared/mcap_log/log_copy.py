@@ -141,7 +141,7 @@ class LogCopy:
         times = [row.log_ns for row in rows]
         right = (chunk.message_start_time, chunk.message_end_time) == (min(times), max(times))
         described = len(rows) == len(record.rows) and not self._without_schema
-        if record.whole and right and described:
+        if record.lost is None and right and described:
             self._write_chunk(chunk, self._raw(record.start, record.end), rows)
         else:
             self._write_rows(_cut_out(record, rows))
@@ -166,7 +166,7 @@ class LogCopy:
     def _write_rows(self, records: list[bytes]) -> None:
         """Write message records as a chunk of their own."""
         content = b"".join(records)
-        rows, _ = split_chunk(content)
+        rows = split_chunk(content).rows
         times = [row.log_ns for row in rows]
         chunk = compressed_chunk(min(times), max(times), content)
         self._write_chunk(chunk, encode(chunk), rows)

@@ -13,6 +13,8 @@ import mmap
 import os
 import stat
 import struct
+import zlib
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -25,11 +27,14 @@ from shared.clock import NS_PER_S
 from shared.exceptions import RunError
 from shared.mcap_log.records import (
     CHUNK_TIMES,
+    CRC,
     DECOMPRESSED_MAX,
     EXPANSION_MAX,
     KNOWN,
     MAGIC,
+    MESSAGE_RECORD,
     PREFIX,
+    Chunk,
     ChunkMessage,
     Malformed,
     decode,
@@ -48,11 +53,25 @@ _MARK_AT: Final = PREFIX.size + CHUNK_TIMES.size
 IN_LINE_NS: Final = 10 * NS_PER_S
 """A recorder flushes four times a second: a chunk with longer times, or so far off, is opened."""
 _INDEX_HEAD: Final = struct.Struct("<HI")  # of a message index: channel, size of its entries
+_ENTRY: Final = struct.Struct("<QQ")  # of a message index: log time, offset in the chunk
+_DEFINITIONS: Final = (Opcode.SCHEMA, Opcode.CHANNEL)
 LOOSE_MAX: Final = 1 << 20
 """Messages outside of chunks are given, and copied, in pieces of this size, bytes."""
 
 EXPANDED_MIN: Final = 1 << 28
 """Bytes that any file may expand to."""
+
+
+class LostBytes(NamedTuple):
+    """Bytes that hold nothing readable, and when they were written if they still say it."""
+
+    start: int
+    end: int
+    first_ns: int = 0
+    last_ns: int = 0
+    """Log times; 0: unknown."""
+    missing: int | None = None
+    """Messages that these bytes lack: a chunk that can be read in part. None: nothing is read."""
 
 
 class LogRecord(NamedTuple):
@@ -70,24 +89,14 @@ class LogRecord(NamedTuple):
     """The messages: `body[row.start:row.end]` is the payload of one."""
     definitions: Sequence[LogRecord] = ()
     """Schemas and channels inside the chunk."""
-    whole: bool = True
-    """False: the start of a chunk in which the file ends."""
+    lost: LostBytes | None = None
+    """What is missing of a chunk that can be read in part."""
 
     def values(self) -> Iterator[McapRecord]:
         """Yield the decoded record and those inside the chunk."""
         for record in (self, *self.definitions):
             if record.value is not None:
                 yield record.value
-
-
-class LostBytes(NamedTuple):
-    """Bytes that hold nothing readable, and when they were written if they still say it."""
-
-    start: int
-    end: int
-    first_ns: int = 0
-    last_ns: int = 0
-    """Log times; 0: unknown."""
 
 
 class ChunkPlace(NamedTuple):
@@ -119,16 +128,19 @@ class LogReader:
         """Places in the middle that could not be read."""
         self.passed_over = 0
         """Records of unknown kinds."""
-        self.chunk_indices = 0
-        """Chunks that the summary says the place of."""
+        self.earlier_ends = 0
+        """Ends of the file with more data behind them: its writer finished it more than once."""
+        self.in_summary: Counter[int] = Counter()
+        """Records of the summary, by opcode."""
         self.message_count: int | None = None
-        """What the summary's statistics say; None without any."""
+        """Messages that the summary's statistics count; None if it has none or is damaged."""
         self._encodings: dict[int, str] = {}
         self._vouched = 0
         """Up to here, records of unknown kinds are known to lead to a known one."""
         self._marks = list(_CHUNK_MARKS)
         self._expanded = 0
         self._end = self.size
+        self._sound = False  # the summary's CRC is right
         self._summary_start = self._find_summary()
 
     def __iter__(self) -> Iterator[LogRecord]:
@@ -143,7 +155,8 @@ class LogReader:
             record, at = self._next(at)
             if record is not None:
                 if record.opcode == Opcode.DATA_END:
-                    return
+                    at = self._behind_data_end(at)
+                    continue
                 self._learn(record)
                 yield record
 
@@ -174,7 +187,8 @@ class LogReader:
             if record is None:
                 continue
             if record.opcode == Opcode.DATA_END:
-                return
+                at = self._behind_data_end(at)
+                continue
             self._learn(record)
             if record.rows:
                 channels = frozenset(row.channel_id for row in record.rows)
@@ -212,17 +226,25 @@ class LogReader:
             return None, at
         first_ns, last_ns, _, _ = CHUNK_TIMES.unpack_from(self._data, start)
         channels = set()
-        while True:
-            opcode, start, end = self._extent(following)
-            if opcode != Opcode.MESSAGE_INDEX or not start + _INDEX_HEAD.size <= end <= self._end:
-                break
-            number, size = _INDEX_HEAD.unpack_from(self._data, start)
-            if size:
+        for number, entries, behind in self._indices(following):
+            if entries:
                 channels.add(number)
-            following = end
+            following = behind
+        opcode, _, end = self._extent(following)
         if opcode in (0, Opcode.MESSAGE_INDEX) and end > self._end:  # one of its indices is cut
             channels.clear()
         return ChunkPlace(at, first_ns, last_ns, frozenset(channels) or None), following
+
+    def _indices(self, at: int) -> Iterator[tuple[int, bytes, int]]:
+        """Yield each message index from a place on: its channel, its entries, where it ends."""
+        while True:
+            opcode, start, end = self._extent(at)
+            start += _INDEX_HEAD.size
+            if opcode != Opcode.MESSAGE_INDEX or not start <= end <= self._end:
+                return
+            number, size = _INDEX_HEAD.unpack_from(self._data, start - _INDEX_HEAD.size)
+            yield number, self._data[start : min(start + size, end)], end
+            at = end
 
     def raw(self, start: int, end: int) -> bytes:
         """Return the file's bytes from one place to another."""
@@ -244,6 +266,8 @@ class LogReader:
             # Either its content is wrong, or its length: then no record follows it.
             following = end if self._plausible(end) else self._chunk_after(at + 1)
             return None, self._lost(at, following, *_times(self._data[start:end], opcode))
+        if record.lost is not None:
+            self.damage.append(record.lost)
         return record, record.end
 
     def _record(self, opcode: int, at: int, start: int, end: int) -> LogRecord:
@@ -262,15 +286,58 @@ class LogReader:
         body = self._data[start:end]
         if opcode == Opcode.CHUNK:
             chunk, size = decode_chunk(body)
-            content = decompressed(chunk)
-            rows, others = split_chunk(content)
-            record = LogRecord(opcode, at, end, content, chunk, rows, _definitions(others))
+            record = self._opened(at, end, chunk)
         else:
             value, size = decode(opcode, body)
             record = LogRecord(opcode, at, end, body, value)
         if size < len(body) and not self._leads_on(end):
             raise Malformed  # no later version's field: the length is wrong
         return record
+
+    def _opened(self, at: int, end: int, chunk: Chunk) -> LogRecord:
+        """Return a chunk's records. A CRC vouches for its bytes, and its indices for its records.
+
+        Records that a writer did not complete are left out.
+        """
+        content = decompressed(chunk)
+        rows, others, whole = split_chunk(content)
+        indices = [entries for _, entries, _ in self._indices(end)]
+        counted = sum(len(entries) // _ENTRY.size for entries in indices)
+        if not whole and (places := _places(content, indices)):
+            # The next record may begin within an incomplete one: only the indices say where.
+            others = split_chunk(content, places).others
+            found = [split_messages(content, place, len(content), enough=1) for place in places]
+            rows = [row for messages, _ in found for row in messages]
+        definitions = _definitions(others)
+        described = sum(opcode in _DEFINITIONS for opcode, _ in others)
+        lost = None
+        if not whole or counted > len(rows) or described > len(definitions):
+            times = chunk.message_start_time, chunk.message_end_time
+            lost = LostBytes(at, end, *times, max(0, counted - len(rows)))
+        return LogRecord(Opcode.CHUNK, at, end, content, chunk, rows, definitions, lost)
+
+    def _behind_data_end(self, at: int) -> int:
+        """Return where to go on behind a data end: where the data ends, unless more follows.
+
+        A writer that was finished and then took further messages has written its first summary,
+        footer and magic in the middle of the file, or less if finishing failed.
+        """
+        if at >= self._end:
+            return at
+        if self._extent(at)[0] in KNOWN - {*_DEFINITIONS}:
+            self.earlier_ends += 1
+            return at
+        magic = self._data.find(MAGIC, at, self._end)
+        if magic < 0:
+            chunk = self._chunk_after(at)
+            if chunk is None and not self.finished:
+                return self._end  # cut off in its summary: no message is lost
+            return self._lost(at, chunk)
+        following = magic + len(MAGIC)
+        if self._data[following : following + len(MAGIC)] == MAGIC:
+            return self._lost(at, None)  # another file, with channels of the same numbers
+        self.earlier_ends += 1
+        return following
 
     def _leads_on(self, at: int) -> bool:
         """Return True if a known record follows here, maybe behind unknown ones, or the data ends.
@@ -300,7 +367,7 @@ class LogReader:
         except Malformed:
             return None
         first_ns, end_ns = chunk.message_start_time, chunk.message_end_time
-        rows, others = split_chunk(content)
+        rows, others, _ = split_chunk(content)
         definitions = _definitions(others)
         for definition in definitions:
             self._learn(definition)
@@ -311,9 +378,7 @@ class LogReader:
             good.append(row)
         last_ns = good[-1].log_ns if good else first_ns
         self.cut = LostBytes(at, self.size, last_ns, end_ns)
-        return LogRecord(
-            Opcode.CHUNK, at, self.size, content, chunk, good, definitions, whole=False
-        )
+        return LogRecord(Opcode.CHUNK, at, self.size, content, chunk, good, definitions, self.cut)
 
     def _is_sound(self, content: bytes, row: ChunkMessage) -> bool:
         """Return False for a payload that does not fit its channel's encoding; no CRC covers it."""
@@ -387,7 +452,11 @@ class LogReader:
         start = int.from_bytes(tail[PREFIX.size : PREFIX.size + 8], "little")
         if not len(MAGIC) < start < self._end:
             return 0
-        self._end = start
+        (crc,) = CRC.unpack_from(tail, PREFIX.size + _FOOTER_LENGTH - CRC.size)
+        vouched = self._data[start : self.size - len(MAGIC) - CRC.size]
+        self._sound = crc in (0, zlib.crc32(vouched))
+        if self._sound:  # else no data end is known, and what follows the data shows as damage
+            self._end = start
         return start
 
     def _summary(self) -> Iterator[LogRecord]:
@@ -397,11 +466,11 @@ class LogReader:
             start, at = at, at + PREFIX.size + length
             if at > end:
                 return
-            self.chunk_indices += opcode == Opcode.CHUNK_INDEX
-            if opcode == Opcode.STATISTICS:
+            self.in_summary[opcode] += 1
+            if opcode == Opcode.STATISTICS and self._sound:
                 count = self._data[start + PREFIX.size : start + PREFIX.size + 8]
                 self.message_count = int.from_bytes(count, "little")
-            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            if opcode in _DEFINITIONS:
                 with contextlib.suppress(Malformed):
                     record = self._record(opcode, start, start + PREFIX.size, at)
                     self._learn(record)
@@ -412,10 +481,22 @@ def _definitions(records: Sequence[tuple[int, bytes]]) -> tuple[LogRecord, ...]:
     """Return the schemas and channels among a chunk's records; a malformed one is left out."""
     found = []
     for opcode, body in records:
-        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+        if opcode in _DEFINITIONS:
             with contextlib.suppress(Malformed):
                 found.append(LogRecord(opcode, 0, 0, body, decode(opcode, body)[0]))
     return tuple(found)
+
+
+def _places(content: bytes, indices: Sequence[bytes]) -> list[int]:
+    """Return the offsets at which a chunk has the messages of its indices."""
+    found = []
+    for entries in indices:
+        for log_ns, at in _ENTRY.iter_unpack(entries[: len(entries) // _ENTRY.size * _ENTRY.size]):
+            if at + MESSAGE_RECORD.size <= len(content):
+                opcode, _, _, _, here_ns, _ = MESSAGE_RECORD.unpack_from(content, at)
+                if (opcode, here_ns) == (Opcode.MESSAGE, log_ns):
+                    found.append(at)
+    return sorted(found)
 
 
 def _is_in_line(place: ChunkPlace, before_ns: int | None) -> bool:

@@ -13,7 +13,7 @@ import math
 import mmap
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from io import BytesIO
 from types import MappingProxyType
 from typing import Final, NamedTuple
@@ -296,19 +296,37 @@ def split_messages(
     return rows, at
 
 
-def split_chunk(data: bytes) -> tuple[list[ChunkMessage], list[tuple[int, bytes]]]:
-    """Split a chunk's decompressed data into its messages, and (opcode, body) of each other record.
+class ChunkContent(NamedTuple):
+    """The records of a chunk that can be read."""
 
-    An incomplete record at the end is left out, so this reads the start of a cut chunk too.
+    rows: list[ChunkMessage]
+    others: list[tuple[int, bytes]]
+    """Opcode and body of each record that is no message."""
+    whole: bool
+    """The records fill the chunk. Its CRC does not prove that: a writer that fails in the middle
+    of a record, and goes on, computes the CRC over what it has written."""
+
+
+def split_chunk(data: bytes, places: Sequence[int] = ()) -> ChunkContent:
+    """Split a chunk's decompressed data into its records.
+
+    `places` are the offsets of its messages, in order, if they are known: behind an incomplete
+    record, reading continues at the next of them.
     """
     others: list[tuple[int, bytes]] = []
+    whole = True
     rows, at = split_messages(data, 0, len(data))
-    while at + PREFIX.size <= len(data):
-        opcode, length = PREFIX.unpack_from(data, at)
-        start, at = at + PREFIX.size, at + PREFIX.size + length
-        if opcode == Opcode.MESSAGE or at > len(data):
-            break
-        others.append((opcode, data[start:at]))
+    while at < len(data):
+        opcode, start, end = 0, at + PREFIX.size, len(data) + 1
+        if start <= len(data):
+            opcode, length = PREFIX.unpack_from(data, at)
+            end = start + length
+        if end <= len(data) and opcode != Opcode.MESSAGE:
+            others.append((opcode, data[start:end]))
+            at = end
+        else:
+            whole = False
+            at = next((place for place in places if place > at), len(data))
         found, at = split_messages(data, at, len(data))
         rows += found
-    return rows, others
+    return ChunkContent(rows, others, whole)

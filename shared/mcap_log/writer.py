@@ -98,10 +98,12 @@ class RunWriter:
     ) -> None:
         """Create `run.mcap` in `directory`, or `run-1.mcap`, ... if there is a run already.
 
-        `topics` are those of every key to record, `offset_ns` is wall minus monotonic clock;
-        `metadata` records, by name, and `attachments`, by file name, go into each file; `chunk_kib`
-        is the size of a chunk before compression. Without `begin` the first file is left to
-        `begin`. Raises RunError if the file cannot be created or written, as all methods do.
+        `topics` are those of every key to record, `offset_ns` is wall minus monotonic clock. If the
+        wall clock is behind, it is not set, and the times of the file are those of the monotonic
+        clock: MCAP has no time before 1970. `metadata` records, by name, and `attachments`, by file
+        name, go into each file; `chunk_kib` is the size of a chunk before compression. Without
+        `begin` the first file is left to `begin`. Raises RunError if the file cannot be created or
+        written, as all methods do.
         """
         self.path = directory / files.FIRST
         """The file being written, or the last one."""
@@ -118,7 +120,7 @@ class RunWriter:
         self.left_out = 0
         """Messages that came while no file could be written."""
         self._directory, self._topics = directory, topics
-        self._offset_ns, self._chunk_size = offset_ns, chunk_kib * 1024
+        self._offset_ns, self._chunk_size = max(0, offset_ns), chunk_kib * 1024
         self._metadata, self._attachments = metadata, attachments
         self._run_id = secrets.token_hex(8)
         self._stem = ""

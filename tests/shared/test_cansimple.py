@@ -6,7 +6,7 @@ Of 0.5.6 can-protocol and can_simple.cpp; of 0.6 the protocol page and the .dbc.
 from __future__ import annotations
 
 import math
-from enum import IntEnum
+from enum import Enum, IntEnum
 
 import pytest
 from hypothesis import given
@@ -55,6 +55,16 @@ NUMBERS: dict[type[IntEnum], dict[str, int]] = {
 @pytest.mark.parametrize("kind", NUMBERS)
 def test_commands_and_errors_have_the_numbers_of_the_documents(kind: type[IntEnum]) -> None:
     assert {name: int(kind[name]) for name in NUMBERS[kind]} == NUMBERS[kind]
+
+
+@pytest.mark.parametrize(
+    ("ours", "name"),
+    [(DriveError06, "ODriveError"), (ProcedureResult, "ProcedureResult"), (AxisState, "AxisState")],
+)
+def test_what_0_6_reports_is_named_as_in_the_odrive_package(ours: type[Enum], name: str) -> None:
+    enums = pytest.importorskip("odrive.enums")
+    theirs = {each.name: each.value for each in getattr(enums, name).__members__.values()}
+    assert {each.name: each.value for each in ours.__members__.values()} == theirs
 
 
 def test_arbitration_id_is_node_times_32_plus_command() -> None:

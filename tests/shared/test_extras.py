@@ -160,14 +160,30 @@ def test_a_folder_of_deploy_is_no_package(monkeypatch: pytest.MonkeyPatch) -> No
         _ = late("plants.inner").name
 
 
-def test_a_package_that_lacks_another_one_is_not_said_to_be_absent(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        ("raise ImportError('its core is missing.\\n  pip install core')",
+         "its core is missing. pip install core"),
+        ("import there_is_no_such_package", "No module named 'there_is_no_such_package'"),
+        ("import rosbags._inner", "No module named 'rosbags._inner'"),
+        ("import ctypes; ctypes.CDLL('no_such_library.so')", "no_such_library.so: .*"),
+        ("1 / 0", "division by zero"),
+    ],
+)  # fmt: skip
+def test_a_package_that_cannot_be_imported_says_why_in_one_line_and_its_extra(
+    code: str, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "rosbags.py").write_text("import there_is_no_such_package\n", encoding="utf-8")
+    (tmp_path / "rosbags").mkdir()
+    (tmp_path / "rosbags" / "__init__.py").write_text(code, encoding="utf-8")
     monkeypatch.delitem(sys.modules, "rosbags", raising=False)
-    with pytest.raises(ModuleNotFoundError, match="there_is_no_such_package"):
-        _ = late("rosbags").typesys
+    brings = f"the extra `ros2` brings it: {ROOT}/deploy/install --runtime ros2$"
+    pattern = f"^rosbags is installed and cannot be imported: {said}; {brings}"
+    with pytest.raises(MissingPackageError, match=pattern):
+        require("ros2")
+    with pytest.raises(MissingPackageError, match=pattern):
+        _ = late("rosbags.typesys").name
 
 
 @pytest.mark.parametrize(

@@ -219,7 +219,8 @@ def test_an_endpoint_is_written_for_the_axis_asked_and_read_back(new: Bench) -> 
     name = "controller.config.vel_limit"
     written = cansimple_06.pack_sdo(SdoOpcode.WRITE, endpoint(name), struct.pack("<f", 7.5))
     new.send(Command06.RX_SDO, written)
-    assert new.heard() == [], "a write has no answer"
+    confirmed = cansimple_06.pack_sdo(0, endpoint(name), struct.pack("<f", 7.5))
+    assert new.heard() == [(arbitration_id(NODE, Command06.TX_SDO), confirmed)]
     assert new.bank.vel_limit[AXIS] == 7.5
     assert new.bank.vel_limit[AXIS - 1] == 60.0
     assert struct.unpack("<f", read(new, name)) == (7.5,)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 
 import msgspec
+import mujoco
 import numpy as np
 import pytest
 
 from services.simulator.physics.body import body_of
-from services.simulator.physics.plant import IDEAL, changed
+from services.simulator.physics.plant import IDEAL, PlantConfig, changed
 from services.simulator.physics.world import World
 from shared.arrays import Array
 from shared.bus.traces import SimTruth
@@ -65,6 +66,37 @@ def test_at_the_start_it_stands_level_soles_flat_where_the_planner_takes_it_to_b
         assert foot.xpos[2] == pytest.approx(0.0, abs=1e-3)
         heading = foot.xmat.reshape(3, 3)[:, 0]
         assert heading[1] == pytest.approx(0.0, abs=2e-3)  # toes forward
+
+
+def test_the_world_asks_for_dense_matrices(robot: RobotConfig) -> None:
+    """MuJoCo's sparse Newton solver was wrong in 4.0.0 (services/simulator/physics/body.py)."""
+    assert world_of(robot).model.opt.jacobian == mujoco.mjtJacobian.mjJAC_DENSE
+
+
+@pytest.mark.parametrize("plant", [IDEAL, PlantConfig()], ids=["ideal", "realistic"])
+@pytest.mark.parametrize("bad", [math.nan, math.inf, 1e39])
+def test_a_torque_that_resets_mujoco_is_a_fall(
+    robot: RobotConfig, bad: float, plant: PlantConfig
+) -> None:
+    world = World(body_of(robot, plant), STAND)
+    world.remove_hoist()
+    run(world, 0.1)
+    assert not seen(world).fallen
+    assert world.data.time == world.time
+    torque = IDLE.copy()
+    torque[3] = bad
+    world.step(torque)
+    run(world, 0.01)
+    assert seen(world).fallen
+    assert all(map(math.isfinite, (*world.data.qpos, *world.hidden())))
+
+
+def test_a_push_that_resets_mujoco_is_a_fall(robot: RobotConfig) -> None:
+    world = world_of(robot, push=(Push(at=0.0, duration=1.0, force=(1e300, 0.0, 0.0)),))
+    world.start()
+    world.remove_hoist()
+    run(world, 0.01)
+    assert seen(world).fallen
 
 
 def test_motor_turns_obey_the_differential(robot: RobotConfig) -> None:

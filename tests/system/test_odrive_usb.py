@@ -154,7 +154,7 @@ def test_a_torque_is_sent_without_gains_and_at_most_the_current_limits_worth(
 
 def test_a_target_that_is_no_number_is_not_sent(drive: OdriveUsb) -> None:
     assert eventually(lambda: is_status(drive.read(0.01), DriveStatus.IDLE))
-    bad = itertools.product(HOLD.__struct_fields__, (math.nan, math.inf))
+    bad = itertools.product(HOLD.__struct_fields__, (math.nan, math.inf, 1e39, -1e300))
     for number, (field, value) in enumerate(bad, start=1):
         drive.write(msgspec.structs.replace(HOLD, **{field: (0.0, value)}))
         drive.write(HOLD)
@@ -241,6 +241,17 @@ def test_the_drive_takes_a_position_that_is_written(usb: UsbRobot, control: Cont
     assert eventually(lambda: control.pos == (64.25, -3.5))
     with usb.lock:
         assert usb.pos[AXES].tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, 1e39])
+def test_a_position_that_is_no_count_is_refused_and_the_drive_stays(
+    control: Control, drive: OdriveUsb, bad: float
+) -> None:
+    with pytest.raises(DriveError, match="are no positions"):
+        control.drive.set_position((bad, 0.0))
+    control.drive.set_position((1.0, 1.0))
+    assert eventually(lambda: control.pos == (1.0, 1.0))
+    assert drive.connections == 1
 
 
 def test_an_idle_drives_encoders_tell_where_they_read_0(drive: OdriveUsb) -> None:

@@ -1,6 +1,8 @@
 """Without an optional package a verb says in one line what is absent, before it begins anything."""
 
+import os
 import shlex
+import subprocess
 import sys
 from pathlib import Path
 
@@ -8,7 +10,7 @@ import pytest
 
 from shared.config.files import load_without_schedule
 from shared.extras import EXTRAS
-from shared.places import DEFAULT_CONFIG
+from shared.places import CHECKOUT, DEFAULT_CONFIG
 from tools import cli
 from tools.bringup import survey
 
@@ -57,6 +59,28 @@ def test_a_verb_names_the_extra_that_it_lacks(
     assert f"the extra `{extra}` brings " in errors
     assert output == ""
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("verb", ["sim", "doctor"])
+def test_a_verb_whose_package_cannot_be_imported_gives_the_packages_remedy_in_one_line(
+    verb: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """As MuJoCo 3 upgraded in place to 4: pip leaves the new package without its core."""
+    (tmp_path / "mujoco").mkdir()
+    code = "raise ImportError('mujoco-core is missing.\\n  pip install --force-reinstall mujoco')"
+    (tmp_path / "mujoco" / "__init__.py").write_text(code, encoding="utf-8")
+    path = os.pathsep.join((str(tmp_path), str(CHECKOUT)))
+    monkeypatch.setenv("PYTHONPATH", path)
+    monkeypatch.chdir(tmp_path)
+    command = [sys.executable, "-m", "tools.cli", verb]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith(
+        "xrl: mujoco is installed and cannot be imported: mujoco-core is missing. "
+        "pip install --force-reinstall mujoco; the extra `sim` brings it: "
+    )
+    assert done.stderr.count("\n") == 1
+    assert [file.name for file in tmp_path.iterdir()] == ["mujoco"]
 
 
 @pytest.mark.parametrize(("flags", "extra"), [([], "sim"), (["--no-sim", "--ros2"], "ros2")])

@@ -43,7 +43,6 @@ def fetch(remote: Remote, name: str, into: Path) -> Path:
         into.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=into) as packed:
             remote.fetch("sh", "-c", _PACK, "-", RECORDS, name, into=packed)
-            packed.seek(0)
             with tarfile.open(fileobj=packed) as archive:
                 archive.extractall(into, filter="data")
     except (OSError, tarfile.TarError) as error:

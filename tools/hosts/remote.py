@@ -6,7 +6,7 @@ import shlex
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from typing import BinaryIO, Final, NamedTuple, TypedDict, TypeVar, Unpack
 
@@ -19,6 +19,9 @@ R = TypeVar("R")
 
 TIMEOUT_S: Final = 90.0
 ECHOES: Final = 20
+MARK: Final = "xrl-output-follows"
+"""Line before a command's own output: a host's .bashrc may print lines before it."""
+_NOISE_MAX: Final = 1 << 20
 
 
 class Said(NamedTuple):
@@ -80,7 +83,10 @@ class Remote:
         errors = done.stderr.decode(errors="replace").strip()
         if done.returncode == 255:  # ssh's own
             raise FleetError(f"{name}: {self.host.ssh} is not reached: {_last(errors)}")
-        return Said(done.returncode, done.stdout.decode(errors="replace"), errors)
+        noise, mark, out = done.stdout.decode(errors="replace").partition(f"{MARK}\n")
+        if not mark:
+            raise self._not_run(errors or noise)
+        return Said(done.returncode, out, errors)
 
     def follow(self, *words: str, tell: Callable[[str], None], **manner: Unpack[Manner]) -> None:
         """Run a command, and hand on each line as it prints it.
@@ -97,19 +103,25 @@ class Remote:
         except OSError as error:
             raise FleetError(f"{name}: {command[0]}: {error.strerror}") from None
         with process:
-            for line in process.stdout or ():
+            lines = iter(process.stdout or ())
+            _skip_noise(lines)
+            for line in lines:
                 tell(f"{name}: {printable(line.rstrip())}")
             errors = process.stderr.read() if process.stderr is not None else ""
         if process.returncode != 0:
             raise FleetError(f"{name}: {_last(errors)}")
 
     def _command(self, words: Sequence[str], manner: Manner) -> list[str]:
-        """Return what this computer runs to have a host run words."""
+        """Return what this computer runs to have a host run words; they print after `MARK`."""
         before = [
             *(self._in_network if manner.get("on_bus") else []),
             *(self._as_user if manner.get("as_user") else []),
         ]
-        return [*self._begin, shlex.join([*before, *words])]
+        return [*self._begin, f"echo {MARK}; {shlex.join([*before, *words])}"]
+
+    def _not_run(self, said: str) -> FleetError:
+        text = f"the shell of {self.host.ssh} did not run the command: {_last(said)}"
+        return FleetError(f"{self.host.name}: {text}")
 
     def must(self, *words: str, **manner: Unpack[Manner]) -> str:
         """Run a command that has to succeed, and return what it printed."""
@@ -120,7 +132,10 @@ class Remote:
         return said.out
 
     def fetch(self, *words: str, into: BinaryIO) -> None:
-        """Run a command as the services' user, and put what it prints into a file."""
+        """Run a command as the services' user, and put what it prints into a file.
+
+        The file is then at the begin of the command's own output.
+        """
         command = self._command(words, {"as_user": True})
         try:
             done = subprocess.run(command, stdout=into, stderr=subprocess.PIPE, check=False)
@@ -129,6 +144,11 @@ class Remote:
         if done.returncode != 0:
             why = _last(done.stderr.decode(errors="replace"))
             raise FleetError(f"{self.host.name}: {words[0]}: {why}")
+        into.seek(0)
+        noise, mark, _ = into.read(_NOISE_MAX).partition(f"{MARK}\n".encode())
+        if not mark:
+            raise self._not_run(noise.decode(errors="replace"))
+        into.seek(len(noise) + len(mark))
 
     def write(self, path: str, content: bytes, *, private: bool) -> None:
         """Write a file whole or not at all; a private one is the services' user's alone."""
@@ -162,6 +182,7 @@ def _talk(process: subprocess.Popen[str]) -> tuple[str, list[ClockOffset]]:
     there, back = process.stdin, process.stdout
     if there is None or back is None:
         raise ValueError
+    _skip_noise(back)
     first = back.readline()
     found = []
     for _ in range(ECHOES):
@@ -173,6 +194,13 @@ def _talk(process: subprocess.Popen[str]) -> tuple[str, list[ClockOffset]]:
         found.append(ClockOffset(answer / 1e9 - (before + after) / 2, after - before))
     there.close()
     return first, found
+
+
+def _skip_noise(lines: Iterable[str]) -> None:
+    """Read up to the line before a command's own output, or to the end."""
+    for line in lines:
+        if line.endswith(f"{MARK}\n"):
+            return
 
 
 def on_all(

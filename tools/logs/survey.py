@@ -63,6 +63,10 @@ class FileFacts(msgspec.Struct, kw_only=True):
     attachments: dict[str, int] = msgspec.field(default_factory=dict)
     """Sizes by name."""
     metadata: MetadataByName = msgspec.field(default_factory=dict)
+    counted: int | None = None
+    """Messages that its summary counts; None if it has none or is damaged."""
+    earlier_ends: int = 0
+    """Ends in the middle of the file: its writer finished it more than once."""
     cut: LostBytes | None = None
     damage: list[LostBytes] = msgspec.field(default_factory=list)
 
@@ -106,7 +110,8 @@ class Survey:
                 )
                 taken = take(_Reading(facts, self.topics), reader)
                 facts.cut, facts.damage = reader.cut, reader.damage
-                facts.passed_over = reader.passed_over
+                facts.passed_over, facts.earlier_ends = reader.passed_over, reader.earlier_ends
+                facts.counted = reader.message_count
             if taken:
                 break
         self.files.append(facts)

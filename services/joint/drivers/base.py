@@ -12,13 +12,15 @@ from shared.clock import NS_PER_S
 
 __all__ = [
     "HEAT_EVERY_NS", "SUPPLY_EVERY_NS", "Drive", "DriveReading", "DriveStatus", "MotorTarget",
-    "real_readings",
+    "is_target", "real_readings",
 ]  # fmt: skip
 
 HEAT_EVERY_NS: Final = NS_PER_S
 """How often a driver asks its drive for the temperatures, ns, where the firmware tells them."""
 SUPPLY_EVERY_NS: Final = NS_PER_S // 2
 """Time between two questions for the supply's voltage, ns."""
+LARGEST: Final = 1e9
+"""Largest target, in any unit; beyond it a single float holds no fraction."""
 CELSIUS: Final = (-40.0, 200.0)
 """What a thermistor that is there reads; a pin without one reads 0 or nonsense."""
 
@@ -83,6 +85,20 @@ class MotorTarget(msgspec.Struct, gc=False, frozen=True):
     """1/s"""
     vel_gain: Pair
     """N m s/turn"""
+
+
+def is_target(target: MotorTarget) -> bool:
+    """Return True if every field is a number that a drive can take, over CAN and USB."""
+    for first, second in (
+        target.pos_turns,
+        target.vel_turns,
+        target.torque,
+        target.pos_gain,
+        target.vel_gain,
+    ):
+        if not (-LARGEST < first < LARGEST and -LARGEST < second < LARGEST):
+            return False
+    return True
 
 
 class Drive(Protocol):

@@ -18,6 +18,7 @@ from services.joint.drivers.base import (
     DriveReading,
     DriveStatus,
     MotorTarget,
+    is_target,
 )
 from services.joint.drivers.can_link import CanLink, message
 from services.joint.drivers.firmware import (
@@ -175,7 +176,7 @@ class OdriveCan:
         velocity and torque travel in thousandths: 0.035 N m at the joint.
         """
         frames = self._frames
-        if not self._link.is_open or not odrive_frames.is_target(target):
+        if not self._link.is_open or not is_target(target):
             self.write_failures += 1
             return
         frames.fill_inputs(target)

@@ -23,9 +23,6 @@ Nodes = tuple[int, int]
 CanCommand = tuple[Command, bytes]
 """A command with its payload, for both axes."""
 
-LARGEST: Final = 1e9
-"""Largest target, in any unit; beyond it a single float holds no fraction."""
-
 _pack_float = Struct("<f").pack
 _pack_two_floats = Struct("<ff").pack
 
@@ -157,20 +154,6 @@ def positions(
         message(node, Command.SET_LINEAR_COUNT, data)
         for node, data in zip(nodes, payloads, strict=True)
     ]
-
-
-def is_target(target: MotorTarget) -> bool:
-    """Return True if every field is a number that a frame can hold."""
-    for first, second in (
-        target.pos_turns,
-        target.vel_turns,
-        target.torque,
-        target.pos_gain,
-        target.vel_gain,
-    ):
-        if not (-LARGEST < first < LARGEST and -LARGEST < second < LARGEST):
-            return False
-    return True
 
 
 def _either_first(

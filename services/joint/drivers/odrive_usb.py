@@ -25,7 +25,13 @@ import msgspec
 from odrive.device_manager import DeviceManager, get_device_manager
 from odrive.runtime_device import RuntimeDevice
 
-from services.joint.drivers.base import HEAT_EVERY_NS, DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.base import (
+    HEAT_EVERY_NS,
+    DriveReading,
+    DriveStatus,
+    MotorTarget,
+    is_target,
+)
 from services.joint.drivers.odrive_v3 import AxesStatus, OdriveV3
 from shared import log
 from shared.bus.messages import Pair
@@ -52,6 +58,8 @@ ANSWER_S: Final = 0.003
 """Time an exchange waits for the control thread's target after its sample."""
 REPORT_S: Final = 5.0
 """Time after which a drive that is not found is reported: its number may be another's."""
+TURNS_MAX: Final = 1 << 13
+"""Largest position: with 18 bits a turn, the count of an axis has 31 bits and a sign."""
 CLOSE_S: Final = 1.0
 """Time that `close` waits for a last request; not for the control path."""
 
@@ -173,11 +181,11 @@ class OdriveUsb:
     def write(self, target: MotorTarget) -> None:
         """Leave a target for the next exchange; the newest wins.
 
-        The feedforward is at most `current_lim`'s worth. A target that is not finite is not sent:
-        the drive keeps the last one.
+        The feedforward is at most `current_lim`'s worth. A target that is no number a drive can
+        take is not sent, as over CAN: the drive keeps the last one. Packing it would fail, and that
+        ends the connection.
         """
-        fields = (*target.pos_turns, *target.vel_turns, *target.pos_gain, *target.vel_gain)
-        if not self._connected or not all(map(isfinite, (*fields, *target.torque))):
+        if not self._connected or not is_target(target):
             self.write_failures += 1
             return
         limit = self._torque_max
@@ -211,10 +219,15 @@ class OdriveUsb:
         """Request writing both encoders' position, turns; dropped if the drive is lost before.
 
         Raises:
-            DriveError: it is lost now.
+            DriveError: it is lost now, or the position is more than its count can hold.
         """
         if not self._connected:
             raise DriveError(f"ODrive {self._serial_number}: lost; its position cannot be written")
+        if not all(abs(turn) < TURNS_MAX for turn in turns):
+            raise DriveError(
+                f"ODrive {self._serial_number}: {turns[0]:g} and {turns[1]:g} turns are no "
+                f"positions; give less than {TURNS_MAX} turns"
+            )
         self._wanted.position = turns
 
     def close(self) -> None:

@@ -43,7 +43,7 @@ Vector = NDArray[np.float64]
 Answer = Callable[[AxisBank, int], bytes]
 Setter = Callable[[AxisBank, int, bytes], None]
 
-VERSION_06: Final = Version(protocol=2, hardware=(4, 4, 58), firmware=(0, 6, 10), unreleased=0)
+VERSION_06: Final = Version(protocol=2, hardware=(4, 4, 58), firmware=(0, 6, 11), unreleased=0)
 
 _ERRORS_06: Final[tuple[tuple[str, int, DriveError06], ...]] = (
     ("axis", AxisError.WATCHDOG_TIMER_EXPIRED, DriveError06.WATCHDOG_TIMER_EXPIRED),
@@ -175,28 +175,32 @@ def _twice(value: float) -> bytes:
 
 
 def _sdo(bank: AxisBank, axis: int, data: bytes) -> bytes | None:
-    """Read or write an endpoint; one that does not exist, or a write, has no answer."""
+    """Read or write an endpoint; both are answered, with the value, unless it does not exist.
+
+    Firmware 0.6.11 and later confirms a write. A value that is not a number is not written, and not
+    confirmed.
+    """
     opcode, endpoint, value = cansimple_06.unpack_sdo(data)
     name = SDO_ENDPOINTS.get(endpoint)
     if name is None:
         return None
     drive = axis >> 1
-    if opcode == SdoOpcode.READ:
-        if name in _READINGS:
-            reading: Value = bank.bus.state(drive)[_READINGS.index(name)]
-        else:
-            reading = bank.settings.get(drive, _full(name, axis))
-        layout = sdo_layout(reading)
-        return cansimple_06.pack_sdo(0, endpoint, struct.pack(layout, reading).ljust(4, b"\0"))
     if opcode == SdoOpcode.WRITE and name not in _READINGS:
         full = _full(name, axis)
         layout = sdo_layout(bank.settings.get(drive, full))
         number: Value = struct.unpack_from(layout, value.ljust(4, b"\0"))[0]
         try:
             bank.settings.set(drive, full, number)
-        except DriveError:  # not a number: a drive says nothing either
+        except DriveError:
             return None
-    return None
+    elif opcode != SdoOpcode.READ:
+        return None
+    if name in _READINGS:
+        reading: Value = bank.bus.state(drive)[_READINGS.index(name)]
+    else:
+        reading = bank.settings.get(drive, _full(name, axis))
+    layout = sdo_layout(reading)
+    return cansimple_06.pack_sdo(0, endpoint, struct.pack(layout, reading).ljust(4, b"\0"))
 
 
 def _set_absolute_position(bank: AxisBank, axis: int, data: bytes) -> None:

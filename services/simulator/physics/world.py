@@ -177,8 +177,16 @@ class World:
     # ---- a step, and what can be seen between two
 
     def step(self, motor_torque: Array) -> None:
-        """Move on by one time step under motor torques (12,) in N m."""
+        """Move on by one time step under motor torques (12,) in N m.
+
+        MuJoCo puts the robot back to its start, without an error, when a force is no number or the
+        motion diverges: such a robot counts as fallen. A torque that is no number acts as zero, and
+        never reaches the drivetrains, which would keep it.
+        """
         actuation, joints = self.actuation, self.joints
+        if not math.isfinite(motor_torque @ motor_torque):
+            self._fallen = True
+            motor_torque = np.where(np.isfinite(motor_torque), motor_torque, 0.0)
         q_index, v_index = joints.q_index, joints.v_index
         for _ in range(self._steps):
             q, v = joints.qpos.take(q_index), joints.qvel.take(v_index)
@@ -188,6 +196,8 @@ class World:
             self.outside.apply(self.scenario_s, self._dt)
             mujoco.mj_step(self.model, self.data)
             self.time += self._dt
+            if self.data.time < self.time - self._dt:
+                self._fallen = True
 
     def motor_turns(self) -> tuple[Array, Array]:
         """Return motor positions (12,) in turns and rates (12,) in turn/s.

@@ -9,7 +9,7 @@ from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
 from mcap.stream_reader import StreamReader
 
-from shared.bus import codec
+from shared.bus import codec, topics
 from shared.exceptions import RunError
 from shared.mcap_log import files
 from tests.shared.mcap_log import runs
@@ -57,6 +57,20 @@ def test_times_are_mapped_to_the_wall_clock_by_one_offset(tmp_path: Path) -> Non
     assert (channel.topic, message.sequence) == (STATE_KEY, 7)
     assert message.log_time == OFFSET_NS + 7_000_500
     assert message.publish_time == OFFSET_NS + 7_000_000
+
+
+def test_with_a_wall_clock_behind_the_monotonic_clock_every_message_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A host without a battery for its clock begins in 1970."""
+    monkeypatch.setattr(runs, "OFFSET_NS", -60 * 10**9)
+    path = runs.write(tmp_path, [item(7), item(8)])
+    with path.open("rb") as file:
+        times = [message.publish_time for _, _, message in make_reader(file).iter_messages()]
+    assert times == [7_000_000, 8_000_000]
+    assert read_run(path).messages(topics.JOINT_STATE, "knee_right") == [
+        runs.state(7), runs.state(8)
+    ]  # fmt: skip
 
 
 def test_an_existing_file_is_left_alone_and_the_next_number_is_taken(tmp_path: Path) -> None:

@@ -193,7 +193,12 @@ def _program(config: RobotConfig, node: PoseNode, z: float, pitch: float) -> Arr
             problem.solve(solver=cp.CLARABEL)
     except cp.error.SolverError as error:
         raise RunError(f"{where}: the solver failed: {error}") from None
-    if D.value is None:
+    if problem.status == cp.settings.USER_LIMIT:  # there are values, and they are no solution
+        raise RunError(
+            f"{where}: the solver stopped at its iteration limit; "
+            "check the values of [certificate] and [law] in the robot file"
+        )
+    if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
         raise RunError(
             f"{where}: no local gains meet the certificate ({problem.status}); "
             "lower certificate.K_required, or raise certificate.k_q_fraction_max or law.K_p"

@@ -13,7 +13,13 @@ from rich.text import Text
 from shared.bus import topics
 from shared.clock import NS_PER_S
 from shared.exceptions import XrlError
-from shared.mcap_log.recover import clock_time, describe_lost, describe_passed_over
+from shared.mcap_log.recover import (
+    clock_time,
+    describe_count,
+    describe_earlier_ends,
+    describe_lost,
+    describe_passed_over,
+)
 from shared.mcap_log.writer import SCHEMA_VERSION
 from tools.flags import Arg, Flags, option, positional
 from tools.guarded_streams import printable
@@ -141,9 +147,13 @@ def _show_file(file: FileFacts, console: Console) -> None:
         state = Text("being written" if file.in_use else "not finished", "yellow")
     size = f"{file.size / MIB:.2f} MiB" if file.size >= MIB else f"{file.size} bytes"
     console.print(marked("[bold]{}[/]: {}, {}", file.path, size, state), soft_wrap=True)
-    if not file.finished or file.damage:
-        for line in describe_lost(file.cut, file.damage, finished=file.finished):
-            console.print(f"  {line}", style="yellow", soft_wrap=True)
+    lines = describe_count(file.counted, file.messages + file.orphans)
+    if file.damage or not file.finished:
+        lines = [*describe_lost(file.cut, file.damage, finished=file.finished), *lines]
+    if file.earlier_ends:
+        lines.append(describe_earlier_ends(file.earlier_ends))
+    for line in lines:
+        console.print(f"  {line}", style="yellow", soft_wrap=True)
     if file.orphans:
         console.print(f"  {file.orphans} messages of channels without a description")
     if file.passed_over:
@@ -154,9 +164,9 @@ def _show_file(file: FileFacts, console: Console) -> None:
             console.print(f"  written every {printable(flush_ms)} ms: all after that is missing")
         command = f"xrl log recover {printable(str(file.path))}"
         console.print(f"  finish it with: {command}", soft_wrap=True)
-    elif file.damage:
+    elif lines and not file.in_use:
         command = f"xrl log recover {printable(str(file.path))}"
-        console.print(f"  a copy without the damage: {command}", soft_wrap=True)
+        console.print(f"  a copy of all that can be read: {command}", soft_wrap=True)
     note = file.metadata.get("recovered")
     if note is not None:
         console.print(f"  recovered from {printable(note.get('from', '?'))}", style="dim")
@@ -282,6 +292,8 @@ def _file_as_json(file: FileFacts) -> dict[str, Any]:
         "end_ns": file.last_ns if file.messages else None,
         "orphans": file.orphans,
         "passed_over": file.passed_over,
+        "counted": file.counted,
+        "earlier_ends": file.earlier_ends,
         "cut": file.cut and file.cut._asdict(),
         "damage": [loss._asdict() for loss in file.damage],
         "attachments": file.attachments,

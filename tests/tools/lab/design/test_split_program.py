@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cvxpy as cp
 import msgspec
 import numpy as np
 import pytest
@@ -146,6 +147,16 @@ def test_smallest_margins_see_a_single_node_that_would_fall(
     rows[12][1] = (0.0,) * 6
     spoiled = msgspec.structs.replace(solved, D=tuple(tuple(row) for row in rows))
     assert split_program.smallest_margins(robot, spoiled).service < 0.5
+
+
+def test_a_solver_that_stops_at_its_iteration_limit_gives_no_gains(
+    robot: RobotConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """CVXPY 1.9 does not raise then, and its variables have values."""
+    solve = cp.Problem.solve
+    monkeypatch.setattr(cp.Problem, "solve", lambda self, **how: solve(self, max_iter=2, **how))
+    with pytest.raises(RunError, match=r"^COM height 0\..* stopped at its iteration limit"):
+        split_program.solve(robot)
 
 
 def test_what_no_gains_can_hold_is_refused_with_the_pose_and_what_to_change(
