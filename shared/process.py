@@ -49,12 +49,13 @@ def add_injected(parser: argparse.ArgumentParser) -> None:
 class StopFlag:
     """True once SIGTERM or SIGINT has come; the loops look at it once a cycle."""
 
-    def __init__(self) -> None:
+    def __init__(self, *also: signal.Signals) -> None:
+        """Stop at SIGTERM and SIGINT, and at `also`."""
         self.stopped = False
         self.interrupted = False
         """SIGINT has come: the fleet goes down, and not this process alone."""
-        signal.signal(signal.SIGTERM, self._stop)
-        signal.signal(signal.SIGINT, self._stop)
+        for number in (signal.SIGTERM, signal.SIGINT, *also):
+            signal.signal(number, self._stop)
 
     def _stop(self, number: int, _frame: FrameType | None) -> None:
         self.stopped = True

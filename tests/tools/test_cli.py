@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import importlib.metadata
 import itertools
+import os
+import pty
 import re
 import shlex
 import subprocess
@@ -102,6 +104,31 @@ def test_a_reader_that_has_gone_ends_a_verb_without_words() -> None:
         capture_output=True, text=True, timeout=60, check=True,
     )  # fmt: skip
     assert (done.stdout, done.stderr) == ("141\n", "")
+
+
+@pytest.mark.parametrize(
+    ("ends_by", "code"), [("print('more')", 129), ("raise FleetError('x')", 2), ("1 / 0", 70)]
+)
+def test_a_terminal_that_is_gone_is_no_fall(ends_by: str, code: int) -> None:
+    """As after a dropped ssh session: the error could not be printed, and Python's code was 1."""
+    script = (
+        "import sys, time\n"
+        "from shared.exceptions import FleetError\n"
+        "from tools import cli, keyboard\n"
+        "from tools.verbs import faults\n"
+        "def run(flags: faults.FaultsFlags) -> int:\n"
+        "    while not keyboard.is_hung_up(1): time.sleep(0.01)\n"
+        f"    {ends_by}\n"
+        "faults.run = run\n"
+        "sys.exit(cli.main(['faults']))\n"
+    )
+    person, terminal = pty.openpty()
+    with subprocess.Popen(
+        [sys.executable, "-c", script], stdin=terminal, stdout=terminal, stderr=terminal
+    ) as verb:
+        os.close(terminal)
+        os.close(person)
+        assert verb.wait(timeout=60) == code
 
 
 def test_a_folder_that_is_gone_is_told(
