@@ -11,6 +11,7 @@ from collections.abc import Callable
 from types import FrameType
 
 from shared import log, places
+from shared.arguments import FlagParser
 from shared.exceptions import BUG_EXIT_CODE, XrlError, os_error_in_words
 from shared.run_directory import default_run_dir, service_directory
 
@@ -20,7 +21,7 @@ SOCKET_PATH_MAX = 100
 
 def service_parser(description: str, example: str) -> argparse.ArgumentParser:
     """Return a parser with the arguments that every service takes."""
-    parser = argparse.ArgumentParser(
+    parser = FlagParser(
         description=description,
         epilog=f"example:\n  {example}",
         formatter_class=argparse.RawDescriptionHelpFormatter,

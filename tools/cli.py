@@ -17,6 +17,7 @@ from types import FrameType
 from typing import Any
 
 from shared import revision
+from shared.arguments import FlagParser
 from shared.exceptions import (
     BUG_EXIT_CODE,
     HUNG_UP_EXIT_CODE,
@@ -103,7 +104,7 @@ def _drop_output() -> None:
                 os.close(nowhere)
 
 
-class _TopParser(argparse.ArgumentParser):
+class _TopParser(FlagParser):
     """Its help is one screen: a line for each verb of every day, then for each noun."""
 
     def format_help(self) -> str:
@@ -131,7 +132,7 @@ def _parser(arguments: Sequence[str], *, whole: bool = False) -> argparse.Argume
     parser.add_argument("--version", action=_Version, help="print version and commit, and exit")
     asked = _asked(parser, arguments)
     verbs = parser.add_subparsers(
-        prog="xrl", metavar="VERB", required=True, parser_class=argparse.ArgumentParser
+        prog="xrl", metavar="VERB", required=True, parser_class=FlagParser
     )
     below: dict[str, Subparsers] = {"": verbs}
     for verb in VERBS:

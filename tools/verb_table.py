@@ -8,9 +8,10 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Final, NamedTuple, TypeAlias, get_type_hints
 
+from shared.arguments import FlagParser
 from tools.flags import Flags, add_flags, read_flags
 
-Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # noqa: SLF001 - its only name
+Subparsers: TypeAlias = "argparse._SubParsersAction[FlagParser]"  # noqa: SLF001 - its only name
 """What `add_parser` is given."""
 
 

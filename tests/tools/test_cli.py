@@ -54,6 +54,33 @@ def test_an_old_name_answers_with_the_new_one_in_a_line(
     assert noun in {verb.name for verb in VERBS} | set(NOUNS)
 
 
+@pytest.mark.parametrize(
+    ("words", "usage", "hint"),
+    [
+        ("down --li", "xrl down", "no flag '--li'; did you mean --limp? "),
+        ("demo --kil planner@3", "xrl demo", "no flag '--kil'; did you mean --kill? "),
+        ("demo --kil=planner@3", "xrl demo", "no flag '--kil'; did you mean --kill? "),
+        (
+            "drive tare -reun-dir=x",
+            "xrl drive tare",
+            "no flag '-reun-dir'; did you mean --run-dir? ",
+        ),
+        ("sim --nosuch", "xrl sim", "no flag '--nosuch'; `--help`"),
+        ("drive --nosuch jog", "xrl drive", "no flag '--nosuch'; `--help`"),
+        ("--nosuch sim", "xrl", "no flag '--nosuch'; `--help`"),
+        ("status more", "xrl status", "unexpected: more"),
+    ],
+)
+def test_a_shortened_or_unknown_flag_is_refused_with_its_verbs_usage_and_the_closest_flag(
+    words: str, usage: str, hint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`xrl down --li` was taken as `--limp`, and let a standing robot fall."""
+    assert exit_code(words.split()) == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"usage: {usage} [")
+    assert f"\n{usage}: error: {hint}" in told
+
+
 def commands(example: str) -> Iterator[list[str]]:
     """Yield what stands behind each `xrl` of a line."""
     words = shlex.split(example, comments=True)
