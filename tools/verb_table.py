@@ -90,6 +90,7 @@ VERBS: Final = (
     Verb("kill", "send a signal to one service", "services:kill"),
     Verb("inject", "delay, drop or cut a live fleet's messages for a while"),
     Verb("estop", "stop every module: a slow sink, never a drop"),
+    Verb("rearm", "arm all six modules again after an emergency stop, or none", "services:rearm"),
     Verb("pendant", "hold a dead man's handle: silent, it stops this host's modules"),
     Verb("lead", "lead height, pitch and assist by a gamepad or by keys"),
     Verb("view", "show the robot in a browser: live, recorded, or to lead and push"),

@@ -152,5 +152,5 @@ def _conclude(going: list[str], which: str) -> None:
     refuse_going(going)
     Console().print(
         f"{which} are stopped: DAMP. The robot sinks slowly, or holds beside a limp or dead "
-        "module; `xrl down` ends it"
+        "module; `xrl rearm` or `xrl down` ends it"
     )

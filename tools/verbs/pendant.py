@@ -64,6 +64,7 @@ def run(flags: PendantFlags) -> int:
     request_here(flags.run_dir)  # faster than the pendant's silence
     refuse_going(wait_here(flags.run_dir, list(pendant.modules), pendant.modules))
     console.print(
-        "stopped: DAMP. It sinks slowly, or holds beside a limp or dead module; `xrl down` ends it"
+        "stopped: DAMP. It sinks slowly, or holds beside a limp or dead module; `xrl rearm` or "
+        "`xrl down` ends it"
     )
     return 0
