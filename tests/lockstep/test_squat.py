@@ -58,7 +58,7 @@ def test_the_robot_stands_through_pushes_with_the_planner_dead(squat: Run) -> No
 
 def test_all_six_modules_hold_within_the_command_age_of_the_kill(squat: Run) -> None:
     assert set(squat.modes) == {Mode.HOLD}
-    into_hold = [e for _, e in squat.lockstep.events if e.cause == Cause.PLANNER_ENDED]
+    into_hold = [e for _, e in squat.lockstep.events if e.cause == Cause.COMMAND_STALE]
     assert len(into_hold) == 6
     start_ns = squat.rows[0].t_ns - round(squat.rows[0].scenario_s * 1e9)
     for event in into_hold:
