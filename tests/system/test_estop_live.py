@@ -84,7 +84,8 @@ def test_after_a_stop_all_six_are_rearmed_together_once_it_rests_and_nobody_pull
     robot: RobotConfig, run_dir: Path
 ) -> None:
     """After `xrl kill` of one module that one held while five sank."""
-    with started(run_dir) as fleet, open_session(robot, "test", run_dir) as session:
+    services = ("simulator", "harness", "planner", *MODULES)
+    with started(run_dir, *services) as fleet, open_session(robot, "test", run_dir) as session:
         ear = FleetEar(session)
         hands = session.publisher(topics.OPERATOR_HAND, HandLead)
         ear.wait_until_led()
