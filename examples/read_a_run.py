@@ -27,6 +27,6 @@ def main(path: Path) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
+    parser = argparse.ArgumentParser(allow_abbrev=False)
     parser.add_argument("run", type=Path, metavar="RUN.mcap")
     main(parser.parse_args().run)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import os
+import signal
 from typing import Final
 
 
@@ -30,6 +31,8 @@ FAULT_EXIT_CODE: Final = 3
 BUG_EXIT_CODE: Final = 70
 """Exit code of a process that an unforeseen exception ended: a fault of this project (EX_SOFTWARE
 of sysexits.h). Python's own would be `FELL_EXIT_CODE`."""
+HUNG_UP_EXIT_CODE: Final = 128 + signal.SIGHUP
+"""Exit code of a verb whose terminal is gone, as after a dropped ssh session."""
 
 
 class ConfigError(XrlError):
@@ -62,6 +65,12 @@ class DriveError(XrlError):
 
 class FleetError(XrlError):
     """The services could not be started, found or stopped."""
+
+
+class HungUpError(FleetError):
+    """The terminal is gone, from which a person led the robot."""
+
+    exit_code = HUNG_UP_EXIT_CODE
 
 
 class RunError(XrlError):

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from types import FrameType
 
 from shared import log, places
+from shared.arguments import FlagParser
 from shared.exceptions import BUG_EXIT_CODE, XrlError, os_error_in_words
 from shared.run_directory import default_run_dir, service_directory
 
@@ -20,7 +21,7 @@ SOCKET_PATH_MAX = 100
 
 def service_parser(description: str, example: str) -> argparse.ArgumentParser:
     """Return a parser with the arguments that every service takes."""
-    parser = argparse.ArgumentParser(
+    parser = FlagParser(
         description=description,
         epilog=f"example:\n  {example}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -49,12 +50,13 @@ def add_injected(parser: argparse.ArgumentParser) -> None:
 class StopFlag:
     """True once SIGTERM or SIGINT has come; the loops look at it once a cycle."""
 
-    def __init__(self) -> None:
+    def __init__(self, *also: signal.Signals) -> None:
+        """Stop at SIGTERM and SIGINT, and at `also`."""
         self.stopped = False
         self.interrupted = False
         """SIGINT has come: the fleet goes down, and not this process alone."""
-        signal.signal(signal.SIGTERM, self._stop)
-        signal.signal(signal.SIGINT, self._stop)
+        for number in (signal.SIGTERM, signal.SIGINT, *also):
+            signal.signal(number, self._stop)
 
     def _stop(self, number: int, _frame: FrameType | None) -> None:
         self.stopped = True

@@ -550,3 +550,19 @@ def test_only_simulations_know_the_centralised_baseline_and_no_robot_file_names_
     }
     for file in (ROOT / "deploy").rglob("*.toml"):
         assert "centralised" not in file.read_text(encoding="utf-8"), file
+
+
+def test_no_parser_accepts_abbreviated_flags() -> None:
+    """`xrl down --li` was `--limp`. All parsers are a `FlagParser`; an example stands alone."""
+    trees = TREES | {
+        path.name: ast.parse(path.read_text()) for path in (ROOT / "examples").glob("*.py")
+    }
+    calls = [
+        (file, node.keywords)
+        for file, tree in trees.items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "argparse.ArgumentParser"
+    ]
+    assert calls, "the example's"
+    for file, keywords in calls:
+        assert [ast.unparse(each) for each in keywords] == ["allow_abbrev=False"], file

@@ -17,8 +17,15 @@ from types import FrameType
 from typing import Any
 
 from shared import revision
-from shared.exceptions import BUG_EXIT_CODE, XrlError, os_error_in_words
+from shared.arguments import FlagParser
+from shared.exceptions import (
+    BUG_EXIT_CODE,
+    HUNG_UP_EXIT_CODE,
+    XrlError,
+    os_error_in_words,
+)
 from tools.guarded_streams import guarded_streams
+from tools.keyboard import is_hung_up
 from tools.verb_table import NOUNS, RENAMED, VERBS, Subparsers, add_declared, sentence
 
 INTERRUPTED = 128 + signal.SIGINT
@@ -36,21 +43,23 @@ def main(argv: Sequence[str] | None = None) -> int:
         try:
             return _run(arguments)
         except XrlError as error:
-            print(f"xrl: {error}", file=sys.stderr)
+            _tell(f"xrl: {error}")
             return error.exit_code
         except BrokenPipeError:
             _drop_output()
             return 128 + signal.SIGPIPE
         except OSError as error:
-            _drop_output()
-            print(f"xrl: {os_error_in_words(error)}", file=sys.stderr)
+            if any(map(is_hung_up, range(3))):
+                _drop_output()
+                return HUNG_UP_EXIT_CODE
+            _tell(f"xrl: {os_error_in_words(error)}")
             return XrlError.exit_code
         except KeyboardInterrupt:
-            print("xrl: interrupted", file=sys.stderr)
+            _tell("xrl: interrupted")
             return INTERRUPTED
         except Exception:  # noqa: BLE001 - Python's own exit code would be 1: a robot that fell
-            traceback.print_exc()
-            print("xrl: a fault of xrl itself: please report the lines above", file=sys.stderr)
+            bug = "xrl: a fault of xrl itself: please report the lines above"
+            _tell(f"{traceback.format_exc()}{bug}")
             return BUG_EXIT_CODE
 
 
@@ -76,18 +85,26 @@ def _with_values(arguments: Sequence[str]) -> list[str]:
     return joined
 
 
+def _tell(words: str) -> None:
+    """Print an error; a standard error that is gone changes no exit code."""
+    with contextlib.suppress(OSError):
+        print(words, file=sys.stderr)
+    _drop_output()
+
+
 def _drop_output() -> None:
-    """Take what nobody can be given from the standard output, or Python tries again at its end."""
-    with contextlib.suppress(ValueError):
-        try:
-            sys.stdout.flush()
-        except OSError:
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, sys.stdout.fileno())
-            os.close(nowhere)
+    """Discard output that cannot be written, or Python tries again, and fails, at its end."""
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(ValueError):
+            try:
+                stream.flush()
+            except OSError:
+                nowhere = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nowhere, stream.fileno())
+                os.close(nowhere)
 
 
-class _TopParser(argparse.ArgumentParser):
+class _TopParser(FlagParser):
     """Its help is one screen: a line for each verb of every day, then for each noun."""
 
     def format_help(self) -> str:
@@ -115,7 +132,7 @@ def _parser(arguments: Sequence[str], *, whole: bool = False) -> argparse.Argume
     parser.add_argument("--version", action=_Version, help="print version and commit, and exit")
     asked = _asked(parser, arguments)
     verbs = parser.add_subparsers(
-        prog="xrl", metavar="VERB", required=True, parser_class=argparse.ArgumentParser
+        prog="xrl", metavar="VERB", required=True, parser_class=FlagParser
     )
     below: dict[str, Subparsers] = {"": verbs}
     for verb in VERBS:

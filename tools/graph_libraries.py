@@ -28,6 +28,7 @@ from services.simulator.drives import axis_control
 from services.simulator.physics.actuation import step_graph
 from services.simulator.physics.body import body_of
 from services.simulator.physics.plant import PlantConfig
+from shared.arguments import FlagParser
 from shared.arrays import Array
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
@@ -140,9 +141,7 @@ def compare(function: ca.Function, translated: ca.Function) -> None:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Build what is missing; without a compiler say so. 0 if no graph failed."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = FlagParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_flags(parser, ConfigFlags)
     flags = read_flags(ConfigFlags, parser.parse_args(argv))
     robot = config_file.load(flags.config)

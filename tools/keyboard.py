@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import os
 import select
 import sys
@@ -10,7 +12,7 @@ import time
 import tty
 from collections.abc import Mapping
 from types import TracebackType
-from typing import Any, Final, Generic, Self, TypeVar
+from typing import Any, Final, Generic, Self, TextIO, TypeVar
 
 K = TypeVar("K")
 _READ_MAX: Final = 256
@@ -34,8 +36,7 @@ class Keyboard(Generic[K]):
         """Read keys one by one, if this is a terminal's foreground."""
         try:
             descriptor = sys.stdin.fileno()
-            # A job in the background would be stopped for touching the terminal.
-            if os.isatty(descriptor) and os.tcgetpgrp(descriptor) == os.getpgrp():
+            if os.isatty(descriptor) and _is_foreground(descriptor):
                 self._before = termios.tcgetattr(descriptor)
                 tty.setcbreak(descriptor)
                 self._descriptor = descriptor
@@ -51,7 +52,9 @@ class Keyboard(Generic[K]):
     ) -> None:
         """Give the terminal back as it was."""
         if self.present:
-            termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._before)
+            with contextlib.suppress(OSError, termios.error):  # the terminal may be gone
+                if _is_foreground(self._descriptor):
+                    termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._before)
             self._descriptor = -1
 
     def wait(self, timeout_s: float) -> list[K]:
@@ -59,6 +62,7 @@ class Keyboard(Generic[K]):
         if not self.present:
             time.sleep(timeout_s)
             return []
+        self._set_cbreak()
         ready, _, _ = select.select([self._descriptor], [], [], timeout_s)
         if not ready:
             return []
@@ -70,6 +74,30 @@ class Keyboard(Generic[K]):
             self._descriptor = -1
         presses, self._rest = understood(self._rest + text, self._codes)
         return presses
+
+    def _set_cbreak(self) -> None:
+        """Read keys one by one again after a shell has reset the terminal (Ctrl-Z, then `fg`).
+
+        No typed key is discarded: it may be the stop.
+        """
+        with contextlib.suppress(OSError, termios.error):
+            is_by_line = termios.tcgetattr(self._descriptor)[3] & termios.ICANON
+            if is_by_line and _is_foreground(self._descriptor):
+                tty.setcbreak(self._descriptor, termios.TCSANOW)
+
+
+def _is_foreground(descriptor: int) -> bool:
+    """Return True if this process may change its terminal; a job in the background is stopped."""
+    return os.tcgetpgrp(descriptor) == os.getpgrp()
+
+
+def is_hung_up(file: int | TextIO) -> bool:
+    """Return True for a terminal whose other end is closed, as by a dropped ssh session."""
+    try:
+        termios.tcgetattr(file)
+    except (OSError, ValueError, termios.error) as error:
+        return error.args[:1] == (errno.EIO,)
+    return False
 
 
 def understood(text: bytes, codes: Mapping[bytes, K]) -> tuple[list[K], bytes]:
@@ -89,11 +117,16 @@ def understood(text: bytes, codes: Mapping[bytes, K]) -> tuple[list[K], bytes]:
 
 
 def typed_line(wait_s: float) -> str | None:
-    """Return the line that a person enters within a time, s; None: none, "": the terminal is gone.
+    """Return the line that a person enters within a time, s.
 
-    Without a terminal there is nobody to enter one.
+    Return None if no line is entered or there is no terminal, "" if the terminal is gone.
     """
     if not sys.stdin.isatty():
+        if is_hung_up(sys.stdin):
+            return ""
         time.sleep(wait_s)
         return None
-    return sys.stdin.readline() if select.select([sys.stdin], [], [], wait_s)[0] else None
+    try:
+        return sys.stdin.readline() if select.select([sys.stdin], [], [], wait_s)[0] else None
+    except OSError:
+        return ""

@@ -8,9 +8,10 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Final, NamedTuple, TypeAlias, get_type_hints
 
+from shared.arguments import FlagParser
 from tools.flags import Flags, add_flags, read_flags
 
-Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # noqa: SLF001 - its only name
+Subparsers: TypeAlias = "argparse._SubParsersAction[FlagParser]"  # noqa: SLF001 - its only name
 """What `add_parser` is given."""
 
 
@@ -89,6 +90,7 @@ VERBS: Final = (
     Verb("kill", "send a signal to one service", "services:kill"),
     Verb("inject", "delay, drop or cut a live fleet's messages for a while"),
     Verb("estop", "stop every module: a slow sink, never a drop"),
+    Verb("rearm", "arm all six modules again after an emergency stop, or none", "services:rearm"),
     Verb("pendant", "hold a dead man's handle: silent, it stops this host's modules"),
     Verb("lead", "lead height, pitch and assist by a gamepad or by keys"),
     Verb("view", "show the robot in a browser: live, recorded, or to lead and push"),

@@ -32,10 +32,11 @@ class Event(IntEnum):
     TORQUE_LIMIT = 5
     TOO_FAST = 6
     DRIVE_ARMED = 7
-    COMMAND_STALE = 8
-    HOLD_REQUESTED = 9
-    READY = 10
-    NONE = 11
+    PLANNER_ENDED = 8
+    COMMAND_STALE = 9
+    HOLD_REQUESTED = 10
+    READY = 11
+    NONE = 12
 
 
 Q_REF_MAX: Final = 6.4
@@ -66,6 +67,7 @@ TRANSITIONS: Final[dict[Mode, dict[Event, tuple[Mode, Cause]]]] = {
         Event.SHAKING: (Mode.HOLD, Cause.SHAKING),
         Event.TORQUE_LIMIT: (Mode.HOLD, Cause.TORQUE_LIMIT),
         Event.TOO_FAST: (Mode.HOLD, Cause.TOO_FAST),
+        Event.PLANNER_ENDED: (Mode.HOLD, Cause.PLANNER_ENDED),
         Event.COMMAND_STALE: (Mode.HOLD, Cause.COMMAND_STALE),
         Event.HOLD_REQUESTED: (Mode.HOLD, Cause.HOLD_ALL),
     },
@@ -127,6 +129,7 @@ REFUSED_SHOWN_NS: Final = NS_PER_S
 # Compared in each cycle: docs/contributing.md, The control path.
 _DISARMED, _HOLD, _TRACK = Mode.DISARMED, Mode.HOLD, Mode.TRACK
 _ESTOP, _DRIVE_ARMED, _STALE = Event.ESTOP, Event.DRIVE_ARMED, Event.COMMAND_STALE
+_PLANNER_ENDED: Final = Event.PLANNER_ENDED
 _HOLD_REQUESTED, _READY, _NONE = Event.HOLD_REQUESTED, Event.READY, Event.NONE
 _INSIDE, _USABLE = Outside.NOTHING, Refusal.NONE
 
@@ -156,6 +159,8 @@ class Failsafe(msgspec.Struct):
     """Part of the newest usable command that lies outside the envelope."""
     judged_ns: int = 0
     """Time of that judgement; an old one is no longer reported."""
+    planner_ended: bool = False
+    """True from the end of the followed planner's process until the cycle that acts on it."""
 
     def offer(
         self,
@@ -189,9 +194,10 @@ class Failsafe(msgspec.Struct):
         return refusal
 
     def end_session(self, session: int) -> None:
-        """Take the newest command for stale: the process of its planner has ended."""
+        """Record that a planner's process has ended: its newest command is no longer usable."""
         if session == self.session:
             self.fresh_since_ns = -1
+            self.planner_ended = True
 
     def count_malformed(self, count: int, now_ns: int) -> None:
         """Count what came as a command and was none."""
@@ -267,6 +273,7 @@ class Failsafe(msgspec.Struct):
         elif self.fresh_since_ns < 0:
             self.fresh_since_ns = now_ns
         event = self._event(now_ns, timing, drive, estop, fresh and not broken)
+        self.planner_ended = False
         if trip is not _NONE and tracks:
             gone = estop or not (drive is _NONE or drive is _DRIVE_ARMED)
             if not gone:
@@ -276,7 +283,7 @@ class Failsafe(msgspec.Struct):
         self.dropouts.advance(
             now_ns,
             engaged=tracks,
-            dropped=event is _STALE or event in TRIPS,
+            dropped=event is _STALE or event is _PLANNER_ENDED or event in TRIPS,
             count_max=timing.dropouts_max,
             forget_ns=timing.dropout_forget_ns,
         )
@@ -294,7 +301,7 @@ class Failsafe(msgspec.Struct):
         elif drive is not _NONE:
             return drive
         if not fresh:
-            return _STALE
+            return _PLANNER_ENDED if self.planner_ended else _STALE
         if self.command is not None and self.command.hold:
             return _HOLD_REQUESTED
         return _READY if self.ready(now_ns, timing) else _NONE

@@ -5,6 +5,7 @@ Live, lockstep and re-execution run this loop over ports, a drive and a clock of
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Final, Protocol
@@ -38,7 +39,9 @@ READ_TIMEOUT_S: Final = 0.005
 """Longest wait for a sample; a cycle without one still runs the age rule and the failsafe."""
 
 REPORT_EVERY_NS: Final = 10 * NS_PER_S
-"""What keeps a drive from being armed is said so often."""
+"""Time between two reports of what keeps a drive from being armed, ns."""
+START_NS: Final = 2 * NS_PER_S
+"""Time after which a drive that does not acknowledge is an error: it may start late, ns."""
 
 _WHY_NOT: Final = {
     ArmingInhibit.UNZEROED: "the drive has had no power since it was zeroed, or never was, or its "
@@ -229,8 +232,12 @@ class JointLoop:
             )
         reported = step.inhibit is self._reported and now < self._report_at_ns
         if step.inhibit is not ArmingInhibit.NONE and not reported:
-            self._reported, self._report_at_ns = step.inhibit, now + REPORT_EVERY_NS
+            is_new = step.inhibit is not self._reported
+            starts = is_new and step.inhibit is ArmingInhibit.UNACKNOWLEDGED
+            waits = starts or step.inhibit is ArmingInhibit.WAITING
+            self._report_at_ns = now + (START_NS if starts else REPORT_EVERY_NS)
+            self._reported = step.inhibit
             why = _WHY_NOT[step.inhibit].format(
                 q=samples.q, error=samples.error, bus=self.module.bus
             )
-            log.get("xrl").error("not armed: %s", why)
+            log.get("xrl").log(logging.INFO if waits else logging.ERROR, "not armed: %s", why)

@@ -22,7 +22,7 @@ import os
 import signal
 import struct
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from enum import IntEnum
 from pathlib import Path
 from types import FrameType
@@ -108,13 +108,19 @@ class RearmGuard:
         return int(_BEATS.unpack_from(self._memory, _BEATS_AT)[0])
 
 
-def clear(run_dir: Path, module: str) -> None:
-    """Clear the state of a module's earlier services: a person asks for the module.
+def clear(run_dir: Path, *modules: str) -> None:
+    """Clear the state of the modules' earlier services: a person asks for the modules.
 
-    It is cleared in place, because a running service has the file mapped.
+    It is cleared in place, because a running service has the file mapped. If a file cannot be
+    opened, none is cleared.
     """
-    with suppress(FileNotFoundError), path_of(run_dir, module).open("r+b") as file:
-        file.write(_NEW)
+    with ExitStack() as stack:
+        files = []
+        for module in modules:
+            with suppress(FileNotFoundError):
+                files.append(stack.enter_context(path_of(run_dir, module).open("r+b")))
+        for file in files:
+            file.write(_NEW)
 
 
 def stop_source(run_dir: Path, module: str) -> str:

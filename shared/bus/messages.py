@@ -72,6 +72,8 @@ class Cause(IntEnum):
     """A trip of this module."""
     TOO_FAST = 11
     """A trip of this module."""
+    PLANNER_ENDED = 12
+    """The process of its planner, on the same host, has ended."""
 
 
 class Trip(IntEnum):

@@ -132,7 +132,7 @@ LOSSES: Final[dict[str, LossRow]] = {
     "planner killed or hung": LossRow(
         "HOLD within max_command_age: local gains, references frozen",
         "the same",
-        "`xrl status`: HOLD because COMMAND_STALE",
+        "`xrl status`: HOLD because PLANNER_ENDED (its process ended, same host) or COMMAND_STALE",
         "automatic: a new planner starts from the measured pose and leads after a blend",
     ),
     "bus slow, lossy or cut": LossRow(
@@ -166,7 +166,7 @@ LOSSES: Final[dict[str, LossRow]] = {
         "all hold where they are",
         "the same",
         "`xrl status`: DAMP because ESTOP",
-        "restart the joint services",
+        "once the robot is at rest: `xrl rearm` re-arms all six together, or none",
     ),
     "feet away from their place before the planner leads": LossRow(
         "HOLD",

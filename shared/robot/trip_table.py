@@ -124,6 +124,8 @@ _NEVER: Final = TripsConfig(
 
 RESTART: Final = "xrl kill MODULE"
 """Its supervisor starts it again."""
+REARM: Final = "xrl rearm"
+"""All six modules together, or none."""
 OTHER_VERSION: Final = "its service is of another version: the same checkout on every host"
 
 
@@ -137,7 +139,7 @@ def remedy_of(state: JointState) -> str:
     if mode is Mode.FAULT:
         return f"{recovery_of(cause)}; then {RESTART}"
     if mode is Mode.DAMP:
-        return RESTART
+        return REARM
     if drive is DriveStatus.UNZEROED:
         return "hang the robot, xrl drive zero"
     if drive is DriveStatus.UNACKNOWLEDGED:

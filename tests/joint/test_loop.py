@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from pathlib import Path
 from typing import Any, Generic, cast
@@ -289,6 +290,21 @@ def test_every_cycle_is_traced_and_the_rest_when_the_service_ends(rig: Rig) -> N
     assert [trace.seq for trace in rig.traces.sent] == [1, 2, 3]
 
 
+@pytest.mark.parametrize(("after_s", "errors"), [(1, 0), (4, 1)])
+def test_a_drive_that_starts_after_its_service_is_an_error_only_if_it_lasts(
+    rig: Rig, caplog: pytest.LogCaptureFixture, after_s: int, errors: int
+) -> None:
+    """Each healthy start logged an error in three services."""
+    caplog.set_level(logging.INFO, "xrl")
+    rig.drive.status = DriveStatus.UNACKNOWLEDGED
+    rig.run_ns(after_s * NS_PER_S)
+    rig.drive.status = DriveStatus.IDLE
+    rig.run_ns(NS_PER_S)
+    assert rig.mode is Mode.HOLD
+    levels = [row.levelno for row in caplog.records]
+    assert levels == [logging.INFO] + [logging.ERROR] * errors
+
+
 def test_what_is_no_command_is_counted_and_traced_with_its_cycle(onboard: Rig) -> None:
     onboard.run(5)
     onboard.commands.refused = 3
@@ -309,7 +325,7 @@ def test_the_end_of_the_planners_process_is_hold_in_that_cycle_and_traced(onboar
     onboard.ended_session = SESSION
     onboard.run(1)
     event = onboard.events.sent[-1]
-    assert (onboard.mode, event.cause) == (Mode.HOLD, Cause.COMMAND_STALE)
+    assert (onboard.mode, event.cause) == (Mode.HOLD, Cause.PLANNER_ENDED)
     assert event.age_ns < onboard.controller.timing.max_command_age_ns, "it was not the age rule"
     onboard.run(20)
     cycles = [each for trace in onboard.traces.sent for each in trace.cycles]

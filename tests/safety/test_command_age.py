@@ -368,8 +368,9 @@ def test_a_planner_whose_process_ended_is_tracked_no_more_and_counts_anew(
     if session == OTHER:
         assert cause == (Cause.COMMANDS_FRESH if mode is Mode.HOLD else None)
     elif mode is Mode.TRACK:
-        assert (failsafe.mode, cause) == (Mode.HOLD, Cause.COMMAND_STALE)
+        assert (failsafe.mode, cause) == (Mode.HOLD, Cause.PLANNER_ENDED)
         assert failsafe.dropouts.count == 1
+        assert not failsafe.planner_ended, "the next drop-out has a cause of its own"
     else:
         assert (failsafe.mode, cause) == (mode, None)
     if session == SESSION and mode in (Mode.HOLD, Mode.TRACK):  # by what was on its way to it

@@ -87,6 +87,7 @@ def test_the_sweep_knows_every_state_and_every_event() -> None:
     assert set(TRANSITIONS) == set(Mode)
     assert {*DRIVE_EVENTS, *TRIPS} | {
         Event.ESTOP,
+        Event.PLANNER_ENDED,
         Event.COMMAND_STALE,
         Event.HOLD_REQUESTED,
         Event.READY,
@@ -115,6 +116,8 @@ def test_advance_follows_the_table_throughout(mode: Mode, event: Event, timing: 
         trip=event if event in TRIPS else Event.NONE,
     )
     failsafe = placed(situation, timing)
+    if event is Event.PLANNER_ENDED:
+        failsafe.end_session(SESSION)
     cause = failsafe.advance(T0, timing, situation.drive, situation.estop, situation.trip)
     assert (failsafe.mode, cause) == TRANSITIONS[mode].get(event, (mode, None))
 
@@ -123,6 +126,7 @@ CAUSES = {
     (Mode.DISARMED, Mode.HOLD): {Cause.DRIVE_ARMED},
     (Mode.HOLD, Mode.TRACK): {Cause.COMMANDS_FRESH},
     (Mode.TRACK, Mode.HOLD): {
+        Cause.PLANNER_ENDED,
         Cause.COMMAND_STALE,
         Cause.HOLD_ALL,
         Cause.SHAKING,

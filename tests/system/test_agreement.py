@@ -198,10 +198,8 @@ def test_a_killed_and_restarted_planner_is_survived_and_recorded(
     given = max(abs(row.operator_force[2]) for row in log.messages(topics.SIM_TRUTH))
     assert felt == pytest.approx(given, rel=0.25)
     first = [log.messages(topics.JOINT_EVENT, module) for module in MODULES]
-    ages_ms = [
-        e.age_ns / NS_PER_MS for each in first for e in each if e.cause == Cause.COMMAND_STALE
-    ]
-    assert min(ages_ms) < robot.joint_service.max_command_age_ms, "its process was seen to end"
+    causes = {event.cause for each in first for event in each}
+    assert Cause.PLANNER_ENDED in causes, "its process was seen to end"
     assert {"robot.toml", "robot.gains.json", "scenario.toml", "model.xml"} <= set(log.attachments)
 
 

@@ -16,10 +16,14 @@ import pytest
 
 from services.joint.neighbours import Neighbours
 from services.joint.rearm_guard import PENDANT, Pendant, stop_source
-from shared.bus.messages import Mode
+from shared.bus import topics
+from shared.bus.messages import HandLead, Mode
+from shared.bus.session import open_session
+from shared.clock import now_ns
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
 from shared.places import CHECKOUT
+from tests.messages import sample
 from tests.system.fleets import FleetEar, command, heard, started, wait_for, xrl
 from tools.fleet import procfs
 from tools.fleet.supervise import SupervisedFleet
@@ -74,6 +78,40 @@ def test_a_pendant_that_is_killed_stops_all_six_without_a_planner(
     ear.wait_for(Mode.DAMP)
     said = xrl("status", run_dir=run_dir).stdout
     assert f"emergency stop by {PENDANT}: {', '.join(MODULES)}" in " ".join(said.split())
+
+
+def test_after_a_stop_all_six_are_rearmed_together_once_it_rests_and_nobody_pulls(
+    robot: RobotConfig, run_dir: Path
+) -> None:
+    """After `xrl kill` of one module that one held while five sank."""
+    services = ("simulator", "harness", "planner", *MODULES)
+    with started(run_dir, *services) as fleet, open_session(robot, "test", run_dir) as session:
+        ear = FleetEar(session)
+        hands = session.publisher(topics.OPERATOR_HAND, HandLead)
+        ear.wait_until_led()
+        before = fleet.pids()
+        assert xrl("estop", run_dir=run_dir).returncode == 0
+        assert "xrl rearm" in xrl("status", run_dir=run_dir).stdout
+        assert wait_for(lambda: ear.world(after_s=0.1).torso[2] < 0.95), "it sinks"
+        refused = xrl("rearm", run_dir=run_dir)
+        assert refused.returncode == 2
+        assert "nothing was re-armed" in refused.stderr
+        assert fleet.pids() == before, "none of the six"
+
+        def hand_is_off() -> bool:
+            torso, pitch = ear.world(after_s=0.05).torso[2], ear.world().angles[1]
+            hands.put(
+                sample(
+                    HandLead, t_ns=now_ns(), leads=True, height=torso, pitch=pitch, push=(0, 0, 0)
+                )
+            )
+            return xrl("rearm", run_dir=run_dir).returncode == 0
+
+        assert wait_for(hand_is_off), "the hand goes where the robot is"
+        now = fleet.pids()
+        assert all(now[name] != before[name] for name in MODULES)
+        assert {ear.modes()[name] for name in MODULES} <= {Mode.HOLD, Mode.TRACK}
+        assert not ear.fell
 
 
 @pytest.mark.parametrize("disaster", ["hung", "dead, disk full", "dead, directory gone"])

@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import importlib.metadata
 import itertools
+import os
+import pty
 import re
 import shlex
 import subprocess
@@ -50,6 +52,33 @@ def test_an_old_name_answers_with_the_new_one_in_a_line(
     assert said == f"xrl: `xrl {old}` is `xrl {RENAMED[old]}` now\n"
     noun = RENAMED[old].partition(" --")[0]
     assert noun in {verb.name for verb in VERBS} | set(NOUNS)
+
+
+@pytest.mark.parametrize(
+    ("words", "usage", "hint"),
+    [
+        ("down --li", "xrl down", "no flag '--li'; did you mean --limp? "),
+        ("demo --kil planner@3", "xrl demo", "no flag '--kil'; did you mean --kill? "),
+        ("demo --kil=planner@3", "xrl demo", "no flag '--kil'; did you mean --kill? "),
+        (
+            "drive tare -reun-dir=x",
+            "xrl drive tare",
+            "no flag '-reun-dir'; did you mean --run-dir? ",
+        ),
+        ("sim --nosuch", "xrl sim", "no flag '--nosuch'; `--help`"),
+        ("drive --nosuch jog", "xrl drive", "no flag '--nosuch'; `--help`"),
+        ("--nosuch sim", "xrl", "no flag '--nosuch'; `--help`"),
+        ("status more", "xrl status", "unexpected: more"),
+    ],
+)
+def test_a_shortened_or_unknown_flag_is_refused_with_its_verbs_usage_and_the_closest_flag(
+    words: str, usage: str, hint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`xrl down --li` was taken as `--limp`, and let a standing robot fall."""
+    assert exit_code(words.split()) == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"usage: {usage} [")
+    assert f"\n{usage}: error: {hint}" in told
 
 
 def commands(example: str) -> Iterator[list[str]]:
@@ -102,6 +131,31 @@ def test_a_reader_that_has_gone_ends_a_verb_without_words() -> None:
         capture_output=True, text=True, timeout=60, check=True,
     )  # fmt: skip
     assert (done.stdout, done.stderr) == ("141\n", "")
+
+
+@pytest.mark.parametrize(
+    ("ends_by", "code"), [("print('more')", 129), ("raise FleetError('x')", 2), ("1 / 0", 70)]
+)
+def test_a_terminal_that_is_gone_is_no_fall(ends_by: str, code: int) -> None:
+    """As after a dropped ssh session: the error could not be printed, and Python's code was 1."""
+    script = (
+        "import sys, time\n"
+        "from shared.exceptions import FleetError\n"
+        "from tools import cli, keyboard\n"
+        "from tools.verbs import faults\n"
+        "def run(flags: faults.FaultsFlags) -> int:\n"
+        "    while not keyboard.is_hung_up(1): time.sleep(0.01)\n"
+        f"    {ends_by}\n"
+        "faults.run = run\n"
+        "sys.exit(cli.main(['faults']))\n"
+    )
+    person, terminal = pty.openpty()
+    with subprocess.Popen(
+        [sys.executable, "-c", script], stdin=terminal, stdout=terminal, stderr=terminal
+    ) as verb:
+        os.close(terminal)
+        os.close(person)
+        assert verb.wait(timeout=60) == code
 
 
 def test_a_folder_that_is_gone_is_told(

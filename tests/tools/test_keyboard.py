@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import os
 import pty
+import signal
 import sys
 import termios
+import time
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tools.keyboard import Keyboard, understood
+from tools.keyboard import Keyboard, is_hung_up, typed_line, understood
 from tools.logs.playback.player import PRESSES, Press
+from tools.verbs import lead
 
 TYPED = {b" ": Press.PAUSE, b"\x1b[C": Press.STEP, b"\x1bOA": Press.FASTER, b"q": Press.QUIT}
 
@@ -47,6 +51,62 @@ def test_on_a_pipe_it_only_waits(monkeypatch: pytest.MonkeyPatch) -> None:
             assert not keyboard.present
             assert keyboard.wait(0.001) == []
     os.close(write)
+
+
+@pytest.mark.parametrize("typed", ["after fg", "before it"])
+def test_the_stop_key_counts_after_ctrl_z_and_fg(typed: str) -> None:
+    """The shell leaves the terminal with line editing: no key came through until Enter."""
+    pid, descriptor = pty.fork()
+    if pid == 0:  # a terminal of its own: never back into pytest
+        code = 1
+        try:
+            sys.stdin = os.fdopen(0)
+            pressed: list[lead.Key] = []
+            with Keyboard(lead.KEYS) as keyboard:
+                os.write(1, b"ready")
+                ends_s = time.monotonic() + 5.0
+                while not pressed and time.monotonic() < ends_s:
+                    pressed = keyboard.wait(lead.PERIOD_S)
+            code = 0 if pressed == [lead.Key.STOP] else 2
+        finally:
+            os._exit(code)
+    told = b""
+    while b"ready" not in told:
+        told += os.read(descriptor, 100)
+    os.kill(pid, signal.SIGSTOP)
+    os.waitpid(pid, os.WUNTRACED)
+    by_line = termios.tcgetattr(descriptor)
+    by_line[3] |= termios.ICANON
+    termios.tcsetattr(descriptor, termios.TCSADRAIN, by_line)
+    if typed == "before it":
+        os.write(descriptor, b"x")
+    os.kill(pid, signal.SIGCONT)
+    if typed == "after fg":
+        time.sleep(2 * lead.PERIOD_S)
+        os.write(descriptor, b"x")
+    _, status = os.waitpid(pid, 0)
+    os.close(descriptor)
+    assert os.waitstatus_to_exitcode(status) == 0
+
+
+def test_a_terminal_whose_other_end_is_closed_is_hung_up() -> None:
+    person, terminal = pty.openpty()
+    assert not is_hung_up(terminal)
+    os.close(person)
+    assert is_hung_up(terminal)
+    os.close(terminal)
+    with Path(os.devnull).open() as no_terminal:
+        assert not is_hung_up(no_terminal)
+
+
+def test_a_terminal_that_is_gone_enters_an_empty_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The line that lays no pendant down: `xrl pendant` and `xrl estop --wait` then stop."""
+    person, terminal = pty.openpty()
+    with os.fdopen(terminal) as stdin:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        assert typed_line(0.001) is None
+        os.close(person)
+        assert [typed_line(0.001) for _ in range(3)] == ["", "", ""]
 
 
 def test_a_terminal_is_given_back_as_it_was() -> None:

@@ -26,6 +26,7 @@ from shared.can.cansimple_06 import Command06, Version, unpack_version
 from shared.can.imu_can import IDS as IMU_IDS
 from shared.can.imu_can import ImuAssembler, ImuSample
 from shared.can.loadcell_can import FRAME_IDS, SampleAssembler
+from shared.clock import keep_pace, machine_s, pace
 from shared.config.robot_config import RobotConfig, expand
 from shared.config.sections import CanConfig
 from shared.exceptions import DriveError
@@ -113,7 +114,11 @@ def listen(
 def listen_to(
     robot: RobotConfig, name: str, run_dir: Path, *, poll_nodes: bool, seconds: float | None = None
 ) -> BusTraffic:
-    """Listen to a bus of a robot for all that should be on it; without a time, long enough."""
+    """Listen to a bus of a robot for all that should be on it; without a time, long enough.
+
+    All times are of the fleet's clock in `run_dir`: in slow motion no frame is late.
+    """
+    keep_pace(run_dir)
     nodes = bus_nodes(robot)[name]
     return listen(
         bus_config(robot, name, run_dir), nodes, poll_nodes=poll_nodes,
@@ -226,10 +231,11 @@ def _receive(
 ) -> None:
     assembler, orientation = SampleAssembler(), ImuAssembler()
     begun = time.monotonic()
-    while (left := begun + seconds - time.monotonic()) > 0.0:
+    while (left := begun + machine_s(seconds) - time.monotonic()) > 0.0:
         message = bus.recv(min(left, _WAIT_S))
         if message is None:
             continue
+        message.timestamp *= pace()
         if message.is_error_frame:
             traffic.error_frames += 1
         elif is_data_frame(message):
@@ -240,7 +246,7 @@ def _receive(
                 _add(traffic.imu, orientation.add(message.arbitration_id, message.data), message)
             elif len(message.data) == _FRAME_BYTES:
                 _of_node(message, traffic.nodes)
-    traffic.seconds = time.monotonic() - begun
+    traffic.seconds = pace() * (time.monotonic() - begun)
     traffic.malformed = assembler.malformed + orientation.malformed
 
 

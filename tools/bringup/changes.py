@@ -152,7 +152,7 @@ def difference_table(difference: Sequence[SettingChange]) -> Group:
         if change.inhibit:
             inhibit = f"{change.module} {change.name} cannot be written: {change.inhibit}"
             reasons.setdefault(inhibit)
-    return Group(rows, *(Padding(Text(reason), (0, 1, 0, 2)) for reason in reasons))
+    return Group(rows, *(Padding(Text(reason), (0, 0, 0, 2), expand=False) for reason in reasons))
 
 
 def _fits(row: WantedSetting, value: Value) -> bool:

@@ -219,7 +219,7 @@ def _group(title: str, rows: list[Finding], width: int) -> RenderableType:
             subjects.setdefault((row.what, note), []).append(row.subject)
     # below the table, a text that several rows share appears once
     notes = [f"{', '.join(who)} {what}: {note}" for (what, note), who in subjects.items()]
-    below = [Padding(Text(note), (0, 1, 0, 2)) for note in notes]
+    below = [Padding(Text(note), (0, 0, 0, 2), expand=False) for note in notes]
     return Group(table, *below, *([Text("")] if below else []))
 
 

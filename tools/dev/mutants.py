@@ -22,6 +22,7 @@ from typing import Annotated, Final, NamedTuple
 import msgspec
 import tomli_w
 
+from shared.arguments import FlagParser
 from shared.exceptions import FAULT_EXIT_CODE, RunError, XrlError
 from shared.toml_file import Section, read_toml
 from tools.terminal import Console, marked
@@ -109,7 +110,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = FlagParser(
         prog="./deploy/mutants",
         description=__doc__.split("\n", 1)[0] if __doc__ else None,
         epilog=EXAMPLES,

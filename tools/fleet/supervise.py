@@ -13,7 +13,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Self
 
@@ -148,6 +148,20 @@ class SupervisedFleet:
     def forget(self, service: str) -> None:
         """Have the next process of a joint service arm its drive, whatever the last left."""
         rearm_guard.clear(self.run.path, service)
+
+    def restart_together(self, modules: Sequence[str]) -> None:
+        """Restart joint services at the same moment; their next processes arm their drives.
+
+        Raises:
+            FleetError: one has no process, or nothing would restart it; nothing was changed then.
+        """
+        if fault := self.supervision_fault():
+            raise FleetError(f"nothing was restarted: {fault}")
+        pids = self.pids()
+        if missing := [module for module in modules if module not in pids]:
+            raise FleetError(f"nothing was restarted: {', '.join(missing)} have no process")
+        rearm_guard.clear(self.run.path, *modules)
+        procfs.signal_all([pids[module] for module in modules], signal.SIGKILL)
 
     def start_service(self, service: str) -> int | None:
         """Start a service that is down, before any delayed restart; return None.

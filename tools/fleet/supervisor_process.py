@@ -23,6 +23,7 @@ from supervisor import loggers, process, supervisord
 from supervisor.options import ServerOptions, decode_wait_status
 from supervisor.states import ProcessStates, getProcessStateDescription
 
+from shared.arguments import FlagParser
 from tools.fleet.procfs import die_with_parent
 
 BACKOFF_MAX_S: Final = 5.0
@@ -185,7 +186,7 @@ def main() -> None:
     os.umask(0o077)  # logs, sockets and shared memory, whoever starts the fleet
     # The tool that starts us blocks signals meanwhile, and a mask is inherited.
     signal.pthread_sigmask(signal.SIG_SETMASK, ())
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = FlagParser(description=__doc__)
     parser.add_argument("--parent", type=int, help="stop the fleet when this process dies")
     parser.add_argument("arguments", nargs=argparse.REMAINDER, help="for supervisord, after --")
     args = parser.parse_args()

@@ -5,7 +5,6 @@ python -m tools.hosts.probe --config /etc/xrl/robot.toml --run-dir /var/lib/xrl/
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import platform
 import sys
@@ -18,6 +17,7 @@ import msgspec
 from services.recorder.disk_guard import MIB
 from services.recorder.loop import free_bytes_at
 from shared import scheduling
+from shared.arguments import FlagParser
 from shared.bus.credentials import NAMES, keys_folder
 from shared.config import files as config_file
 from shared.config import gain_schedule
@@ -135,7 +135,7 @@ def _revision() -> str:
 
 def main() -> None:
     """Print what there is to say, then answer until the input ends."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = FlagParser(description=__doc__)
     parser.add_argument("--config", type=Path, required=True)
     parser.add_argument("--run-dir", type=Path, required=True)
     args = parser.parse_args()

@@ -244,7 +244,7 @@ def drop_outs(
         for module in MODULES
         for event in log.messages(topics.JOINT_EVENT, module)
         if goes_to_hold(event)
-        and event.cause in (Cause.COMMAND_STALE, Cause.HOLD_ALL)
+        and event.cause in (Cause.COMMAND_STALE, Cause.PLANNER_ENDED, Cause.HOLD_ALL)
         and begin_ns <= event.t_ns < end_ns
         and not any(_is_excused(event, stall) for stall in excused)
     )

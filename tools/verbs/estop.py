@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import signal
 import sys
 import time
 from pathlib import Path
@@ -121,20 +123,21 @@ def _robot(flags: EstopFlags) -> RobotConfig:
 def _wait(robot: RobotConfig, run_dir: Path, *, here: bool) -> int:
     """Keep the links open until a person asks for the stop, or leaves."""
     require_operator(robot, "estop")
-    console, asked = Console(), StopFlag()
+    console, asked = Console(), StopFlag(signal.SIGHUP)
     with open_session(robot, "estop", run_dir) as session:
         stop = BusStop(robot, session, run_dir if here else None)
         console.print("Enter, Ctrl-C, or this terminal's end stops all modules; q and Enter leaves")
         told: list[str] | None = None
         since_s = time.monotonic()
         typed = None
-        while not asked and typed is None:
-            typed = typed_line(EVERY_S)
-            silent = stop.listen()
-            if silent != told and time.monotonic() - since_s > LINKS_S:
-                told = silent
-                words = f"not heard: {', '.join(silent)}" if silent else "all six heard"
-                console.print(words, style="bold red" if silent else None)
+        with contextlib.suppress(OSError):  # the terminal is gone
+            while not asked and typed is None:
+                typed = typed_line(EVERY_S)
+                silent = stop.listen()
+                if silent != told and time.monotonic() - since_s > LINKS_S:
+                    told = silent
+                    words = f"not heard: {', '.join(silent)}" if silent else "all six heard"
+                    console.print(words, style="bold red" if silent else None)
         if not asked and typed is not None and typed.strip().lower() == "q":
             console.print("left without a stop")
             return 0
@@ -149,5 +152,5 @@ def _conclude(going: list[str], which: str) -> None:
     refuse_going(going)
     Console().print(
         f"{which} are stopped: DAMP. The robot sinks slowly, or holds beside a limp or dead "
-        "module; `xrl down` ends it"
+        "module; `xrl rearm` or `xrl down` ends it"
     )

@@ -18,7 +18,7 @@ from shared.bus.session import Session, open_session
 from shared.bus.traces import SimTruth
 from shared.clock import now_ns
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import FleetError
+from shared.exceptions import FleetError, HungUpError
 from shared.process import StopFlag
 from tools.flags import Arg, Duration, Number, RunDirFlags, numbers, option, parsed
 from tools.fleet.emergency_stop import BusStop, refuse_going, request_here
@@ -272,6 +272,8 @@ def _by_keys(leader: Leader, console: Console) -> Key | None:
                 leader.lead(deflection_of(presses), min(now - last, KEY_HELD_S))
                 last = now
                 shown.update(leader.describe("led"))
+        if not keyboard.present:
+            raise HungUpError("the terminal is gone: the hand stays, assist fades out")
     return None
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from typing import Annotated, Final
 
@@ -46,7 +47,7 @@ def run(flags: PendantFlags) -> int:
     time.sleep(OTHER_S)
     if pendant.beats != before:
         raise FleetError("another pendant is held: lay that one down first")
-    console, stop = Console(), StopFlag()
+    console, stop = Console(), StopFlag(signal.SIGHUP)
     elsewhere = [module for module in MODULES if module not in pendant.modules]
     if elsewhere:
         console.print(f"does not stop {', '.join(elsewhere)}: they have no service on this host")
@@ -63,6 +64,7 @@ def run(flags: PendantFlags) -> int:
     request_here(flags.run_dir)  # faster than the pendant's silence
     refuse_going(wait_here(flags.run_dir, list(pendant.modules), pendant.modules))
     console.print(
-        "stopped: DAMP. It sinks slowly, or holds beside a limp or dead module; `xrl down` ends it"
+        "stopped: DAMP. It sinks slowly, or holds beside a limp or dead module; `xrl rearm` or "
+        "`xrl down` ends it"
     )
     return 0

@@ -1,4 +1,4 @@
-"""`xrl kill` and `xrl start`: a signal to one service, and its next process."""
+"""`xrl kill`, `xrl start` and `xrl rearm`: signals to services, and their next processes."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Annotated, Final, Literal
 
 from shared.joints import MODULES
 from tools.flags import RunDirFlags, positional
+from tools.fleet.rearming import rearm as rearm_all
 from tools.fleet.supervise import SupervisedFleet
 
 EXAMPLES: Final = """
@@ -16,6 +17,7 @@ xrl kill planner                        # dead at once; the supervisor restarts 
 xrl kill planner --signal STOP          # frozen, like a hung process
 xrl kill planner --signal CONT          # resumed
 xrl kill knee_left                      # its drive holds; the new service takes it over
+xrl rearm               # once the robot is at rest: all six hold, then the planner leads
 """
 
 
@@ -49,4 +51,11 @@ def kill(flags: KillFlags) -> int:
         fleet.forget(flags.service)  # a person asked for its next process: it may arm the drive
     pid = fleet.kill(flags.service, signal.Signals[f"SIG{flags.signal}"])
     print(f"{flags.service} (pid {pid}): {flags.signal} sent")
+    return 0
+
+
+def rearm(flags: RunDirFlags) -> int:
+    """End an emergency stop for all six modules together, or for none."""
+    taken_s = rearm_all(SupervisedFleet.attach(flags.run_dir))
+    print(f"all six modules hold or track again, after {taken_s:.1f} s; the planner leads next")
     return 0

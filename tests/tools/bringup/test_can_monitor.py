@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import can
 import pytest
@@ -16,9 +18,11 @@ from shared.can import cansimple, imu_can, loadcell_can
 from shared.can.cansimple import AxisState, Command, Heartbeat, arbitration_id
 from shared.can.cansimple_06 import Command06, Version, pack_version
 from shared.can.unix_can import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, Frame
+from shared.clock import PACE_FILE, keep_pace
+from shared.config.robot_config import RobotConfig
 from shared.config.sections import CanConfig
 from tools.bringup import can_monitor
-from tools.bringup.can_monitor import listen, round_trips
+from tools.bringup.can_monitor import bus_nodes, listen, listen_to, period_ms, round_trips
 
 NODE, STRANGER = 8, 30
 IDLE = Heartbeat(0, AxisState.IDLE, False, False, False, True)
@@ -86,6 +90,26 @@ def test_an_imu_is_received_where_there_is_one(short_dir: Path) -> None:
     assert traffic.imu.samples[0].valid
     assert len(traffic.imu.samples) == len(traffic.imu.times_s) > 3
     assert traffic.nodes == {}, "its frames are no nodes"
+
+
+def test_beside_a_fleet_in_slow_motion_no_frame_is_late(
+    robot: RobotConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`xrl doctor` gave 25 warnings at half speed, and advised to configure the drives anew."""
+    (tmp_path / PACE_FILE).write_text("0.5\n")
+    name, nodes = next((name, nodes) for name, nodes in bus_nodes(robot).items() if nodes)
+    beat_id = arbitration_id(nodes[0], Command.HEARTBEAT)
+    stamps = itertools.count(100.0, 0.04)
+    slow = SimpleNamespace(
+        recv=lambda _: can.Message(next(stamps), beat_id, is_extended_id=False, data=BEAT)
+    )
+    monkeypatch.setattr(can_monitor, "_bus", lambda _: contextlib.nullcontext(slow))
+    try:
+        traffic = listen_to(robot, name, tmp_path, poll_nodes=False, seconds=0.02)
+    finally:
+        keep_pace(tmp_path / "none")
+    assert period_ms(traffic.nodes[nodes[0]].heartbeats_s, 20.0) == pytest.approx(20.0)
+    assert traffic.seconds == pytest.approx(0.02, rel=0.5)
 
 
 def test_version_and_supply_are_asked_for_by_requests_without_data(short_dir: Path) -> None:

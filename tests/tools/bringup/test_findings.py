@@ -105,6 +105,15 @@ def test_name_values_reason_and_command_are_printed_whatever_the_width(width: in
     assert "xrl drive configure" in text
 
 
+def test_in_a_pipe_a_note_is_not_padded_to_its_width() -> None:
+    """`xrl doctor | cat` wrote lines of 10 000 columns."""
+    text = io.StringIO()
+    show(Console(file=text), {"drives": [TRAP]}, verbose=False)
+    lines = text.getvalue().splitlines()
+    assert any(line.endswith("it disarms") for line in lines)
+    assert max(map(len, lines)) < 200
+
+
 def test_verbose_prints_every_row() -> None:
     text = printed({"drives": FINE}, 80, verbose=True)
     assert ("m0" in text, "m1" in text, "all 2" in text) == (True, True, False)

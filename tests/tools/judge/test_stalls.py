@@ -440,6 +440,13 @@ def test_figures_leave_out_what_a_stall_made_of_a_run_and_a_line_tells_it(log: R
     stall = Stall(stop.t_ns, stop.t_ns + ms(80), MACHINE)
     series = part._series[topics.RUN_EVENT.key(part.robot)]
     series.decoded = [*kept]
+    for module in MODULES:
+        part._series[topics.JOINT_EVENT.key(part.robot, module)].decoded = [
+            structs.replace(row, cause=int(Cause.COMMAND_STALE))
+            if row.cause == Cause.PLANNER_ENDED
+            else row
+            for row in part.messages(topics.JOINT_EVENT, module)
+        ]
     without = verdict.summarise(part, 3.1)
     series.decoded = [*kept, stall.event(9, zero_ns)]
     apart = verdict.summarise(part, 3.1)

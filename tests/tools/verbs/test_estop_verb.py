@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import pty
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import msgspec
@@ -13,8 +18,9 @@ from shared.bus.messages import Mode
 from shared.bus.topics import VIEWER
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
+from shared.exceptions import HUNG_UP_EXIT_CODE
 from shared.joints import MODULES
-from shared.places import DEFAULT_CONFIG
+from shared.places import CHECKOUT, DEFAULT_CONFIG
 from tests.certified import certified, install_all
 from tests.tools.exit_codes import exit_code
 from tools.fleet.run_dir import Manifest, RunDir
@@ -77,3 +83,27 @@ def test_a_viewers_key_stands_by_for_nothing(
     file.write_text(config_file.to_toml(secured), encoding="utf-8")
     assert exit_code(["estop", "--wait", "--config", file, "--run-dir", run_dir]) == 2
     assert "to act takes an operator's" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("how", ["a dropped session", "a hang-up"])
+def test_one_that_waits_stops_when_its_terminal_goes(
+    how: str, run_dir: Path, fleet: list[RearmGuard]
+) -> None:
+    """A hang-up ended it without a stop."""
+    person, terminal = pty.openpty()
+    words = [sys.executable, "-m", "tools.cli", "estop", "--wait", "--run-dir", str(run_dir)]
+    with subprocess.Popen(
+        words, cwd=CHECKOUT, stdin=terminal, stdout=terminal, stderr=terminal
+    ) as waiting:
+        os.close(terminal)
+        told = b""
+        while b"q and Enter leaves" not in told:
+            told += os.read(person, 1000)
+        if how == "a hang-up":
+            waiting.send_signal(signal.SIGHUP)
+            assert waiting.wait(timeout=60.0) == 0
+            os.close(person)
+        else:
+            os.close(person)
+            assert waiting.wait(timeout=60.0) == HUNG_UP_EXIT_CODE
+    assert all(guard.stop_requested for guard in fleet)

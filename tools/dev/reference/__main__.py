@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Final
 
+from shared.arguments import FlagParser
 from shared.exceptions import FAULT_EXIT_CODE
 from tools.dev.reference import faults, modes, robot_file, topics, verbs
 
@@ -30,7 +30,7 @@ def text_of(name: str) -> str:
 
 def main() -> int:
     """Write the pages; with `--check` say which differ: a fault."""
-    parser = argparse.ArgumentParser(
+    parser = FlagParser(
         prog="python -m tools.dev.reference",
         description="Write docs/reference from the code. A test holds that it is up to date.",
     )

@@ -26,6 +26,7 @@ the environment made first. `xrl --version` prints version and commit, `xrl help
 | 2 | bad input, a person declined, the fleet cannot start, or the system refused a request |
 | 3 | a check found a fault or a difference, or no message came |
 | 70 | a fault of `xrl` itself: please report its traceback |
+| 129 | its terminal is gone, as after a dropped ssh session |
 | 130, 141, 143 | Ctrl-C; the reader of its output ended (`xrl ... \\| head`); SIGTERM |
 
 A pipe or a file gets whole tables, without frames and colours. Control characters in a log, on the

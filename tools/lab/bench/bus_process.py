@@ -7,7 +7,6 @@ the services' own; laws and drives are absent. Prints one JSON object, `BusRepor
 
 from __future__ import annotations
 
-import argparse
 import gc
 import sys
 import time
@@ -17,6 +16,7 @@ from typing import Final
 import msgspec
 
 from shared import scheduling
+from shared.arguments import FlagParser
 from shared.bus.codec import Decoder, encode
 from shared.bus.messages import JointCommand, JointState
 from shared.clock import NS_PER_S, NS_PER_US
@@ -147,7 +147,7 @@ _COMMAND: Final = JointCommand(
 
 def main() -> int:
     """Run one process and print its report."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = FlagParser(description=__doc__)
     parser.add_argument("transport")
     parser.add_argument("name")
     parser.add_argument("folder", type=Path)

@@ -9,7 +9,6 @@ Reads one `Request` a line, answers each with one `Answer`; ends with its input.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from contextlib import ExitStack
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import Final
 
 import msgspec
 
+from shared.arguments import FlagParser
 from shared.config import files as config_file
 from shared.config import scenarios
 from tools.lab.bench import parts
@@ -90,7 +90,7 @@ class Bench:
 
 def main() -> int:
     """Answer requests until the input ends."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = FlagParser(description=__doc__)
     parser.add_argument("config", type=Path)
     arguments = parser.parse_args()
     decode = msgspec.json.Decoder(Request).decode

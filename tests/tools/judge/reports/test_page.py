@@ -208,7 +208,7 @@ def test_the_timeline_has_the_kill_the_hold_and_the_recovery(log: RunLog) -> Non
     texts = [row.text for row in rows]
     kill = next(row for row in rows if row.kind == "kill")
     assert (kill.mark, kill.t) == ("planner KILL", pytest.approx(1.0, abs=0.01))
-    hold = next(row for row in rows if "TRACK to HOLD, COMMAND_STALE" in row.text)
+    hold = next(row for row in rows if "TRACK to HOLD, PLANNER_ENDED" in row.text)
     assert hold.text.startswith("all six: ")
     assert 0.0 < hold.t - kill.t < 0.065
     silence = next(text for text in texts if "silent for up to 0." in text)
