@@ -200,7 +200,7 @@ REFUSALS: Final = {
     "study kill --n 0": "--n: '0': a whole number from 1",
     "study robust --n 0": "--n: '0': a whole number from 1",
     "study certificate --n 0": "--n: '0': a whole number from 1",
-    "study latency --trials 0": "--trials: '0': a whole number from 1",
+    "study latency --n 0": "--n: '0': a whole number from 1",
     "study kill --workers 0": "--workers: '0': a whole number from 1",
     "study kill --only -1": "--only: '-1': a whole number from 0",
     "study kill --cluster tcp://127.0.0.1:1 --workers 2": "--workers are of this machine",
