@@ -30,7 +30,7 @@ from shared.config.scenarios import Fault, Inject, Kill, Push, Restart, Scenario
 from shared.exceptions import RunError
 from shared.joints import MODULES
 from tools.fleet import procfs
-from tools.fleet.pace import IDLE_LEAST, CoresFullError, idle_and_total, idle_share
+from tools.fleet.pace import IDLE_LEAST, PACE_MIN, CoresFullError, idle_and_total, idle_share
 from tools.fleet.proxy_client import ProxyClient
 from tools.fleet.supervise import SupervisedFleet
 from tools.judge.stalls import Stall
@@ -311,10 +311,11 @@ class ScenarioRunner:
     def _check_cores(self, idle: float) -> None:
         """Raise CoresFullError if the idle fraction of the cores is too small."""
         if idle < IDLE_LEAST:
+            half = max(PACE_MIN, pace() / 2)
+            remedy = f"give `--pace {half:g}`" if half < pace() else "end other programs"
             raise CoresFullError(
                 f"the cores do not carry the fleet at {pace():g} of real time: "
-                f"{100 * idle:.0f} % idle; modules: {self._describe_modes()}; "
-                f"`--pace {pace() / 2:g}` asks for half of it"
+                f"{100 * idle:.0f} % idle; modules: {self._describe_modes()}; {remedy}"
             )
 
     def _describe_modes(self) -> str:
