@@ -29,6 +29,7 @@ from tools.dev.reference.__main__ import FOLDER, PAGES, text_of
 from tools.judge import standing
 
 ROOT = Path(__file__).resolve().parents[1]
+CERTIFICATE = files.load(DEFAULT_CONFIG).certificate
 DOCS = ROOT / "docs"
 _PAGE = re.compile(r"docs/([\w/-]+\.md)(?:#([\w-]+))?")
 _PATH = re.compile(r"`((?:services|shared|tools|tests|deploy|docs|examples)/[\w./-]+?)/?`")
@@ -151,6 +152,12 @@ def test_the_table_of_processes_has_every_topic_that_a_service_writes() -> None:
         ("logs.md", f"the same factors of {host_watch.RUN_DIR_MIN_MIB} MiB"),
         ("logs.md", f"silent for {snapshot.SILENT_NS // NS_PER_S} s"),
         ("logs.md", " or ".join(f"`{row.name}`" for row in snapshot.STEADY[1:])),
+        ("law.md", f"down to {CERTIFICATE.margin_min:g} (`certificate.margin_min`)"),
+        (
+            "law.md",
+            f"down to {CERTIFICATE.onboard_margin_min:g} (`certificate.onboard_margin_min`)",
+        ),
+        ("tutorial.md", f"The planner accepts down to {CERTIFICATE.margin_min:g};"),
         ("simulator.md", f"| below {posture.FALLEN_HEIGHT:.2f} m;"),
         ("simulator.md", f"yaw, either way | over {posture.FALLEN_ANGLE:g} rad"),
         ("simulator.md", f"against the floor | over {posture.FALLEN_TILT:g} rad"),
@@ -161,6 +168,12 @@ def test_the_table_of_processes_has_every_topic_that_a_service_writes() -> None:
 )
 def test_a_page_has_the_codes_figure(page: str, text: str) -> None:
     assert text in (DOCS / page).read_text(encoding="utf-8")
+
+
+def test_readme_links_every_page() -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    pages = {path.name for path in DOCS.glob("*.md")} - {"index.md"}
+    assert {page for page in pages if f"(docs/{page}" not in readme} == set()
 
 
 def test_every_reference_to_a_page_leads_to_a_page_and_an_anchor() -> None:

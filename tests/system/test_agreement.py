@@ -66,8 +66,8 @@ TRIES = 5
 
 NOT_HERE = (topics.ESTOP, topics.HARNESS_TARE, topics.LINK_EVENT, topics.OPERATOR_HAND)
 SUMMARY_KEYS = {
-    "stood", "duration_s", "real_time_factor", "com_x_max_mm", "com_y_max_mm", "roll_max_rad",
-    "pitch_max_rad", "yaw_max_rad", "torso_height_min_m", "torso_height_max_m",
+    "stood", "sound", "duration_s", "real_time_factor", "com_x_max_mm", "com_y_max_mm",
+    "roll_max_rad", "pitch_max_rad", "yaw_max_rad", "torso_height_min_m", "torso_height_max_m",
     "operator_peak_n", "assist_error_n", "handover_ms", "handover_torque_step_nm", "reengage_s",
     "pd_cycles_late_pct", "planner_tick_us", "messages_recorded", "sequence_gaps",
     *(

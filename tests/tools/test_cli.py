@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import importlib.metadata
 import itertools
@@ -9,6 +10,7 @@ import os
 import pty
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -16,15 +18,20 @@ from pathlib import Path
 
 import pytest
 
+from services.simulator.physics.plant import plant_from
 from shared import revision
-from shared.exceptions import BUG_EXIT_CODE, RunError
+from shared.exceptions import BUG_EXIT_CODE, RunError, XrlError
+from shared.places import DEFAULT_CONFIG
 from shared.process import run_service
 from tests.tools.exit_codes import exit_code
 from tools import cli
 from tools.flags import read_flags
 from tools.lab.studies.sweeps import pool
+from tools.live.experiment import ExperimentFlags, PlantFlags, make_scenario
 from tools.verb_table import NOUNS, RENAMED, VERBS, Verb
 from tools.verbs import faults
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_help_is_a_screen_that_lists_every_verb_or_its_noun_and_imports_none() -> None:
@@ -81,26 +88,90 @@ def test_a_shortened_or_unknown_flag_is_refused_with_its_verbs_usage_and_the_clo
     assert f"\n{usage}: error: {hint}" in told
 
 
-def commands(example: str) -> Iterator[list[str]]:
-    """Yield what stands behind each `xrl` of a line."""
-    words = shlex.split(example, comments=True)
-    for is_joint, part in itertools.groupby(words, lambda word: word in ("|", ">", "&&")):
-        command = [word for word in part if word != "sudo"]
-        if not is_joint and command[0] == "xrl":
+DEPLOYED = ("demo", "up", "down", "status", "kill")
+"""Scripts in `deploy` that are verbs with the environment made first."""
+STAND_INS = {"MODULE": "knee_left", "KIND": "brown_out", "SERVICE": "planner", "VERB": "status"}
+"""A value for each placeholder of the pages that a parser would refuse."""
+
+
+def commands(line: str) -> Iterator[list[str]]:
+    """Yield the arguments of each `xrl` in a line of shell."""
+    lexer = shlex.shlex(line, posix=True, punctuation_chars=True)
+    lexer.whitespace_split = True
+    for is_joint, part in itertools.groupby(lexer, lambda word: word in ("|", ">", "&&", ";")):
+        command = list(part)
+        if command[0] in ("sudo", "uvx") and "xrl" in command:
+            command = command[command.index("xrl") :]
+        folder, _, name = command[0].rpartition("/")
+        if folder == "./deploy" and name in DEPLOYED:
+            yield [name, *command[1:]]
+        elif not is_joint and command[0] in ("xrl", ".venv/bin/xrl"):
             yield command[1:]
+
+
+def read(words: list[str]) -> str:
+    """Read a command as `xrl` does before it starts anything; return its verb."""
+    if words[0] == "help":
+        words = [*words[1:], "--help"]
+    parser = cli._parser(words)
+    asked = cli._asked(parser, words)
+    found = parser.parse_args(cli._with_values(words))
+    flags = read_flags(next(verb for verb in VERBS if verb.name == asked).declaration, found)
+    if isinstance(flags, PlantFlags):
+        plant_from(flags.plant)
+    if isinstance(flags, ExperimentFlags):
+        make_scenario(dataclasses.replace(flags, scenario=flags.scenario or "squat"))
+    return asked
 
 
 @pytest.mark.parametrize("verb", VERBS, ids=lambda verb: verb.name)
 def test_every_example_of_every_help_is_read_and_its_flags_fit_each_other(verb: Verb) -> None:
-    by_name = {one.name: one for one in VERBS}
-    own = 0
-    for words in itertools.chain.from_iterable(map(commands, verb.examples)):
-        parser = cli._parser(words)
-        asked = by_name[cli._asked(parser, words)]
-        found = parser.parse_args(cli._with_values(words))
-        own += asked is verb
-        read_flags(asked.declaration, found)
-    assert own
+    read_verbs = [read(words) for line in verb.examples for words in commands(line)]
+    assert verb.name in read_verbs
+
+
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def lines_of(page: Path) -> Iterator[tuple[str, bool]]:
+    """Yield the commands of a page, and whether it shows them in full, in a block.
+
+    A command with an ellipsis stands for many.
+    """
+    text = re.sub(r"\b[A-Z]+\b", lambda word: STAND_INS.get(word[0], word[0]), page.read_text())
+    blocks = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+    for kind, block in blocks.findall(text):
+        lines = block.replace("\\\n", " ").splitlines() if kind in ("", "sh", "bash") else ()
+        for line in lines:
+            if re.match(r"\s*(?:\S+=|sudo |uvx |\./deploy/|(?:\.venv/bin/)?xrl )", line):
+                yield line, True
+    for span in re.findall(r"`(xrl [^`]+)`", blocks.sub("", text)):
+        yield " ".join(span.split()), False
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_command_of_a_page_is_read(
+    page: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("robot.toml", "lab.toml"):
+        shutil.copy(DEFAULT_CONFIG, name)
+    refused = []
+    for line, is_whole in lines_of(page):
+        for words in commands(line):
+            if "..." in words or " ".join(words) in {verb.name for verb in VERBS} | set(NOUNS):
+                continue
+            try:
+                read(words)
+            except (SystemExit, XrlError) as error:
+                said = f"{error} {capsys.readouterr().err}"
+                is_part = re.search("arguments are required|expected one argument", said)
+                if error.args != (0,) and (is_whole or not is_part):
+                    refused.append(f"{line}: {said}")
+    assert refused == []
 
 
 @pytest.mark.parametrize("verb", ["down", "status"])

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
-from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Final, TypeVar
@@ -21,13 +19,12 @@ PACE_MIN: Final = 0.1
 SLOWER: Final = 0.6
 """Factor on the pace when the cores are full."""
 IDLE_LEAST: Final = 0.08
-"""Below this idle fraction the cores count as full. A fleet in real time leaves about 0.25."""
-WINDOW_S: Final = 5.0
-"""Window of the idle fraction."""
+"""Below this idle fraction while the robot stands before the scenario, the cores count as full.
+A fleet in real time leaves about 0.25."""
 
 
 class CoresFullError(FleetError):
-    """The fleet does not come to track, and the cores have no time left."""
+    """The cores have no time left beside a fleet that stands, or that does not come to stand."""
 
 
 class PaceFlags(Flags):
@@ -40,7 +37,7 @@ class PaceFlags(Flags):
             metavar="X",
             help="clock rate of a simulated fleet: 0.5 is slow motion at half speed, as on a "
             f"machine twice as fast (default: ${PACE_VARIABLE}, else 1; `demo` and `study crash` "
-            f"lower it by {SLOWER:g} while the cores are full)",
+            f"multiply it by {SLOWER:g} if the cores are full before the scenario starts)",
         ),
     ] = None
 
@@ -74,23 +71,6 @@ def run_at_fitting_pace(run: Callable[[float], T], tell: Callable[[str], None]) 
                 raise
             os.environ[PACE_VARIABLE] = f"{slower:g}"
             tell(f"{error}; starting again in slow motion, at {slower:g}")
-
-
-class IdleMeter:
-    """Idle fraction of all cores over the last `WINDOW_S`."""
-
-    def __init__(self) -> None:
-        self._samples: deque[tuple[float, int, int]] = deque()
-        self.sample()
-
-    def sample(self) -> float | None:
-        """Sample; return the idle fraction, or None until the window is full."""
-        now_s = time.monotonic()
-        self._samples.append((now_s, *idle_and_total()))
-        while len(self._samples) > 1 and now_s - self._samples[1][0] >= WINDOW_S:
-            self._samples.popleft()
-        begin_s, *before = self._samples[0]
-        return None if now_s - begin_s < WINDOW_S else idle_share((before[0], before[1]))
 
 
 def idle_share(before: tuple[int, int]) -> float:

@@ -45,6 +45,9 @@ KILLED, RESTARTED, FAULTED = (
 )  # fmt: skip
 
 REAL_TIME_FACTOR_MIN: Final = 0.99
+NEXT_CYCLE_MS: Final = 2.0
+"""In virtual time a module sees the end of a process on its host in its next cycle, after up to
+this time, ms: nothing is measured."""
 LATE_MAX_S: Final = 0.05
 """More world time given up than this: the run was not in real time."""
 
@@ -83,13 +86,18 @@ def course(log: RunLog) -> Course:
 
 
 def summarise(log: RunLog, duration_s: float) -> Summary:
-    """Return the figures of a run."""
+    """Return the figures of a run; what follows a fall does not count."""
     t, truth, began, zero_ns = course(log)
+    whole = log
+    fall = next((index for index, row in enumerate(truth) if row.fallen), None)
+    if fall is not None:
+        t, truth = t[: fall + 1], truth[: fall + 1]
+        log = log.until(truth[-1].t_ns)
     events: list[RunEvent] = log.messages(topics.RUN_EVENT)
     kills = [row for row in events if row.kind == KILLED]
     kill_s = kills[0].scenario_s if kills else np.inf
     last = truth[-1]
-    fallen = any(row.fallen for row in truth)
+    fallen = last.fallen
     reached = began and bool(t[-1] >= duration_s - 0.1)
     robot = None
     with contextlib.suppress(RunError, ConfigError):  # none in it, or one of another version
@@ -99,11 +107,12 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
     stands = reached and not fallen and not why_not
     unsound = why_not_sound(sound) if stands else ""
     summary: Summary = {
-        "stood": stands and not unsound,
+        "stood": stands,
+        "sound": stands and not unsound,
         "why_not": why_not,
         "unsound": unsound,
         "began": began,
-        "fallen_at_s": float(t[[row.fallen for row in truth]][0]) if fallen else None,
+        "fallen_at_s": float(t[-1]) if fallen else None,
         "duration_s": float(t[-1]),
         "pace": _pace(log),
         "real_time_factor": last.real_time_factor,
@@ -147,8 +156,8 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
     ticks_us = [row.tick_us for row in statuses if row.t_ns >= truth[0].t_ns]
     summary["planner_tick_us"] = _middle_and_most(np.array(ticks_us))
     summary["stopped"] = sorted({row.subject for row in kills if row.detail == "STOP"})
-    summary["messages_recorded"] = sum(log.count(key) for key in log.keys())  # noqa: SIM118 - not a dict
-    summary["sequence_gaps"] = sum(count.missing for count in log.gaps().values())
+    summary["messages_recorded"] = sum(whole.count(key) for key in whole.keys())  # noqa: SIM118 - not a dict
+    summary["sequence_gaps"] = sum(count.missing for count in whole.gaps().values())
     summary["stalls"] = as_dicts(log, disturbed, truth, zero_ns)
     summary["across_stalls"] = _across(summary, events, disturbed)
     done_ns = [row.t_ns for row in events if row.kind in (KILLED, FAULTED)]
@@ -202,7 +211,7 @@ def fell(summary: Mapping[str, Any]) -> bool:
 
 def exit_code(summary: Mapping[str, Any]) -> int:
     """Return the exit code of a run that was judged: standing, but not soundly, is a fault."""
-    if summary["stood"]:
+    if summary["sound"]:
         return 0
     return FELL_EXIT_CODE if fell(summary) else FAULT_EXIT_CODE
 
@@ -245,9 +254,9 @@ def joined(parts: Sequence[Summary], counts: Iterable[KeyCount]) -> Summary:
     summary["across_stalls"] = sorted(across) + _lost_in_stalls(summary)
     fallen = [part["fallen_at_s"] for part in parts if part["fallen_at_s"] is not None]
     summary["fallen_at_s"] = min(fallen, default=None)
-    stands = (last["stood"] or bool(last["unsound"])) and not fallen
-    summary["unsound"] = why_not_sound(summary) if stands else ""
-    summary["stood"] = stands and not summary["unsound"]
+    summary["stood"] = last["stood"] and not fallen
+    summary["unsound"] = why_not_sound(summary) if summary["stood"] else ""
+    summary["sound"] = summary["stood"] and not summary["unsound"]
     summary["in_real_time"] = all(part["in_real_time"] for part in parts)
     return summary
 
@@ -368,9 +377,13 @@ def _handover(log: RunLog, kills: Sequence[RunEvent]) -> Summary:
         if after:
             times[module] = (after[0] - kills[0].t_ns) / NS_PER_MS
     known = [value for value in times.values() if value is not None]
+    slowest = max(known) if len(known) == len(MODULES) else None
+    is_virtual = bool(log.metadata.get("run", {}).get("lockstep"))
+    if is_virtual and slowest is not None and slowest <= NEXT_CYCLE_MS:
+        slowest = None
     return {
         "handover_ms": times if kills else None,
-        "handover_max_ms": max(known) if len(known) == len(MODULES) else None,
+        "handover_max_ms": slowest,
         "handover_torque_step_nm": max(steps, default=None),
     }
 

@@ -33,7 +33,7 @@ def show(summary: Summary, console: Console) -> None:
         colour = "green" if word == OK else "yellow" if word.startswith(OVER) else "default"
         table.add_row(*cells, Text(word, colour))
     console.print(table)
-    if summary["stood"] and any(word.startswith(OVER) for *_, word in figures):
+    if summary["sound"] and any(word.startswith(OVER) for *_, word in figures):
         decide = ", ".join(BY_KEY[key].what for key in SOUND)
         console.print(
             "A figure over its limit is reported and does not decide: standing to the end does, "
@@ -62,13 +62,19 @@ def show(summary: Summary, console: Console) -> None:
 
 
 def rows(summary: Summary) -> list[tuple[str, str, str, str]]:
-    """Return figure, measured, limit and mark of each figure that is known."""
+    """Return figure, measured, limit and mark of each figure that is known.
+
+    After a kill its time to HOLD has a row in any case: `-` if it was not measured.
+    """
     found = []
     for row in LIMITS:
+        unit = f" {row.unit}" if row.unit else ""
+        limit = f"{row.limit:g}{unit}"
         if summary.get(row.key) is not None:
-            unit = f" {row.unit}" if row.unit else ""
             measured = f"{digits(summary[row.key])}{unit}"
-            found.append((row.what, measured, f"{row.limit:g}{unit}", mark(row, summary)))
+            found.append((row.what, measured, limit, mark(row, summary)))
+        elif row.key == "handover_max_ms" and summary.get("handover_ms"):
+            found.append((row.what, "-", limit, ""))
     return found
 
 
@@ -134,7 +140,7 @@ def digits(value: float) -> str:
 
 
 def _sentence(summary: Summary) -> Text:
-    if summary["stood"]:
+    if summary["sound"]:
         return marked("[bold green]STOOD[/] for {:.1f} s", summary["duration_s"])
     if not summary["began"]:
         return marked(

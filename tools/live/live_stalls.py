@@ -237,11 +237,9 @@ class LiveStalls:
         who = "all six" if self._held == len(MODULES) else self._held
         return f"{self.found[-1].words}: {who} {'hold' if held else 'held'}"
 
-    def describe_machine(self, idle: float, least: float) -> str:
+    def describe_machine(self, idle: float) -> str:
         """Return how the machine carries the fleet."""
         words = f"{self.cores} cores, {100 * idle:.0f} % idle beside the fleet"
-        if idle < least:
-            words += f": too little, modules may hold; `--pace {pace() / 2:g}` asks for half of it"
         pause_ms = self._pause_ms() if idle < FULL_CORE else 0.0
         if pause_ms:
             words += (

@@ -30,7 +30,7 @@ from shared.config.scenarios import Fault, Inject, Kill, Push, Restart, Scenario
 from shared.exceptions import RunError
 from shared.joints import MODULES
 from tools.fleet import procfs
-from tools.fleet.pace import IDLE_LEAST, CoresFullError, IdleMeter, idle_and_total, idle_share
+from tools.fleet.pace import IDLE_LEAST, PACE_MIN, CoresFullError, idle_and_total, idle_share
 from tools.fleet.proxy_client import ProxyClient
 from tools.fleet.supervise import SupervisedFleet
 from tools.judge.stalls import Stall
@@ -39,8 +39,8 @@ from tools.live.live_stalls import LiveStalls
 READY_TIMEOUT_S: Final = 45.0
 """Longer than all that a planner waits after the first five drop-outs: a machine may stall."""
 PATIENCE_S: Final = 10.0
-"""Start-up uses all cores, so the idle fraction is checked only after this time."""
-IDLE_EVERY_S: Final = 0.5
+"""Start-up uses all cores. A robot that does not stand after this time gets as long again, in which
+the idle fraction is measured."""
 SETTLE_S: Final = 2.0
 """All six modules track for so long before the scenario starts."""
 AFTER_FALL_S: Final = 1.0
@@ -202,8 +202,7 @@ class ScenarioRunner:
         """Wait until the robot stands, run the scenario to its end, or until `is_over`.
 
         Raises:
-            CoresFullError: the cores do not carry the fleet at its pace, so it does not come to
-                stand.
+            CoresFullError: the cores do not carry the fleet at its pace.
             RunError: the robot did not come to stand, or the simulated world went silent.
             FleetError: a service that was to be restarted could not be.
         """
@@ -268,23 +267,17 @@ class ScenarioRunner:
     def _wait_until_tracking(self, is_over: Callable[[], bool]) -> bool:
         """Wait until the hoist is down and all six modules have tracked for a while.
 
+        While it tracks, the idle fraction of the cores decides whether they carry the fleet.
         Returns False if the robot falls first: that is a finding, not an error.
         """
         begin_s = time.monotonic()
-        deadline, next_look_s = begin_s + machine_s(READY_TIMEOUT_S), begin_s
-        meter, idle = IdleMeter(), None
-        since, before = None, idle_and_total()
+        deadline, look_s = begin_s + machine_s(READY_TIMEOUT_S), begin_s + PATIENCE_S
+        since = before = None
         self._note = "waiting for six modules to track"
         while since is None or time.monotonic() - since < machine_s(SETTLE_S):
             self._listen()
             if is_over():
                 raise KeyboardInterrupt
-            if time.monotonic() >= next_look_s:
-                next_look_s += IDLE_EVERY_S
-                idle = meter.sample()
-                late = time.monotonic() - begin_s >= PATIENCE_S
-                if late:
-                    self._check_cores(idle)
             tracking = [self._modes.get(module) == Mode.TRACK for module in MODULES]
             standing = self._truth is not None and self._truth.hoist == 0.0
             if self._truth is not None and self._truth.fallen:
@@ -296,6 +289,10 @@ class ScenarioRunner:
                 self._note = "standing, settling"
             else:
                 since = None
+                if time.monotonic() >= look_s:
+                    if before is not None:
+                        self._check_cores(idle_share(before))
+                    before, look_s = idle_and_total(), time.monotonic() + PATIENCE_S
             if time.monotonic() > deadline:
                 lead = self._leads.take()
                 raise RunError(
@@ -304,18 +301,21 @@ class ScenarioRunner:
                     "the services' logs tell more"
                 )
             time.sleep(POLL_S)
-        self._check_cores(idle)  # tracking for a moment is not being carried through a scenario
-        self._tell(self._stalls.describe_machine(idle_share(before), IDLE_LEAST))
+        assert before is not None  # noqa: S101 - set with `since`
+        idle = idle_share(before)
+        self._check_cores(idle)
+        self._tell(self._stalls.describe_machine(idle))
         self._note = ""
         return True
 
-    def _check_cores(self, idle: float | None) -> None:
-        """Raise CoresFullError if the idle fraction of the cores is known and too small."""
-        if idle is not None and idle < IDLE_LEAST:
+    def _check_cores(self, idle: float) -> None:
+        """Raise CoresFullError if the idle fraction of the cores is too small."""
+        if idle < IDLE_LEAST:
+            half = max(PACE_MIN, pace() / 2)
+            remedy = f"give `--pace {half:g}`" if half < pace() else "end other programs"
             raise CoresFullError(
                 f"the cores do not carry the fleet at {pace():g} of real time: "
-                f"{100 * idle:.0f} % idle; modules: {self._describe_modes()}; "
-                f"`--pace {pace() / 2:g}` asks for half of it"
+                f"{100 * idle:.0f} % idle; modules: {self._describe_modes()}; {remedy}"
             )
 
     def _describe_modes(self) -> str:

@@ -11,6 +11,7 @@ So what may be long is read by `parts_of`, one after the other.
 from __future__ import annotations
 
 import bisect
+import copy
 import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
@@ -69,6 +70,13 @@ class Series:
         """Reception by the recorder, monotonic clock."""
         self.seq: list[int] = []
         self.decoded: list[Any] | None = None
+
+    def until(self, received_ns: int) -> Series:
+        """Return the messages received up to a time."""
+        count, cut = bisect.bisect_right(self.received_ns, received_ns), Series()
+        cut.payloads, cut.received_ns = self.payloads[:count], self.received_ns[:count]
+        cut.seq = self.seq[:count]
+        return cut
 
 
 class NewestAt:
@@ -195,6 +203,13 @@ class RunLog:
                 for seq in series.seq:
                     found[key].feed(seq)
         return found
+
+    def until(self, received_ns: int) -> RunLog:
+        """Return the log with only the messages received up to a time."""
+        cut = copy.copy(self)
+        series = {key: one.until(received_ns) for key, one in self._series.items()}
+        cut._series = series  # noqa: SLF001 - of the same class
+        return cut
 
     def forget(self) -> None:
         """Drop all messages; metadata and attachments stay."""

@@ -100,19 +100,22 @@ class InjectFlags(RunDirFlags):
         return {name: value for name, value in found.items() if value not in (None, False)}
 
     def check(self) -> None:
-        """Refuse flags that would have no effect."""
+        """Refuse values that are not understood, and flags that do not go together."""
         super().check()
-        one = "--list" if self.list else "--clear" if self.clear else WORDS if self.words else ""
-        if not one:
-            return
-        without = [f"--{word}" for word in self.given]
-        if self.link is not None and one != "--clear":
-            without.append("--link")
-        if self.words is not None and one != WORDS:
-            without.append(WORDS)
-        if without:
+        flags = [f"--{word}" for word in self.given]
+        if self.link is not None and not self.clear:
+            flags.append("--link")
+        other = "--list" if self.list else "--clear" if self.clear else ""
+        without = flags if self.words is None else [*flags, WORDS]
+        if other and without:
             names = ", ".join(without)
-            raise RunError(f"{one} with {names}: without effect; leave one of them out")
+            raise RunError(f"{other} with {names}: without effect; leave one of them out")
+        if self.words is not None and flags:
+            names = ", ".join(flags)
+            right = "write everything in the words ('all loss=20% for=5'), or everything as flags"
+            raise RunError(f"{WORDS} with {names}: {right}")
+        if not other:
+            inject_of(self)
 
 
 def run(flags: InjectFlags) -> int:

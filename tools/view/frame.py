@@ -126,7 +126,8 @@ class PlannerShown(msgspec.Struct, frozen=True):
     wait_s: float
     margin: float
     margin_onboard: float
-    tick_us: float
+    tick_us: float | None
+    """None in virtual time, where it is not measured."""
     assist_n: float
     height_ref: float
     """COM height that it follows, m."""
@@ -304,7 +305,7 @@ def _shown(status: PlannerStatus) -> PlannerShown:
         wait_s=status.wait_s,
         margin=status.margin,
         margin_onboard=status.margin_onboard,
-        tick_us=status.tick_us,
+        tick_us=status.tick_us or None,
         assist_n=status.assist_n,
         height_ref=status.p_ref[2],
         heat_left_s=status.heat_left_s,

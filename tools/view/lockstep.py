@@ -18,7 +18,7 @@ from shared.joints import MODULES
 from tools.sim.lockstep import Lockstep
 from tools.sim.standing_start import begin_standing
 from tools.view.frame import Frame, Newest
-from tools.view.source import CUT_S, CUTS, HandOrders, Order, Source
+from tools.view.source import CUT_S, CUTS, HandOrders, Order, Source, without_fleet
 
 _FOREVER_S: Final = 1e9
 _STEP_S: Final = 0.01
@@ -96,7 +96,7 @@ class LockstepSource(Source):
             found = self._newest.frame(fleet.now_ns)
             if found is not None:
                 network = fleet.network.active(fleet.world.scenario_s)
-                found = msgspec.structs.replace(found, network=network)
+                found = without_fleet(msgspec.structs.replace(found, network=network))
             with self._lock:
                 self._frame = found
             due = max(due + _STEP_S, time.monotonic() - 0.2)  # a slow machine: slow motion

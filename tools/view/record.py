@@ -6,6 +6,7 @@ import base64
 import gzip
 import re
 from collections.abc import Callable
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
@@ -20,7 +21,16 @@ from tools.judge.reports.run_data import RunData
 from tools.judge.reports.timeline import timeline_events
 from tools.logs.run_log import NewestAt, RunLog
 from tools.view.frame import SHOWN, Frame, Newest
-from tools.view.source import FRAMES_S, PAGE, UPLOT, Mark, Model, Source
+from tools.view.source import (
+    COURSE_FRAMES,
+    FRAMES_S,
+    PAGE,
+    UPLOT,
+    Mark,
+    Model,
+    Source,
+    without_fleet,
+)
 
 
 class RecordSource(Source):
@@ -42,11 +52,19 @@ class RecordSource(Source):
         )
 
     def model(self) -> Model:
-        """Return what does not change, with the record's timeline."""
+        """Return what does not change, with the record's timeline and course."""
         span = self._data.span
         return msgspec.structs.replace(
-            super().model(), begin_s=span.begin, end_s=span.end, marks=self._marks
-        )
+            super().model(),
+            begin_s=span.begin, end_s=span.end, marks=self._marks, course=self._course,
+        )  # fmt: skip
+
+    @cached_property
+    def _course(self) -> tuple[Frame, ...]:
+        begin_s, end_s = self._data.span
+        step_s = (end_s - begin_s) / COURSE_FRAMES
+        found = (self.frame(begin_s + n * step_s) for n in range(COURSE_FRAMES + 1))
+        return tuple(frame for frame in found if frame is not None)
 
     def frame(self, t_s: float) -> Frame | None:
         """Return the frame at a time of the timeline; None before each module was heard."""
@@ -58,7 +76,7 @@ class RecordSource(Source):
             if message is not None:
                 newest.add(topic, module, message)
         found = newest.frame(t_ns)
-        return None if found is None else msgspec.structs.replace(found, t_s=t_s)
+        return None if found is None else without_fleet(msgspec.structs.replace(found, t_s=t_s))
 
 
 _MODULES: Final = (
@@ -85,7 +103,8 @@ def single_file(source: RecordSource, done: Callable[[float], None] = lambda _s:
         done(number / FRAMES_S)
     if not any(frames):
         raise RunError(f"{source.title}: no moment at which all six modules were heard")
-    model = msgspec.structs.replace(model, title=Path(model.title).name)  # no path of this machine
+    name = Path(model.title).name  # no path of this machine
+    model = msgspec.structs.replace(model, title=name, course=())  # the frames are beside it
     run = {"model": model, "frames": frames, "every_s": 1.0 / FRAMES_S}
     packed = base64.b64encode(gzip.compress(msgspec.json.encode(run), mtime=0)).decode()
     page = (PAGE / "index.html").read_text(encoding="utf-8")

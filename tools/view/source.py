@@ -19,6 +19,8 @@ from tools.judge.reports import scene
 from tools.judge.reports.scene import RobotPose
 from tools.view.frame import Frame
 
+COURSE_FRAMES: Final = 300
+"""Frames of a record's course: a point for each pixel of a plot."""
 HOST: Final = "127.0.0.1"
 PORT: Final = 8417
 FOXGLOVE_PORT: Final = 8765
@@ -97,6 +99,8 @@ class Model(msgspec.Struct, frozen=True):
     end_s: float = 0.0
     """A record's end on its timeline; equal to `begin_s`: there is no timeline."""
     marks: tuple[Mark, ...] = ()
+    course: tuple[Frame, ...] = ()
+    """A record from its beginning to its end, for the plots."""
 
 
 class Source(ABC):
@@ -150,6 +154,12 @@ class Source(ABC):
 
 
 SOURCE = "xrl view"
+
+
+def without_fleet(frame: Frame) -> Frame:
+    """Return the frame of a robot without a fleet: without advice that needs one."""
+    ways_out = tuple("" if "xrl " in way else way for way in frame.ways_out)
+    return msgspec.structs.replace(frame, ways_out=ways_out)
 
 
 class HandOrders:

@@ -9,11 +9,17 @@ from pathlib import Path
 import pytest
 
 from shared import clock
+from shared.bus.messages import Mode
+from shared.bus.traces import SimTruth
 from shared.exceptions import FleetError
+from shared.joints import MODULES
+from tests.messages import filled
 from tools.fleet import pace
 from tools.fleet.pace import CoresFullError, check_pace, usual_pace
 from tools.fleet.process_table import FleetOptions
-from tools.live import live
+from tools.live import live, scenario_runner
+from tools.live.live_stalls import LiveStalls
+from tools.live.scenario_runner import ScenarioRunner
 
 
 @pytest.fixture(autouse=True)
@@ -120,6 +126,25 @@ def test_a_pace_that_was_asked_for_is_kept_or_refused(
     with pytest.raises(CoresFullError):
         run_live(machine, monkeypatch, tmp_path, 1.0, [])
     assert machine.paces == [1.0]
+
+
+@pytest.mark.parametrize("idle", [0.0, 0.25])
+def test_the_cores_are_judged_while_the_robot_stands_before_the_scenario(
+    monkeypatch: pytest.MonkeyPatch, idle: float
+) -> None:
+    """However soon it stands: the start alone says nothing of the cores."""
+    runner = object.__new__(ScenarioRunner)
+    runner._modes = dict.fromkeys(MODULES, int(Mode.TRACK))
+    runner._truth = filled(SimTruth, {bool: False, int: 0, float: 0.0})
+    runner._stalls, runner._tell = LiveStalls(), print
+    monkeypatch.setattr(runner, "_listen", lambda: None)
+    monkeypatch.setattr(scenario_runner, "SETTLE_S", 0.05)
+    monkeypatch.setattr(scenario_runner, "idle_share", lambda _before: idle)
+    if idle:
+        assert runner._wait_until_tracking(lambda: False)
+        return
+    with pytest.raises(CoresFullError, match="0 % idle"):
+        runner._wait_until_tracking(lambda: False)
 
 
 def test_a_machine_that_runs_no_fleet_is_reported_so(

@@ -95,7 +95,7 @@ def test_a_sound_run_has_figures_within_their_limits(log: RunLog) -> None:
     """Until its planner is killed."""
     before_s = (verdict.course(log).zero_ns - log.began_ns()) / 1e9
     sound = verdict.summarise(RunLog(log.index, RunPart(0.0, before_s + 0.95)), 0.95)
-    assert sound["stood"]
+    assert (sound["stood"], sound["sound"]) == (True, True)
     assert sound["torque_at_limit_ms"] == 0.0
     assert 0.05 < sound["shaking_nm"] < 5.0
     assert 0.05 < sound["sinking_m_s"] < 0.3, "it is led down"
@@ -112,26 +112,51 @@ def test_motors_at_their_limit_are_no_sound_standing(
     flags = ("--fault", "knee_left:disarmed@1.5", "--duration", "4")
     assert cli.main(["sim", *flags, "--out", str(tmp_path)]) == 3
     summary = verdict.summarise(read_run(tmp_path / "run.mcap"), 4.0)
-    assert (summary["stood"], summary["fallen_at_s"], summary["why_not"]) == (False, None, "")
+    assert (summary["stood"], summary["sound"]) == (True, False)
+    assert (summary["fallen_at_s"], summary["why_not"]) == (None, "")
     assert "torque at its limit" in summary["unsound"]
     output = capsys.readouterr().out
     assert "STOOD, BUT NOT SOUNDLY" in output
     assert "(limit 50)" in output
 
 
+def test_what_follows_a_fall_does_not_count(log: RunLog, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The robot is down before the planner is killed, and the record goes on."""
+    whole = verdict.course(log)
+    fall = int(np.searchsorted(whole.t, 0.5))
+    rows = [
+        *whole.rows[:fall],
+        *(msgspec.structs.replace(row, fallen=True) for row in whole.rows[fall:]),
+    ]
+    monkeypatch.setattr(verdict, "course", lambda _log: whole._replace(rows=rows))
+    summary = verdict.summarise(log, 2.0)
+    assert summary["fallen_at_s"] == summary["duration_s"] == whole.t[fall]
+    assert (summary["handover_ms"], summary["hold_entries"]) == (None, 0)
+    assert summary["torso_height_min_m"] == min(row.torso[2] for row in rows[: fall + 1])
+    assert summary["messages_recorded"] == sum(log.count(key) for key in log.keys())  # noqa: SIM118
+
+
+def test_a_time_to_hold_that_was_not_measured_is_a_dash(log: RunLog) -> None:
+    """In virtual time the joint services see the end of the planner in the same instant."""
+    summary = verdict.summarise(log, 2.0)
+    assert summary["handover_max_ms"] is None
+    shown = {what: measured for what, measured, *_ in verdict_table.rows(summary)}
+    assert shown["kill to HOLD, slowest module"] == "-"
+
+
 @pytest.mark.parametrize(
     ("changes", "code"),
     [
-        ({"stood": True}, 0),
+        ({"stood": True, "sound": True}, 0),
         ({"fallen_at_s": 2.0}, 1),
         ({"why_not": "a sole is up, by 0.06 rad"}, 1),
-        ({"unsound": "torque at its limit: 90 ms (limit 50)"}, 3),
+        ({"stood": True, "unsound": "torque at its limit: 90 ms (limit 50)"}, 3),
         ({}, 3),
     ],
     ids=["stood", "fell", "tips at the end", "not soundly", "not finished"],
 )
 def test_only_a_fall_is_exit_code_1(changes: dict[str, object], code: int) -> None:
-    summary = {"stood": False, "fallen_at_s": None, "why_not": "", "unsound": ""}
+    summary = {"stood": False, "sound": False, "fallen_at_s": None, "why_not": "", "unsound": ""}
     assert verdict.exit_code(summary | changes) == code
 
 

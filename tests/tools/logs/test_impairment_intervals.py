@@ -82,8 +82,8 @@ def test_a_module_is_touched_by_its_own_links_only() -> None:
 
 def judged(**figures: object) -> Summary:
     return {
-        "stood": True, "duration_s": 8.0, "in_real_time": True, "stopped": [], "stalls": [],
-        "drop_outs": [], "across_stalls": [], **figures,
+        "stood": True, "sound": True, "duration_s": 8.0, "in_real_time": True, "stopped": [],
+        "stalls": [], "drop_outs": [], "across_stalls": [], **figures,
     }  # fmt: skip
 
 
@@ -110,7 +110,7 @@ def test_beside_a_figure_over_its_limit_it_is_told_what_decides() -> None:
     words = "does not decide: standing to the end does"
     assert words in shown(judged(operator_peak_n=row.limit + 1.0))
     assert words not in shown(judged(operator_peak_n=row.limit))
-    fell = {"stood": False, "began": True, "fallen_at_s": 3.0}
+    fell = {"stood": False, "sound": False, "began": True, "fallen_at_s": 3.0}
     assert words not in shown(judged(operator_peak_n=row.limit + 1.0, **fell))
 
 

@@ -111,3 +111,4 @@ def test_an_emergency_stop_sinks_it(source: LockstepSource) -> None:
     source.carry_out(Order(order="estop"))
     stopped = until(source, lambda frame: frame.modes == (Mode.DAMP,) * 6)
     until(source, lambda frame: frame.torso[2] < stopped.torso[2] - 0.05)
+    assert not any("xrl " in way for way in stopped.ways_out), "there is no fleet to kill in"

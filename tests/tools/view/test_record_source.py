@@ -16,7 +16,7 @@ from tests.tools.judge.reports.runs import changed
 from tools.judge.stalls import MACHINE, Stall
 from tools.logs.run_log import RunLog, read_run, robot_of
 from tools.view.record import RecordSource
-from tools.view.source import Order
+from tools.view.source import COURSE_FRAMES, Order
 
 LOG = Path(__file__).parents[1] / "logs" / "reexecution" / "golden" / "stand-v6c.mcap"
 
@@ -94,6 +94,16 @@ def test_behind_the_end_the_modules_are_silent(source: RecordSource) -> None:
     assert frame is not None
     assert frame.modes == (-1,) * 6
     assert frame.planner is None
+
+
+def test_the_course_goes_from_begin_to_end_and_advises_nothing(source: RecordSource) -> None:
+    model = source.model()
+    times = [frame.t_s for frame in model.course]
+    assert len(times) > 0.9 * COURSE_FRAMES
+    assert times == sorted(times)
+    assert times[-1] == pytest.approx(model.end_s)
+    assert times[0] < 0.1 * model.end_s
+    assert not any(way for frame in model.course for way in frame.ways_out if "xrl " in way)
 
 
 def test_a_record_takes_no_order(source: RecordSource) -> None:

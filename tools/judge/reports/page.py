@@ -179,8 +179,9 @@ def _head(run: RunData, verdict: RunVerdict, name: str) -> str:
     caution = f'<p class="caution">{escape(verdict.caution)}</p>' if verdict.caution else ""
     table = ""
     if verdict.rows:
-        over = sum(mark.startswith(verdict_table.OVER) for *_, mark in verdict.rows)
-        count = f"{over} of {len(verdict.rows)} over" if over else f"all {len(verdict.rows)} ok"
+        marks = [mark for *_, mark in verdict.rows if mark]
+        over = sum(mark.startswith(verdict_table.OVER) for mark in marks)
+        count = f"{over} of {len(marks)} over" if over else f"all {len(marks)} ok"
         names = ("figure", "measured", "limit", "")
         cells = _table(names, verdict.rows, numbers=(1, 2))
         table = _details(f"Figures against their limits: {count}", cells, is_open=True)

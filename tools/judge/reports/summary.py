@@ -89,7 +89,7 @@ class Judge:
         cautions = verdict_table.stalls(summary)
         cautions += [] if summary["in_real_time"] else [lines[-2]]
         caution = " ".join(f"{line.rstrip('.')}." for line in cautions)
-        return RunVerdict(lines[-1], bool(summary["stood"]), verdict_table.rows(summary), caution)
+        return RunVerdict(lines[-1], bool(summary["sound"]), verdict_table.rows(summary), caution)
 
 
 def _scenario_of(run: RunData) -> dict[str, Any]:

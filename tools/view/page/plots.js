@@ -1,4 +1,5 @@
-// Plots of the last seconds, beside the robot.
+// Plots beside the robot: of a record's whole course with a line at the present place, else of the
+// last seconds.
 const KEPT_S = 20, EVERY_MS = 200, JUMP_S = 1;
 const COLOURS = ["#e0702a", "#2f8fe0", "#2e8a5c", "#b46ae0", "#d98f1f", "#6b7684"];
 
@@ -18,7 +19,8 @@ const PANELS = [
 ];
 
 export class Plots {
-  constructor(root) {
+  constructor(root, course) {
+    this.isWhole = course.length > 0;
     this.panels = PANELS.map(([title, names, values]) => {
       const box = document.createElement("div");
       box.className = "panel";
@@ -33,10 +35,13 @@ export class Plots {
         width: 100, height: 96, cursor: { show: false }, legend: { show: names.length > 1, live: false },
         scales: { x: { time: false } },
         axes: [{ ...axis, size: 22 }, axis],
+        hooks: { draw: [(plot) => this.drawPlace(plot, ink)] },
         series: [{}, ...names.map((label, n) => ({ label, stroke: COLOURS[n], width: 1.5 }))],
       }, [[], ...names.map(() => [])], box);
       return { plot, values, data: [[], ...names.map(() => [])], box };
     });
+    for (const frame of course) this.add(frame);
+    for (const { plot, data } of this.panels) plot.setData(data);
     new ResizeObserver(() => this.resize(root)).observe(root);
   }
 
@@ -49,12 +54,25 @@ export class Plots {
     for (const panel of this.panels) panel.data = panel.data.map(() => []);
   }
 
-  take(frame) {
-    const last = this.panels[0].data[0].at(-1);
-    if (last !== undefined && (frame.t_s < last || frame.t_s > last + JUMP_S)) this.clear();
-    for (const { values, data } of this.panels) {
+  add(frame) {
+    for (const { values, data } of this.panels)
       [frame.t_s, ...values(frame)].forEach((value, n) => data[n].push(value));
-      while (data[0][0] < frame.t_s - KEPT_S) data.forEach((column) => column.shift());
+  }
+
+  drawPlace({ ctx, bbox, valToPos }, ink) {
+    if (!this.isWhole || this.place_s === undefined) return;
+    ctx.fillStyle = ink.getPropertyValue("--ink");
+    ctx.fillRect(valToPos(this.place_s, "x", true), bbox.top, devicePixelRatio, bbox.height);
+  }
+
+  take(frame) {
+    this.place_s = frame.t_s;
+    if (!this.isWhole) {
+      const last = this.panels[0].data[0].at(-1);
+      if (last !== undefined && (frame.t_s < last || frame.t_s > last + JUMP_S)) this.clear();
+      this.add(frame);
+      for (const { data } of this.panels)
+        while (data[0][0] < frame.t_s - KEPT_S) data.forEach((column) => column.shift());
     }
     // after the last frame, too: a record may stand still from here on
     this.due ??= setTimeout(() => {

@@ -12,6 +12,7 @@ export async function recordedRun() {
 // The part of a WebSocket that the page uses.
 class RecordedRun {
   constructor({ model, frames, every_s }) {
+    model.course = frames.filter(Boolean);
     Object.assign(this, { model, frames, every_s, readyState: WebSocket.OPEN });
     this.place_s = Math.max(model.begin_s, Math.min(0, model.end_s));
     this.rate = 1;

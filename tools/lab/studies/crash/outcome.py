@@ -98,11 +98,13 @@ def measure(case: CrashCase, messages: CrashMessages, robot: RobotConfig) -> Cra
         return unjudged(f"ended at {truth[-1].scenario_s:.1f} s, before the crash")
     crash_ns = zero_ns + round(crash_s * NS_PER_S)
     request_ns = zero_ns + round(REQUEST_S * NS_PER_S)
-    reaction = [(name, e) for name, e in messages.events if crash_ns <= e.t_ns < request_ns]
-    safe_ms = _safe_ms(case, messages.events, crash_ns, request_ns)
+    fall = next((row for row in truth if row.fallen), None)
+    events = [row for row in messages.events if fall is None or row[1].t_ns <= fall.t_ns]
+    reaction = [(name, e) for name, e in events if crash_ns <= e.t_ns < request_ns]
+    safe_ms = _safe_ms(case, events, crash_ns, request_ns)
     holds = [e for name, e in reaction if name in case.others and e.mode_after == Mode.HOLD]
-    later = [event for _, event in messages.events if event.t_ns >= request_ns]
-    fell_at = next((row.scenario_s for row in truth if row.fallen), None)
+    later = [event for _, event in events if event.t_ns >= request_ns]
+    fell_at = None if fall is None else fall.scenario_s
     standing = [row for row in after if not row.fallen] or after[:1]
     scenario = scenario_of(case)
     lowest_hand = min(lead(scenario, row.scenario_s).height for row in after)

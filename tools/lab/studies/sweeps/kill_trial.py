@@ -291,10 +291,12 @@ class KillRecorder:
         self.kill_ns: int | None = None
         self.status: PlannerStatus | None = None
         """The planner's last."""
+        self.fallen = False
+        """From then on nothing counts."""
 
     def __call__(self, topic: Topic, module: str, message: Message) -> None:
         """Take a message as the bus would."""
-        if isinstance(message, PlannerStatus):
+        if isinstance(message, PlannerStatus) and not self.fallen:
             self.status = message
         elif isinstance(message, RunEvent) and message.kind == RunEventKind.KILLED:
             self.kill_ns = message.t_ns
@@ -331,6 +333,7 @@ def run_case(case: KillCase, robot: RobotConfig, observer: Observer = NOBODY) ->
 
     for row in observer._replace(watch=let_go_in_time).rows_that_count(fleet.run(), 0.0):
         rows.append(row)
+        monitor.fallen = row.fallen
         loads.append(min(feet.read()))
     return measure(case, rows, loads, fleet.events, monitor, robot)
 
@@ -373,6 +376,7 @@ def measure(
     if not rows or rows[0].scenario_s < 0.0:
         return KillResult(ending=Ending.FELL if rows else Ending.UNREADY)
     last = rows[-1]
+    events = [row for row in events if row[1].t_ns <= last.t_ns]
     before = [row for row in rows if row.scenario_s < case.kill_s]
     figures: dict[str, float] = {}
     if before:

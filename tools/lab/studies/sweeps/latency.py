@@ -74,7 +74,7 @@ _SHARES: Final = values_in(0.0, 1.0)
 
 EXAMPLES: Final = """
 xrl study latency
-xrl study latency --delay 0:200:10 --jitter 5 --loss 0,0.2 --trials 10 --out out/latency
+xrl study latency --delay 0:200:10 --jitter 5 --loss 0,0.2 --n 10 --out out/latency
 xrl study latency --control distributed --delay 0:60:5 --loss 0 --lead-easing 0
 xrl study latency --only 137 --out out/trial137
 xrl study latency --cluster tcp://HOST:8786
@@ -102,8 +102,8 @@ class LatencyStudyFlags(AloneFlags):
             f"(default: {LOSSES})",
         ),
     ] = _SHARES(LOSSES)  # fmt: skip
-    trials: Count = TRIALS
-    """for each of these networks"""
+    n: Count = TRIALS
+    """trials of each network"""
     control: Annotated[
         tuple[str, ...],
         parsed(
@@ -159,7 +159,7 @@ STUDY: Final = Study[LatencyTrial](
         "latency-effort.png": latency_report.draw_effort,
     },
     load=load,
-    total=lambda flags: flags.trials * len(grid_of(flags)),
+    total=lambda flags: flags.n * len(grid_of(flags)),
     cases=lambda flags, _robot: partial(trial_of, grid_of(flags), flags.seed),
     decided_by=("seed", "delay", "jitter", "loss", "control"),
     inputs=lambda _flags: {"ranges": plants.digest()},

@@ -139,7 +139,7 @@ def run_trial(trial: RobustTrial, robot: RobotConfig, observer: Observer = NOBOD
     last = rows[-1]
     led = [row for row in rows if row.scenario_s < trial.kill_s]
     held = [row for row in rows if row.scenario_s >= trial.kill_s]
-    events = [event for _, event in fleet.events if event.t_ns >= rows[0].t_ns]
+    events = [event for _, event in fleet.events if rows[0].t_ns <= event.t_ns <= last.t_ns]
     return RobustResult(
         ending=ending_of(last, fleet.scenario.duration, robot),
         fell_at_s=last.scenario_s if last.fallen else None,

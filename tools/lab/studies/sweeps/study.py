@@ -45,9 +45,7 @@ class Numbered(Protocol):
 
 C = TypeVar("C", bound=Numbered)
 
-HOW_MANY: Final = ("n", "trials")
-"""Flags that say how many cases there are: a case alone does without."""
-NOT_THE_STUDY: Final = (*HOW_MANY, "config", "seed", "only", "workers", "cluster", "out")
+NOT_THE_STUDY: Final = ("n", "config", "seed", "only", "workers", "cluster", "out")
 """Those that `command_of` leaves out, or writes apart."""
 
 
@@ -188,9 +186,8 @@ def run(study: Study[C], flags: Any) -> int:
             case_s = _fill(table, study, begun, drawn)
         except (KeyboardInterrupt, SystemExit, RunError):
             if done := len(table.numbers):
-                many = [
-                    f"--{name} {getattr(flags, name)}" for name in HOW_MANY if hasattr(flags, name)
-                ]
+                count = getattr(flags, "n", None)
+                many = [] if count is None else [f"--n {count}"]
                 many += [f"--cluster {flags.cluster}"] if flags.cluster else []
                 again = " ".join([begun.command, *many, f"--out {shlex.quote(str(out))}"])
                 said = f"{done} cases are in {out}; resume with: {again}"

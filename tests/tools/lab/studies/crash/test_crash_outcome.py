@@ -133,9 +133,11 @@ def test_safe_is_when_the_slowest_module_that_was_not_hit_holds_and_all_else_is_
 
 
 def test_a_fall_is_timed_from_the_crash(robot: RobotConfig) -> None:
-    run = heard(PLANNER, holds(), world=lambda t: truth(t, fallen=t >= 4.0), end=5.0)
+    late = hip_left(4.5, Mode.HOLD, Mode.FAULT, step=115.6)
+    run = heard(PLANNER, [*holds(), late], world=lambda t: truth(t, fallen=t >= 4.0), end=5.0)
     outcome = measure(PLANNER, run, robot)
     assert outcome.verdict is CrashVerdict.FELL
+    assert (outcome.remarks, outcome.torque_step_back_nm) == ((), None), "what follows is no answer"
     assert outcome.fell_after_s == pytest.approx(4.0 - CRASH_S)
     assert not as_expected(PLANNER, outcome)
 

@@ -114,7 +114,7 @@ def test_without_dask_the_extra_that_brings_it_is_named(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    flags = ("--trials", 1, "--cluster", "tcp://127.0.0.1:1", "--out", tmp_path)
+    flags = ("--n", 1, "--cluster", "tcp://127.0.0.1:1", "--out", tmp_path)
     assert sweep("latency", *flags) == 2
     output = capsys.readouterr().err
     assert "extra `cluster`" in output

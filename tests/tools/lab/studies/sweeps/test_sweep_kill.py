@@ -11,13 +11,14 @@ import pytest
 
 from services.planner.law.kinematics import Kinematics
 from services.simulator.physics.plant import IDEAL
+from shared.bus.messages import JointEvent, Mode
 from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_S
 from shared.config import gain_schedule, scenarios
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.config.scenarios import Keyframe, Push, Scenario, lead
 from shared.robot.robot_model import stand_pose
-from tests.messages import filled
+from tests.messages import filled, sample
 from tests.tools.lab.studies.sweeps.tables import run_cases_here
 from tools.judge.standing import is_tipping
 from tools.lab.design import split_program
@@ -200,6 +201,26 @@ def test_a_robot_that_falls_before_it_can_begin_has_fallen(
     row = msgspec.structs.replace(AT_REST, scenario_s=-1.0, fallen=True)
     outcome = cases.measure(drawn[0], [row], [0.0], [], KillRecorder(lockstep.forget), robot)
     assert (outcome.ending, outcome.fell_at_s, outcome.stood) == (Ending.FELL, None, False)
+
+
+def test_a_change_of_mode_after_the_fall_does_not_count(
+    robot: RobotConfig, drawn: list[KillCase]
+) -> None:
+    rows = [
+        msgspec.structs.replace(AT_REST, t_ns=t_s * NS_PER_S, scenario_s=100.0 + t_s)
+        for t_s in range(3)
+    ]
+    rows[-1] = msgspec.structs.replace(rows[-1], fallen=True)
+    monitor = KillRecorder(lockstep.forget)
+    monitor.kill_ns = 0
+    hold = {"mode_before": int(Mode.TRACK), "mode_after": int(Mode.HOLD), "tau_before": (0, 0)}
+    events = [
+        (module, sample(JointEvent, **hold, t_ns=t_ns, tau_after=(0, step)))
+        for module, t_ns, step in (("hip_left", 1, 1.5), ("knee_left", 3 * NS_PER_S, 115.6))
+    ]
+    case = msgspec.structs.replace(drawn[0], kill_s=100.0)
+    outcome = cases.measure(case, rows, [0.0] * 3, events, monitor, robot)
+    assert outcome.torque_step_nm == 1.5
 
 
 @pytest.mark.parametrize(

@@ -88,7 +88,7 @@ def test_values_that_make_no_sense_are_refused(text: str) -> None:
 
 
 def test_every_network_meets_every_control_and_more_trials_come_behind() -> None:
-    few, more = grid("--trials", "2"), grid("--trials", "3")
+    few, more = grid("--n", "2"), grid("--n", "3")
     assert more[: len(few)] == few
     assert [t.number for t in more] == list(range(len(more)))
     points = {(t.network, t.control, t.repeat) for t in more}
@@ -106,7 +106,7 @@ def test_trials_are_paired_over_delays_and_controls_and_independent_at_one_delay
     pushes = {trial(control=name).scenario(robot_of(robot, name)).push for name in CONTROLS}
     assert len(pushes) == 1
     by_draw: dict[object, set[tuple[float, str]]] = {}
-    for t in grid("--trials", "2"):
+    for t in grid("--n", "2"):
         by_draw.setdefault(t.draw, set()).add((t.network.delay_ms, t.control))
     assert len(by_draw) == 2 * 4
     assert all(len(points) == 7 * 3 for points in by_draw.values())

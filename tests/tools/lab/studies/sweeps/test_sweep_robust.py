@@ -9,10 +9,14 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from shared.bus.messages import JointEvent, Mode
+from shared.bus.traces import SimTruth
+from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
+from tests.messages import filled, sample
 from tests.tools.lab.studies.sweeps.tables import finished, printed
-from tools.lab.studies.sweeps import plants, robust
-from tools.lab.studies.sweeps.figures import Ending
+from tools.lab.studies.sweeps import plants, robust, robust_trial
+from tools.lab.studies.sweeps.figures import Ending, Observer
 from tools.lab.studies.sweeps.push_range import PushRange
 from tools.lab.studies.sweeps.robust_trial import (
     KINDS,
@@ -54,6 +58,36 @@ def test_every_trial_is_a_scenario_that_ends_after_its_kill(
         scenario = scenario_of(robot, trial)
         assert scenario.duration > trial.kill_s + 2.0
         assert all(push.at + push.duration < scenario.duration for push in scenario.push)
+
+
+AT_REST: SimTruth = filled(SimTruth, {bool: False, int: 0, float: 0.0})
+
+
+def test_a_change_of_mode_after_the_fall_does_not_count(
+    robot: RobotConfig, pushes: PushRange, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A recorded trial goes on for a second after the fall."""
+
+    def event(t_s: float, step: float) -> tuple[str, JointEvent]:
+        times = {"t_ns": round(t_s * NS_PER_S), "mode_after": int(Mode.HOLD)}
+        return "hip_left", sample(JointEvent, **times, tau_before=(0, 0), tau_after=(0, step))
+
+    class Fleet:
+        def __init__(self, _robot: RobotConfig, scenario: object, *_: object, **__: object) -> None:
+            self.scenario = scenario
+            self.events = [event(0.5, 1.41), event(2.5, 115.6)]
+
+        def run(self) -> list[SimTruth]:
+            return [
+                msgspec.structs.replace(
+                    AT_REST, t_ns=t_s * NS_PER_S, scenario_s=float(t_s), fallen=t_s >= 2
+                )
+                for t_s in range(4)
+            ]
+
+    monkeypatch.setattr(robust_trial, "Lockstep", Fleet)
+    outcome = run_trial(draw(pushes, 1, 0), robot, Observer(after_fall_s=1.0))
+    assert (outcome.fell_at_s, outcome.hold_step_nm) == (2.0, 1.41)
 
 
 @pytest.mark.parametrize("cause", ["body.com_offset", "drive.lag_s", "floor.slope"])
