@@ -13,6 +13,7 @@ log.
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import re
@@ -470,9 +471,21 @@ def _open_error(name: str, listen: Sequence[str], error: Exception) -> BusError:
     reason = _reason(error)
     # EAGAIN is the lock that Zenoh holds beside a UNIX socket while it listens there.
     if "EAGAIN" in reason or "Address already in use" in reason:
+        if dead := [endpoint for endpoint in listen if _is_dead(endpoint)]:
+            right = "find out why (`dmesg`): its disk may be read-only"
+            return BusError(f"{dead[0]}: a dead socket that cannot be removed; {right}")
         right = f"stop the {name} that runs already, or take another run directory"
         return BusError(f"{where}: in use; {right}")
     return BusError(f"{where}: {name} cannot listen: {reason}; an endpoint it may use is needed")
+
+
+def _is_dead(endpoint: str) -> bool:
+    """Return True for a UNIX socket on which no process listens."""
+    if not endpoint.startswith(security.UNIX):
+        return False
+    with socket.socket(socket.AF_UNIX) as probe:
+        probe.setblocking(False)
+        return probe.connect_ex(endpoint.removeprefix(security.UNIX)) == errno.ECONNREFUSED
 
 
 def _reason(error: Exception) -> str:

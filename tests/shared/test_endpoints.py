@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from shared.config.endpoints import filled, host_and_port, is_endpoint, stray_braces
 from shared.config.robot_config import expand
 from shared.exceptions import BusError
+from shared.run_directory import live_dir
 
 
 @pytest.mark.parametrize(
@@ -43,7 +44,8 @@ def test_what_is_no_host_and_port_is_refused(endpoint: str) -> None:
 
 def test_a_placeholder_is_filled_in_once_whatever_it_is_filled_with() -> None:
     assert filled("{a}/{b}/{c}", {"{a}": "{b}", "{b}": "2"}) == "{b}/2/{c}"
-    assert expand("unixsock-stream/{run}/x", Path("/tmp/{run}")) == "unixsock-stream//tmp/{run}/x"
+    run_dir = Path("/tmp/{run}")
+    assert expand("unixsock-stream/{run}/x", run_dir) == f"unixsock-stream/{live_dir(run_dir)}/x"
     assert expand("tcp/10.0.0.1:7447", Path("/tmp")) == "tcp/10.0.0.1:7447"
 
 

@@ -253,7 +253,7 @@ def emulated_usb(run_dir: Path) -> Iterator[None]:
     with tempfile.TemporaryDirectory(prefix="xrl-usb-") as folder:
         usb_standin.load(usb_standin.build(Path(folder)))
         wanted = {
-            usb_standin.VARIABLE: str(RunDir(run_dir).path / usb_standin.FOLDER),
+            usb_standin.VARIABLE: str(RunDir(run_dir).live / usb_standin.FOLDER),
             # where the package keeps drives' descriptors: not those of emulated ones at home
             "XDG_CACHE_HOME": str(Path(folder) / "cache"),
         }

@@ -20,7 +20,7 @@ from typing import Self
 from services.joint import rearm_guard
 from services.simulator.fronts import usb_standin
 from shared import log
-from shared.exceptions import FleetError
+from shared.exceptions import FleetError, os_error_in_words
 from shared.run_directory import FLEET_VARIABLE, check_own, private_files
 from tools.fleet import process_table, procfs
 from tools.fleet.pace import check_pace, usual_pace
@@ -82,7 +82,7 @@ class SupervisedFleet:
         run = attached.run
         check_own(run.path)
         running = procfs.fleet_pids(run.path)
-        if not run.is_marked or run.read_manifest() is None:
+        if run.read_manifest() is None:
             if running:
                 raise FleetError(
                     f"{run.path}: {len(running)} processes of a fleet run, and its files are gone; "
@@ -145,9 +145,34 @@ class SupervisedFleet:
             raise FleetError(f"{service} (pid {pid}) has just ended by itself") from None
         return pid
 
-    def forget(self, service: str) -> None:
-        """Have the next process of a joint service arm its drive, whatever the last left."""
-        rearm_guard.clear(self.run.path, service)
+    def forget(self, service: str) -> str:
+        """Let the next process of a joint service arm its drive, whatever state the last left.
+
+        Returns:
+            Why not, which is also logged; empty if the state is cleared.
+        """
+        try:
+            rearm_guard.clear(self.run.path, service)
+        except OSError as error:
+            fault = (
+                f"{service}: the state of its last process cannot be cleared, so its next process "
+                f"arms no drive: {os_error_in_words(error)}"
+            )
+            log.get("xrl").warning("%s", fault)
+            return fault
+        return ""
+
+    def crash_loop(self, service: str) -> str:
+        """Describe the failed starts of a service whose starts fail one after another, or ""."""
+        with contextlib.suppress(FleetError):
+            for row in self.info():
+                if row.name == service and row.failed_starts:
+                    return (
+                        f"{service} is in a crash loop: {row.failed_starts} failed starts in a "
+                        f"row, the last ended with {row.last_exit}: {row.last_line}; "
+                        f"its log is {self.run.log_of(service)}"
+                    )
+        return ""
 
     def start_service(self, service: str) -> int | None:
         """Start a service that is down, before any delayed restart; return None.
@@ -238,7 +263,7 @@ class SupervisedFleet:
         self.run.clear(keep_logs=keep_logs, keep_stops=keep_stops)
 
     def _end(self) -> None:
-        manifest = self.run.read_manifest() if self.run.is_marked else None
+        manifest = self.run.read_manifest()
         procfs.signal_all(procfs.fleet_pids(self.run.path), signal.SIGCONT)
         try:
             if manifest is None:

@@ -19,10 +19,12 @@ from io import FileIO
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
-from supervisor import loggers, process, supervisord
+from supervisor import events, loggers, process, supervisord
 from supervisor.options import ServerOptions, decode_wait_status
 from supervisor.states import ProcessStates, getProcessStateDescription
 
+from shared.run_directory import FLEET_VARIABLE
+from tools.fleet import kept_state
 from tools.fleet.procfs import die_with_parent
 
 BACKOFF_MAX_S: Final = 5.0
@@ -138,6 +140,7 @@ class Service(process.Subprocess):  # type: ignore[misc]  # supervisor has no ty
             "state": getProcessStateDescription(self.get_state()).lower(),
             "uptime_s": max(0.0, time.time() - self.laststart) if self.pid else 0.0,
             "starts": self.starts,
+            "failed_starts": self.backoff or 0,
             "last_exit": self.last_exit or self.spawnerr or "",
             "last_line": LogFile.newest.get(self.config.stdout_logfile, ""),
         }
@@ -195,6 +198,8 @@ def main() -> None:
     loggers.RotatingFileHandler = LogFile
     process.Subprocess = Service
     supervisord.ServerOptions = _Options
+    run_dir = Path(os.environ[FLEET_VARIABLE])
+    events.subscribe(events.Tick5Event, lambda _event: kept_state.save(run_dir))
     supervisord.main([word for word in args.arguments if word != "--"])
     sys.stderr.close()  # on a full disk it could not be flushed, which would be an exit code
 

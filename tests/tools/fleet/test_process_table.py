@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from shared import run_directory
 from shared.config.files import load
 from shared.config.robot_config import SERVICES
 from shared.exceptions import ConfigError, FleetError, MissingPackageError
@@ -145,7 +146,9 @@ def test_a_bad_row_is_refused_with_its_key(
     assert refusal.value.key == key
 
 
-def test_a_run_directory_too_long_for_sockets_is_refused() -> None:
+def test_a_run_directory_too_long_for_sockets_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan(Path("/tmp") / ("long" * 25))  # its sockets lie elsewhere, in memory
+    monkeypatch.setattr(run_directory, "_MEMORY_FOLDERS", ())
     with pytest.raises(FleetError, match=r"too long by \d+ bytes"):
         plan(Path("/tmp") / ("long" * 25))
 

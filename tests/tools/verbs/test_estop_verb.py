@@ -15,6 +15,7 @@ from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
+from shared.run_directory import live_dir
 from tests.certified import certified, install_all
 from tests.tools.exit_codes import exit_code
 from tools.fleet.run_dir import Manifest, RunDir
@@ -61,7 +62,7 @@ def test_of_several_hosts_one_answers_for_its_own_modules(
 def test_a_module_without_a_service_here_is_named_and_the_others_are_stopped(
     partly: list[str], run_dir: Path, fleet: list[RearmGuard], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (run_dir / "knee_left.rearm").unlink()
+    (live_dir(run_dir) / "knee_left.rearm").unlink()
     assert exit_code(["estop", "--local", "--run-dir", run_dir, *partly]) == 2
     assert "knee_left has no service on this host" in capsys.readouterr().err
     stopped = [guard.stop_requested for guard in fleet]
