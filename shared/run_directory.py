@@ -19,6 +19,7 @@ import hashlib
 import mmap
 import os
 import pwd
+import shlex
 import stat
 from collections.abc import Iterator
 from pathlib import Path
@@ -114,7 +115,8 @@ def _check_directory(path: Path, *, alone: bool) -> None:
     _check_owner(path, found.st_uid)
     if alone and found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         raise FleetError(
-            f"{path}: others may write to it; `chmod go-w {path}`, or give another --run-dir"
+            f"{path}: others may write to it; `chmod go-w {shlex.quote(str(path))}`, "
+            "or give another --run-dir"
         )
     if alone:
         _check_parents(path)
@@ -134,7 +136,8 @@ def _check_parents(path: Path) -> None:
         if found.st_uid not in (0, os.getuid()):
             wrong = f"{above} belongs to another user, who can replace it"
         elif _others_may_rename_in(found):
-            wrong = f"others may write to {above} and replace it; `chmod go-w {above}`"
+            remedy = f"`chmod go-w {shlex.quote(str(above))}`"
+            wrong = f"others may write to {above} and replace it; {remedy}"
         else:
             continue
         raise FleetError(f"{path}: {wrong}; or give another --run-dir")

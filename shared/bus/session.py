@@ -35,7 +35,7 @@ from shared.bus.sockets import Address
 from shared.bus.tls_probe import LinkWatch
 from shared.bus.topics import Priority, Topic
 from shared.clock import keep_pace, now_ns
-from shared.config.endpoints import host_and_port
+from shared.config.endpoints import host_and_port, is_endpoint
 from shared.config.robot_config import SERVICES, RobotConfig, expand
 from shared.exceptions import BusError, NonFiniteError
 from shared.joints import MODULES
@@ -449,6 +449,8 @@ def _endpoint(text: str, run_dir: Path) -> str:
     endpoint = expand(text, run_dir)
     if endpoint.startswith(security.TCP):
         host_and_port(endpoint)
+    elif not is_endpoint(endpoint):
+        raise BusError(f"{endpoint}: no socket path with ? or #; choose another directory")
     length = len(os.fsencode(endpoint.removeprefix(security.UNIX)))
     if endpoint.startswith(security.UNIX) and length > SOCKET_PATH_MAX:
         raise BusError(

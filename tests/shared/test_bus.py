@@ -348,6 +348,7 @@ SESSIONS_REFUSED = {
     "planner": ("x" * 100, r"unixsock-stream/.*/planner\.zenoh.*shorter run directory"),
     "ankle_right": ("x" * 100, r"unixsock-stream/.*/ankle_right\.zenoh.*shorter run directory"),
     TOOL: ("x" * 100, r"unixsock-stream/.*shorter run directory"),
+    "harness": ("a?b", r"harness\.zenoh: no socket path with \? or #; choose another directory"),
     "simulator": ("file", r"file/simulator\.zenoh: simulator cannot listen: "),
 }
 """Name: folder below the run directory, and what the error says."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -59,3 +60,9 @@ def test_braces_that_nothing_is_filled_into_are_found_and_refused(text: str, str
     if stray:
         with pytest.raises(BusError, match=r"is no placeholder; only \{run\} is filled in"):
             expand(text, Path("/tmp"))
+
+
+@pytest.mark.parametrize("path", ["/tmp/a?b", "/tmp/a#b", "/tmp/a #b"])
+def test_a_socket_path_that_the_bus_would_take_apart_is_no_endpoint(path: str) -> None:
+    assert not is_endpoint(f"unixsock-stream/{path}")
+    assert is_endpoint(f"unixsock-stream/{re.sub('[?#]', '', path)} 50% ;")

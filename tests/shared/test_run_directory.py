@@ -154,3 +154,13 @@ def test_memory_that_a_read_only_disk_refuses_is_an_error_that_names_file_and_re
     monkeypatch.setattr(run_directory, "open_private", refuse)
     with pytest.raises(FleetError, match=rf"{tmp_path}/x: .*the disk is read-only: .*`dmesg`"):
         mapped(tmp_path / "x", 8)
+
+
+def test_the_remedy_can_be_pasted_into_a_shell(tmp_path: Path) -> None:
+    odd = tmp_path / "a #b; c"
+    odd.mkdir()
+    odd.chmod(0o777)
+    with pytest.raises(FleetError, match=f"`chmod go-w '{odd}'`"):
+        check_own(odd)
+    with pytest.raises(FleetError, match=f"`chmod go-w '{odd}'`"):
+        check_own(odd / "run")

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shlex
 import sys
 import tempfile
 import time
@@ -109,7 +110,7 @@ def refuse_service(robot: RobotConfig, module: str, run_dir: Path) -> None:
     if fleet is not None:
         raise FleetError(
             f"{module}: its joint service in {fleet.run.path} has the drive; hang the robot and "
-            f"`xrl down --run-dir {fleet.run.path}` first"
+            f"`xrl down --run-dir {shlex.quote(str(fleet.run.path))}` first"
         )
 
 

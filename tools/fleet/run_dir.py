@@ -300,6 +300,7 @@ def supervisor_config(run: RunDir, plan: FleetPlan) -> str:
         restarts = row.name not in plan.options.no_restart
         sections[f"program:{row.name}"] = {
             "command": shlex.join(plan.commands[row.name]),
+            "process_name": row.name,
             "priority": priority,
             "autostart": str(row.autostart).lower(),
             "autorestart": str(restarts).lower(),
@@ -316,9 +317,21 @@ def supervisor_config(run: RunDir, plan: FleetPlan) -> str:
         }
     lines: list[str] = []
     for name, settings in sections.items():
-        pairs = (f"{key}={value}".replace("%", "%%") for key, value in settings.items())
+        pairs = (f"{key}={one_line(value)}" for key, value in settings.items())
         lines += [f"[{name}]", *pairs, ""]
     return "\n".join(lines)
+
+
+def one_line(value: object) -> str:
+    """Return a value as supervisord's file holds it.
+
+    `tools.fleet.supervisor_process` reads a value without comments behind it and fills nothing in,
+    so only a line break is special.
+    """
+    text = str(value)
+    if "\n" in text or "\r" in text:
+        raise FleetError(f"{text!r}: a path or argument of a service has no line break; rename it")
+    return text
 
 
 def _remove_socket(path: Path) -> None:

@@ -15,11 +15,12 @@ import os
 import signal
 import sys
 import time
+from functools import partial
 from io import FileIO
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
-from supervisor import events, loggers, process, supervisord
+from supervisor import events, loggers, options, process, supervisord
 from supervisor.options import ServerOptions, decode_wait_status
 from supervisor.states import ProcessStates, getProcessStateDescription
 
@@ -198,6 +199,9 @@ def main() -> None:
     loggers.RotatingFileHandler = LogFile
     process.Subprocess = Service
     supervisord.ServerOptions = _Options
+    # As `run_dir.one_line` writes it: a value is what stands there, whatever characters it has.
+    options.UnhosedConfigParser = partial(options.UnhosedConfigParser, inline_comment_prefixes=None)
+    options.expand = lambda value, _expansions, _name: value
     run_dir = Path(os.environ[FLEET_VARIABLE])
     events.subscribe(events.Tick5Event, lambda _event: kept_state.save(run_dir))
     supervisord.main([word for word in args.arguments if word != "--"])

@@ -18,7 +18,7 @@ from shared.joints import MODULES
 from shared.links import PAIRS
 from tests.tools.fleet.plans import plan, robot_file, table_file
 from tools.fleet.process_table import UNIX, ListenPoint, check_free, is_simulated, load_table
-from tools.fleet.run_dir import RunDir, supervisor_config
+from tools.fleet.run_dir import RunDir, one_line, supervisor_config
 
 REAL = ('"xrl_unix"', '"socketcan"')
 FITTED = ("fitted = false", "fitted = true")
@@ -171,9 +171,15 @@ def test_an_endpoint_is_in_use_only_while_somebody_listens_on_it(
     check_free(points)
 
 
-def test_a_percent_sign_in_a_path_reaches_supervisord_unharmed(run_dir: Path) -> None:
+def test_an_argument_with_special_characters_is_quoted_for_its_program(run_dir: Path) -> None:
     options = {"services": ["recorder"], "no_restart": ["recorder"]}
-    odd = plan(run_dir, overrides={"recorder": ["--out", "50 % off"]}, **options)
+    odd = plan(run_dir, overrides={"recorder": ["--out", "50 % #off"]}, **options)
     text = supervisor_config(RunDir(run_dir), odd)
-    assert "'50 %% off'" in text
+    assert " --out '50 % #off'\n" in text
     assert "autorestart=false" in text
+
+
+@pytest.mark.parametrize("text", ["a\nb", "a\rb"])
+def test_a_line_break_that_would_begin_another_setting_is_refused(text: str) -> None:
+    with pytest.raises(FleetError, match="has no line break; rename it"):
+        one_line(text)
