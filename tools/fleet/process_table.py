@@ -128,7 +128,7 @@ class FleetOptions(msgspec.Struct, frozen=True, kw_only=True):
     would idle the drives of the others: the supervisor keeps trying."""
     table_path: Path = TABLE
     timeout_s: float = 30.0
-    """Time in which every service has to be up."""
+    """Time without progress after which the start has failed (`supervise.START_MAX_S`)."""
 
 
 class FleetPlan(NamedTuple):

@@ -15,6 +15,7 @@ import os
 import signal
 import sys
 import time
+from collections import deque
 from functools import partial
 from io import FileIO
 from pathlib import Path
@@ -31,6 +32,8 @@ from tools.fleet.procfs import die_with_parent
 BACKOFF_MAX_S: Final = 5.0
 """Longest wait before a service that ends at once is started again, s. supervisord adds a second
 each time without a bound: after 135 failed starts a mended service stayed down for two minutes."""
+LATELY_S: Final = 60.0
+"""Time over which the ends of a service are counted."""
 NEWEST_MAX: Final = 300
 """Bytes of a log's newest line that are kept."""
 
@@ -115,6 +118,10 @@ class Service(process.Subprocess):  # type: ignore[misc]  # supervisor has no ty
     last_exit = ""
     delay: float
 
+    def __init__(self, config: Any) -> None:
+        super().__init__(config)
+        self._ends_s: deque[float] = deque(maxlen=99)
+
     def spawn(self) -> Any:
         """Start the process."""
         pid = super().spawn()
@@ -124,6 +131,7 @@ class Service(process.Subprocess):  # type: ignore[misc]  # supervisor has no ty
     def finish(self, pid: int, status: int) -> None:
         """Note how the process ended."""
         self.last_exit = decode_wait_status(status)[1]
+        self._ends_s.append(time.monotonic())
         super().finish(pid, status)
 
     def change_state(self, new_state: int, expected: bool = True) -> Any:
@@ -141,7 +149,7 @@ class Service(process.Subprocess):  # type: ignore[misc]  # supervisor has no ty
             "state": getProcessStateDescription(self.get_state()).lower(),
             "uptime_s": max(0.0, time.time() - self.laststart) if self.pid else 0.0,
             "starts": self.starts,
-            "failed_starts": self.backoff or 0,
+            "ends_lately": sum(time.monotonic() - end_s < LATELY_S for end_s in self._ends_s),
             "last_exit": self.last_exit or self.spawnerr or "",
             "last_line": LogFile.newest.get(self.config.stdout_logfile, ""),
         }
