@@ -178,7 +178,8 @@ class Served:
     """A control socket whose answers are long, turn by turn."""
 
     def __init__(self, folder: Path) -> None:
-        self.path, self.watch = make_live_dir(folder) / SOCKET, SocketWatch()
+        self.folder, self.watch = folder, SocketWatch()
+        self.path = make_live_dir(folder) / SOCKET
         self.control = ControlSocket(self.path, lambda _: LONG, self.watch)
 
     def turn(self) -> None:
@@ -187,7 +188,7 @@ class Served:
                 call(events, 0)
 
     def ask(self, text: bytes = b"") -> socket.socket:
-        asking = dialled(self.path.parent)
+        asking = dialled(self.folder)
         asking.sendall(text)
         asking.setblocking(False)
         self.turn()
