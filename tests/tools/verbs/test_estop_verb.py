@@ -15,7 +15,7 @@ from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
-from shared.run_directory import live_dir
+from shared.run_directory import live_dir, make_live_dir
 from tests.certified import certified, install_all
 from tests.tools.exit_codes import exit_code
 from tools.fleet.run_dir import Manifest, RunDir
@@ -25,6 +25,7 @@ from tools.fleet.run_dir import Manifest, RunDir
 def fleet(run_dir: Path) -> list[RearmGuard]:
     """Return what the six services of a fleet of the shipped robot have open; all are in DAMP."""
     run_dir.mkdir()
+    make_live_dir(run_dir)
     manifest = Manifest(str(DEFAULT_CONFIG), MODULES, {}, (), 1.0)
     RunDir(run_dir).manifest.write_bytes(msgspec.json.encode(manifest))
     for module in MODULES:
