@@ -12,13 +12,14 @@ import time
 from pathlib import Path
 
 from shared.exceptions import FleetError
+from shared.run_directory import live_dir
 
 NS_PER_S = 1_000_000_000
 NS_PER_MS = 1_000_000
 NS_PER_US = 1_000
 
 PACE_FILE = "pace"
-"""In the run directory of a fleet in slow motion."""
+"""In the live directory of a fleet in slow motion."""
 
 _pace = 1.0
 
@@ -52,7 +53,7 @@ def keep_pace(run_dir: Path) -> None:
     Raises FleetError if the file with its pace is malformed.
     """
     global _pace  # noqa: PLW0603 - a process has one clock, as it has one CLOCK_MONOTONIC
-    path = run_dir / PACE_FILE
+    path = live_dir(run_dir) / PACE_FILE
     try:
         text = path.read_text(encoding="ascii")
     except (FileNotFoundError, NotADirectoryError):

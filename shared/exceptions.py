@@ -84,6 +84,7 @@ class MissingPackageError(RunError):
 _REMEDIES: Final = {
     errno.ENOSPC: "a disk is full: that of the output, /tmp or /dev/shm",
     errno.EDQUOT: "this user's share of a disk is used up",
+    errno.EROFS: "the disk is read-only: find out why (`dmesg`), then remount or replace it",
     errno.EMFILE: "this process may open no more files: `ulimit -n`",
     errno.ENOMEM: "the machine has no memory left",
 }

@@ -19,7 +19,7 @@ from typing import Final, TypeVar
 
 from shared import log
 from shared.exceptions import FleetError
-from shared.run_directory import mapped
+from shared.run_directory import live_dir, mapped
 
 End = TypeVar("End")
 
@@ -38,7 +38,7 @@ _SET_ROBUST_LIST: Final = {"x86_64": 273, "aarch64": 99}
 
 def path_of(run_dir: Path) -> Path:
     """Return where the planner of a run directory says that it lives."""
-    return run_dir / "planner.life"
+    return live_dir(run_dir) / "planner.life"
 
 
 class _Head(ctypes.Structure):

@@ -33,7 +33,7 @@ def service_parser(description: str, example: str) -> argparse.ArgumentParser:
         "--run-dir",
         type=service_directory,
         default=str(default_run_dir()),
-        help="directory of the fleet's sockets",
+        help="run directory of the fleet",
     )
     return parser
 

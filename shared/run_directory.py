@@ -1,23 +1,31 @@
-"""The run directory: one fleet's sockets, memory and logs. Whose it is, is looked at before use.
+"""The run directory of a fleet, with its logs, and the live directory, with its sockets and memory.
 
-Its name can be guessed and lies in a folder where everybody may write: a directory that is somebody
-else's, or that others may write to, is refused wherever one is named.
+The run directory names the fleet and may lie on a disk. Everything that a restart creates, removes
+or opens for writing lies in the live directory (`live_dir`), which is in memory: a service must
+come back after the disk has turned read-only.
+
+The names of both can be guessed, and both may lie in a folder where everybody may write: a
+directory that is somebody else's, or that others may write to, is refused wherever one is named.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import errno
+import functools
 import grp
+import hashlib
 import mmap
 import os
 import pwd
+import shlex
 import stat
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from shared.exceptions import FleetError
+from shared.exceptions import FleetError, os_error_in_words
 
 PRIVATE: Final = stat.S_IRUSR | stat.S_IWUSR
 
@@ -28,19 +36,67 @@ RUN_DIR_VARIABLE = "XRL_RUN_DIR"
 FLEET_VARIABLE: Final = "XRL_FLEET"
 """Environment variable of every process that a fleet's supervisor starts: its run directory."""
 
+_MEMORY_FOLDERS: Final = (Path("/run/lock"), Path("/dev/shm"))  # noqa: S108 - owners are checked
+"""Folders for the live directories, best first. At logout systemd may remove a user's files from
+/dev/shm (logind.conf: RemoveIPC), but not from /run/lock."""
+_MEMORY_TYPES: Final = ("tmpfs", "ramfs")
+
 
 def default_run_dir() -> Path:
     """Return the run directory: sockets, logs and the supervisor's files of one fleet."""
     return Path(os.environ.get(RUN_DIR_VARIABLE) or f"/tmp/xrl-{os.getuid()}")  # noqa: S108 - short on purpose: socket paths have 107 bytes
 
 
-def check_own(path: Path, *, alone: bool = True) -> None:
-    """Refuse a directory that is not this user's; one that is not there is no fault.
+def live_dir(run_dir: Path) -> Path:
+    """Return the directory of a fleet's sockets and shared memory, by its run directory.
 
-    `alone`: refuse one that others may write to, too, itself or a directory above it. A fleet is
-    not started or acted on in such a one; it can be stopped, for it may have become one while the
-    fleet was up. Raises FleetError.
+    The name is a hash of the run directory's path, so each process finds it without the disk. On a
+    host without a suitable folder in memory it is the run directory itself.
     """
+    folder = _memory_folder(_MEMORY_FOLDERS)
+    if folder is None:
+        return run_dir
+    name = hashlib.sha256(os.fsencode(os.path.realpath(run_dir))).hexdigest()[:16]
+    return folder / f"xrl-{name}"
+
+
+@functools.cache
+def _memory_folder(folders: tuple[Path, ...]) -> Path | None:
+    """Return the first folder that is in memory and where every user may write, or None.
+
+    Goes by type and mode, not by what this process may write: a systemd unit and a shell must
+    find the same folder.
+    """
+    mounts = [line.split() for line in Path("/proc/self/mounts").read_text("utf-8").splitlines()]
+    for folder in folders:
+        holding = (mount for mount in mounts if folder.is_relative_to(mount[1]))
+        kind = max(holding, key=lambda mount: len(mount[1]), default=("", "", ""))[2]
+        shared = stat.S_ISVTX | stat.S_IWOTH
+        with contextlib.suppress(OSError):
+            if kind in _MEMORY_TYPES and folder.stat().st_mode & shared == shared:
+                return folder
+    return None
+
+
+def make_live_dir(run_dir: Path) -> Path:
+    """Return the live directory of a run directory, made for this user alone if it is missing."""
+    path = live_dir(run_dir)
+    path.mkdir(mode=0o700, parents=True, exist_ok=True)
+    return path
+
+
+def check_own(path: Path, *, alone: bool = True) -> None:
+    """Refuse a run directory that is not this user's, or whose live directory is not.
+
+    A directory that does not exist is no fault. `alone`: refuse one that others may write to, too,
+    itself or a directory above it. A fleet is not started or acted on in such a one; it can be
+    stopped, for it may have become one while the fleet was up. Raises FleetError.
+    """
+    for directory in dict.fromkeys((path, live_dir(path))):
+        _check_directory(directory, alone=alone)
+
+
+def _check_directory(path: Path, *, alone: bool) -> None:
     try:
         found = path.lstat()
         if stat.S_ISLNK(found.st_mode):
@@ -51,13 +107,16 @@ def check_own(path: Path, *, alone: bool = True) -> None:
             _check_parents(path)
         return
     except OSError as error:
+        if error.errno == errno.EIO:
+            return  # the disk has failed; the fleet on it can still be stopped and signalled
         raise FleetError(f"{path}: cannot be a run directory: {error.strerror}") from None
     if not stat.S_ISDIR(found.st_mode):
         raise FleetError(f"{path}: is no directory; give another --run-dir")
     _check_owner(path, found.st_uid)
     if alone and found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         raise FleetError(
-            f"{path}: others may write to it; `chmod go-w {path}`, or give another --run-dir"
+            f"{path}: others may write to it; `chmod go-w {shlex.quote(str(path))}`, "
+            "or give another --run-dir"
         )
     if alone:
         _check_parents(path)
@@ -77,7 +136,8 @@ def _check_parents(path: Path) -> None:
         if found.st_uid not in (0, os.getuid()):
             wrong = f"{above} belongs to another user, who can replace it"
         elif _others_may_rename_in(found):
-            wrong = f"others may write to {above} and replace it; `chmod go-w {above}`"
+            remedy = f"`chmod go-w {shlex.quote(str(above))}`"
+            wrong = f"others may write to {above} and replace it; {remedy}"
         else:
             continue
         raise FleetError(f"{path}: {wrong}; or give another --run-dir")
@@ -111,7 +171,7 @@ def open_private(path: Path) -> BinaryIO:
 
 
 def mapped(path: Path, size: int) -> mmap.mmap:
-    """Return a shared file as memory, made if it is not there, for this user alone.
+    """Return a shared file as memory, made with its directory if missing, for this user alone.
 
     Its space is allocated now: on a full disk the first store would end the process (SIGBUS).
 
@@ -119,11 +179,13 @@ def mapped(path: Path, size: int) -> mmap.mmap:
         FleetError: it cannot be made.
     """
     try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with open_private(path) as file:
             os.posix_fallocate(file.fileno(), 0, size)
             return mmap.mmap(file.fileno(), size)
     except OSError as error:
-        raise FleetError(f"{path}: no shared memory: {error.strerror}") from None
+        words = os_error_in_words(OSError(error.errno, error.strerror))
+        raise FleetError(f"{path}: no shared memory: {words}") from None
 
 
 @contextlib.contextmanager

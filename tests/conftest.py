@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import gc
+import os
+import shutil
 import signal
 import sys
 import tempfile
@@ -15,6 +17,7 @@ from hypothesis import Phase, settings
 from shared.config import files as config_file
 from shared.config.gain_table import GainSchedule
 from shared.config.robot_config import RobotConfig
+from shared.run_directory import live_dir
 
 # A shell without job control starts its background with SIGINT ignored, and every program that a
 # test starts would inherit that.
@@ -49,6 +52,20 @@ def short_dir() -> Iterator[Path]:
     """Return a folder whose path is short: sockets are in it."""
     with tempfile.TemporaryDirectory(dir="/tmp", prefix="xrl-t-") as path:
         yield Path(path)
+        remove_live_dirs(Path(path))
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _nothing_left_in_memory(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    yield
+    remove_live_dirs(tmp_path_factory.getbasetemp())
+
+
+def remove_live_dirs(root: Path) -> None:
+    """Remove the live directories of all run directories below a folder."""
+    for folder, _, _ in os.walk(root):
+        if (live := live_dir(Path(folder))) != Path(folder):
+            shutil.rmtree(live, ignore_errors=True)
 
 
 @pytest.fixture

@@ -330,8 +330,8 @@ class RunDirFlags(Flags):
     run_dir: Annotated[Path, parsed(own_directory, "DIR")] = dataclasses.field(
         default_factory=_own_run_dir
     )
-    """directory of the fleet's sockets and logs (default: $XRL_RUN_DIR, else /tmp/xrl-UID of the
-    user); keep it short"""
+    """run directory: names the fleet and holds its logs (default: $XRL_RUN_DIR, else /tmp/xrl-UID
+    of the user)"""
 
 
 class ConfigFlags(Flags):

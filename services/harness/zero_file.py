@@ -16,7 +16,7 @@ import numpy as np
 
 from shared.arrays import Array
 from shared.robot.stewart import N_LEGS
-from shared.run_directory import mapped
+from shared.run_directory import live_dir, mapped
 
 _KEPT: Final = struct.Struct(f"<{N_LEGS}dI")
 """The leg forces, N, and a checksum of this boot and them: a kill may come amid a write."""
@@ -25,7 +25,7 @@ _BOOT: Final = Path("/proc/sys/kernel/random/boot_id")
 
 def path_of(run_dir: Path) -> Path:
     """Return where the zero is kept."""
-    return run_dir / "harness.zero"
+    return live_dir(run_dir) / "harness.zero"
 
 
 class ZeroFile:

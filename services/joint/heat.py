@@ -23,7 +23,7 @@ import msgspec
 from shared.bus.messages import LEFT_MAX_S, Pair
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
-from shared.run_directory import mapped
+from shared.run_directory import live_dir, mapped
 
 STEP_S: Final = 0.5
 """Step of the estimate, and of the seconds left."""
@@ -253,10 +253,11 @@ _POSSIBLE: Final = (-60.0, 400.0)
 
 
 class HeatFile:
-    """A module's temperatures in its run directory: a service that restarts finds it warm.
+    """A module's temperatures in its live directory: a service that restarts finds it warm.
 
-    The file is mapped: writing it is a store, which the control path may do. Times are of the
-    monotonic clock; after a restart of the host nothing counts as cooled.
+    The file is mapped: writing it is a store, which the control path may do. The supervisor
+    copies it to the disk (`tools.fleet.kept_state`). Times are of the monotonic clock; after a
+    restart of the host nothing counts as cooled.
     """
 
     def __init__(self, run_dir: Path, module: str) -> None:
@@ -265,7 +266,7 @@ class HeatFile:
         Raises:
             FleetError: it cannot be made.
         """
-        self._memory = mapped(run_dir / f"{module}.heat", _KEPT.size)
+        self._memory = mapped(live_dir(run_dir) / f"{module}.heat", _KEPT.size)
         self._written_ns = 0
 
     def restore(self, estimate: HeatEstimate, now_ns: int) -> None:

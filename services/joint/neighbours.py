@@ -30,7 +30,7 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import LOST_S
 from shared.joints import MODULE_INDEX, MODULES, N_MODULES, kind_of
 from shared.robot.hold_rules import SUPPORT_FOR
-from shared.run_directory import mapped
+from shared.run_directory import live_dir, mapped
 
 STALE_NS: Final = 20 * NS_PER_MS
 """An older angle says nothing of where the joint is now."""
@@ -85,7 +85,7 @@ UNKNOWN: Final = NeighbourView()
 
 def path_of(run_dir: Path) -> Path:
     """Return where the six are kept."""
-    return run_dir / "joints.near"
+    return live_dir(run_dir) / "joints.near"
 
 
 def view_of(module: str, rows: Sequence[NeighbourRow | None], now_ns: int) -> NeighbourView:

@@ -28,7 +28,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
-from shared.run_directory import mapped
+from shared.run_directory import live_dir, mapped
 
 _LAST_STATE, _STOP = range(2)
 _BEATS: Final = struct.Struct("<Q")
@@ -54,7 +54,7 @@ class LastState(IntEnum):
 
 def path_of(run_dir: Path, module: str) -> Path:
     """Return the path of a module's rearm-guard file."""
-    return run_dir / f"{module}.rearm"
+    return live_dir(run_dir) / f"{module}.rearm"
 
 
 class RearmGuard:

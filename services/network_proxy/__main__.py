@@ -22,6 +22,7 @@ from shared.config.robot_config import RobotConfig, expand
 from shared.links import DIRECTIONS, PAIRS, Pair, endpoint_through
 from shared.network.impairment_schedule import ImpairmentSchedule
 from shared.network.proxy_protocol import SOCKET
+from shared.run_directory import live_dir
 
 _UNIX = "unixsock-stream/"
 
@@ -44,7 +45,7 @@ def main() -> int:
             directions, session.publisher(topics.LINK_EVENT, LinkEvent).put
         )
         commands = CommandHandler(impairments)
-        control = ControlSocket(arguments.run_dir / SOCKET, commands.obey, watch)
+        control = ControlSocket(live_dir(arguments.run_dir) / SOCKET, commands.obey, watch)
         logger.info("between %d pairs, priority %s", len(endpoints), granted)
         process.freeze_garbage()
         try:

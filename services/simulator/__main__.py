@@ -28,6 +28,7 @@ from shared.config.robot_config import RobotConfig, expand
 from shared.joints import MODULE_INDEX, N_JOINTS
 from shared.places import SCENARIOS
 from shared.process import StopFlag, freeze_garbage, run_service, service_parser
+from shared.run_directory import live_dir, make_live_dir
 
 DEFAULT_SCENARIO = SCENARIOS / "stand.toml"
 
@@ -131,7 +132,7 @@ def drive_buses(robot: RobotConfig) -> dict[str, dict[int, int]]:
 
 def open_hubs(robot: RobotConfig, run_dir: Path, stack: ExitStack) -> dict[str, UnixCanHub]:
     """Return the CAN buses of the robot, simulated, by name."""
-    run_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
+    make_live_dir(run_dir)
     sensors = [robot.harness.bus, *([robot.imu.bus] if robot.imu.fitted else [])]
     hubs = {
         name: stack.enter_context(UnixCanHub(Path(expand(robot.can[name].channel, run_dir))))
@@ -147,7 +148,7 @@ def open_usb(robot: RobotConfig, bank: AxisBank, run_dir: Path, stack: ExitStack
 
     An ODrive v3 has USB beside CAN, so they are there whichever the services use.
     """
-    folder = run_dir / FOLDER
+    folder = live_dir(run_dir) / FOLDER
     ports: list[FibrePort] = []
     for module in robot.module:
         if module.serial_number:

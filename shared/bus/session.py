@@ -13,6 +13,7 @@ log.
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import re
@@ -34,7 +35,7 @@ from shared.bus.sockets import Address
 from shared.bus.tls_probe import LinkWatch
 from shared.bus.topics import Priority, Topic
 from shared.clock import keep_pace, now_ns
-from shared.config.endpoints import host_and_port
+from shared.config.endpoints import host_and_port, is_endpoint
 from shared.config.robot_config import SERVICES, RobotConfig, expand
 from shared.exceptions import BusError, EncodeError
 from shared.joints import MODULES
@@ -456,6 +457,8 @@ def _endpoint(text: str, run_dir: Path) -> str:
     endpoint = expand(text, run_dir)
     if endpoint.startswith(security.TCP):
         host_and_port(endpoint)
+    elif not is_endpoint(endpoint):
+        raise BusError(f"{endpoint}: no socket path with ? or #; choose another directory")
     length = len(os.fsencode(endpoint.removeprefix(security.UNIX)))
     if endpoint.startswith(security.UNIX) and length > SOCKET_PATH_MAX:
         raise BusError(
@@ -478,9 +481,21 @@ def _open_error(name: str, listen: Sequence[str], error: Exception) -> BusError:
     reason = _reason(error)
     # EAGAIN is the lock that Zenoh holds beside a UNIX socket while it listens there.
     if "EAGAIN" in reason or "Address already in use" in reason:
+        if dead := [endpoint for endpoint in listen if _is_dead(endpoint)]:
+            right = "find out why (`dmesg`): its disk may be read-only"
+            return BusError(f"{dead[0]}: a dead socket that cannot be removed; {right}")
         right = f"stop the {name} that runs already, or take another run directory"
         return BusError(f"{where}: in use; {right}")
     return BusError(f"{where}: {name} cannot listen: {reason}; an endpoint it may use is needed")
+
+
+def _is_dead(endpoint: str) -> bool:
+    """Return True for a UNIX socket on which no process listens."""
+    if not endpoint.startswith(security.UNIX):
+        return False
+    with socket.socket(socket.AF_UNIX) as probe:
+        probe.setblocking(False)
+        return probe.connect_ex(endpoint.removeprefix(security.UNIX)) == errno.ECONNREFUSED
 
 
 def _reason(error: Exception) -> str:

@@ -194,7 +194,7 @@ def _endpoints(config: RobotConfig) -> Problems:
         if service not in SERVICES:
             yield where, "no such service", f"one of {_words(SERVICES)}"
         if not is_endpoint(endpoint):
-            right = "unixsock-stream/PATH, tcp/HOST:PORT or tls/HOST:PORT"
+            right = "unixsock-stream/PATH (no ? and no #), tcp/HOST:PORT or tls/HOST:PORT"
             yield where, f"{endpoint!r}", f"{right}, with a port from 1 to {PORT_MAX}"
         yield from _placeholders(where, endpoint, RUN)
         if endpoint in seen:

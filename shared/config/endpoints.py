@@ -13,7 +13,8 @@ RUN: Final = "{run}"
 """Placeholder of the run directory, in endpoints and channels."""
 ROBOT: Final = "{robot}"
 """Placeholder of the robot's name, in `bus.security.keys`."""
-_UNIX: Final = re.compile(r"unixsock-stream/.+")
+_UNIX: Final = re.compile(r"unixsock-stream/[^?#]+")
+"""Zenoh takes what follows ? or # for settings of the link, not for a part of the path."""
 _ADDRESS: Final = re.compile(
     r"(?:tcp|tls)/(\[[0-9A-Za-z:.%_-]+\]|[^\[\]:/]+):([0-9]{1,5})(?:[?#].*)?"
 )

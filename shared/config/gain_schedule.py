@@ -8,6 +8,7 @@ again.
 from __future__ import annotations
 
 import hashlib
+import shlex
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
@@ -178,5 +179,5 @@ def require(config: RobotConfig, robot_file: Path) -> None:
     if not stale and schedule is not None and schedule.bounds is None:
         stale = "has no bounds by which the joint services judge commands"
     if stale:
-        right = f"run `xrl gains --config {robot_file}`"
+        right = f"run `xrl gains --config {shlex.quote(str(robot_file))}`"
         raise ConfigError(str(path_beside(robot_file)), "(file)", stale, right)

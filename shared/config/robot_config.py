@@ -9,6 +9,7 @@ from shared.config.endpoints import RUN, filled, stray_braces
 from shared.config.gain_table import GainSchedule
 from shared.exceptions import BusError
 from shared.joints import MODULES, kind_of
+from shared.run_directory import live_dir
 from shared.toml_file import Section
 
 SERVICES = ("planner", "harness", "imu", "recorder", "simulator", *MODULES)
@@ -146,11 +147,11 @@ class RobotConfig(Section, frozen=True):
 
 
 def expand(text: str, run_dir: Path) -> str:
-    """Return a path or endpoint with `{run}` replaced by the run directory.
+    """Return a path or endpoint with `{run}` replaced by the live directory of a run directory.
 
     Raises BusError if something else stands in braces; it would be taken as it is.
     """
     stray = stray_braces(text, [RUN])
     if stray:
         raise BusError(f"{text}: {stray} is no placeholder; only {RUN} is filled in")
-    return filled(text, {RUN: str(run_dir)})
+    return filled(text, {RUN: str(live_dir(run_dir))})

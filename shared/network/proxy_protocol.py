@@ -10,7 +10,7 @@ from shared.config.scenarios import Inject
 from shared.links import directions_of
 
 SOCKET: Final = "network_proxy.sock"
-"""Name of the socket in the run directory of the fleet."""
+"""Name of the socket in the live directory of the fleet."""
 LINE_MAX: Final = 65536
 
 

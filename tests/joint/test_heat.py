@@ -12,6 +12,7 @@ from services.joint.heat import HeatEstimate, HeatFile
 from shared.bus.messages import LEFT_MAX_S, Pair
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
+from shared.run_directory import make_live_dir
 
 SQUAT: Pair = (20.2 * 0.0827, 14.9 * 0.0827)
 """Torques of a knee's motors, torso at 0.948 m; N m."""
@@ -164,7 +165,7 @@ def test_a_service_that_restarts_finds_the_module_as_warm_as_it_was_left(
 def test_a_file_that_holds_nonsense_holds_nothing(
     robot: RobotConfig, tmp_path: Path, content: bytes
 ) -> None:
-    (tmp_path / "knee_left.heat").write_bytes(content)
+    (make_live_dir(tmp_path) / "knee_left.heat").write_bytes(content)
     state = restarted(robot, tmp_path, 100.0).state
     assert max(state.winding) <= 40.0
     assert all(map(math.isfinite, (*state.winding, *state.housing, *state.load)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import getpass
 import os
 import signal
@@ -25,6 +26,7 @@ from services.joint.rearm_guard import (
 from shared.exceptions import FleetError
 from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
+from shared.run_directory import make_live_dir
 from tools.fleet import emergency_stop, process_table, procfs, supervise
 from tools.fleet.run_dir import RunDir
 from tools.fleet.supervise import SupervisedFleet
@@ -58,6 +60,7 @@ def test_what_a_process_leaves_the_next_one_reads(tmp_path: Path, last_state: La
 
 @pytest.mark.parametrize("byte", [3, 0x20, 0xFF, LastState.HELD])
 def test_a_file_of_one_byte_is_read_and_an_odd_state_is_held(tmp_path: Path, byte: int) -> None:
+    make_live_dir(tmp_path)
     path_of(tmp_path, MODULE).write_bytes(bytes([byte]))
     old = RearmGuard(tmp_path, MODULE)
     assert (old.read(), old.stop_requested) == (LastState.HELD, False)
@@ -83,7 +86,7 @@ def test_where_no_service_is_nothing_is_forgotten_or_stopped(tmp_path: Path) -> 
     clear(tmp_path, MODULE)
     assert not request_stop(tmp_path, MODULE)
     assert stop_source(tmp_path, MODULE) == ""
-    assert list(tmp_path.iterdir()) == []
+    assert not path_of(tmp_path, MODULE).exists()
 
 
 class Fleet:
@@ -150,6 +153,7 @@ def test_a_pendant_from_before_is_forgotten_with_the_rest(tmp_path: Path, file: 
 
 
 def test_a_pendant_reaches_a_service_through_a_file_older_than_pendants(tmp_path: Path) -> None:
+    make_live_dir(tmp_path)
     path_of(tmp_path, MODULE).write_bytes(bytes([LastState.HELD, 0]))
     Pendant(tmp_path, MODULES).beat()
     found = RearmGuard(tmp_path, MODULE)
@@ -198,7 +202,22 @@ def test_the_verb_that_ends_a_service_asks_for_the_next_and_one_that_suspends_it
 
 def test_a_service_without_a_drive_leaves_nothing_to_forget(fleet: Fleet, tmp_path: Path) -> None:
     fleet.kill("planner", "KILL")
-    assert list(tmp_path.iterdir()) == []
+    assert not path_of(tmp_path, "planner").exists()
+
+
+@pytest.mark.parametrize("name", ["KILL", "TERM"])
+def test_the_signal_is_sent_though_the_state_cannot_be_cleared_and_the_verb_says_so(
+    fleet: Fleet, name: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """After a stop it is the only way out of it, also on a read-only disk."""
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), "/run/x/knee_left.rearm")
+
+    monkeypatch.setattr(supervise.rearm_guard, "clear", refuse)
+    fleet.kill(MODULE, name)
+    assert fleet.made == [("kill", PID, signal.Signals[f"SIG{name}"])]
+    assert "arms no drive: /run/x/knee_left.rearm: Read-only file system; the disk" in caplog.text
 
 
 @pytest.mark.parametrize("ends", ["a new fleet", "a fleet that goes down"])
@@ -228,7 +247,7 @@ def test_the_memory_of_a_service_takes_its_space_when_it_is_made(tmp_path: Path)
 
 
 def test_memory_that_cannot_be_made_is_refused_by_its_name(tmp_path: Path) -> None:
-    path_of(tmp_path, MODULE).mkdir()
+    path_of(tmp_path, MODULE).mkdir(parents=True)
     with pytest.raises(FleetError, match=rf"{MODULE}\.rearm: no shared memory: Is a directory"):
         RearmGuard(tmp_path, MODULE)
 
@@ -238,7 +257,7 @@ def test_a_signal_stops_a_service_whose_file_is_gone(tmp_path: Path, file: Rearm
     try:
         file.stop_on(signal.SIGUSR1)
         path = path_of(tmp_path, MODULE)
-        elsewhere = path.rename(tmp_path / "elsewhere")
+        elsewhere = path.rename(path.with_name("elsewhere"))
         assert not file.stop_requested
         os.kill(os.getpid(), signal.SIGUSR1)
         assert file.stop_requested

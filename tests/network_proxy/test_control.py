@@ -17,6 +17,7 @@ from shared.config.scenarios import Inject
 from shared.exceptions import FleetError
 from shared.links import COMMANDS
 from shared.network.proxy_protocol import LINE_MAX, SOCKET, Begin, Clear, List, Reply
+from shared.run_directory import live_dir, make_live_dir
 from tests.shared.test_impairment_schedule import Rig as Schedule
 from tools.fleet.proxy_client import ProxyClient
 
@@ -108,14 +109,14 @@ def test_a_hidden_impairment_is_reported_and_there_is_a_bound_to_what_is_asked_f
 def dialled(folder: Path, timeout_s: float = 5.0) -> socket.socket:
     asking = socket.socket(socket.AF_UNIX)
     asking.settimeout(timeout_s)
-    asking.connect(str(folder / SOCKET))
+    asking.connect(str(live_dir(folder) / SOCKET))
     return asking
 
 
 @pytest.fixture
 def served(rig: Rig, tmp_path: Path) -> Iterator[tuple[Rig, Path]]:
     watch = SocketWatch()
-    control = ControlSocket(tmp_path / SOCKET, rig.commands.obey, watch)
+    control = ControlSocket(make_live_dir(tmp_path) / SOCKET, rig.commands.obey, watch)
     over = threading.Event()
 
     def serve() -> None:
@@ -130,7 +131,7 @@ def served(rig: Rig, tmp_path: Path) -> Iterator[tuple[Rig, Path]]:
     thread.join()
     control.close()
     watch.close()
-    assert not (tmp_path / SOCKET).exists()
+    assert not (live_dir(tmp_path) / SOCKET).exists()
 
 
 def test_the_client_asks_and_is_answered_or_names_how_to_get_a_proxy(
@@ -177,7 +178,8 @@ class Served:
     """A control socket whose answers are long, turn by turn."""
 
     def __init__(self, folder: Path) -> None:
-        self.path, self.watch = folder / SOCKET, SocketWatch()
+        self.folder, self.watch = folder, SocketWatch()
+        self.path = make_live_dir(folder) / SOCKET
         self.control = ControlSocket(self.path, lambda _: LONG, self.watch)
 
     def turn(self) -> None:
@@ -186,7 +188,7 @@ class Served:
                 call(events, 0)
 
     def ask(self, text: bytes = b"") -> socket.socket:
-        asking = dialled(self.path.parent)
+        asking = dialled(self.folder)
         asking.sendall(text)
         asking.setblocking(False)
         self.turn()
@@ -230,7 +232,7 @@ def test_idle_clients_keep_no_other_out(tmp_path: Path) -> None:
 )
 def test_an_invalid_answer_is_reported_as_such(tmp_path: Path, answer: bytes) -> None:
     with socket.socket(socket.AF_UNIX) as listener:
-        listener.bind(str(tmp_path / SOCKET))
+        listener.bind(str(make_live_dir(tmp_path) / SOCKET))
         listener.listen()
 
         def serve() -> None:

@@ -24,6 +24,7 @@ from shared.bus.session import Publisher, open_session
 from shared.config.files import load
 from shared.exceptions import ConfigError, RunError
 from shared.places import DEFAULT_CONFIG
+from shared.run_directory import live_dir
 from tests.shared.mcap_log import runs
 from tests.waiting import comes_true
 from tools import cli
@@ -169,7 +170,7 @@ def test_sigkill_loses_less_than_a_second_and_the_next_recorder_recovers_the_res
 
 def test_a_snapshot_is_written_when_asked_for_and_holds_what_was_before() -> None:
     with rig_with("--snapshot", "30") as rig:
-        wait_for((rig.run_dir / "recorder.zenoh").exists)
+        wait_for((live_dir(rig.run_dir) / "recorder.zenoh").exists)
         for _ in range(50):
             rig.send(20)
             time.sleep(0.01)

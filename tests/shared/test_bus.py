@@ -13,6 +13,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from shared import run_directory
 from shared.bus import topics
 from shared.bus.messages import Estop, JointCommand, JointEvent, Wrench
 from shared.bus.session import Latest, Publisher, Session, open_session
@@ -20,6 +21,7 @@ from shared.config import files as config_file
 from shared.exceptions import BusError
 from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
+from shared.run_directory import live_dir, make_live_dir
 from tests.messages import sample
 from tests.waiting import comes_true
 
@@ -212,7 +214,7 @@ def test_a_subscriber_that_is_stopped_or_killed_stalls_nobody_and_is_reached_aga
         assert deaf.reaches()
         process.kill()
         process.wait()
-        assert (run_dir / "ankle_right.zenoh").exists()  # nobody cleaned up
+        assert (live_dir(run_dir) / "ankle_right.zenoh").exists()  # nobody cleaned up
         assert longest_put_s(deaf, other) < 2.0
         assert comes_true(lambda: session.alive() == {"planner", "knee_right"})
         again = start(ECHO, "ankle_right")
@@ -232,7 +234,7 @@ def test_session_closes_while_a_subscriber_is_stopped(run_dir: Path, start: Star
         stopped.send_signal(signal.SIGSTOP)
         for _ in range(2000):
             link.send()
-    assert not (run_dir / "planner.zenoh").exists()
+    assert not (live_dir(run_dir) / "planner.zenoh").exists()
     assert not link.send()
     assert link.commands.failed == 1
 
@@ -335,7 +337,7 @@ except BusError as error:
     with open_session(ROBOT, "planner", run_dir) as session:
         out, err = start(script).communicate(timeout=30)
         assert out.count("\n") == 1
-        assert f"unixsock-stream/{run_dir}/planner.zenoh: in use" in out
+        assert f"unixsock-stream/{live_dir(run_dir)}/planner.zenoh: in use" in out
         assert "stop the planner" in out
         assert err == ""
         assert session.alive() == {"planner"}
@@ -346,13 +348,17 @@ SESSIONS_REFUSED = {
     "planner": ("x" * 100, r"unixsock-stream/.*/planner\.zenoh.*shorter run directory"),
     "ankle_right": ("x" * 100, r"unixsock-stream/.*/ankle_right\.zenoh.*shorter run directory"),
     TOOL: ("x" * 100, r"unixsock-stream/.*shorter run directory"),
+    "harness": ("a?b", r"harness\.zenoh: no socket path with \? or #; choose another directory"),
     "simulator": ("file", r"file/simulator\.zenoh: simulator cannot listen: "),
 }
 """Name: folder below the run directory, and what the error says."""
 
 
 @pytest.mark.parametrize("name", SESSIONS_REFUSED)
-def test_session_that_cannot_be_opened_is_one_clear_error(run_dir: Path, name: str) -> None:
+def test_session_that_cannot_be_opened_is_one_clear_error(
+    run_dir: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_directory, "_MEMORY_FOLDERS", ())
     folder, why = SESSIONS_REFUSED[name]
     (run_dir / "file").write_text("in the way")
     with pytest.raises(BusError, match=why) as caught:
@@ -382,7 +388,9 @@ def test_topic_used_with_a_wrong_type_or_module_is_refused(run_dir: Path) -> Non
 
 def test_mute_and_absent_peers_delay_neither_opening_nor_closing(run_dir: Path) -> None:
     with socket.socket(socket.AF_UNIX) as mute:
-        mute.bind(str(run_dir / "ankle_right.zenoh"))  # as a stopped process: never answers
+        mute.bind(
+            str(make_live_dir(run_dir) / "ankle_right.zenoh")
+        )  # as a stopped process: never answers
         mute.listen()
         begin = time.monotonic()
         with open_session(ROBOT, "planner", run_dir) as session:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 from shared.config.endpoints import filled, host_and_port, is_endpoint, stray_braces
 from shared.config.robot_config import expand
 from shared.exceptions import BusError
+from shared.run_directory import live_dir
 
 
 @pytest.mark.parametrize(
@@ -43,7 +45,8 @@ def test_what_is_no_host_and_port_is_refused(endpoint: str) -> None:
 
 def test_a_placeholder_is_filled_in_once_whatever_it_is_filled_with() -> None:
     assert filled("{a}/{b}/{c}", {"{a}": "{b}", "{b}": "2"}) == "{b}/2/{c}"
-    assert expand("unixsock-stream/{run}/x", Path("/tmp/{run}")) == "unixsock-stream//tmp/{run}/x"
+    run_dir = Path("/tmp/{run}")
+    assert expand("unixsock-stream/{run}/x", run_dir) == f"unixsock-stream/{live_dir(run_dir)}/x"
     assert expand("tcp/10.0.0.1:7447", Path("/tmp")) == "tcp/10.0.0.1:7447"
 
 
@@ -57,3 +60,9 @@ def test_braces_that_nothing_is_filled_into_are_found_and_refused(text: str, str
     if stray:
         with pytest.raises(BusError, match=r"is no placeholder; only \{run\} is filled in"):
             expand(text, Path("/tmp"))
+
+
+@pytest.mark.parametrize("path", ["/tmp/a?b", "/tmp/a#b", "/tmp/a #b"])
+def test_a_socket_path_that_the_bus_would_take_apart_is_no_endpoint(path: str) -> None:
+    assert not is_endpoint(f"unixsock-stream/{path}")
+    assert is_endpoint(f"unixsock-stream/{re.sub('[?#]', '', path)} 50% ;")

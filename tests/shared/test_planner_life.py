@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from shared.places import CHECKOUT
-from shared.planner_life import OwnLife, PlannerLife, if_possible
+from shared.planner_life import OwnLife, PlannerLife, if_possible, path_of
 from tests.waiting import comes_true
 
 pytestmark = [pytest.mark.system]
@@ -103,5 +103,7 @@ def test_without_shared_memory_a_service_does_without(
 ) -> None:
     for end in (OwnLife, PlannerLife):
         assert if_possible(end, short_dir) is not None
-        assert if_possible(end, short_dir / "gone") is None
+    path_of(short_dir / "other").mkdir(parents=True)  # in the way
+    for end in (OwnLife, PlannerLife):
+        assert if_possible(end, short_dir / "other") is None
     assert caplog.text.count("a planner's end is seen by the age of its commands") == 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 import stat
 from collections.abc import Iterator
@@ -12,8 +13,17 @@ import pytest
 
 from services.joint.neighbours import Neighbours
 from services.joint.rearm_guard import LastState, RearmGuard, path_of
+from shared import run_directory
 from shared.exceptions import FleetError
-from shared.run_directory import FLEET_VARIABLE, check_own, open_private, service_directory
+from shared.run_directory import (
+    FLEET_VARIABLE,
+    check_own,
+    live_dir,
+    make_live_dir,
+    mapped,
+    open_private,
+    service_directory,
+)
 
 AS_ROOT = pytest.mark.skipif(os.getuid() != 0, reason="gives a directory to somebody else")
 
@@ -33,7 +43,7 @@ def mode_of(path: Path) -> int:
 def test_shared_memory_is_its_users_alone_whatever_the_umask(tmp_path: Path) -> None:
     RearmGuard(tmp_path, "knee_left")
     Neighbours(tmp_path, "knee_left")
-    assert {mode_of(path) for path in tmp_path.iterdir()} == {0o600}
+    assert {mode_of(path) for path in live_dir(tmp_path).iterdir()} == {0o600}
 
 
 def test_a_file_that_others_could_write_is_taken_from_them_and_kept(tmp_path: Path) -> None:
@@ -90,3 +100,67 @@ def test_a_service_by_hand_is_refused_there_and_a_successor_is_not(
         service_directory(str(tmp_path))
     monkeypatch.setenv(FLEET_VARIABLE, str(tmp_path))
     assert service_directory(str(tmp_path)) == tmp_path
+
+
+IN_MEMORY = pytest.mark.skipif(
+    live_dir(Path("/nowhere")) == Path("/nowhere"), reason="this host has no folder in memory"
+)
+
+
+@IN_MEMORY
+def test_the_live_directory_is_in_memory_found_by_any_path_and_private(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    run_dir.mkdir()
+    (tmp_path / "link").symlink_to(run_dir)
+    live = make_live_dir(run_dir)
+    assert live_dir(tmp_path / "link") == live_dir(tmp_path / "." / "run") == live
+    assert live_dir(tmp_path / "other") != live
+    assert live.parent in run_directory._MEMORY_FOLDERS
+    assert mode_of(live) == 0o700
+
+
+def test_without_a_folder_in_memory_the_live_directory_is_the_run_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for folders in ((), (tmp_path,), (Path("/proc"),), (Path("/nowhere"),)):
+        monkeypatch.setattr(run_directory, "_MEMORY_FOLDERS", folders)
+        assert live_dir(tmp_path / "run") == tmp_path / "run"
+
+
+@IN_MEMORY
+@pytest.mark.parametrize("mode", [0o777, 0o770])
+def test_a_live_directory_that_others_may_write_to_is_refused(tmp_path: Path, mode: int) -> None:
+    live = make_live_dir(tmp_path)
+    live.chmod(mode)
+    with pytest.raises(FleetError, match=rf"{live}: others may write to it"):
+        check_own(tmp_path)
+    check_own(tmp_path, alone=False)
+
+
+@AS_ROOT
+@IN_MEMORY
+def test_a_strangers_live_directory_is_refused(tmp_path: Path) -> None:
+    os.chown(make_live_dir(tmp_path), 12345, 12345)
+    with pytest.raises(FleetError, match="belongs to another user"):
+        check_own(tmp_path, alone=False)
+
+
+def test_memory_that_a_read_only_disk_refuses_is_an_error_that_names_file_and_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(run_directory, "open_private", refuse)
+    with pytest.raises(FleetError, match=rf"{tmp_path}/x: .*the disk is read-only: .*`dmesg`"):
+        mapped(tmp_path / "x", 8)
+
+
+def test_the_remedy_can_be_pasted_into_a_shell(tmp_path: Path) -> None:
+    odd = tmp_path / "a #b; c"
+    odd.mkdir()
+    odd.chmod(0o777)
+    with pytest.raises(FleetError, match=f"`chmod go-w '{odd}'`"):
+        check_own(odd)
+    with pytest.raises(FleetError, match=f"`chmod go-w '{odd}'`"):
+        check_own(odd / "run")

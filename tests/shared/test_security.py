@@ -28,6 +28,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import BusError, ConfigError
 from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
+from shared.run_directory import live_dir
 from tests.certified import certified, give, install_all, opened, signer_of, with_keys
 from tests.shared.test_links import TALK
 from tests.waiting import comes_true
@@ -433,7 +434,7 @@ def test_a_local_socket_is_its_users_alone_whatever_the_umask(short_dir: Path, u
     before = os.umask(umask)
     try:
         with open_session(ROBOT, "planner", short_dir):
-            mode = stat.S_IMODE((short_dir / "planner.zenoh").stat().st_mode)
+            mode = stat.S_IMODE((live_dir(short_dir) / "planner.zenoh").stat().st_mode)
             assert mode & 0o077 == 0
             (short_dir / "after").touch()
             assert stat.S_IMODE((short_dir / "after").stat().st_mode) == 0o666 & ~umask

@@ -11,6 +11,7 @@ import pytest
 
 from services.simulator.fronts import usb_standin
 from shared.exceptions import FleetError
+from shared.run_directory import live_dir
 
 
 def test_it_compiles_without_a_warning(tmp_path: Path) -> None:
@@ -62,19 +63,20 @@ def test_the_environment_leads_to_library_plugs_and_a_cache_of_their_own(
     first, _, rest = environment["LD_LIBRARY_PATH"].partition(":")
     assert (Path(first) / usb_standin.SONAME).is_file()
     assert rest == "/opt/lib"
-    assert environment[usb_standin.VARIABLE] == str(tmp_path / usb_standin.FOLDER)
+    assert environment[usb_standin.VARIABLE] == str(live_dir(tmp_path) / usb_standin.FOLDER)
     assert Path(environment["XDG_CACHE_HOME"]).is_relative_to(tmp_path)
 
 
 def test_clearing_leaves_nothing_but_what_is_not_the_fleets(tmp_path: Path) -> None:
     usb_standin.prepare(tmp_path)
-    plugs = tmp_path / usb_standin.FOLDER
-    plugs.mkdir()
+    plugs = live_dir(tmp_path) / usb_standin.FOLDER
+    plugs.mkdir(parents=True)
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as plug:
         plug.bind(str(plugs / "3A0000000001"))
     (plugs / "notes.txt").write_text("mine")
     usb_standin.clear(tmp_path)
-    assert [path.name for path in tmp_path.rglob("*")] == [usb_standin.FOLDER, "notes.txt"]
+    assert list(tmp_path.iterdir()) == []
+    assert [path.name for path in plugs.iterdir()] == ["notes.txt"]
     (plugs / "notes.txt").unlink()
     usb_standin.clear(tmp_path)
-    assert list(tmp_path.iterdir()) == []
+    assert not plugs.exists()

@@ -21,6 +21,7 @@ from shared.clock import NS_PER_MS, now_ns
 from shared.config import files as config_file
 from shared.network.proxy_protocol import SOCKET
 from shared.places import CHECKOUT, DEFAULT_CONFIG
+from shared.run_directory import live_dir
 from tests.shared.mcap_log.runs import sample
 from tools.fleet.proxy_client import ProxyClient
 
@@ -69,8 +70,8 @@ class Proxied:
         self.proxy.send_signal(signal.SIGTERM)
         output = self.proxy.communicate(timeout=PATIENCE_S)[1]
         assert self.proxy.returncode == 0, output
-        assert not list(self.run_dir.glob("through-*"))
-        assert not (self.run_dir / SOCKET).exists()
+        assert not list(live_dir(self.run_dir).glob("through-*"))
+        assert not (live_dir(self.run_dir) / SOCKET).exists()
 
     def kill(self) -> None:
         self.proxy.kill()
@@ -151,7 +152,7 @@ def proxied(*modules: str) -> Iterator[Proxied]:
         planner = stack.enter_context(open_session(ROBOT, "planner", run_dir, injected=True))
         links = Proxied(run_dir, opened, planner, tool)
         try:
-            links.wait(lambda: (run_dir / SOCKET).exists() and links.linked())
+            links.wait(lambda: (live_dir(run_dir) / SOCKET).exists() and links.linked())
             yield links
             links.stop()
         finally:

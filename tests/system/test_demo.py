@@ -19,6 +19,7 @@ import pytest
 from shared.bus import topics
 from shared.clock import PACE_FILE
 from shared.places import CHECKOUT
+from shared.run_directory import live_dir
 from tests.system.fleets import command, leaving_nothing, xrl_led
 from tests.system.stalls import stalled_before_it_began
 from tools.fleet import procfs
@@ -97,7 +98,7 @@ def test_a_stall_of_all_services_is_told_in_line_record_and_verdict(tmp_path: Pa
 
 def stop_all(run_dir: Path, for_s: float) -> None:
     """Have every service of a fleet stand still, for so long on the fleet's clock."""
-    slow = run_dir / PACE_FILE
+    slow = live_dir(run_dir) / PACE_FILE
     pace = float(slow.read_text()) if slow.exists() else 1.0
     pids = procfs.service_pids(run_dir).values()
     procfs.signal_all(pids, signal.SIGSTOP)

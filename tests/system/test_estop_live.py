@@ -131,6 +131,7 @@ def test_it_needs_no_supervisor(
             os.kill(supervisor, signal.SIGKILL)
         if gone:
             shutil.rmtree(run_dir)
+            shutil.rmtree(fleet.run.live)
         pids = fleet.pids()
         time.sleep(1.0)
         assert fleet.pids() == pids, "every service goes on"

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from shared.run_directory import live_dir
 from tests.system.fleets import command, wait_for
 from tools import cli
 
@@ -27,9 +28,11 @@ def test_a_fleet_that_was_started_with_umask_0_leaves_nothing_to_others(
     try:
         subprocess.run(["bash", "-c", script, "-", *words], check=True, timeout=90)
         # "up" is a service that listens; what else it opens follows, on a busy machine later
-        opened = (run_dir / "ankle_right.rearm", run_dir / "joints.near")
+        opened = (live_dir(run_dir) / "ankle_right.rearm", live_dir(run_dir) / "joints.near")
         assert wait_for(lambda: all(path.exists() for path in opened) and any(out.glob("*.mcap")))
-        found = [run_dir, *run_dir.rglob("*"), *(set(SHARED_MEMORY.iterdir()) - before)]
+        folders = (run_dir, live_dir(run_dir))
+        found = [*folders, *(path for folder in folders for path in folder.rglob("*"))]
+        found += set(SHARED_MEMORY.iterdir()) - before
         modes = {str(path): stat.S_IMODE(path.lstat().st_mode) for path in found}
         assert {path.suffix for path in found} >= {".rearm", ".near", ".log"}
         assert {path: oct(mode) for path, mode in modes.items() if mode & 0o077} == {}

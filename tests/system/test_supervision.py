@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -247,6 +248,54 @@ def test_supervision_goes_on_without_a_place_for_its_logs(
     assert fleet.lost_lines()[1] in shown
 
 
+@contextlib.contextmanager
+def read_only(folder: Path) -> Iterator[None]:
+    """Make a folder read-only, as its disk after an error."""
+    steps = (["--bind", folder, folder], ["-o", "remount,ro,bind", folder])
+    for step in steps:
+        if subprocess.run(["mount", *step], check=False, capture_output=True).returncode:
+            pytest.skip("only root may mount")
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", "--lazy", folder], check=True)
+
+
+def test_on_a_read_only_disk_a_killed_service_is_reached_again_and_status_warns(
+    start: Start, run_dir: Path, order: Order
+) -> None:
+    """Its dead socket could not be removed, and `xrl kill` sent no signal."""
+
+    def rate_hz() -> float:
+        return json.loads(order("status", "--json")[1])["services"]["ankle_right"]["rate_hz"] or 0.0
+
+    fleet = start({"ankle_right": JOINT, "planner": SLEEPER})
+    assert wait_for(lambda: rate_hz() > 20)
+    before = fleet.pids()["ankle_right"]
+    with read_only(run_dir):
+        assert order("kill", "ankle_right")[0] == 0
+        assert wait_for(lambda: fleet.pids().get("ankle_right", before) != before)
+        assert wait_for(lambda: rate_hz() > 20)
+        assert f"{run_dir}: its disk is read-only" in " ".join(order("status")[1].split())
+        assert order("down", "--limp")[0] == 0
+        assert procfs.fleet_pids(run_dir) == set()
+
+
+def test_a_fleet_runs_at_paths_with_characters_that_are_special_in_other_files(
+    run_dir: Path, tmp_path: Path
+) -> None:
+    odd = "a #b ;c 50% d?e 'f"
+    (tmp_path / odd).mkdir()
+    table = write_table(tmp_path / odd / "p.toml", {"ankle_right": JOINT}, ready="endpoint")
+    options = FleetOptions(table_path=table)
+    fleet = SupervisedFleet.start(robot_file(tmp_path / odd), run_dir.parent / odd, options)
+    try:
+        assert [row.state for row in fleet.info()] == ["running"]
+        assert fleet.run.log_of("ankle_right").exists()
+    finally:
+        fleet.stop()
+
+
 def test_the_wait_before_another_start_is_bounded() -> None:
     """After a power cut a planner failed 135 starts, and a mended one waited for minutes."""
     waiting = Service.__new__(Service)
@@ -303,12 +352,24 @@ def test_a_start_that_nobody_asked_for_ends_nothing_when_a_service_fails_and_sta
     assert wait_for(is_told), shown
     assert "no drive on can0" in shown
     assert fleet.pids()["harness"] == before
+    assert wait_for(lambda: service(fleet, "planner").ends_lately >= 3)
+    code, said = order("start", "planner")
+    assert (code, "planner is in a crash loop: it ended" in said) == (3, True), said
+    assert "exit status 3: no drive on can0" in said
+    assert "runs already" not in said
 
 
 def test_a_service_that_never_listens_fails_the_start(start: Start, run_dir: Path) -> None:
-    with pytest.raises(FleetError, match="not up after 2 s: planner"):
+    with pytest.raises(FleetError, match="not up, and no progress for 2 s: planner"):
         start({"planner": SLEEPER}, ready="endpoint", timeout_s=2.0)
     assert_nothing_left(run_dir, [])
+
+
+def test_a_start_that_goes_on_takes_as_long_as_the_machine_needs(start: Start) -> None:
+    """At load 11 to 26, 6 of 17 starts gave up after 30 s."""
+    slow = f"import time\nwhile time.process_time() < 4.0:\n    pass\n{JOINT}"
+    fleet = start({"ankle_right": slow}, ready="endpoint", timeout_s=2.0)
+    assert [row.state for row in fleet.info()] == ["running"]
 
 
 def test_a_port_in_use_is_refused_before_anything_starts(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Final
 
@@ -33,7 +34,7 @@ def robot_rows(robot: RobotConfig, path: Path) -> list[Finding]:
     rows = [ok(SUBJECT, "read", str(path)), assumed]
     if robot.law.split == "certified":
         stale = gain_schedule.why_stale(robot)
-        fix = f"`xrl gains --config {path}`"
+        fix = f"`xrl gains --config {shlex.quote(str(path))}`"
         rows.append(judged(not stale, SUBJECT, "gain schedule", stale or "fits", "fits", fix))
     return rows
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shlex
 import sys
 import tempfile
 import time
@@ -109,7 +110,7 @@ def refuse_service(robot: RobotConfig, module: str, run_dir: Path) -> None:
     if fleet is not None:
         raise FleetError(
             f"{module}: its joint service in {fleet.run.path} has the drive; hang the robot and "
-            f"`xrl down --run-dir {fleet.run.path}` first"
+            f"`xrl down --run-dir {shlex.quote(str(fleet.run.path))}` first"
         )
 
 
@@ -253,7 +254,7 @@ def emulated_usb(run_dir: Path) -> Iterator[None]:
     with tempfile.TemporaryDirectory(prefix="xrl-usb-") as folder:
         usb_standin.load(usb_standin.build(Path(folder)))
         wanted = {
-            usb_standin.VARIABLE: str(RunDir(run_dir).path / usb_standin.FOLDER),
+            usb_standin.VARIABLE: str(RunDir(run_dir).live / usb_standin.FOLDER),
             # where the package keeps drives' descriptors: not those of emulated ones at home
             "XDG_CACHE_HOME": str(Path(folder) / "cache"),
         }

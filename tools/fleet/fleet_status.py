@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import Final
 
 import msgspec
@@ -284,12 +287,32 @@ def _service_status(
     )
 
 
+def _is_read_only(folder: Path) -> bool:
+    """Return True if a disk takes no file; a nameless file tells, mount options may not."""
+    try:
+        os.close(os.open(folder, os.O_TMPFILE | os.O_WRONLY, 0o600))
+    except OSError as error:
+        return error.errno in (errno.EROFS, errno.EIO)
+    return False
+
+
 def _trouble_of(fleet: SupervisedFleet, services: Iterable[ServiceInfo]) -> tuple[str, ...]:
     fault = fleet.supervision_fault()
     lines = [fault] if fault else []
     lost, why = (0, "") if fault else fleet.lost_lines()  # it would only be waited for again
     if lost:
         lines.append(f"{lost} log lines are lost: {why}: {fleet.run.logs}")
+    if not os.access(fleet.run.live, os.W_OK):
+        lines.append(
+            f"{fleet.run.live}: read-only or missing: a service that ends cannot restart; hang the "
+            "robot, then `xrl down`"
+        )
+    if _is_read_only(fleet.run.path):
+        lines.append(
+            f"{fleet.run.path}: its disk is read-only: logs and records on it are lost. "
+            "Services still restart, but a new fleet does not start: hang the robot, "
+            "`xrl down`, then mend the disk"
+        )
     try:
         free_mib = free_mib_at(fleet.run.path)
     except OSError as error:

@@ -27,6 +27,7 @@ from shared.links import PAIRS, endpoint_through
 from shared.network.proxy_protocol import SOCKET
 from shared.places import FILES
 from shared.process import SOCKET_PATH_MAX
+from shared.run_directory import live_dir
 from shared.toml_file import Range, Section, read_toml
 
 TABLE = FILES / "processes.toml"
@@ -39,7 +40,7 @@ SIMULATED_CAN = "xrl_unix"
 """python-can interface of the emulated drives: the robot is a simulated one."""
 
 SUPERVISOR_SOCKET = "supervisor.sock"
-"""Name of the supervisor's own socket in the run directory."""
+"""Name of the supervisor's own socket in the live directory."""
 
 UNIX = "unixsock-stream/"
 """Prefix of a bus endpoint on a UNIX socket."""
@@ -127,7 +128,7 @@ class FleetOptions(msgspec.Struct, frozen=True, kw_only=True):
     would idle the drives of the others: the supervisor keeps trying."""
     table_path: Path = TABLE
     timeout_s: float = 30.0
-    """Time in which every service has to be up."""
+    """Time without progress after which the start has failed (`supervise.START_MAX_S`)."""
 
 
 class FleetPlan(NamedTuple):
@@ -294,7 +295,7 @@ def _listeners(
             ]
         if row.kind == "network_proxy":
             endpoints = [expand(endpoint_through(pair), run_dir) for pair in PAIRS]
-            endpoints.append(f"{UNIX}{run_dir / SOCKET}")
+            endpoints.append(f"{UNIX}{live_dir(run_dir) / SOCKET}")
             listeners += [ListenPoint(row.name, "(the run directory)", at) for at in endpoints]
         if row.kind == "simulator":
             listeners += [
@@ -309,7 +310,7 @@ def _check_lengths(run_dir: Path, listeners: Iterable[ListenPoint]) -> None:
     """Refuse a run directory that is too long for its UNIX sockets, of whoever listens or dials."""
     paths = [at.endpoint.removeprefix(UNIX) for at in listeners if at.endpoint.startswith(UNIX)]
     # supervisord binds NAME.PID first, and renames it
-    paths.append(f"{run_dir / SUPERVISOR_SOCKET}.4194304")
+    paths.append(f"{live_dir(run_dir) / SUPERVISOR_SOCKET}.4194304")
     excess = max(len(os.fsencode(path)) for path in paths) - SOCKET_PATH_MAX
     if excess > 0:
         raise FleetError(

@@ -19,6 +19,7 @@ from shared.network.proxy_protocol import (
     Request,
     RequestedImpairment,
 )
+from shared.run_directory import live_dir
 from tools.fleet.run_dir import RunDir
 
 _PATIENCE_S: Final = 2.0
@@ -29,7 +30,7 @@ class ProxyClient:
     """One question, one answer, one connection each."""
 
     def __init__(self, run_dir: Path) -> None:
-        self._path = run_dir / SOCKET
+        self._run_dir, self._path = run_dir, live_dir(run_dir) / SOCKET
 
     def begin(self, inject: Inject, in_s: float = 0.0) -> tuple[RequestedImpairment, ...]:
         """Start an impairment after a delay, s; return all impairments then."""
@@ -73,7 +74,7 @@ class ProxyClient:
 
     def _why_absent(self) -> str:
         """Return why nobody listens there, and the way out."""
-        folder = RunDir(self._path.parent)
+        folder = RunDir(self._run_dir)
         manifest = folder.read_manifest()
         if manifest is None or not folder.supervisor_socket.exists():
             return (

@@ -1,4 +1,4 @@
-"""The run directory of one fleet: what lies in it, who owns it, how it is cleared."""
+"""The run directory of one fleet and its live directory: contents, owner, and how to clear them."""
 
 from __future__ import annotations
 
@@ -18,12 +18,14 @@ from services.harness import zero_file
 from services.joint import neighbours, rearm_guard
 from services.joint.rearm_guard import LastState, RearmGuard
 from services.simulator.fronts import usb_standin
+from shared import log
 from shared.clock import PACE_FILE
 from shared.config.files import load
 from shared.config.robot_config import SERVICES, RobotConfig
-from shared.exceptions import FleetError
+from shared.exceptions import FleetError, os_error_in_words
 from shared.joints import MODULES
-from shared.run_directory import check_own
+from shared.run_directory import check_own, live_dir, make_live_dir
+from tools.fleet import kept_state
 from tools.fleet.process_table import SUPERVISOR_SOCKET, UNIX, FleetPlan, is_listening
 
 SUPERVISOR_PID: Final = "supervisord.pid"
@@ -45,7 +47,7 @@ _LOGGED: Final = (*SERVICES, "network_proxy", "ros2_gateway", "supervisord", "vi
 FILES_MIN: Final = 128
 """Files that the supervisor may have open at the least: three for each of some twelve services."""
 SPACE_MIN_MIB: Final = 4
-"""Free space that a start needs in the run directory, for sockets, shared memory and logs."""
+"""Free space that a start needs in the run directory, for logs."""
 SPACE_LOW_MIB: Final = 64
 """Free space below which `xrl status` says so: each of twelve logs may take 10 MB."""
 _NEVER_GIVE_UP = 1_000_000
@@ -76,11 +78,12 @@ class RunDir:
     def __init__(self, path: Path) -> None:
         self.path = Path(os.path.abspath(path))  # noqa: PTH100 - no symlink resolved: paths stay short
         self.marker = self.path / MARKER
-        self.pace = self.path / PACE_FILE
-        self.supervisor_socket = self.path / SUPERVISOR_SOCKET
-        self.supervisor_config = self.path / "supervisord.conf"
+        self.live = live_dir(self.path)
+        self.pace = self.live / PACE_FILE
+        self.supervisor_socket = self.live / SUPERVISOR_SOCKET
+        self.supervisor_config = self.live / "supervisord.conf"
         self.supervisor_pid = self.path / SUPERVISOR_PID
-        self.manifest = self.path / "fleet.json"
+        self.manifest = self.live / "fleet.json"
         self.logs = self.path / "logs"
         self.supervisor_log = self.logs / "supervisord.log"
         self.supervisor_stderr = self.logs / "supervisord.stderr"
@@ -125,18 +128,27 @@ class RunDir:
             self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
             return os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
         except OSError as error:
-            raise FleetError(f"{self.path}: cannot be a run directory: {error.strerror}") from None
+            raise self._unusable(error) from None
 
     def _marked(self, descriptor: int) -> int:
-        foreign = None if self.is_marked else self._foreign()
-        if foreign is not None:
+        if self.is_marked:
+            return descriptor
+        try:
+            foreign = self._foreign()
+            if foreign is None:
+                self.marker.touch(mode=0o600)
+                return descriptor
+        except OSError as error:
             os.close(descriptor)
-            raise FleetError(
-                f"{self.path}: holds {foreign}, which does not belong to a fleet; give a new or an "
-                "empty directory with --run-dir"
-            )
-        self.marker.touch(mode=0o600)
-        return descriptor
+            raise self._unusable(error) from None
+        os.close(descriptor)
+        raise FleetError(
+            f"{self.path}: holds {foreign}, which does not belong to a fleet; give a new or an "
+            "empty directory with --run-dir"
+        )
+
+    def _unusable(self, error: OSError) -> FleetError:
+        return FleetError(f"{self.path}: cannot be a run directory: {os_error_in_words(error)}")
 
     def _foreign(self) -> str | None:
         """Return the name of a file that no fleet has left here, or None."""
@@ -164,25 +176,28 @@ class RunDir:
             free_mib = free_mib_at(self.path)
         except OSError as error:
             raise FleetError(
-                f"{self.path}: {error.strerror}: a fleet keeps its sockets, shared memory and "
-                "logs there; free some space, or give another directory with --run-dir"
+                f"{os_error_in_words(error)}; a fleet keeps its logs in {self.path}, its sockets "
+                f"and shared memory in {self.live}: give another directory with --run-dir"
             ) from None
         if free_mib < SPACE_MIN_MIB and not plan.options.disarmed:
             raise FleetError(
                 f"{self.path}: {free_mib:.1f} MiB free, and a fleet needs {SPACE_MIN_MIB} MiB "
-                "there for sockets, shared memory and logs; free some, or give another --run-dir"
+                "there for its logs; free some, or give another --run-dir"
             )
 
     def _prepare(self, plan: FleetPlan, pace: float) -> None:
         disarmed = plan.options.disarmed
+        make_live_dir(self.path)
         self.pace.unlink(missing_ok=True)
         if pace != 1.0:
             self.pace.write_text(f"{pace:g}\n", encoding="ascii")
+        self._remove_shared_memory(keep_stops=disarmed)
         if not disarmed:
             self._remove_logs()
-        self._remove_shared_memory(keep_stops=disarmed)
-        if not disarmed:  # after a crash of the supervisor somebody may rest on the harness
+            kept_state.forget_stops(self.path)
+            # after a crash of the supervisor somebody may rest on the harness
             zero_file.path_of(self.path).unlink(missing_ok=True)
+        kept_state.restore(self.path)
         self.logs.mkdir(exist_ok=True)
         sockets = [item.endpoint for item in plan.listeners if item.endpoint.startswith(UNIX)]
         manifest = Manifest(
@@ -216,25 +231,40 @@ class RunDir:
             return None
 
     def clear(self, *, keep_logs: bool, keep_stops: bool = False) -> None:
-        """Remove the fleet's files, and the directory itself if it is then empty.
+        """Remove the fleet's files, and its two directories if they are then empty.
 
-        In a directory that is no fleet's nothing is removed.
+        In a directory that is no fleet's nothing is removed. What a read-only disk keeps is logged.
         """
         if not self.is_marked:
             return
+        saved = kept_state.save(self.path)
+        try:
+            self._clear_live(keep_stops=keep_stops, keep_heat=not saved)
+            if not keep_stops:
+                kept_state.forget_stops(self.path)
+            self.supervisor_pid.unlink(missing_ok=True)
+            if not keep_logs:
+                self._remove_logs()
+            if [entry.name for entry in self.path.iterdir()] == [MARKER]:
+                self.marker.unlink()
+                self.path.rmdir()
+        except OSError as error:
+            log.get("xrl").warning("not all files are removed: %s", os_error_in_words(error))
+
+    def _clear_live(self, *, keep_stops: bool, keep_heat: bool) -> None:
         manifest = self.read_manifest()
         for path in manifest.sockets if manifest else ():
             _remove_socket(Path(path))
         _remove_socket(self.supervisor_socket)
         self._remove_shared_memory(keep_stops=keep_stops)
         zero_file.path_of(self.path).unlink(missing_ok=True)
-        for file in (self.supervisor_config, self.supervisor_pid, self.manifest, self.pace):
+        for file in (self.supervisor_config, self.manifest, self.pace):
             file.unlink(missing_ok=True)
-        if not keep_logs:
-            self._remove_logs()
-        if [entry.name for entry in self.path.iterdir()] == [MARKER]:
-            self.marker.unlink()
-            self.path.rmdir()
+        if self.live != self.path:
+            for heat in () if keep_heat else self.live.glob(kept_state.HEAT):
+                heat.unlink()
+            with contextlib.suppress(OSError):  # none there, or it keeps a stop or others' files
+                self.live.rmdir()
 
     def _remove_logs(self) -> None:
         with contextlib.suppress(OSError):  # none there, or it holds files of others
@@ -270,6 +300,7 @@ def supervisor_config(run: RunDir, plan: FleetPlan) -> str:
         restarts = row.name not in plan.options.no_restart
         sections[f"program:{row.name}"] = {
             "command": shlex.join(plan.commands[row.name]),
+            "process_name": row.name,
             "priority": priority,
             "autostart": str(row.autostart).lower(),
             "autorestart": str(restarts).lower(),
@@ -286,9 +317,21 @@ def supervisor_config(run: RunDir, plan: FleetPlan) -> str:
         }
     lines: list[str] = []
     for name, settings in sections.items():
-        pairs = (f"{key}={value}".replace("%", "%%") for key, value in settings.items())
+        pairs = (f"{key}={one_line(value)}" for key, value in settings.items())
         lines += [f"[{name}]", *pairs, ""]
     return "\n".join(lines)
+
+
+def one_line(value: object) -> str:
+    """Return a value as supervisord's file holds it.
+
+    `tools.fleet.supervisor_process` reads a value without comments behind it and fills nothing in,
+    so only a line break is special.
+    """
+    text = str(value)
+    if "\n" in text or "\r" in text:
+        raise FleetError(f"{text!r}: a path or argument of a service has no line break; rename it")
+    return text
 
 
 def _remove_socket(path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final, Literal, TypeVar
@@ -245,7 +246,7 @@ def warn_of_others(console: Console, own: Path | None = None) -> None:
                     "[yellow]another fleet runs in {}: two do not fit on two cores, and drives "
                     "of either may be lost; `xrl down --run-dir {}` stops it[/]",
                     other,
-                    other,
+                    shlex.quote(other),
                 ),
                 soft_wrap=True,
             )

@@ -13,14 +13,14 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Self
 
 from services.joint import rearm_guard
 from services.simulator.fronts import usb_standin
 from shared import log
-from shared.exceptions import FleetError
+from shared.exceptions import FleetError, os_error_in_words
 from shared.run_directory import FLEET_VARIABLE, check_own, private_files
 from tools.fleet import process_table, procfs
 from tools.fleet.pace import check_pace, usual_pace
@@ -29,7 +29,15 @@ from tools.fleet.run_dir import FILES_MIN, Manifest, RunDir
 from tools.fleet.supervisor_client import RefusedError, ServiceInfo, Supervisor
 
 _POLL_S = 0.1
+_LOOK_S = 0.5
+"""Period at which a start's progress is looked at."""
+_USED_S = 0.05
+"""Processor time that is progress, s."""
+START_MAX_S = 600.0
+"""Timeout of a start that makes progress."""
 _KILLED_S = 5.0  # until the kernel has cleared away what SIGKILL has ended
+_LOOPS = 3
+"""Ends within a minute from which on a service is in a crash loop."""
 _FAILED = ("backoff", "exited", "fatal")
 _INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _BY_DEFAULT = FleetOptions()
@@ -82,7 +90,7 @@ class SupervisedFleet:
         run = attached.run
         check_own(run.path)
         running = procfs.fleet_pids(run.path)
-        if not run.is_marked or run.read_manifest() is None:
+        if run.read_manifest() is None:
             if running:
                 raise FleetError(
                     f"{run.path}: {len(running)} processes of a fleet run, and its files are gone; "
@@ -145,9 +153,34 @@ class SupervisedFleet:
             raise FleetError(f"{service} (pid {pid}) has just ended by itself") from None
         return pid
 
-    def forget(self, service: str) -> None:
-        """Have the next process of a joint service arm its drive, whatever the last left."""
-        rearm_guard.clear(self.run.path, service)
+    def forget(self, service: str) -> str:
+        """Let the next process of a joint service arm its drive, whatever state the last left.
+
+        Returns:
+            Why not, which is also logged; empty if the state is cleared.
+        """
+        try:
+            rearm_guard.clear(self.run.path, service)
+        except OSError as error:
+            fault = (
+                f"{service}: the state of its last process cannot be cleared, so its next process "
+                f"arms no drive: {os_error_in_words(error)}"
+            )
+            log.get("xrl").warning("%s", fault)
+            return fault
+        return ""
+
+    def crash_loop(self, service: str) -> str:
+        """Describe a service that ends again and again; empty if it does not."""
+        with contextlib.suppress(FleetError):
+            for row in self.info():
+                if row.name == service and row.ends_lately >= _LOOPS:
+                    return (
+                        f"{service} is in a crash loop: it ended {row.ends_lately} times in the "
+                        f"last minute, the last time with {row.last_exit}: {row.last_line}; its "
+                        f"log is {self.run.log_of(service)}"
+                    )
+        return ""
 
     def restart_together(self, modules: Sequence[str]) -> None:
         """Restart joint services at the same moment; their next processes arm their drives.
@@ -252,7 +285,7 @@ class SupervisedFleet:
         self.run.clear(keep_logs=keep_logs, keep_stops=keep_stops)
 
     def _end(self) -> None:
-        manifest = self.run.read_manifest() if self.run.is_marked else None
+        manifest = self.run.read_manifest()
         procfs.signal_all(procfs.fleet_pids(self.run.path), signal.SIGCONT)
         try:
             if manifest is None:
@@ -296,7 +329,6 @@ class SupervisedFleet:
             )
 
     def _wait_until_up(self, plan: FleetPlan) -> None:
-        timeout_s = plan.options.timeout_s
         endpoints = {  # of a service that listens twice the first: its socket
             item.service: item.endpoint
             for item in reversed(plan.listeners)
@@ -304,7 +336,7 @@ class SupervisedFleet:
         }
         waiting = {row.name: row for row in plan.processes if row.autostart}
         watched = tuple(waiting)
-        deadline = time.monotonic() + timeout_s
+        watch = ProgressWatch(plan.options.timeout_s, self._used_s)
         while waiting:
             time.sleep(_POLL_S)
             for service in self._info_or_none():
@@ -314,10 +346,17 @@ class SupervisedFleet:
                 row = waiting.get(service.name)
                 if row is not None and _is_up(row, service, endpoints.get(row.name)):
                     del waiting[row.name]
-            if waiting and time.monotonic() > deadline:
+            if waiting and (given_up := watch.look(waiting)):
                 log = self.run.log_of(next(iter(waiting)))
-                words = f"not up after {timeout_s:g} s: {', '.join(waiting)}; {log}:"
+                words = f"{given_up}: {', '.join(waiting)}; {log}:"
                 raise FleetError(f"{words}\n{_tail(log)}".rstrip())
+
+    def _used_s(self, services: Collection[str]) -> float:
+        """Return the processor time of some services; without any, that of their supervisor."""
+        pids = [pid for name, pid in self.pids().items() if name in services]
+        if not pids and self._process is not None:
+            pids = [self._process.pid]
+        return sum(use.cpu_s for use in procfs.use_of(pids).values())
 
     def _info_or_none(self) -> list[ServiceInfo]:
         """Return every service; none while the supervisor is still starting."""
@@ -337,6 +376,33 @@ class SupervisedFleet:
         how = service.last_exit or "could not be run"
         words = _tail(log) or service.last_line
         return f"{service.name} ended at once ({how}); {log}:\n{words}".rstrip()
+
+
+class ProgressWatch:
+    """Tells a start that is slow, on a busy machine, from one that does not go on.
+
+    A service that comes up is progress, and so is processor time that the others use: their
+    imports take seconds of it.
+    """
+
+    def __init__(self, timeout_s: float, used_s: Callable[[Collection[str]], float]) -> None:
+        self._timeout_s, self._used_s = timeout_s, used_s
+        self._begun_s = self._moved_s = self._looked_s = time.monotonic()
+        self._seen: tuple[int, float] = (0, 0.0)
+
+    def look(self, waiting: Collection[str]) -> str:
+        """Return why the start has failed, or "" if it goes on."""
+        now_s = time.monotonic()
+        if now_s - self._looked_s >= _LOOK_S:
+            self._looked_s = now_s
+            seen = (len(waiting), self._used_s(waiting))
+            if seen[0] != self._seen[0] or abs(seen[1] - self._seen[1]) >= _USED_S:
+                self._seen, self._moved_s = seen, now_s
+        if now_s - self._moved_s > self._timeout_s:
+            return f"not up, and no progress for {self._timeout_s:g} s"
+        if now_s - self._begun_s > START_MAX_S:
+            return f"not up after {START_MAX_S:g} s"
+        return ""
 
 
 def _not_up(run: RunDir, why: str = "") -> FleetError:

@@ -41,6 +41,8 @@ class ServiceInfo(msgspec.Struct, frozen=True):
     """How it ended last, for example "terminated by SIGKILL"; empty if it never has."""
     last_line: str = ""
     """Newest line of its log, also if no disk took it."""
+    ends_lately: int = 0
+    """How often it ended within the last minute."""
 
 
 class RefusedError(FleetError):
@@ -104,4 +106,5 @@ def _service_info(row: Mapping[str, Any]) -> ServiceInfo:
         restarts=max(0, row["starts"] - 1),
         last_exit=row["last_exit"],
         last_line=row["last_line"],
+        ends_lately=row["ends_lately"],
     )

@@ -15,20 +15,26 @@ import os
 import signal
 import sys
 import time
+from collections import deque
+from functools import partial
 from io import FileIO
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
-from supervisor import loggers, process, supervisord
+from supervisor import events, loggers, options, process, supervisord
 from supervisor.options import ServerOptions, decode_wait_status
 from supervisor.states import ProcessStates, getProcessStateDescription
 
 from shared.arguments import FlagParser
+from shared.run_directory import FLEET_VARIABLE
+from tools.fleet import kept_state
 from tools.fleet.procfs import die_with_parent
 
 BACKOFF_MAX_S: Final = 5.0
 """Longest wait before a service that ends at once is started again, s. supervisord adds a second
 each time without a bound: after 135 failed starts a mended service stayed down for two minutes."""
+LATELY_S: Final = 60.0
+"""Time over which the ends of a service are counted."""
 NEWEST_MAX: Final = 300
 """Bytes of a log's newest line that are kept."""
 
@@ -113,6 +119,10 @@ class Service(process.Subprocess):  # type: ignore[misc]  # supervisor has no ty
     last_exit = ""
     delay: float
 
+    def __init__(self, config: Any) -> None:
+        super().__init__(config)
+        self._ends_s: deque[float] = deque(maxlen=99)
+
     def spawn(self) -> Any:
         """Start the process."""
         pid = super().spawn()
@@ -122,6 +132,7 @@ class Service(process.Subprocess):  # type: ignore[misc]  # supervisor has no ty
     def finish(self, pid: int, status: int) -> None:
         """Note how the process ended."""
         self.last_exit = decode_wait_status(status)[1]
+        self._ends_s.append(time.monotonic())
         super().finish(pid, status)
 
     def change_state(self, new_state: int, expected: bool = True) -> Any:
@@ -139,6 +150,7 @@ class Service(process.Subprocess):  # type: ignore[misc]  # supervisor has no ty
             "state": getProcessStateDescription(self.get_state()).lower(),
             "uptime_s": max(0.0, time.time() - self.laststart) if self.pid else 0.0,
             "starts": self.starts,
+            "ends_lately": sum(time.monotonic() - end_s < LATELY_S for end_s in self._ends_s),
             "last_exit": self.last_exit or self.spawnerr or "",
             "last_line": LogFile.newest.get(self.config.stdout_logfile, ""),
         }
@@ -196,6 +208,11 @@ def main() -> None:
     loggers.RotatingFileHandler = LogFile
     process.Subprocess = Service
     supervisord.ServerOptions = _Options
+    # As `run_dir.one_line` writes it: a value is what stands there, whatever characters it has.
+    options.UnhosedConfigParser = partial(options.UnhosedConfigParser, inline_comment_prefixes=None)
+    options.expand = lambda value, _expansions, _name: value
+    run_dir = Path(os.environ[FLEET_VARIABLE])
+    events.subscribe(events.Tick5Event, lambda _event: kept_state.save(run_dir))
     supervisord.main([word for word in args.arguments if word != "--"])
     sys.stderr.close()  # on a full disk it could not be flushed, which would be an exit code
 

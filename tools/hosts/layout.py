@@ -101,6 +101,8 @@ LimitCORE=0
 {processors}{of_service}NoNewPrivileges=yes
 {capabilities}
 ProtectSystem=strict
+# for the sockets of the services: `live_dir` in shared/run_directory.py
+ReadWritePaths=-/run/lock
 ProtectHome=yes
 ProtectKernelTunables=yes
 ProtectKernelModules=yes

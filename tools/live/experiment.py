@@ -6,8 +6,9 @@ Shared by the verbs that run scenarios: the flags mean the same everywhere.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Final, get_args, get_type_hints
 
@@ -33,6 +34,7 @@ from shared.config.scenarios import (
 from shared.config.sections import LawConfig
 from shared.exceptions import FleetError, RunError
 from shared.joints import MODULES
+from shared.mcap_log.files import FIRST
 from shared.places import DEFAULT_CONFIG, SCENARIOS
 from tools.flags import Arg, ConfigFlags, Duration, Flags, Natural, parsed
 from tools.guarded_streams import printable
@@ -42,6 +44,9 @@ from tools.terminal import Console, marked
 
 PLANT_FILE = "plant.toml"
 """Name of the plant among a run's results and in its log."""
+
+FAILED_START: Final = "failed-start.mcap"
+"""Name of the record of the newest start that failed."""
 
 UNJUDGED = ("simulator", "recorder")
 """A run cannot be judged without their part of it."""
@@ -270,9 +275,23 @@ def load_robot(path: Path, *, imu: bool = False, **law: str) -> RobotConfig:
 def make_out(out: Path | None, verb: str) -> Path:
     """Make the directory of a run's results; without a name, one of this verb and time."""
     out = make_folder(out, verb)
-    if (out / "run.mcap").exists():
+    if (out / FIRST).exists():
         raise RunError(f"{out}: holds a run already; choose another --out, or remove it")
     return out
+
+
+@contextlib.contextmanager
+def record_of_start(out: Path) -> Iterator[None]:
+    """Rename the record of a start that fails: it must not keep the next run from this folder."""
+    record = out / FIRST
+    is_new = not record.exists()
+    try:
+        yield
+    except BaseException:
+        if is_new:
+            with contextlib.suppress(OSError):
+                record.replace(out / FAILED_START)
+        raise
 
 
 def write_inputs(

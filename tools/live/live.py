@@ -19,7 +19,7 @@ from tools.fleet.pace import run_at_fitting_pace
 from tools.fleet.process_table import FleetOptions
 from tools.fleet.supervise import SupervisedFleet
 from tools.live import experiment
-from tools.live.experiment import PLANT_FILE
+from tools.live.experiment import PLANT_FILE, record_of_start
 
 T = TypeVar("T")
 
@@ -119,7 +119,8 @@ def _run_once(
 ) -> T:
     run_dir = Path(tempfile.mkdtemp(prefix=f"xrl-{verb}-", dir="/tmp"))
     try:
-        fleet = SupervisedFleet.start(robot_path, run_dir, options)
+        with record_of_start(out):
+            fleet = SupervisedFleet.start(robot_path, run_dir, options)
         try:
             with open_session(robot, verb, run_dir) as session:
                 return lead(fleet, session)

@@ -46,7 +46,7 @@ def run(flags: DownFlags) -> int:
     Then store where the joints rest, which `xrl drive zero --resume` goes by.
     """
     fleet = SupervisedFleet(flags.run_dir)
-    manifest = fleet.run.read_manifest() if fleet.run.is_marked else None
+    manifest = fleet.run.read_manifest()
     was_up = manifest is not None
     was_up |= bool(procfs.fleet_pids(fleet.run.path))  # its directory may have been removed
     if not flags.limp:
@@ -71,7 +71,7 @@ def _lower(fleet: SupervisedFleet, flags: DownFlags) -> None:
     simulated = "simulator" in running
     if not {*running} & {*MODULES} or (simulated and not (flags.sit or flags.lower_only)):
         return
-    manifest = fleet.run.read_manifest() if fleet.run.is_marked else None
+    manifest = fleet.run.read_manifest()
     if manifest is None:
         raise FleetError(
             f"{fleet.run.path}: the fleet's files are gone, so nobody knows whether the robot "

@@ -46,8 +46,8 @@ class EstopFlags(Flags):
     run_dir: Annotated[Path, parsed(Path, "DIR")] = dataclasses.field(
         default_factory=default_run_dir  # of any user: whoever can reach the robot may stop it
     )
-    """directory of the fleet's sockets and logs (default: $XRL_RUN_DIR, else /tmp/xrl-UID of the
-    user)"""
+    """run directory: names the fleet and holds its logs (default: $XRL_RUN_DIR, else /tmp/xrl-UID
+    of the user)"""
     local: bool = False
     """only by shared memory, to the joint services on this host (default: both ways)"""
     partly: Annotated[

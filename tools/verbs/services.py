@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 from typing import Annotated, Final, Literal
 
+from shared.exceptions import FAULT_EXIT_CODE
 from shared.joints import MODULES
 from tools.flags import RunDirFlags, positional
 from tools.fleet.rearming import rearm as rearm_all
@@ -36,7 +37,12 @@ class KillFlags(ServiceFlags):
 
 def start(flags: ServiceFlags) -> int:
     """Start it, or continue it."""
-    runs = SupervisedFleet.attach(flags.run_dir).start_service(flags.service)
+    fleet = SupervisedFleet.attach(flags.run_dir)
+    crash_loop = fleet.crash_loop(flags.service)
+    runs = fleet.start_service(flags.service)
+    if crash_loop:
+        print(f"{crash_loop}. {'Nothing was done' if runs is not None else 'Started once more'}")
+        return FAULT_EXIT_CODE
     if runs is not None:
         print(f"{flags.service}: runs already, as process {runs}; nothing was done")
     else:
@@ -48,7 +54,7 @@ def kill(flags: KillFlags) -> int:
     """Send the signal."""
     fleet = SupervisedFleet.attach(flags.run_dir)
     if flags.signal in ("KILL", "TERM") and flags.service in MODULES:
-        fleet.forget(flags.service)  # a person asked for its next process: it may arm the drive
+        fleet.forget(flags.service)  # a person asks for its next process: it may arm the drive
     pid = fleet.kill(flags.service, signal.Signals[f"SIG{flags.signal}"])
     print(f"{flags.service} (pid {pid}): {flags.signal} sent")
     return 0

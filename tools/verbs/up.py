@@ -31,6 +31,7 @@ from tools.live.experiment import (
     ControllerFlags,
     PlantFlags,
     make_out,
+    record_of_start,
     scenario_file,
 )
 from tools.terminal import Console, marked
@@ -168,7 +169,8 @@ def run(flags: UpFlags) -> int:
         disarmed=flags.disarmed,
     )
     try:
-        fleet = SupervisedFleet.start(flags.config, flags.run_dir, options)
+        with record_of_start(out):
+            fleet = SupervisedFleet.start(flags.config, flags.run_dir, options)
     except BaseException:
         if made:
             with contextlib.suppress(OSError):  # it has a record, or was never made

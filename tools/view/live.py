@@ -102,18 +102,23 @@ class LiveOrders:
             raise FleetError(f"not stopped: {', '.join(going)}; cut the power")
 
     def _kill(self, order: Order) -> None:
-        if order.service in MODULES:
-            self._fleet.forget(order.service)  # a person asked for its next process
+        # A person asks for its next process, which may arm the drive.
+        fault = self._fleet.forget(order.service) if order.service in MODULES else ""
         self._fleet.kill(order.service, signal.SIGKILL)
         self._tell(RunEventKind.KILLED, order.service, "KILL")
+        if fault:
+            raise FleetError(f"killed, but {fault}")
 
     def _freeze(self, order: Order) -> None:
         self._fleet.kill(order.service, signal.SIGSTOP)
         self._tell(RunEventKind.KILLED, order.service, "STOP")
 
     def _start(self, order: Order) -> None:
+        crash_loop = self._fleet.crash_loop(order.service)
         self._fleet.start_service(order.service)
         self._tell(RunEventKind.RESTARTED, order.service, "")
+        if crash_loop:
+            raise FleetError(crash_loop)
 
     def _tell(self, kind: RunEventKind, subject: str, detail: str) -> None:
         events = self._events

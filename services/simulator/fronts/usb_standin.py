@@ -1,7 +1,7 @@
 """The USB bus of the emulated drives: a stand-in for libusb-1.0, built and loaded.
 
 The genuine `odrive` package finds the emulated drives when the stand-in takes the place of
-the system's libusb-1.0 and `XRL_USB` names the folder of the plugs (`FOLDER` in the run
+the system's libusb-1.0 and `XRL_USB` names the folder of the plugs (`FOLDER` in the live
 directory): in another process by its environment (`prepare`), in this one by `load`.
 `libusb_standin.c` describes the stand-in.
 """
@@ -18,12 +18,13 @@ from pathlib import Path
 from typing import Final
 
 from shared.exceptions import FleetError
+from shared.run_directory import live_dir
 
 SOURCE: Final = Path(__file__).with_name("libusb_standin.c")
 SONAME: Final = "libusb-1.0.so.0"
 """As libodrive asks for it."""
 FOLDER: Final = "usb"
-"""Folder of the plugs in the run directory; a plug's file name is the drive's serial number."""
+"""Folder of the plugs in the live directory; a plug's file name is the drive's serial number."""
 VARIABLE: Final = "XRL_USB"
 """Environment variable in which the stand-in looks for the folder of the plugs."""
 
@@ -76,7 +77,7 @@ def prepare(run_dir: Path) -> dict[str, str]:
     paths = [str(library.parent), os.environ.get("LD_LIBRARY_PATH", "")]
     return {
         "LD_LIBRARY_PATH": os.pathsep.join(filter(None, paths)),
-        VARIABLE: str(run_dir / FOLDER),
+        VARIABLE: str(live_dir(run_dir) / FOLDER),
         # where the package keeps drives' descriptors: not those of emulated ones at home
         "XDG_CACHE_HOME": str(library.parent / "cache"),
     }
@@ -85,7 +86,7 @@ def prepare(run_dir: Path) -> dict[str, str]:
 def clear(run_dir: Path) -> None:
     """Remove what `prepare` has built, and plugs that a killed simulator has left."""
     shutil.rmtree(run_dir / BUILT, ignore_errors=True)
-    folder = run_dir / FOLDER
+    folder = live_dir(run_dir) / FOLDER
     for plug in folder.glob("*"):
         if plug.is_socket():
             plug.unlink(missing_ok=True)

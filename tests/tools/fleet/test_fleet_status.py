@@ -159,10 +159,10 @@ def test_each_way_out_is_told_once_with_its_modules_at_any_width() -> None:
 
 
 def test_another_fleet_is_named_and_the_own_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(procfs, "fleets", lambda: {"/tmp/mine", "/tmp/other"})
+    monkeypatch.setattr(procfs, "fleets", lambda: {"/tmp/mine", "/tmp/an #other"})
     printed = io.StringIO()
     warn_of_others(Console(file=printed, width=60), own=Path("/tmp/mine"))
-    assert "xrl down --run-dir /tmp/other" in printed.getvalue()
+    assert "xrl down --run-dir '/tmp/an #other'" in printed.getvalue()
     assert "mine" not in printed.getvalue()
 
 

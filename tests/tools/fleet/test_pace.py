@@ -13,6 +13,7 @@ from shared.bus.messages import Mode
 from shared.bus.traces import SimTruth
 from shared.exceptions import FleetError
 from shared.joints import MODULES
+from shared.run_directory import make_live_dir
 from tests.messages import filled
 from tools.fleet import pace
 from tools.fleet.pace import CoresFullError, check_pace, usual_pace
@@ -29,7 +30,7 @@ def _real_time_again(tmp_path: Path) -> Iterator[None]:
 
 
 def test_a_fleet_in_slow_motion_reads_a_slower_clock_and_waits_for_longer(tmp_path: Path) -> None:
-    (tmp_path / clock.PACE_FILE).write_text("0.5\n")
+    (make_live_dir(tmp_path) / clock.PACE_FILE).write_text("0.5\n")
     clock.keep_pace(tmp_path)
     machine_ns = time.monotonic_ns()
     assert clock.now_ns() == pytest.approx(0.5 * machine_ns, abs=1e9)
@@ -40,7 +41,7 @@ def test_a_fleet_in_slow_motion_reads_a_slower_clock_and_waits_for_longer(tmp_pa
 
 
 def test_a_fleet_without_a_pace_goes_by_the_machines_clock(tmp_path: Path) -> None:
-    (tmp_path / clock.PACE_FILE).write_text("0.5\n")
+    (make_live_dir(tmp_path) / clock.PACE_FILE).write_text("0.5\n")
     clock.keep_pace(tmp_path)
     clock.keep_pace(tmp_path / "another")
     before_ns = time.monotonic_ns()
@@ -49,7 +50,7 @@ def test_a_fleet_without_a_pace_goes_by_the_machines_clock(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("text", ["", "fast", "0", "-1", "1.5", "nan", "inf"])
 def test_a_file_without_a_pace_is_refused(tmp_path: Path, text: str) -> None:
-    (tmp_path / clock.PACE_FILE).write_text(text)
+    (make_live_dir(tmp_path) / clock.PACE_FILE).write_text(text)
     with pytest.raises(FleetError, match="is no pace"):
         clock.keep_pace(tmp_path)
 

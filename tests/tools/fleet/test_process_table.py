@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from shared import run_directory
 from shared.config.files import load
 from shared.config.robot_config import SERVICES
 from shared.exceptions import ConfigError, FleetError, MissingPackageError
@@ -17,7 +18,7 @@ from shared.joints import MODULES
 from shared.links import PAIRS
 from tests.tools.fleet.plans import plan, robot_file, table_file
 from tools.fleet.process_table import UNIX, ListenPoint, check_free, is_simulated, load_table
-from tools.fleet.run_dir import RunDir, supervisor_config
+from tools.fleet.run_dir import RunDir, one_line, supervisor_config
 
 REAL = ('"xrl_unix"', '"socketcan"')
 FITTED = ("fitted = false", "fitted = true")
@@ -145,7 +146,9 @@ def test_a_bad_row_is_refused_with_its_key(
     assert refusal.value.key == key
 
 
-def test_a_run_directory_too_long_for_sockets_is_refused() -> None:
+def test_a_run_directory_too_long_for_sockets_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan(Path("/tmp") / ("long" * 25))  # its sockets lie elsewhere, in memory
+    monkeypatch.setattr(run_directory, "_MEMORY_FOLDERS", ())
     with pytest.raises(FleetError, match=r"too long by \d+ bytes"):
         plan(Path("/tmp") / ("long" * 25))
 
@@ -168,9 +171,15 @@ def test_an_endpoint_is_in_use_only_while_somebody_listens_on_it(
     check_free(points)
 
 
-def test_a_percent_sign_in_a_path_reaches_supervisord_unharmed(run_dir: Path) -> None:
+def test_an_argument_with_special_characters_is_quoted_for_its_program(run_dir: Path) -> None:
     options = {"services": ["recorder"], "no_restart": ["recorder"]}
-    odd = plan(run_dir, overrides={"recorder": ["--out", "50 % off"]}, **options)
+    odd = plan(run_dir, overrides={"recorder": ["--out", "50 % #off"]}, **options)
     text = supervisor_config(RunDir(run_dir), odd)
-    assert "'50 %% off'" in text
+    assert " --out '50 % #off'\n" in text
     assert "autorestart=false" in text
+
+
+@pytest.mark.parametrize("text", ["a\nb", "a\rb"])
+def test_a_line_break_that_would_begin_another_setting_is_refused(text: str) -> None:
+    with pytest.raises(FleetError, match="has no line break; rename it"):
+        one_line(text)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -20,10 +21,10 @@ from services.harness.zero_file import path_of as zero_of
 from services.joint.rearm_guard import LastState, RearmGuard, request_stop, stop_source
 from shared.exceptions import FleetError
 from shared.joints import MODULES
-from shared.run_directory import FLEET_VARIABLE
+from shared.run_directory import FLEET_VARIABLE, live_dir, make_live_dir
 from tests.tools.fleet.plans import plan
 from tools import cli
-from tools.fleet import procfs
+from tools.fleet import kept_state, procfs
 from tools.fleet.run_dir import ENDING_S, MARKER, RunDir
 from tools.fleet.supervise import SupervisedFleet
 
@@ -64,11 +65,12 @@ def test_clearing_leaves_foreign_files_and_sockets_alone(claimed: RunDir) -> Non
     claimed.log_of("planner").write_text("a line")
     for name in ("planner.zenoh", "foreign.sock"):
         with closing(socket.socket(socket.AF_UNIX)) as dead:
-            dead.bind(str(claimed.path / name))
+            dead.bind(str(claimed.live / name))
     claimed.clear(keep_logs=False)
-    assert files_in(claimed.path) == [
-        MARKER, "foreign.sock", "logs", "logs/notes.log", "logs/thesis.tex", "notes.txt",
-    ]  # fmt: skip
+    kept = [MARKER, "logs", "logs/notes.log", "logs/thesis.tex", "notes.txt"]
+    assert sorted({*files_in(claimed.path), *files_in(claimed.live)}) == sorted(
+        [*kept, "foreign.sock"]
+    )
 
 
 def test_a_start_in_a_used_directory_keeps_what_a_person_put_there_and_an_empty_one_goes(
@@ -80,6 +82,7 @@ def test_a_start_in_a_used_directory_keeps_what_a_person_put_there_and_an_empty_
     (claimed.logs / "thesis.tex").unlink()
     claimed.clear(keep_logs=False)
     assert not claimed.path.exists()
+    assert not claimed.live.exists()
 
 
 def test_a_folder_of_a_persons_own_files_is_refused_and_stays_as_it_is(run_dir: Path) -> None:
@@ -147,7 +150,7 @@ def test_a_fleet_whose_directory_became_writable_for_others_can_be_stopped(
 def test_a_stop_is_written_into_no_file_that_a_link_leads_to(run_dir: Path) -> None:
     run_dir.mkdir()
     (run_dir / "mine").write_bytes(b"0123456789abcdef")
-    (run_dir / "knee_left.rearm").symlink_to(run_dir / "mine")
+    (make_live_dir(run_dir) / "knee_left.rearm").symlink_to(run_dir / "mine")
     with pytest.raises(OSError, match="symbolic links"):
         request_stop(run_dir, "knee_left")
     assert (run_dir / "mine").read_bytes() == b"0123456789abcdef"
@@ -243,3 +246,46 @@ def test_the_harness_keeps_its_zero_where_only_the_supervisor_has_crashed(
     else:
         claimed.prepare(plan(claimed.path, disarmed=what == "a disarmed start"))
     assert zero_of(claimed.path).exists() is kept
+
+
+IN_MEMORY = pytest.mark.skipif(
+    live_dir(Path("/nowhere")) == Path("/nowhere"), reason="this host has no folder in memory"
+)
+
+
+def power_cut(run: RunDir) -> None:
+    """Lose what is in memory."""
+    shutil.rmtree(run.live)
+
+
+@IN_MEMORY
+@pytest.mark.parametrize("disarmed", [True, False])
+def test_a_stop_outlasts_a_power_cut_until_a_person_starts(claimed: RunDir, disarmed: bool) -> None:
+    RearmGuard(claimed.path, "knee_left").write(LastState.DAMP)
+    request_stop(claimed.path, "knee_left", "anna")
+    assert kept_state.save(claimed.path)
+    power_cut(claimed)
+    claimed.prepare(plan(claimed.path, disarmed=disarmed))
+    guard = RearmGuard(claimed.path, "knee_left")
+    assert (guard.read() is LastState.DAMP, guard.stop_requested) == (disarmed, disarmed)
+
+
+@IN_MEMORY
+def test_the_copy_on_the_disk_follows_the_memory_and_never_replaces_it(claimed: RunDir) -> None:
+    guard = RearmGuard(claimed.path, "knee_left")
+    for last in (LastState.HELD, LastState.NOTHING):
+        guard.write(last)
+        assert kept_state.save(claimed.path)
+        assert (claimed.path / "knee_left.rearm").read_bytes()[0] == last
+    guard.write(LastState.DAMP)
+    kept_state.restore(claimed.path)
+    assert RearmGuard(claimed.path, "knee_left").read() is LastState.DAMP
+
+
+@IN_MEMORY
+def test_how_warm_the_windings_are_outlasts_down_and_a_power_cut(claimed: RunDir) -> None:
+    (claimed.live / "knee_left.heat").write_bytes(b"warm")
+    claimed.clear(keep_logs=True)
+    assert not claimed.live.exists()
+    claimed.prepare(plan(claimed.path))
+    assert (claimed.live / "knee_left.heat").read_bytes() == b"warm"

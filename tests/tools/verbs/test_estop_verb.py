@@ -21,6 +21,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import HUNG_UP_EXIT_CODE
 from shared.joints import MODULES
 from shared.places import CHECKOUT, DEFAULT_CONFIG
+from shared.run_directory import live_dir, make_live_dir
 from tests.certified import certified, install_all
 from tests.tools.exit_codes import exit_code
 from tools.fleet.run_dir import Manifest, RunDir
@@ -30,6 +31,7 @@ from tools.fleet.run_dir import Manifest, RunDir
 def fleet(run_dir: Path) -> list[RearmGuard]:
     """Return what the six services of a fleet of the shipped robot have open; all are in DAMP."""
     run_dir.mkdir()
+    make_live_dir(run_dir)
     manifest = Manifest(str(DEFAULT_CONFIG), MODULES, {}, (), 1.0)
     RunDir(run_dir).manifest.write_bytes(msgspec.json.encode(manifest))
     for module in MODULES:
@@ -67,7 +69,7 @@ def test_of_several_hosts_one_answers_for_its_own_modules(
 def test_a_module_without_a_service_here_is_named_and_the_others_are_stopped(
     partly: list[str], run_dir: Path, fleet: list[RearmGuard], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (run_dir / "knee_left.rearm").unlink()
+    (live_dir(run_dir) / "knee_left.rearm").unlink()
     assert exit_code(["estop", "--local", "--run-dir", run_dir, *partly]) == 2
     assert "knee_left has no service on this host" in capsys.readouterr().err
     stopped = [guard.stop_requested for guard in fleet]

@@ -12,12 +12,14 @@ import pytest
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError, RunError
+from shared.mcap_log.files import FIRST
 from shared.places import DEFAULT_CONFIG
 from tests.certified import certified
 from tests.tools.exit_codes import exit_code
 from tools import cli
 from tools.fleet.supervise import SupervisedFleet
 from tools.keys import authority as authority_module
+from tools.live.experiment import FAILED_START, make_out, record_of_start
 from tools.verbs import up
 
 
@@ -81,3 +83,28 @@ def test_a_host_without_a_recorder_gets_no_folder_for_a_record_and_no_failed_sta
     out.mkdir()  # somebody else's stays
     assert exit_code(words) == 2
     assert out.exists()
+
+
+def fail_after_recording(out: Path, record: bytes, ending: type[BaseException]) -> None:
+    with record_of_start(out):
+        (out / FIRST).write_bytes(record)
+        raise ending
+
+
+@pytest.mark.parametrize("ending", [FleetError, KeyboardInterrupt])
+def test_the_record_of_a_failed_start_does_not_keep_the_next_from_its_folder(
+    ending: type[BaseException], tmp_path: Path
+) -> None:
+    for record in (b"first", b"second"):
+        out = make_out(tmp_path / "out", "up")
+        with pytest.raises(ending):
+            fail_after_recording(out, record, ending)
+        assert (out / FAILED_START).read_bytes() == record
+
+
+def test_a_failed_start_leaves_the_record_of_an_earlier_run_where_it_is(tmp_path: Path) -> None:
+    """A disarmed start begins in a folder that holds one."""
+    (tmp_path / FIRST).write_bytes(b"a run")
+    with pytest.raises(FleetError), record_of_start(tmp_path):
+        raise FleetError
+    assert [path.name for path in tmp_path.iterdir()] == [FIRST]

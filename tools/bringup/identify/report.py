@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -95,7 +96,9 @@ def tell(
     backup = apply(path, values, known, time.strftime("%Y%m%d-%H%M%S"))
     console.print(f"{path}: written; the old file: {backup}")
     if any(key.startswith(SCHEDULED) for key in values):
-        console.print(f"now `xrl gains --config {path}`: the gain schedule no longer fits")
+        console.print(
+            f"now `xrl gains --config {shlex.quote(str(path))}`: the gain schedule no longer fits"
+        )
 
 
 def draw_body(estimates: Sequence[ParameterEstimate], fit: BodyFit, path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shlex
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -133,7 +134,7 @@ def look_and_write(
         if axes:
             calibrate_robot.refuse_standing(robot, flags.run_dir, found, axes)
         kept = keep(flags.out, boards, path)
-        restore = f"`xrl drive configure --restore {kept}`"
+        restore = f"`xrl drive configure --restore {shlex.quote(str(kept))}`"
         console.print(f"\nwhat the boards had: {kept}; {restore} shows it")
         interrupts = Interrupts()
         with interrupts.kept():

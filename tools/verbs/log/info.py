@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -162,10 +163,10 @@ def _show_file(file: FileFacts, console: Console) -> None:
     if not file.finished and not file.in_use:
         if flush_ms:
             console.print(f"  written every {printable(flush_ms)} ms: all after that is missing")
-        command = f"xrl log recover {printable(str(file.path))}"
+        command = f"xrl log recover {printable(shlex.quote(str(file.path)))}"
         console.print(f"  finish it with: {command}", soft_wrap=True)
     elif lines and not file.in_use:
-        command = f"xrl log recover {printable(str(file.path))}"
+        command = f"xrl log recover {printable(shlex.quote(str(file.path)))}"
         console.print(f"  a copy of all that can be read: {command}", soft_wrap=True)
     note = file.metadata.get("recovered")
     if note is not None:

@@ -1,0 +1,48 @@
+"""State of the joint services that outlasts a power cut: emergency stops and temperatures.
+
+The services write it to memory in the live directory only: a store to a mapped file on a failing
+disk can end the process (SIGBUS). The supervisor copies it to the run directory every 5 s, and the
+next start takes it from there. A disk that takes no writing costs only the copy.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Final
+
+from shared.run_directory import live_dir, open_private
+
+STOPS: Final = "*.rearm"
+HEAT: Final = "*.heat"
+
+
+def save(run_dir: Path) -> bool:
+    """Copy what has changed from the live directory to the run directory; False if it cannot be."""
+    return _copy(live_dir(run_dir), run_dir, replace=True)
+
+
+def restore(run_dir: Path) -> None:
+    """Copy what the live directory lacks, as after a power cut, from the run directory."""
+    _copy(run_dir, live_dir(run_dir), replace=False)
+
+
+def _copy(source: Path, target: Path, *, replace: bool) -> bool:
+    whole = True
+    for file in (file for pattern in (STOPS, HEAT) for file in source.glob(pattern)):
+        copy = target / file.name
+        try:
+            data = file.read_bytes()
+            if copy.exists() and (not replace or copy.read_bytes() == data):
+                continue
+            with open_private(copy) as opened:
+                os.pwrite(opened.fileno(), data, 0)  # in place, so that it is never empty
+        except OSError:
+            whole = False
+    return whole
+
+
+def forget_stops(run_dir: Path) -> None:
+    """Remove the emergency stops from the run directory; OSError if the disk refuses."""
+    for file in run_dir.glob(STOPS):
+        file.unlink(missing_ok=True)
