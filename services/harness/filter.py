@@ -9,6 +9,8 @@ Pure: state, time and sample in, next state and reading out (docs/law.md#harness
 new sample's weight grows with the gap.
 - *Saturation*: a sample with any raw leg force at or beyond `leg_force_max` is not used.
 - *Staleness*: a sample is fresh while its age is at most `stale_ms`.
+- *Frozen*: a cell that is alive has noise. Nothing is valid while one has read the same number for
+  `FROZEN_NS`: an amplifier that hangs, a wire that is off, a bus that repeats its last frame.
 - A sample with a number that is not finite is refused and counted.
 """
 
@@ -31,6 +33,8 @@ Array = npt.NDArray[np.float64]
 
 _ZERO: Final[Array] = np.zeros(N_LEGS)
 
+FROZEN_NS: Final = 100 * NS_PER_MS
+"""ns, 25 samples."""
 NEVER_NS = -1
 """Stands for the time of something that has not happened."""
 
@@ -64,6 +68,12 @@ class FilterState(msgspec.Struct, frozen=True, gc=False, kw_only=True):
     """Time of the last sample that went into it."""
     sample_t_ns: int = NEVER_NS
     """Time of the newest finite sample; `NEVER_NS` before the first."""
+    raw: Array = _ZERO
+    """(6,) leg forces of that sample, N."""
+    changed_ns: Array = _ZERO
+    """(6,) times at which each of them last changed."""
+    frozen: bool = False
+    """True if one of them has not changed for `FROZEN_NS`."""
     saturated: bool = False
     """True if a leg of that sample was saturated."""
     refused: int = 0
@@ -76,7 +86,8 @@ class FilteredWrench(msgspec.Struct, frozen=True, gc=False, kw_only=True):
     wrench: Array
     """(6,) [force in N; moment in N m], torso axes, about the harness point."""
     valid: bool
-    """True if fresh, not saturated and tared; otherwise the wrench is the last good one."""
+    """True if fresh, not saturated, not frozen and tared; otherwise the wrench is the last good
+    one."""
     saturated: bool
     age_ns: int
     """Age of the newest finite sample; -1 before the first."""
@@ -115,7 +126,7 @@ class WrenchFilter:
         fresh = 0 <= age_ns <= self._stale_ns
         reading = FilteredWrench(
             wrench=state.wrench,
-            valid=fresh and not state.saturated and state.tare is Tare.DONE,
+            valid=fresh and not state.saturated and not state.frozen and state.tare is Tare.DONE,
             saturated=state.saturated,
             age_ns=age_ns,
         )
@@ -126,17 +137,22 @@ class WrenchFilter:
             return msgspec.structs.replace(state, refused=state.refused + 1)
         saturated = max(map(abs, sample)) >= self._force_limit
         forces = np.array(sample)
+        changed_ns = np.where(forces == state.raw, state.changed_ns, t_ns)
+        if state.sample_t_ns == NEVER_NS:
+            changed_ns[:] = t_ns
+        frozen = bool(t_ns - changed_ns.min() >= FROZEN_NS)
+        state = msgspec.structs.replace(state, raw=forces, changed_ns=changed_ns, frozen=frozen)
         if state.tare is not Tare.DONE:
-            state = self._tare(state, t_ns, forces, saturated)
-        elif not saturated:
+            state = self._tare(state, t_ns, forces, unusable=saturated or frozen)
+        elif not (saturated or frozen):
             state = self._measure(state, t_ns, forces)
         return msgspec.structs.replace(state, sample_t_ns=t_ns, saturated=saturated)
 
-    def _tare(self, state: FilterState, t_ns: int, forces: Array, saturated: bool) -> FilterState:
+    def _tare(self, state: FilterState, t_ns: int, forces: Array, *, unusable: bool) -> FilterState:
         gap = t_ns - state.sample_t_ns > self._stale_ns
-        if saturated or gap:
+        if unusable or gap:
             state = _begin_tare(state, state.tare)
-        if saturated:
+        if unusable:
             return state
         if state.tare_start_ns == NEVER_NS:
             state = msgspec.structs.replace(state, tare_start_ns=t_ns, tare_first=forces)

@@ -5,7 +5,8 @@ up in sensor axes; the heading, which is wrong beside steel, drops out. The moun
 turns sensor axes into torso axes.
 
 A sample whose quaternion is not of unit length is refused and counted: then the frames have another
-meaning.
+meaning. A sensor that is alive has noise: nothing is valid while its samples have been the same for
+`FROZEN_NS`.
 """
 
 from __future__ import annotations
@@ -21,6 +22,10 @@ from shared.robot.frames import rotated, torso_rotation
 
 UNIT_TOLERANCE: Final = 0.02
 """How far a quaternion's length may be from 1; rounding to 2^-15 makes 6e-5."""
+
+
+FROZEN_NS: Final = 250 * NS_PER_MS
+"""ns; longer than for a load cell, because the words are coarser: 3e-5 and 2e-3 rad/s."""
 
 
 class AttitudeReading(NamedTuple):
@@ -49,6 +54,8 @@ class AttitudeLaw:
         self._rate: Vector3 = (0.0, 0.0, 0.0)
         self._knows = False
         self._sample_ns: int | None = None
+        self._newest: ImuSample | None = None
+        self._changed_ns = 0
 
     def step(self, now_ns: int, sample: ImuSample | None) -> AttitudeReading:
         """Take the newest sample, or None if there is none, and say what holds now."""
@@ -57,6 +64,8 @@ class AttitudeLaw:
             sample = None
         if sample is not None:
             self._sample_ns = now_ns
+            if sample != self._newest:
+                self._newest, self._changed_ns = sample, now_ns
             self._knows = sample.valid
             if sample.valid:
                 self._up = rotated(self._mounting, up_in_sensor(sample.quaternion))
@@ -65,7 +74,8 @@ class AttitudeLaw:
             return AttitudeReading(self._up, self._rate, valid=False, age_ns=-1)
         age_ns = now_ns - self._sample_ns
         fresh = age_ns <= self._stale_ns
-        return AttitudeReading(self._up, self._rate, fresh and self._knows, age_ns)
+        live = self._sample_ns - self._changed_ns < FROZEN_NS
+        return AttitudeReading(self._up, self._rate, fresh and self._knows and live, age_ns)
 
 
 def up_in_sensor(quaternion: Vector4) -> Vector3:

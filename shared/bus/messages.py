@@ -399,8 +399,8 @@ class Wrench(Message, frozen=True):
     moment: Vector3
     """Moment about the harness point, N m, torso axes."""
     valid: bool
-    """False while the sensor is stale, saturated or without a zero: the numbers are the last good
-    ones."""
+    """False while the sensor is stale, saturated, frozen or without a zero: the numbers are the last
+    good ones."""
     saturated: bool
     """True while a leg of the sensor is at its limit."""
     tare: Int64
@@ -417,7 +417,8 @@ class Attitude(Message, frozen=True):
     rate: Vector3
     """Angular velocity of the torso, rad/s, torso axes."""
     valid: bool
-    """False while the sensor is silent or reports no fix: the numbers are the last good ones."""
+    """False while the sensor is silent, frozen or reports no fix: the numbers are the last good
+    ones."""
     age_ns: Int64
     """Age of the sensor's sample on the IMU service's clock; -1 before the first."""
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from services.imu.attitude import AttitudeLaw, up_in_sensor
+from services.imu.attitude import FROZEN_NS, AttitudeLaw, up_in_sensor
 from services.imu.loop import ImuLoop
 from shared.bus.messages import Attitude, Vector4
 from shared.can.imu_can import ImuSample
@@ -104,3 +104,10 @@ def test_the_loop_publishes_every_cycle_and_counts_what_could_not_be_sent() -> N
     assert [message.age_ns for message in sent] == [0, 10 * NS_PER_MS, 0]
     assert sent[2].up == pytest.approx((-math.sin(0.1), 0.0, math.cos(0.1)))
     assert loop.unsent == 1
+
+
+def test_samples_that_repeat_are_no_attitude_until_one_differs() -> None:
+    law, same = AttitudeLaw(ROBOT_IMU), sample(Rotation.from_euler("X", 0.1))
+    valid = [law.step(T0 + at_ns, same).valid for at_ns in range(0, FROZEN_NS + 1, NS_PER_MS)]
+    assert valid == [True] * (len(valid) - 1) + [False]
+    assert law.step(T0 + 2 * FROZEN_NS, sample(Rotation.from_euler("X", 0.1001))).valid

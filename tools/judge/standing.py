@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from services.joint.trips import AT_LIMIT, SHAKE_ABOVE_HZ, SHAKE_S
 from shared.arrays import Array
 from shared.bus import topics
-from shared.bus.messages import JointState, Mode
+from shared.bus.messages import JointEvent, JointState, Mode
 from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
@@ -38,6 +38,7 @@ LIMITS: Final = (
     VerdictLimit("torque_at_limit_ms", 50.0, "ms", "module's torque at its limit, longest"),
     VerdictLimit("shaking_nm", 15.0, "N m", "torque above 8 Hz, root mean square"),
     VerdictLimit("sinking_m_s", 0.8, "m/s", "torso's fastest way down"),
+    VerdictLimit("overforce_s", 1.0, "s", "hand's force over 100 N while led, longest"),
     VerdictLimit("operator_peak_n", 40.0, "N", "operator's force, led"),
     VerdictLimit("operator_side_peak_n", 60.0, "N", "operator's force sideways, led"),
     VerdictLimit("assist_error_n", 10.0, "N", "assist force against what was asked"),
@@ -57,11 +58,14 @@ of a run counts as neither (`tools.judge.stalls`)."""
 
 BY_KEY: Final = {row.key: row for row in LIMITS}
 
-SOUND: Final = ("torque_at_limit_ms", "shaking_nm", "sinking_m_s")
+SOUND: Final = ("torque_at_limit_ms", "shaking_nm", "sinking_m_s", "overforce_s")
 """A run in which one of these is over its limit did not stand. The limit of sinking: a person who
 catches up with a robot that held leads it down at up to 0.73 m/s (`bad_network`)."""
 
 
+OVERFORCE_N: Final = 100.0
+"""Force of the hand along z. A led robot yields to 20 N; for longer than a second this much means
+that it follows something else, such as a harness sensor that lies."""
 SOLE_TILT_MAX: Final = 0.05
 """rad; a sole tilted more than this does not lie down again by itself."""
 TURNED_MAX: Final = 0.3
@@ -118,7 +122,25 @@ def soundness(log: RunLog, truth: Sequence[SimTruth], robot: RobotConfig) -> dic
         "torque_at_limit_ms": 1e3 * max(longest) if longest else None,
         "shaking_nm": max(shaking) if shaking else None,
         "sinking_m_s": _sinking(truth),
+        "overforce_s": _overforce_s(log, truth),
     }
+
+
+def tracking(log: RunLog, times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return, for each time, True if all six modules track."""
+    track = np.ones(len(times_ns), dtype=bool)
+    for module in MODULES:
+        rows: list[JointEvent] = log.messages(topics.JOINT_EVENT, module)
+        at = np.searchsorted([row.t_ns for row in rows], times_ns, side="right") - 1
+        modes = np.array([row.mode_after for row in rows] or [Mode.DISARMED])
+        track &= modes[at] == Mode.TRACK
+    return track
+
+
+def _overforce_s(log: RunLog, truth: Sequence[SimTruth]) -> float:
+    t = np.array([row.t_ns for row in truth])
+    force = np.abs([row.operator_force[2] for row in truth])
+    return _longest_s(t, (force > OVERFORCE_N) & tracking(log, t))
 
 
 def why_not_sound(figures: Mapping[str, Any]) -> str:

@@ -34,7 +34,13 @@ from tools.judge.stalls import (
     inside,
     stalls_of,
 )
-from tools.judge.standing import BY_KEY, soundness, why_not_sound, why_not_standing
+from tools.judge.standing import (
+    BY_KEY,
+    soundness,
+    tracking,
+    why_not_sound,
+    why_not_standing,
+)
 from tools.logs.impairment_intervals import Impaired, impairments, touches
 from tools.logs.run_log import RunLog, robot_of
 
@@ -316,12 +322,7 @@ def leading(log: RunLog, times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
     led = times_ns < (kills[0] if kills else np.iinfo(np.int64).max)
     if not log.count(topics.LINK_EVENT.key(log.robot)):
         return led
-    for module in MODULES:
-        rows: list[JointEvent] = log.messages(topics.JOINT_EVENT, module)
-        at = np.searchsorted([row.t_ns for row in rows], times_ns, side="right") - 1
-        modes = np.array([row.mode_after for row in rows] or [Mode.DISARMED])
-        led &= modes[at] == Mode.TRACK
-    return led
+    return led & tracking(log, times_ns)
 
 
 def _command_age(log: RunLog, start_ns: int, network: Sequence[Impaired]) -> Summary:

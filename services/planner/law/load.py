@@ -102,12 +102,13 @@ class Load:
         reasons = []
         if abs(s.kg) > RESUME_FRACTION * self._kg_max:
             more = "more" if s.kg > 0.0 else "less"
-            held_up = "" if s.kg > 0.0 else "if nothing holds it up, "
+            held_up = "" if s.kg > 0.0 else " and nothing holds it up"
             reasons.append(
-                f"the robot carries {abs(s.kg):.1f} kg {more} than its file says: at most "
-                f"{self._kg_max:g} kg are accepted "
-                f"({RESUME_FRACTION * self._kg_max:g} once refused); {held_up}set "
-                "mass.payload, then `xrl gains`"
+                f"the robot carries {abs(s.kg):.1f} kg {more} than its file says, or its harness "
+                f"measures wrongly: at most {self._kg_max:g} kg are accepted "
+                f"({RESUME_FRACTION * self._kg_max:g} once refused); tare the unloaded harness "
+                f"(`xrl drive tare`) first; if that changes nothing{held_up}, set mass.payload, "
+                "then `xrl gains`"
             )
         for moment, positive, negative in ((s.a, "behind", "ahead"), (s.b, "low", "high")):
             if abs(moment) > RESUME_FRACTION * self._moment_max:

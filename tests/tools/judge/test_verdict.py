@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -11,15 +12,19 @@ import pytest
 from services.simulator.physics.body import body_of
 from services.simulator.physics.plant import IDEAL
 from services.simulator.physics.world import World
+from shared.bus.messages import JointEvent, Mode
+from shared.bus.topics import Topic
 from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
 from tests.lockstep.runs import still
+from tests.messages import sample
 from tools import cli
 from tools.judge import verdict, verdict_table
 from tools.judge.standing import (
     LIMITS,
     SOUND,
     _longest_s,
+    _overforce_s,
     shaking_of,
     why_not_sound,
     why_not_standing,
@@ -175,3 +180,33 @@ def test_nothing_is_reported_of_a_gap_in_the_log() -> None:
     assert _longest_s(t_ns, np.ones(5, bool)) == pytest.approx(0.008)
     tau = np.array([[10.0, 0.0]] * 3 + [[90.0, 0.0]] * 2)
     assert shaking_of(t_ns, tau).max() == 0.0
+
+
+class Events:
+    """A log of nothing but the modules' changes of mode."""
+
+    def __init__(self, *changes: tuple[float, Mode]) -> None:
+        self.rows = [
+            sample(JointEvent, t_ns=round(t * 1e9), mode_after=int(mode)) for t, mode in changes
+        ]
+
+    def messages(self, _topic: Topic, _module: str) -> list[JointEvent]:
+        return self.rows
+
+
+@pytest.mark.parametrize(
+    ("held_from_s", "force_n", "longest_s"),
+    [(9.0, 150.0, 2.0), (9.0, 90.0, 0.0), (2.5, -150.0, 0.5)],
+)
+def test_only_a_hand_that_presses_a_robot_which_tracks_counts_as_overforce(
+    upright: SimTruth, held_from_s: float, force_n: float, longest_s: float
+) -> None:
+    """The force is there from 2 to 4 s."""
+    truth = [
+        msgspec.structs.replace(
+            upright, t_ns=ms * 1_000_000, operator_force=(0.0, 0.0, force_n * (2000 <= ms <= 4000))
+        )
+        for ms in range(0, 5000, 10)
+    ]
+    log: Any = Events((0.0, Mode.TRACK), (held_from_s, Mode.HOLD))
+    assert _overforce_s(log, truth) == pytest.approx(longest_s, abs=0.02)
