@@ -24,6 +24,7 @@ from shared.clock import now_ns
 from shared.config.files import load, to_toml
 from shared.config.gain_schedule import path_beside, write
 from shared.config.robot_config import RobotConfig
+from shared.run_directory import make_live_dir
 from tests.imu.robots import with_imu
 
 T0 = 10**12
@@ -94,7 +95,7 @@ def test_the_harness_publishes_the_operators_wrench_and_tares_on_request(
 ) -> None:
     taken: list[Wrench] = []
     with (
-        UnixCanHub(short_dir / "can_harness.sock") as hub,
+        UnixCanHub(make_live_dir(short_dir) / "can_harness.sock") as hub,
         open_session(robot, "test", short_dir) as session,
         serving("harness", "--run-dir", str(short_dir)),
     ):
@@ -135,7 +136,7 @@ def test_the_imu_publishes_which_way_is_up_and_invalid_once_the_sensor_is_silent
     tilted = (math.cos(0.05), math.sin(0.05), 0.0, 0.0)
     taken: list[Attitude] = []
     with (
-        UnixCanHub(short_dir / "can_imu.sock") as hub,
+        UnixCanHub(make_live_dir(short_dir) / "can_imu.sock") as hub,
         open_session(load(file), "test", short_dir) as session,
         serving("imu", "--config", str(file), "--run-dir", str(short_dir)),
     ):

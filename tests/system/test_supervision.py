@@ -25,6 +25,7 @@ from shared.exceptions import FleetError
 from shared.places import DEFAULT_CONFIG
 from tests.system.fleets import wait_for
 from tests.tools.fleet.plans import robot_file
+from tests.waiting import comes_true
 from tools import cli
 from tools.fleet import procfs, supervise
 from tools.fleet import run_dir as run_dir_module
@@ -290,7 +291,7 @@ def test_a_fleet_runs_at_paths_with_characters_that_are_special_in_other_files(
     options = FleetOptions(table_path=table)
     fleet = SupervisedFleet.start(robot_file(tmp_path / odd), run_dir.parent / odd, options)
     try:
-        assert [row.state for row in fleet.info()] == ["running"]
+        assert comes_true(lambda: [row.state for row in fleet.info()] == ["running"])
         assert fleet.run.log_of("ankle_right").exists()
     finally:
         fleet.stop()

@@ -19,6 +19,7 @@ from shared.can import cansimple
 from shared.can.cansimple import Command
 from shared.can.cansimple_06 import Command06
 from shared.places import CHECKOUT, DEFAULT_CONFIG
+from shared.run_directory import live_dir
 from tests.system.fleets import command, xrl
 from tools import cli
 from tools.bringup.findings import ok, wrong
@@ -174,7 +175,7 @@ def test_ctrl_c_stops_the_simulator_that_was_started(run_dir: Path) -> None:
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
     )  # fmt: skip
     deadline = time.monotonic() + START_S
-    while not (run_dir / "can_knee_left.sock").exists() and process.poll() is None:
+    while not (live_dir(run_dir) / "can_knee_left.sock").exists() and process.poll() is None:
         assert time.monotonic() < deadline
         time.sleep(0.02)
     os.kill(process.pid, signal.SIGINT)
