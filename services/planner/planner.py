@@ -21,7 +21,7 @@ from services.planner.law.hocca import Hocca, LawOutput, LawState
 from services.planner.state_phases import PhasesState, StatePhases
 from services.planner.watch.controller_guard import ControllerGuard, GuardState
 from services.planner.watch.engagement_fsm import Engagement
-from services.planner.watch.harness_trust import HarnessTrust, HarnessTrustState
+from services.planner.watch.harness_trust import HarnessTrust
 from services.planner.watch.heat import HeatWatch, HeatWatchState
 from services.planner.watch.limp_leg_watch import LimpLegWatch
 from services.planner.watch.plausible import Plausible
@@ -86,7 +86,7 @@ class PlannerState(msgspec.Struct, kw_only=True):
     trips: TripsState = msgspec.field(default_factory=TripsState)
     request: OperatorRequest = OperatorRequest()
     unattended: UnattendedState = msgspec.field(default_factory=UnattendedState)
-    trust: HarnessTrustState = msgspec.field(default_factory=HarnessTrustState)
+    trust: HarnessTrust = msgspec.field(default_factory=HarnessTrust)
     phases: PhasesState = msgspec.field(default_factory=PhasesState)
     rival: RivalWatch = msgspec.field(default_factory=RivalWatch)
     heat: HeatWatchState = msgspec.field(default_factory=HeatWatchState)
@@ -132,7 +132,6 @@ class Planner:
         self._trips = PlannerTrips(config)
         self._soles = Soles(config)
         self._unattended = Unattended()
-        self._trust = HarnessTrust()
         self._heat = HeatWatch(config.heat)
         self._supply = SupplyWatch(config.supply)
         service = config.joint_service
@@ -148,7 +147,6 @@ class Planner:
             overload=self._overload.state,
             trips=self._trips.state,
             unattended=self._unattended.state,
-            trust=self._trust.state,
             phases=self._phases.state,
             heat=self._heat.state,
             supply=self._supply.state,
@@ -240,7 +238,9 @@ class Planner:
         self._phases.advance(states, self._state.arrived_ns, last_ns)
         request = self._state.request
         tare = Tare.DONE if self._state.wrench is None else self._state.wrench.tare
-        trusted = self._trust.advance(self._law.load.state, tare, dt, leads=not engagement.hold)
+        trusted = self._state.trust.advance(
+            self._law.load.state, tare, dt, leads=not engagement.hold
+        )
         heat = self._heat.advance(now_ns, states, trusted * request.assist_n, dt)
         self._supply.advance(states, dt)
         # until all engage, the law restarts from the measured pose each tick: there is no
@@ -303,8 +303,7 @@ class Planner:
         self._law.restore(own.law)
         self._overload.state = own.overload
         self._trips.restore(own.trips)
-        self._unattended.state, self._trust.state = own.unattended, own.trust
-        self._phases.state = own.phases
+        self._unattended.state, self._phases.state = own.unattended, own.phases
         self._heat.state = own.heat
         self._supply.state = own.supply
         if self._guard is not None:
@@ -472,7 +471,7 @@ class Planner:
             or self._unattended.describe()
             or (self._guard.state.why if self._guard is not None else "")
         )
-        parts = self._supply.describe(), self._trust.describe(), refusal
+        parts = self._supply.describe(), self._state.trust.describe(), refusal
         return "; ".join(filter(None, parts))
 
     def status(self, now_ns: int, tick_us: float) -> PlannerStatus:

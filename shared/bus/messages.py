@@ -399,8 +399,8 @@ class Wrench(Message, frozen=True):
     moment: Vector3
     """Moment about the harness point, N m, torso axes."""
     valid: bool
-    """False while the sensor is stale, saturated, frozen or without a zero: the numbers are the last
-    good ones."""
+    """False while the sensor is stale, saturated, frozen or without a zero: the numbers are the
+    last good ones."""
     saturated: bool
     """True while a leg of the sensor is at its limit."""
     tare: Int64

@@ -53,10 +53,10 @@ def test_a_load_that_changes_once_it_was_led_is_the_sensors_fault_and_not_learnt
         for part in (0.99, 1.01)
     )
     go_on(trust, just, leads=leads)
-    assert not trust.state.doubted
+    assert not trust.doubted
     wrong.refused, wrong.weighing_s = True, 1.0
     go_on(trust, wrong, leads=leads)
-    assert trust.state.doubted
+    assert trust.doubted
     assert wrong == LoadState(*before)
     assert "xrl drive tare" in trust.describe()
 
@@ -66,7 +66,7 @@ def test_a_change_that_does_not_last_is_a_robot_that_swings() -> None:
     for _ in range(10):
         go_on(trust, LoadState(9.0), LASTS - 4)
         go_on(trust, LoadState(0.0), 1)
-    assert not trust.state.doubted
+    assert not trust.doubted
 
 
 def test_a_load_that_changes_before_it_is_led_is_a_load() -> None:
@@ -74,7 +74,7 @@ def test_a_load_that_changes_before_it_is_led_is_a_load() -> None:
     for kg in (0.0, 7.0):
         go_on(trust, LoadState(kg), leads=False)
     go_on(trust, LoadState(7.0))
-    assert not trust.state.doubted
+    assert not trust.doubted
     assert trust.describe() == ""
 
 
@@ -85,5 +85,5 @@ def test_the_assist_fades_while_the_wrench_is_doubted_and_comes_back_with_a_new_
     assert go_on(trust, LoadState(0.0), ticks) == 0.0
     assert go_on(trust, LoadState(0.0), leads=False) == 0.0, "HOLD is no new zero"
     go_on(trust, LoadState(0.0), 1, Tare.RUNNING, leads=False)
-    assert not trust.state.doubted
+    assert not trust.doubted
     assert go_on(trust, LoadState(0.0), ticks) == 1.0

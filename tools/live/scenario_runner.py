@@ -35,6 +35,7 @@ from tools.fleet.proxy_client import ProxyClient
 from tools.fleet.supervise import SupervisedFleet
 from tools.judge.stalls import Stall
 from tools.live.live_stalls import LiveStalls
+from tools.live.planner_return import PlannerReturn
 
 READY_TIMEOUT_S: Final = 45.0
 """Longer than all that a planner waits after the first five drop-outs: a machine may stall."""
@@ -186,7 +187,7 @@ class ScenarioRunner:
         self._states = {
             module: session.latest(topics.JOINT_STATE, JointState, module) for module in MODULES
         }
-        self._leads: Latest[PlannerStatus] = session.latest(topics.PLANNER_STATUS, PlannerStatus)
+        self._planner = PlannerReturn(session.latest(topics.PLANNER_STATUS, PlannerStatus))
         self._control = session.publisher(topics.SIM_CONTROL, SimControl)
         self._truth: SimTruth | None = None
         self._truth_at_s = time.monotonic()
@@ -294,7 +295,7 @@ class ScenarioRunner:
                         self._check_cores(idle_share(before))
                     before, look_s = idle_and_total(), time.monotonic() + PATIENCE_S
             if time.monotonic() > deadline:
-                lead = self._leads.take()
+                lead = self._planner.latest.take()
                 raise RunError(
                     f"not all six modules track after {READY_TIMEOUT_S:.0f} s: "
                     f"{(lead.why if lead else '') or self._describe_modes()}; "
@@ -355,7 +356,11 @@ class ScenarioRunner:
                 for module in MODULES
             )
             held_by_it = [] if self._killed else list(self._modes.values())
-            words = (self._note, self._stalls.words(held_by_it))
+            words = (
+                self._note,
+                self._planner.waits(truth, self._modes.values()),
+                self._stalls.words(held_by_it),
+            )
             note = "; ".join(word for word in words if word)
             self._show(LiveSnapshot(truth, modes, note))
         elif time.monotonic() - self._truth_at_s > SILENT_S and self._events.start_ns:
@@ -380,6 +385,8 @@ class ScenarioRunner:
             self._fleet.start_service(row.service)
             self._next_pids_s = 0.0
             self._note = f"{row.service} back"
+            if row.service == "planner":
+                self._planner.start(self._truth)
         elif isinstance(row, Inject):
             ProxyClient(self._fleet.run.path).begin(row)
         elif isinstance(row, Fault):

@@ -144,11 +144,11 @@ class Hocca:
         self._weight = config.total_mass * GRAVITY
         self._F_O: Array = np.zeros(6)
         size = config.geometry.torso_size
-        self._inertia = config.torso_mass * (size[0] ** 2 + size[2] ** 2) / 12.0
+        inertia = config.torso_mass * (size[0] ** 2 + size[2] ** 2) / 12.0
         # the paper's split serves for comparison only: no load correction is added to it
         certified = config.law.split == "certified"
         correction_max = config.law.load_correction if certified else (0.0, 0.0)
-        self.load = Load(correction_max, self._weight, config.torso_mass, self._inertia)
+        self.load = Load(correction_max, self._weight, config.torso_mass, inertia)
         self._assist = AssistLaw(config.assist)
         self._easing = LeadEasing(config.law.lead_easing)
         self._recentre_s = config.law.recentre_s
@@ -246,7 +246,7 @@ class Hocca:
         assist, F_O = self._assist.assist, self._F_O
         if not align and (toward is not _PERSON or any(released) or height.is_active):
             T_z, knees = reference.T[:, 2], (float(q[KNEES[0]]), float(q[KNEES[1]]))
-            drive = self._inertia * pitch_drive
+            drive = self.load.inertia * pitch_drive
             lift_n, moment = height.advance(
                 toward, released, drive, measured.p, pdot, T_z, knees, dt
             )

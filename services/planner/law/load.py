@@ -80,7 +80,7 @@ class Load:
         """
         self._kg_max, self._moment_max = correction_max
         self.enabled = any(correction_max)
-        self._weight, self._mass, self._inertia = weight, mass, inertia
+        self._weight, self._mass, self.inertia = weight, mass, inertia
         self.state = LoadState()
 
     @property
@@ -155,7 +155,7 @@ class Load:
         moment = float(F[4]) - float(n[4]) * GRAVITY * s.kg
         s.kg += min(1.0, dt / pole_s) * (weight / GRAVITY - s.kg)
         s.kg -= self._mass * (rates[0] - before[0]) / (GRAVITY * pole_s)
-        error = dt * (moment - self._moment(pitch)) - self._inertia * (rates[1] - before[1])
+        error = dt * (moment - self._moment(pitch)) - self.inertia * (rates[1] - before[1])
         error /= pole_s
         s.a += error * math.cos(pitch)
         s.b += error * math.sin(pitch)

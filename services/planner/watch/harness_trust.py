@@ -30,8 +30,8 @@ EASE_S: Final = 10.0
 """Time in which all of the assist goes, and comes back, s: 20 N/s of the full one."""
 
 
-class HarnessTrustState(msgspec.Struct):
-    """State of `HarnessTrust`."""
+class HarnessTrust(msgspec.Struct):
+    """Compares the load with that of the first lead."""
 
     load: Vector3 = (0.0, 0.0, 0.0)
     """kg, a and b (N m) of the load when the planner first led."""
@@ -44,46 +44,38 @@ class HarnessTrustState(msgspec.Struct):
     scale: float = 1.0
     """Fraction of the requested assist that is left."""
 
-
-class HarnessTrust:
-    """Compares the load with that at the beginning of the lead."""
-
-    def __init__(self) -> None:
-        self.state = HarnessTrustState()
-
     def advance(self, load: LoadState, tare: int, dt: float, *, leads: bool) -> float:
         """Advance by one tick; return the fraction of the requested assist that is left.
 
         Args:
-            load: as estimated; put back to that at the beginning when the wrench is no longer
+            load: as estimated; put back to that of the first lead when the wrench is no longer
                 believed.
             tare: `Tare` of the newest wrench.
             dt: time since the last tick, s.
             leads: the planner is engaged.
         """
-        s = self.state
         if tare != Tare.DONE:
-            s.doubted = s.has_led = False
+            self.doubted = self.has_led = False
         now = load.kg, load.a, load.b
-        if not s.has_led:
-            s.load, s.has_led = now, leads
-        elif not s.doubted:
-            kg, a, b = (x - before for x, before in zip(now, s.load, strict=True))
+        if not self.has_led:
+            self.load, self.has_led = now, leads
+        elif not self.doubted:
+            kg, a, b = (x - before for x, before in zip(now, self.load, strict=True))
             beyond = abs(kg) > CHANGE_MAX[0] or max(abs(a), abs(b)) > CHANGE_MAX[1]
-            s.beyond_s = s.beyond_s + dt if beyond else 0.0
-            if s.beyond_s > AFTER_S:
-                s.doubted, s.change, s.beyond_s = True, (kg, a, b), 0.0
-                load.kg, load.a, load.b = s.load
+            self.beyond_s = self.beyond_s + dt if beyond else 0.0
+            if self.beyond_s > AFTER_S:
+                self.doubted, self.change, self.beyond_s = True, (kg, a, b), 0.0
+                load.kg, load.a, load.b = self.load
                 load.refused, load.weighing_s = False, 0.0
         step = dt / EASE_S
-        s.scale = clamp(s.scale + (-step if s.doubted else step), 0.0, 1.0)
-        return s.scale
+        self.scale = clamp(self.scale + (-step if self.doubted else step), 0.0, 1.0)
+        return self.scale
 
     def describe(self) -> str:
         """Return that the wrench is not believed, and what to do, in words; "" if it is."""
-        if not self.state.doubted:
+        if not self.doubted:
             return ""
-        kg, a, b = self.state.change
+        kg, a, b = self.change
         moment = max(a, b, key=abs)
         return (
             f"harness and joints disagree by {kg:+.1f} kg and {moment:+.0f} N m since it was led: "

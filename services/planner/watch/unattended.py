@@ -58,7 +58,7 @@ PROOF_NS: Final = 120 * NS_PER_MS
 """ns; a hand that leads the pitch is felt within 100 ms after the pitch was closed."""
 
 
-class Direction(msgspec.Struct):
+class OpenDirection(msgspec.Struct):
     """State of one open direction, in m or rad."""
 
     coast: float = 0.0
@@ -81,8 +81,8 @@ class UnattendedState(msgspec.Struct):
     """Pose in which it left the robot: height of the COM, m, and the torso's pitch, rad."""
     last_ns: int = 0
     """Time of the last tick."""
-    height: Direction = msgspec.field(default_factory=Direction)
-    pitch: Direction = msgspec.field(default_factory=Direction)
+    height: OpenDirection = msgspec.field(default_factory=OpenDirection)
+    pitch: OpenDirection = msgspec.field(default_factory=OpenDirection)
 
     @property
     def released(self) -> Released:
@@ -136,7 +136,7 @@ class Unattended:
         return max(abs(pose[0] - s.left[0]), ARM * abs(pose[1] - s.left[1]))
 
 
-def _coast(direction: Direction, rate: float, dt: float, *, felt: bool) -> None:
+def _coast(direction: OpenDirection, rate: float, dt: float, *, felt: bool) -> None:
     """Update c, and the way beyond it."""
     if felt:
         direction.coast, direction.excess = rate, 0.0
@@ -146,7 +146,7 @@ def _coast(direction: Direction, rate: float, dt: float, *, felt: bool) -> None:
     direction.excess += dt * (rate - direction.coast)
 
 
-def _is_back(direction: Direction, now_ns: int, hand: float, least: float) -> bool:
+def _is_back(direction: OpenDirection, now_ns: int, hand: float, least: float) -> bool:
     """Return True if a hand has been on a direction for `HAND_BACK_NS`, or is not known."""
     if abs(hand) < least:
         direction.back_ns = 0
