@@ -161,11 +161,10 @@ def test_it_integrates_nothing_that_is_led_the_papers_or_without_a_limit(
 # ---- the matrices that it solves
 
 
-@given(seed=st.integers(0, 10_000), n=st.sampled_from([2, 6, 12]), columns=st.integers(0, 6))
-def test_it_solves_as_numpy_does_and_leaves_its_arguments(seed: int, n: int, columns: int) -> None:
+@given(seed=st.integers(0, 10_000), n=st.sampled_from([2, 6, 12]))
+def test_it_solves_as_numpy_does_and_leaves_its_arguments(seed: int, n: int) -> None:
     draw = np.random.default_rng(seed)
-    A, b = draw.normal(size=(n, n)) + 3.0 * np.eye(n), draw.normal(size=(n, columns or 1))
-    b = b if columns else b[:, 0]
+    A, b = draw.normal(size=(n, n)) + 3.0 * np.eye(n), draw.normal(size=n)
     A_before, b_before = A.copy(), b.copy()
     decomposition = LuDecomposition(A)
     np.testing.assert_allclose(decomposition.solve(b), np.linalg.solve(A, b), atol=1e-9)
