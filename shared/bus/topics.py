@@ -93,7 +93,7 @@ PLANNER_STATUS: Final = Topic(
     "inputs and decisions of the law",
 )  # fmt: skip
 PLANNER_CHECKPOINT: Final = Topic(
-    "planner/checkpoint", traces.PlannerCheckpoint, 0.0, _BACKGROUND, ("planner",), (),
+    "planner/checkpoint", traces.PlannerCheckpoint, 1.0, _BACKGROUND, ("planner",), (),
     "the planner's state, more often at its start: re-execution can start here",
 )  # fmt: skip
 OPERATOR_INTENT: Final = Topic(

@@ -21,6 +21,7 @@ from shared.can.unix_can import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, Frame
 from shared.clock import PACE_FILE, keep_pace
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import CanConfig
+from shared.run_directory import make_live_dir
 from tools.bringup import can_monitor
 from tools.bringup.can_monitor import bus_nodes, listen, listen_to, period_ms, round_trips
 
@@ -96,7 +97,7 @@ def test_beside_a_fleet_in_slow_motion_no_frame_is_late(
     robot: RobotConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """`xrl doctor` gave 25 warnings at half speed, and advised to configure the drives anew."""
-    (tmp_path / PACE_FILE).write_text("0.5\n")
+    (make_live_dir(tmp_path) / PACE_FILE).write_text("0.5\n")
     name, nodes = next((name, nodes) for name, nodes in bus_nodes(robot).items() if nodes)
     beat_id = arbitration_id(nodes[0], Command.HEARTBEAT)
     stamps = itertools.count(100.0, 0.04)

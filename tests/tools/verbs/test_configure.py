@@ -19,6 +19,7 @@ from shared.can.drive_settings import of_module
 from shared.config.robot_config import RobotConfig, expand
 from shared.exceptions import DriveError, FleetError
 from shared.joints import MODULES
+from shared.run_directory import make_live_dir
 from tests.system.fleets import xrl
 from tests.tools.bringup.board_in_memory import BoardInMemory, as_wanted
 from tests.tools.exit_codes import exit_code
@@ -198,7 +199,7 @@ def test_ctrl_c_finishes_the_board_that_was_begun_and_touches_no_other(robot: Ro
 
 
 def test_nothing_is_written_while_a_joint_service_is_up(robot: RobotConfig, run_dir: Path) -> None:
-    run_dir.mkdir()
+    make_live_dir(run_dir)
     endpoint = expand(robot.bus.endpoints[MODULE], run_dir).removeprefix("unixsock-stream/")
     configure.refuse_services(robot, run_dir, MODULES)
     with listening(Path(endpoint)), pytest.raises(FleetError, match=r"knee_left.*xrl down"):

@@ -162,7 +162,7 @@ TROUBLES: Final[Mapping[str, Trouble]] = {
         "led by 1.2 rad of pitch in 0.6 s", Trip.TURNING, _led(4.0, _at(1.6, 1.1, pitch=1.2))
     ),
     "is let go": Trouble(
-        "30 % of its payload gone, and nobody's hand on it", Trip.UNATTENDED,
+        "30 % of its payload gone, and nobody's hand on it", None,
         _led(6.0), {"body.payload_scale": 0.7}, let_go_s=BEGINS_S,
     ),
     "is leaned on": Trouble(
