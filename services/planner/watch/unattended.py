@@ -55,8 +55,8 @@ an assist, and differs from it by 24 N at most."""
 HAND_BACK_NS: Final = 50 * NS_PER_MS
 """ns; a bump is shorter."""
 PROOF_NS: Final = 120 * NS_PER_MS
-"""ns; most hands that lead the pitch are felt sooner. In 5 of 60 drawn leads a hand was not, and its
-peak rose by 5 to 32 N."""
+"""ns; most hands that lead the pitch are felt sooner. In 5 of 60 drawn leads a hand was not, and
+its peak rose by 5 to 32 N."""
 
 
 class OpenDirection(msgspec.Struct):
