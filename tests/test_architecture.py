@@ -168,7 +168,6 @@ TOOL_LAWS = [
     "tools/logs/reexecution/params.py",
 ]
 
-
 LAWS = [
     file
     for file in SOURCES

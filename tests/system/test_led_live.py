@@ -36,7 +36,6 @@ pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(240)]
 ROOT = DEFAULT_CONFIG.parents[1]
 SCRIPT = ROOT / "examples" / "send_intent.py"
 
-
 SHORT = Scenario(
     "identify", "", 5.0,
     (Keyframe(0.0, 1.188), Keyframe(2.5, 1.15, shift=(0.0, 0.02, 0.0, 0.0)), Keyframe(5.0, 1.188)),
