@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from services.network_proxy.connection import Splitter, carries_messages
 from services.network_proxy.sockets import (
     READ,
     WRITE,
@@ -21,7 +22,6 @@ from services.network_proxy.sockets import (
     SocketWatch,
     address_of,
 )  # fmt: skip
-from services.network_proxy.wire import Splitter, carries_messages
 from shared.exceptions import BusError
 from tests.network_proxy.rig import MESSAGE, WAIT_S, Rig, batch, heard, listening
 

@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from services.simulator.drives.axis_bank import AxisBank
+from services.simulator.drives.axis_encoders import PERIOD_S, OddEncoder, Words
 from services.simulator.drives.axis_faults import AxisErrors
-from services.simulator.drives.odd_encoder import PERIOD_S, OddEncoder, Words
 from shared.can.cansimple import (
     AxisError,
     AxisState,

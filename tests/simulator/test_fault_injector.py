@@ -10,7 +10,7 @@ import pytest
 from services.simulator.drives.axis_bank import AXIS_NAMES, AxisBank
 from services.simulator.drives.axis_faults import BOOT_S, TALKS_S
 from services.simulator.drives.axis_faults import AxisErrors as Registers
-from services.simulator.fault_injector import FaultInjector
+from services.simulator.robot import FaultInjector
 from shared.can.cansimple import (
     AxisError,
     AxisState,
