@@ -68,9 +68,9 @@ def nodes_of(kind: type[N], *folders: str) -> Iterator[tuple[str, N]]:
 
 
 VENDORS = {
-    "getpass": ["shared/user.py"],
+    "getpass": ["shared/places.py"],
     "zenoh": ["shared/bus/session.py", "services/ros2_gateway/ros_session.py"],
-    "rosbags": ["services/ros2_gateway/ros_types.py", "tools/export/ros2_bag.py"],
+    "rosbags": ["services/ros2_gateway/conversions.py", "tools/export/ros2_bag.py"],
     "gymnasium": ["tools/lab/learning/environment.py"],
     "shtab": ["tools/verbs/completion.py"],
     "pyarrow": ["tools/export/tables.py"],

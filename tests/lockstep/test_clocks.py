@@ -26,7 +26,7 @@ from shared.joints import MODULES
 from tests.lockstep import runs
 from tests.lockstep.runs import kill, led_to, modes_of, moment_of, push, restart, variant
 from tools.sim.lockstep import FleetMoment, Lockstep
-from tools.sim.virtual_time import HostClock
+from tools.sim.virtual_services import HostClock
 
 HOUR_NS = 3600 * NS_PER_S
 

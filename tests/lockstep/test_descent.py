@@ -21,8 +21,7 @@ from tests.lockstep.runs import Run, kill, led_to, modes_of, push, run, still
 from tests.planner.states import with_law
 from tools.fleet.descent import LIGHT_FRACTION, Ask, Descent, Phase
 from tools.lab.studies.sweeps import plants
-from tools.sim.lockstep import Lockstep
-from tools.sim.standing_start import begin_standing
+from tools.sim.lockstep import Lockstep, begin_standing
 
 AT_S = 0.3
 HEARD_S = 0.1

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from services.simulator.physics.led_hand import HEIGHT_MAX_RATE
+from services.simulator.physics.operator import HEIGHT_MAX_RATE
 from shared.bus import topics
 from shared.bus.messages import HandLead, Mode
 from shared.bus.traces import SimTruth

@@ -23,7 +23,7 @@ from tests.tools.exit_codes import exit_code
 from tools import cli
 from tools.logs.run_log import read_run
 from tools.sim import lockstep
-from tools.sim.standing_start import begin_standing
+from tools.sim.lockstep import begin_standing
 
 NOT_HERE = (topics.ATTITUDE, topics.OPERATOR_INTENT, topics.TOOLS)
 """Periodic topics that a run in virtual time does not have: no IMU is fitted, the scenario requests

@@ -31,7 +31,7 @@ from shared.config.scenarios import Keyframe, Scenario
 from tests.planner.states import DT
 from tools.bringup.tune.excitation import Excitation, SinePart
 from tools.bringup.tune.pose_probe import DIRECTIONS, ProbedLockstep, course_of
-from tools.sim.standing_start import begin_standing
+from tools.sim.lockstep import begin_standing
 
 T0 = 5_000_000_000
 

@@ -11,7 +11,7 @@ from typing import Any, cast
 import msgspec
 import pytest
 
-from services.ros2_gateway.conversions import Conversions
+from services.ros2_gateway.conversions import Conversions, RosTypes
 from services.ros2_gateway.gateway import STALE_NS, Gateway, topics_of
 from services.ros2_gateway.inbound import (
     GIVE_UP_NS,
@@ -24,7 +24,6 @@ from services.ros2_gateway.inbound import (
 from services.ros2_gateway.loop import PERIOD_NS, GatewayLoop
 from services.ros2_gateway.rmw import RosTopic
 from services.ros2_gateway.ros_session import RosLink
-from services.ros2_gateway.ros_types import RosTypes
 from shared.bus import topics
 from shared.bus.messages import JointState, Mode
 from shared.clock import NS_PER_MS, NS_PER_S

@@ -22,8 +22,8 @@ from shared import revision
 from shared.atomic_file import atomic_file, replace_file
 from shared.config import files, gain_schedule, scenarios
 from shared.exceptions import ConfigError, XrlError
-from shared.text_file import decoded
-from shared.user import in_home, user_name
+from shared.places import in_home, user_name
+from shared.toml_file import decoded
 from tests.conftest import ROBOT_FILE
 from tools.fleet import process_table
 

@@ -31,7 +31,7 @@ from shared.bus.messages import Vector3
 from shared.can import cansimple, cansimple_06
 from shared.can.cansimple import AxisState, Command, arbitration_id, pack_float, pack_u32
 from shared.can.cansimple_06 import Command06, DriveError06, ProcedureResult, SdoOpcode
-from shared.can.imu_can import ImuAssembler
+from shared.can.sensor_frames import ImuAssembler
 from shared.can.unix_can import REMOTE_FLAG, UnixCanBus
 from shared.config.robot_config import RobotConfig
 from tests.imu.robots import with_imu
@@ -164,7 +164,7 @@ def test_only_its_own_node_changes_a_drive_and_a_current_has_the_calibrated_sign
     old.client.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
     old.front.receive()
     assert not old.bank.input_torque.any()
-    # CAN of 0.5 has no way to ask for it; `test_axis_settings.py` has the rule.
+    # CAN of 0.5 has no way to ask for it; `test_drives.py` has the rule.
     old.bank.input_torque[AXIS] = 0.0827
     old.bank.settings.set(AXIS // 2, "axis1.encoder.config.direction", -1)
     old.step()

@@ -11,7 +11,7 @@ import msgspec
 
 from shared.atomic_file import atomic_file
 from shared.exceptions import DriveError
-from shared.text_file import read_text
+from shared.toml_file import read_text
 from tools.bringup.boards import Board, Value, describe_firmware
 
 VERSION: Final = 1

@@ -16,7 +16,7 @@ from services.joint.differential import motor_from_joint
 from services.joint.drivers.base import Drive
 from shared.bus.messages import Pair
 from shared.can.can_sensor import sensor_of
-from shared.can.imu_can import ImuAssembler
+from shared.can.sensor_frames import ImuAssembler
 from shared.clock import now_ns
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig

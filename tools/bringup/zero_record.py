@@ -20,7 +20,7 @@ from shared.atomic_file import atomic_file
 from shared.bus.messages import Pair
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
-from shared.text_file import read_text
+from shared.toml_file import read_text
 from tools.bringup.boards import Value, equal
 from tools.fleet.process_table import is_simulated
 from tools.fleet.run_dir import RunDir

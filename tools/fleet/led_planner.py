@@ -21,7 +21,7 @@ from shared.bus.session import Session
 from shared.clock import NS_PER_S, now_ns
 from shared.config.scenarios import SCENARIO
 from shared.exceptions import FleetError
-from shared.user import user_name
+from shared.places import user_name
 
 LOOK_S: Final = 0.002
 LINKS_S: Final = 3.0

@@ -5,10 +5,10 @@ from __future__ import annotations
 import time
 from typing import Final, NamedTuple
 
+from services.ros2_gateway.conversions import RosTypes
 from services.ros2_gateway.gateway import RosTopics, topics_of
 from services.ros2_gateway.rmw import RosTopic, SeenEndpoint
 from services.ros2_gateway.ros_session import NODE, RosSession
-from services.ros2_gateway.ros_types import RosTypes
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import BusError
 from shared.joints import JOINTS

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from shared.exceptions import FleetError, XrlError
-from shared.user import in_home
+from shared.places import in_home
 from tools.pads.controls import (
     BUTTONS,
     EV_ABS,

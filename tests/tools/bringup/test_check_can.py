@@ -13,7 +13,7 @@ import pytest
 
 from shared.can.cansimple import AxisState, Heartbeat
 from shared.can.cansimple_06 import Version
-from shared.can.imu_can import ImuSample
+from shared.can.sensor_frames import ImuSample
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import CanConfig
 from tests.imu.robots import with_imu

@@ -40,7 +40,7 @@ from tools.logs.host_clocks import OffsetBounds, offset_bounds
 from tools.logs.joined_records import in_order
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import RunLog, clocks_of, parts_of, read_run
-from tools.sim.virtual_time import HostClock
+from tools.sim.virtual_services import HostClock
 
 # ---- bounds
 

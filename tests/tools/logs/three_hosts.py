@@ -20,9 +20,8 @@ from shared.joints import MODULES, side_of
 from shared.mcap_log.writer import SCHEMA_VERSION, RunWriter
 from tests.conftest import ROBOT_FILE
 from tests.shared.mcap_log.runs import Queue, sample
-from tools.sim.lockstep import Lockstep
-from tools.sim.standing_start import NOTHING_HAPPENS
-from tools.sim.virtual_time import HostClock
+from tools.sim.lockstep import NOTHING_HAPPENS, Lockstep
+from tools.sim.virtual_services import HostClock
 from tools.topic_keys import sender_of
 
 BODY, RIGHT, LEFT = "10.0.0.1", "10.0.0.2", "10.0.0.3"

@@ -13,8 +13,7 @@ from shared.bus.traces import SimTruth
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.robot.robot_model import stand_pose
 from tests.lockstep.runs import still
-from tools.sim.lockstep import Lockstep
-from tools.sim.standing_start import begin_standing
+from tools.sim.lockstep import Lockstep, begin_standing
 from tools.view.frame import SoleEstimate, jacobian
 
 

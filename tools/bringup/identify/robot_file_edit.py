@@ -14,7 +14,7 @@ from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.places import refuse_shipped
-from shared.text_file import read_text
+from shared.toml_file import read_text
 from tools.bringup.identify.estimates import Value
 from tools.fleet import procfs
 from tools.fleet.run_dir import RunDir

@@ -24,8 +24,7 @@ from shared.exceptions import RunError
 from shared.robot.robot_model import stand_pose
 from tools.bringup.tune.excitation import Excitation
 from tools.fleet.led_planner import LedPlanner
-from tools.sim.lockstep import Lockstep
-from tools.sim.standing_start import begin_standing
+from tools.sim.lockstep import Lockstep, begin_standing
 
 DIRECTIONS: Final = ("x", "y", "z", "roll", "pitch", "yaw")
 """Rows of p."""

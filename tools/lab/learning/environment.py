@@ -31,8 +31,7 @@ from shared.places import DEFAULT_CONFIG
 from tools.lab.learning.policy import ACTIONS, LARGEST, OBSERVED, acted, observed
 from tools.lab.studies.sweeps import plants
 from tools.live.experiment import scenario_file
-from tools.sim.lockstep import Lockstep
-from tools.sim.standing_start import begin_standing
+from tools.sim.lockstep import Lockstep, begin_standing
 
 FALLEN: Final = -100.0
 """Reward of a fall."""

@@ -19,8 +19,7 @@ from tests.lockstep.runs import still
 from tools.lab.design.poses import Poses
 from tools.lab.learning.environment import FALLEN, BalanceEnv, standing_reward
 from tools.lab.learning.policy import ACTIONS, OBSERVED, PolicyController
-from tools.sim.lockstep import Lockstep
-from tools.sim.standing_start import begin_standing
+from tools.sim.lockstep import Lockstep, begin_standing
 
 
 @pytest.fixture
