@@ -250,10 +250,6 @@ def test_what_a_robot_can_do_and_python_can_knows_is_taken(
     assert operator.getitem(*place(taken, key)) == value
 
 
-def test_the_interfaces_that_python_can_knows_are_all_there() -> None:
-    assert set(INTERFACES) == set(can.VALID_INTERFACES)
-
-
 # ---- ranges
 
 BESIDE = ("gain_schedule", "axis", "duration")
@@ -288,8 +284,6 @@ def test_every_number_of_a_robot_and_a_scenario_has_a_range() -> None:
     assert list(numbers_without_a_range(RobotConfig, "robot")) == []
     assert list(numbers_without_a_range(Scenario, "scenario")) == []
 
-
-def test_a_number_without_a_range_would_be_found() -> None:
     class Bare(msgspec.Struct):
         pair: tuple[Annotated[float, Range(0.0, 1.0, "m")], float]
 
@@ -324,28 +318,27 @@ def test_every_number_of_the_file_is_refused_when_it_is_absurd(tmp_path: Path, h
 # ---- what is read
 
 
-def test_a_robot_comes_back_from_its_own_toml(robot: RobotConfig, tmp_path: Path) -> None:
+def test_a_robot_comes_back_from_its_own_toml_and_from_text_without_a_schedule(
+    robot: RobotConfig, tmp_path: Path
+) -> None:
     assert robot.gain_schedule is not None
     path = tmp_path / "again.toml"
     path.write_text(config_file.to_toml(robot), encoding="utf-8")
     assert config_file.load(path).gain_schedule is None
     shutil.copy(ROBOT_FILE.with_name("robot.gains.json"), tmp_path / "again.gains.json")
     assert config_file.load(path) == robot
-
-
-def test_text_is_read_as_a_file_is_without_a_schedule(robot: RobotConfig) -> None:
     parsed = config_file.parse(TEXT, "robot.toml of a log")
     assert parsed == msgspec.structs.replace(robot, gain_schedule=None)
     with pytest.raises(ConfigError, match=r"robot\.toml of a log"):
         config_file.parse("name = 3", "robot.toml of a log")
 
 
-def test_masses_add_up_to_table_i(robot: RobotConfig) -> None:
+def test_masses_and_joint_limits_are_those_of_the_file_and_all_interfaces_are_known(
+    robot: RobotConfig,
+) -> None:
     assert (robot.torso_mass, robot.total_mass) == pytest.approx((39.66, 74.58))
-
-
-def test_joint_limits_stand_in_joint_order(robot: RobotConfig) -> None:
     rows = robot.joint_limits()
     assert len(rows) == 12
     assert rows[:6] == rows[6:]
     assert rows[2:4] == (robot.limits.knee.phi, robot.limits.knee.theta)
+    assert set(INTERFACES) == set(can.VALID_INTERFACES)

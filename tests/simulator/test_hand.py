@@ -193,15 +193,12 @@ def worn(person: Person, force: float, assist: float = 0.0, seconds: float = 5.0
     return wearer
 
 
-def test_a_person_gives_way_to_the_hand_by_weight_on_springs() -> None:
+def test_the_wearer_gives_way_by_weight_on_springs_and_rests_later_and_less_than_asked() -> None:
     person = Person(mass=80.0, leg_frequency_hz=2.5)
     stiffness = 80.0 * (2.0 * math.pi * 2.5) ** 2
     assert worn(person, -60.0).above == pytest.approx(60.0 / stiffness, rel=1e-3)
     assert worn(person, 0.0).above == 0.0
     assert worn(IDEAL.person, 150.0).above == 0.0
-
-
-def test_weight_comes_later_and_less_than_what_was_asked_for() -> None:
     person = Person(load_scale=0.9, load_lag_s=0.2)
     assert worn(person, 0.0, 200.0, 0.2).load_n == pytest.approx(0.9 * 200.0 * 0.632, rel=0.01)
     assert worn(person, 0.0, 200.0).load_n == pytest.approx(180.0, rel=1e-3)
