@@ -187,6 +187,7 @@ def test_each_dialect_has_its_own_bits_and_a_heartbeat_of_0_6_its_result(
     assert new.ask(Command06.GET_ERROR) == struct.pack("<II", 0x0100_0000, 0x0100_0000)
     new.bank.clear_errors(AXIS)
     new.bank.request_state(AXIS, AxisState.CLOSED_LOOP_CONTROL)
+    new.step(0.2)
     assert cansimple_06.unpack_heartbeat(new.heartbeat()).procedure_result == ProcedureResult.BUSY
     new.bank.request_state(AXIS, AxisState.IDLE)
     new.step(0.2)
