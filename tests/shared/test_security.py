@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fnmatch
-import json
 import os
 import shutil
 import socket
@@ -29,7 +28,16 @@ from shared.exceptions import BusError, ConfigError
 from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
 from shared.run_directory import live_dir
-from tests.certified import certified, give, install_all, opened, signer_of, with_keys
+from tests.certified import (
+    certified,
+    give,
+    identity,
+    install_all,
+    opened,
+    signer_of,
+    stranger,
+    with_keys,
+)
 from tests.shared.test_links import TALK
 from tests.waiting import comes_true
 from tools.keys.authority import Authority
@@ -72,36 +80,6 @@ def bus() -> Iterator[Bus]:
     shutil.rmtree(folder)
 
 
-def stranger(endpoint: str, tls: dict[str, Any]) -> zenoh.Session:
-    """Open a session without any rule of ours: what somebody with a Zenoh of his own does."""
-    config = zenoh.Config()
-    for key, value in {
-        "mode": "peer",
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "connect/endpoints": [endpoint],
-        "connect/timeout_ms": -1,
-        "connect/exit_on_failure": False,
-        "open/return_conditions/connect_scouted": False,
-        "transport/link/tls": tls,
-    }.items():
-        config.insert_json5(key, json.dumps(value))
-    return zenoh.open(config)
-
-
-def identity(folder: Path, name: str, authority: Path | None = None) -> dict[str, Any]:
-    certificate, key = str(folder / f"{name}.pem"), str(folder / f"{name}.key")
-    return {
-        "root_ca_certificate": str(authority or folder / credentials.AUTHORITY),
-        "connect_certificate": certificate,
-        "connect_private_key": key,
-        "listen_certificate": certificate,
-        "listen_private_key": key,
-        "enable_mtls": True,
-        "verify_name_on_connect": False,
-    }
-
-
 def settles(step: Callable[[], Collection[object]], expected: Collection[object]) -> bool:
     """Return True if what is heard becomes all that is expected, and stays so."""
     assert comes_true(lambda: set(expected) <= set(step()), TRIES_S)
@@ -125,7 +103,7 @@ def test_a_peer_is_heard_on_its_own_keys_and_on_no_other(bus: Bus, name: str) ->
     keys = [*all_keys(ROBOT.name), f"xrl/{ROBOT.name}/something/else", f"xrl/other/{name}"]
     with (
         open_session(bus.robot, "recorder", bus.folder) as recorder,
-        stranger(bus.endpoint("recorder"), identity(bus.keys, name)) as peer,
+        stranger([bus.endpoint("recorder")], identity(bus.keys, name)) as peer,
     ):
         ear = recorder.stream([f"xrl/{ROBOT.name}/**"])
         assert comes_true(lambda: linked(peer))
@@ -146,7 +124,7 @@ def test_a_peer_receives_what_its_row_of_the_table_says(bus: Bus, name: str) -> 
     keys = [key for key in all_keys(ROBOT.name) if fits(key, PUTS[sender])]
     with (
         open_session(bus.robot, sender, bus.folder) as session,
-        stranger(bus.endpoint(sender), identity(bus.keys, name)) as peer,
+        stranger([bus.endpoint(sender)], identity(bus.keys, name)) as peer,
     ):
         heard: set[str] = set()
         ears = [
@@ -168,7 +146,7 @@ def test_a_peer_receives_what_its_row_of_the_table_says(bus: Bus, name: str) -> 
 def test_services_show_themselves_by_their_own_name_only(bus: Bus) -> None:
     with (
         open_session(bus.robot, "recorder", bus.folder) as recorder,
-        stranger(bus.endpoint("recorder"), identity(bus.keys, "viewer")) as peer,
+        stranger([bus.endpoint("recorder")], identity(bus.keys, "viewer")) as peer,
     ):
         tokens = [
             peer.liveliness().declare_token(token_key(ROBOT.name, name))
@@ -211,8 +189,8 @@ ENEMIES: dict[str, Callable[[Bus, Path], dict[str, Any]]] = {
 def test_without_a_valid_certificate_there_is_no_link(bus: Bus, tmp_path: Path, kind: str) -> None:
     with (
         open_session(bus.robot, "recorder", bus.folder),
-        stranger(bus.endpoint("recorder"), identity(bus.keys, "planner")) as friend,
-        stranger(bus.endpoint("recorder"), ENEMIES[kind](bus, tmp_path / "s")) as enemy,
+        stranger([bus.endpoint("recorder")], identity(bus.keys, "planner")) as friend,
+        stranger([bus.endpoint("recorder")], ENEMIES[kind](bus, tmp_path / "s")) as enemy,
     ):
         assert comes_true(lambda: linked(friend)), "the same try with a valid one"
         time.sleep(0.5)
@@ -228,8 +206,8 @@ def test_a_revoked_certificate_links_and_is_not_heard(bus: Bus, tmp_path: Path) 
     assert authority.names.generations["planner"] == 2
     with (
         open_session(robot, "recorder", tmp_path) as recorder,
-        stranger(robot.bus.endpoints["recorder"], identity(old, "planner")) as lost,
-        stranger(robot.bus.endpoints["recorder"], identity(tmp_path / "keys", "planner")) as now,
+        stranger([robot.bus.endpoints["recorder"]], identity(old, "planner")) as lost,
+        stranger([robot.bus.endpoints["recorder"]], identity(tmp_path / "keys", "planner")) as now,
     ):
         ear = recorder.stream([f"xrl/{ROBOT.name}/**"])
         assert comes_true(lambda: linked(lost) and linked(now))
