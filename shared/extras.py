@@ -63,7 +63,7 @@ def is_installed(extra: str) -> bool:
 
 
 def _is_there(package: str) -> bool:
-    """Return True for a package; deploy is on the path too, and its folder `foxglove` is none."""
+    """Return True for a package. A folder of deploy, which is on the path too, does not count."""
     found = importlib.util.find_spec(package)
     if found is None or found.origin is not None:
         return found is not None

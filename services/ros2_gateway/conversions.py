@@ -51,7 +51,7 @@ class RosTypes:
         return bytes(self._store.serialize_cdr(message, type_name))
 
     def decode(self, type_name: str, payload: bytes) -> Any | None:
-        """Return the message of a payload from the network; None if it is none of this type."""
+        """Return the message of a payload from the network; None if it is not of this type."""
         try:
             return self._store.deserialize_cdr(payload, type_name)
         except Exception:  # noqa: BLE001 - whatever a stranger's bytes bring about

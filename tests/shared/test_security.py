@@ -98,6 +98,7 @@ def linked(session: zenoh.Session) -> bool:
     return len(list(session.info.peers_zid())) > 0
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("name", PRINCIPALS)
 def test_a_peer_is_heard_on_its_own_keys_and_on_no_other(bus: Bus, name: str) -> None:
     keys = [*all_keys(ROBOT.name), f"xrl/{ROBOT.name}/something/else", f"xrl/other/{name}"]
@@ -118,6 +119,7 @@ def test_a_peer_is_heard_on_its_own_keys_and_on_no_other(bus: Bus, name: str) ->
         assert settles(put_all, {key for key in keys if fits(key, PUTS[name])})
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("name", PRINCIPALS)
 def test_a_peer_receives_what_its_row_of_the_table_says(bus: Bus, name: str) -> None:
     sender = "planner" if name != "planner" else "knee_left"

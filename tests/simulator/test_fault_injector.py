@@ -107,6 +107,7 @@ def test_every_kind_of_a_scenario_has_its_outcome_here() -> None:
     assert set(OUTCOMES) == set(FAULT_KINDS)
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("axis", range(12), ids=AXIS_NAMES)
 @pytest.mark.parametrize("kind", FAULT_KINDS)
 def test_a_fault_leaves_these_registers_this_state_and_this_sibling(kind: str, axis: int) -> None:

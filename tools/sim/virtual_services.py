@@ -120,7 +120,7 @@ class SharedMemory:
     Attributes:
         estop: set it to stop every module.
         rows: as each service wrote its own last, in virtual time.
-        planner: session of the planner's process on this host; 0: there is none.
+        planner: session of the planner's process on this host; 0 without one.
         ended: session of the one that ended last.
     """
 
@@ -368,7 +368,7 @@ class VirtualCan(Generic[S]):
         self._newest: S | None = None
 
     def poll(self) -> None:
-        """Do nothing: nobody has to be let in."""
+        """Do nothing: no client has to be admitted."""
 
     def broadcast(self, frames: list[tuple[int, bytes]]) -> None:
         """Take the frames of one sample."""

@@ -38,7 +38,7 @@ PUSH_EXPIRES_S: Final = 0.3
 class LedHand(msgspec.Struct):
     """The hand as somebody leads it in place of the scenario, within limits and without jumps.
 
-    Follows what is asked for; while nobody asks it stays where it was led, and pushes no more.
+    Follows what is asked for; without a new request it stays where it was led, and its push ends.
 
     Its fields, in this order, are `SimState.hand`.
     """
