@@ -63,7 +63,8 @@ class SimulatorLoop:
     torque between frames; with a loop of their own they step with the world.
 
     Attributes:
-        autostart_s: delay from hoist down to the start of the scenario, s; None: a message starts it.
+        autostart_s: delay from hoist down to the start of the scenario, s; None: a message
+            starts it.
     """
 
     def __init__(
