@@ -66,12 +66,6 @@ def files_of_run(path: Path, metadata: MetadataByName) -> list[Path]:
     return sorted(numbers, key=lambda file: numbers[file])
 
 
-def further_files(path: Path) -> list[Path]:
-    """Return the other files of the run that a file belongs to."""
-    own = path.resolve()
-    return [file for file in files_of_run(path, head_of(path)) if file.resolve() != own]
-
-
 def files_in(directory: Path) -> list[Path]:
     """Return the files of the one run in a directory, in order."""
     runs = runs_in(directory)
@@ -161,12 +155,12 @@ class RecordedFile:
             return None
         return min(c.first_ns for c in self.chunks), max(c.last_ns for c in self.chunks)
 
-    def keys_with_messages(self) -> list[str]:
-        """Return the keys that have a message, in the order of their channels."""
+    def keys_with_messages(self) -> set[str]:
+        """Return the keys that have a message."""
         known = {n for chunk in self.chunks if chunk.channels is not None for n in chunk.channels}
         if any(chunk.channels is None for chunk in self.chunks):
             known |= {row.channel_id for record in self.records(0, _EVER) for row in record.rows}
-        return [self.keys[number] for number in sorted(known) if number in self.keys]
+        return {self.keys[number] for number in known if number in self.keys}
 
     def records(
         self, begin_ns: int, end_ns: int, keys: frozenset[str] | None = None
@@ -254,6 +248,10 @@ class RunIndex:
     def attachments(self) -> dict[str, bytes]:
         """Attached files by name."""
         return dict(chain.from_iterable(file.attachments.items() for file in self._files))
+
+    def keys_with_messages(self) -> set[str]:
+        """Return the keys that have a message."""
+        return {key for file in self._files for key in file.keys_with_messages()}
 
     @property
     def hosts(self) -> dict[str, str]:
