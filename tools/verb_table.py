@@ -146,7 +146,7 @@ VERBS: Final = (
     Verb("hosts check", "check the hosts' files, versions, keys, clocks and units", "hosts:check"),
     Verb("hosts up", "start the services on all hosts, and arm the drives", "hosts:up"),
     Verb("hosts status", "show the services of all hosts in one table", "hosts:status"),
-    Verb("hosts records", "copy the newest records here, join them into a run", "hosts:bring"),
+    Verb("hosts records", "copy the newest records here", "hosts:bring"),
     Verb("hosts estop", "stop every module, by each host's own shared memory", "hosts:estop"),
     Verb("hosts down", "stop the services on all hosts", "hosts:down"),
     Verb("keys make", "make a robot's authority, and a certificate for each process", "keys:make"),

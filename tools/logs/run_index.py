@@ -15,6 +15,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Final
 
+from shared.bus.topics import RECORDER
 from shared.config.robot_config import SERVICES
 from shared.exceptions import RunError
 from shared.mcap_log.files import SUFFIX
@@ -266,6 +267,11 @@ class RunIndex:
             for service, endpoint in endpoints
             if service in SERVICES and isinstance(endpoint, str)
         }
+
+    @property
+    def recorded_beside(self) -> str:
+        """A service on the host of this record's recorder: a host may record its own services."""
+        return self.metadata["run"].get("of", "").partition(",")[0] or RECORDER
 
     @property
     def complete(self) -> bool:

@@ -10,7 +10,7 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.exceptions import RunError
 from tests.shared.mcap_log.runs import STATE_KEY, item, write, write_in_parts, writer
 from tools.logs.run_index import RunIndex
-from tools.verbs.log.play import Entry, Part, Played, pace
+from tools.verbs.log.play import Entry, Played, PlayedPart, pace
 
 LENGTH = 40
 """Messages, a millisecond apart."""
@@ -81,19 +81,19 @@ def test_the_summary_counts_what_nobody_received_and_what_was_not_sent() -> None
 
 def test_a_part_is_counted_from_the_first_message_of_the_log(tmp_path: Path) -> None:
     index = RunIndex(write(tmp_path, [item(n) for n in range(LENGTH)]))
-    found = list(Part(index, 0.01, 0.005).entries())
+    found = list(PlayedPart(index, 0.01, 0.005).entries())
     assert [entry.payload for entry in found] == [item(n)[1] for n in range(10, 15)]
     assert [entry.after_ns for entry in found] == [n * NS_PER_MS for n in range(5)]
-    parts = [list(Part(index, 0.01 * n, 0.01).entries()) for n in range(4)]
+    parts = [list(PlayedPart(index, 0.01 * n, 0.01).entries()) for n in range(4)]
     assert sum(map(len, parts)) == LENGTH, "parts that follow each other hold every message once"
     with pytest.raises(RunError, match="none of these topics"):
-        Part(index, names=("estop",))
+        PlayedPart(index, names=("estop",))
 
 
 def test_a_split_run_is_played_as_one_in_the_recorded_order(tmp_path: Path) -> None:
     rows = [item(n) for n in range(LENGTH)]
     write_in_parts(writer(tmp_path), rows)
-    part = Part(RunIndex(tmp_path))
+    part = PlayedPart(RunIndex(tmp_path))
     assert part.keys == {STATE_KEY}
     assert [entry.payload for entry in part.entries()] == [row[1] for row in rows]
     assert part.length_ns == (LENGTH - 1) * NS_PER_MS

@@ -92,7 +92,7 @@ class Entry(NamedTuple):
     payload: bytes
 
 
-class Part:
+class PlayedPart:
     """The part of a run that is played."""
 
     def __init__(
@@ -220,7 +220,7 @@ def run(flags: PlayFlags) -> int:
     """Play until the end or Ctrl-C."""
     console = Console()
     index = RunIndex(flags.file)
-    part = Part(index, flags.start_offset, flags.duration, flags.topic)
+    part = PlayedPart(index, flags.start_offset, flags.duration, flags.topic)
     if not index.complete or index.damage:
         words = f"{flags.file}: plays as far as it can be read; see `xrl log info`"
         console.print(words, style="yellow", markup=False, soft_wrap=True)
@@ -241,7 +241,9 @@ def run(flags: PlayFlags) -> int:
         return _play(flags, part, ports, console)
 
 
-def _play(flags: PlayFlags, part: Part, ports: Mapping[str, RawPublisher], console: Console) -> int:
+def _play(
+    flags: PlayFlags, part: PlayedPart, ports: Mapping[str, RawPublisher], console: Console
+) -> int:
     """Play, and say at the end how it went."""
     columns = (TextColumn("{task.completed:.2f} / {task.total:.2f} s"),)
     played, began_ns = Played(), now_ns()
