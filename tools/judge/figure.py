@@ -16,6 +16,7 @@ from shared.config import files as config_file
 from shared.exceptions import ConfigError, RunError
 from shared.extras import late
 from shared.joints import MODULES
+from tools.fleet.stalls import MACHINE
 from tools.judge.verdict import Summary, course, fell
 from tools.logs.impairment_intervals import Impaired, impairments
 from tools.logs.run_log import RunLog, text_of
@@ -222,7 +223,7 @@ def _stalls(axes: Any, stalls: Sequence[dict[str, Any]]) -> None:
                              color=STALLED_COLOUR, lw=0.0, zorder=0)  # fmt: skip
         if row["modules_held"]:
             axes[0].annotate(
-                f"{row['who']} stood still, {row['lasted_ms']:.0f} ms", (begin, 1.0),
+                f"{MACHINE} stalled, {row['lasted_ms']:.0f} ms", (begin, 1.0),
                 xycoords=("data", "axes fraction"), xytext=(0, 13), textcoords="offset points",
                 ha="left", fontsize=8, color=STALLED_COLOUR,
             )  # fmt: skip

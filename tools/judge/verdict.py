@@ -23,19 +23,8 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE, ConfigError, RunError
 from shared.joints import MODULES
 from shared.mcap_log.sequence_stats import KeyCount
-from tools.judge.stalls import (
-    WORLD_STOPS,
-    Disturbance,
-    Stall,
-    as_dicts,
-    disturbances,
-    drop_outs,
-    goes_to_hold,
-    inside,
-    stalls_of,
-)
+from tools.fleet.stalls import Disturbance, disturbances, goes_to_hold, inside, stalls_of
 from tools.judge.standing import (
-    BY_KEY,
     soundness,
     tracking,
     why_not_sound,
@@ -124,11 +113,17 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
         "real_time_factor": last.real_time_factor,
         "world_time_lost_s": last.late_s,
         "in_real_time": _in_real_time(
-            last, [row for row in stalls_of(events) if zero_ns < row.end_ns <= last.t_ns]
+            last,
+            sum(
+                row.lasted_ms / 1e3
+                for row in stalls_of(events)
+                if zero_ns < row.end_ns <= last.t_ns
+            ),
         ),
     }
     times_ns = np.array([row.t_ns for row in truth])
-    disturbed = disturbances(log, truth[0].t_ns, last.t_ns)
+    changes = [row for m in MODULES for row in log.messages(topics.JOINT_EVENT, m)]
+    disturbed = disturbances(events, changes, last.t_ns)
     apart = inside(disturbed, times_ns)
     led = leading(log, times_ns)
     led, held = led & ~apart, ~led & ~apart
@@ -164,50 +159,31 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
     summary["stopped"] = sorted({row.subject for row in kills if row.detail == "STOP"})
     summary["messages_recorded"] = sum(whole.count(key) for key in whole.keys())  # noqa: SIM118 - not a dict
     summary["sequence_gaps"] = sum(count.missing for count in whole.gaps().values())
-    summary["stalls"] = as_dicts(log, disturbed, truth, zero_ns)
-    summary["across_stalls"] = _across(summary, events, disturbed)
-    done_ns = [row.t_ns for row in events if row.kind in (KILLED, FAULTED)]
-    until_ns = min([*done_ns, last.t_ns])
-    summary["drop_outs"] = []
-    if not network and not log.metadata.get("run", {}).get("lockstep"):
-        begin_ns = max(zero_ns, truth[0].t_ns)
-        summary["drop_outs"] = drop_outs(log, disturbed, zero_ns, begin_ns, until_ns)
+    summary["stalls"] = [
+        _stall_row(row, zero_ns) for row in disturbed if row.stall.begin_ns >= truth[0].t_ns
+    ]
     return summary
 
 
-def _in_real_time(last: SimTruth, stalls: Sequence[Stall]) -> bool:
-    """Return True if the world kept up with the clock, but for the stalls in which it stopped."""
-    stood_still_s = sum(row.lasted_ms for row in stalls if row.who in WORLD_STOPS) / 1e3
+def _in_real_time(last: SimTruth, stalled_s: float) -> bool:
+    """Return True if the world kept up with the clock, but for the stalls of the machine."""
     factor = last.real_time_factor
-    if stood_still_s and last.scenario_s > 0.0:
+    if stalled_s and last.scenario_s > 0.0:
         wall_s = last.scenario_s / max(factor, 1e-9)
-        factor = last.scenario_s / max(wall_s - stood_still_s, 1e-9)
-    return factor >= REAL_TIME_FACTOR_MIN and last.late_s - stood_still_s <= LATE_MAX_S
+        factor = last.scenario_s / max(wall_s - stalled_s, 1e-9)
+    return factor >= REAL_TIME_FACTOR_MIN and last.late_s - stalled_s <= LATE_MAX_S
 
 
-def _across(
-    summary: Summary, events: Sequence[RunEvent], disturbed: Sequence[Disturbance]
-) -> list[str]:
-    """Return the keys of figures over their limits that would be within them but for a stall."""
-    found = []
-    for kind, key, unit_s in ((KILLED, "handover_max_ms", 1e-3), (RESTARTED, "reengage_s", 1.0)):
-        begins_ns = [event.t_ns for event in events if event.kind == kind]
-        if not begins_ns or summary[key] is None:
-            continue
-        begin_ns, end_ns = begins_ns[0], begins_ns[0] + summary[key] * unit_s * NS_PER_S
-        overlaps_ns = [
-            max(0.0, min(end_ns, row.stall.end_ns) - max(begin_ns, row.begin_ns))
-            for row in disturbed
-        ]
-        without = summary[key] - sum(overlaps_ns) / NS_PER_S / unit_s
-        if without <= BY_KEY[key].limit < summary[key]:
-            found.append(key)
-    return found + _lost_in_stalls(summary)
-
-
-def _lost_in_stalls(summary: Mapping[str, Any]) -> list[str]:
-    lost = sum(row["messages_lost"] for row in summary["stalls"])
-    return ["sequence_gaps"] if lost and lost >= summary["sequence_gaps"] else []
+def _stall_row(row: Disturbance, zero_ns: int) -> Summary:
+    at_s, held = (row.stall.begin_ns - zero_ns) / NS_PER_S, row.held
+    who = f": {'all six' if held == len(MODULES) else held} held" if held else ""
+    return {
+        "at_s": at_s,
+        "lasted_ms": row.stall.lasted_ms,
+        "apart_until_s": (row.end_ns - zero_ns) / NS_PER_S,
+        "modules_held": held,
+        "said": f"{at_s:.2f} s: {row.stall.words}{who}",
+    }
 
 
 def fell(summary: Mapping[str, Any]) -> bool:
@@ -251,13 +227,10 @@ def joined(parts: Sequence[Summary], counts: Iterable[KeyCount]) -> Summary:
                 }
         elif not isinstance(found[0], bool):
             summary[key] = min(found) if key in LEAST else max(found)
-    told = {(row["at_s"], row["who"]): row for part in parts for row in part["stalls"]}
+    told = {row["at_s"]: row for part in parts for row in part["stalls"]}
     summary["stalls"] = list(told.values())
-    summary["drop_outs"] = list(dict.fromkeys(line for p in parts for line in p["drop_outs"]))
     totals = sum(one.count for one in counted), sum(one.missing for one in counted)
     summary |= dict(zip(COUNTED, totals, strict=True))
-    across = {key for part in parts for key in part["across_stalls"]} - {"sequence_gaps"}
-    summary["across_stalls"] = sorted(across) + _lost_in_stalls(summary)
     fallen = [part["fallen_at_s"] for part in parts if part["fallen_at_s"] is not None]
     summary["fallen_at_s"] = min(fallen, default=None)
     summary["stood"] = last["stood"] and not fallen

@@ -33,8 +33,8 @@ from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES, N_LEG
 from shared.robot.frames import ORIGIN, capture_point
 from tools.fleet.fleet_status import module_status
+from tools.fleet.stalls import STALL_SHOWN_NS, stalls_of
 from tools.judge.reports import scene
-from tools.judge.stalls import STALL_SHOWN_NS, stalls_of
 from tools.topic_keys import every_key
 
 LEAST_N: Final = 20.0

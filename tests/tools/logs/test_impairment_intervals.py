@@ -83,7 +83,7 @@ def test_a_module_is_touched_by_its_own_links_only() -> None:
 def judged(**figures: object) -> Summary:
     return {
         "stood": True, "sound": True, "duration_s": 8.0, "in_real_time": True, "stopped": [],
-        "stalls": [], "drop_outs": [], "across_stalls": [], **figures,
+        "stalls": [], **figures,
     }  # fmt: skip
 
 

@@ -6,9 +6,9 @@ The search for the cause of a fall begins at the earliest violation.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
-from typing import Final, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +18,9 @@ from shared.bus import topics
 from shared.bus.messages import PlannerMode
 from shared.config.robot_config import RobotConfig
 from shared.joints import JOINTS, MODULES
-from tools.judge import stalls
+from tools.fleet import stalls
 from tools.judge.reports.page_model import TimelineEvent
 from tools.judge.reports.run_data import RunData
-from tools.judge.stalls import together
 from tools.judge.standing import BY_KEY
 from tools.judge.verdict import leading
 
@@ -142,7 +141,9 @@ def _world(run: RunData) -> Iterator[Beyond]:
     t = run.course.t + run.at(run.course.zero_ns)
     times_ns = np.array([row.t_ns for row in run.course.rows])
     leads = leading(run.log, times_ns)
-    stalled = stalls.inside(stalls.disturbances(run.log, times_ns[0], times_ns[-1]), times_ns)
+    changes = [row for m in MODULES for row in run.log.messages(topics.JOINT_EVENT, m)]
+    disturbed = stalls.disturbances(run.log.messages(topics.RUN_EVENT), changes, times_ns[-1])
+    stalled = stalls.inside(disturbed, times_ns)
     for name, field, index, scale, leading_key, other_key in WORLD:
         rows = np.array([getattr(row, field) for row in run.course.rows], dtype=np.float64)
         values = np.abs(rows if rows.ndim == 1 else rows[:, index]) * scale
@@ -188,3 +189,19 @@ def _margins(run: RunData, robot: RobotConfig) -> Iterator[Beyond]:
         ("margin of the drives alone", onboard, certificate.onboard_margin_min),
     ):
         yield f"under {least:g}", name, t, (values < least) & has_margin, values
+
+
+Row = TypeVar("Row", bound=tuple[Any, ...])
+
+
+def together(rows: Iterable[Row], key: Callable[[Row], Any], within: float) -> list[list[Row]]:
+    """Group rows with equal keys at about the same time, which is the first field of a row."""
+    groups: list[list[Row]] = []
+    open_: dict[Any, list[Row]] = {}
+    for row in rows:
+        group = open_.get(key(row))
+        if group is None or row[0] - group[0][0] > within:
+            group = open_[key(row)] = []
+            groups.append(group)
+        group.append(row)
+    return groups

@@ -28,11 +28,11 @@ from shared.bus.topics import Topic
 from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS
 from shared.joints import MODULES
-from tools.judge.reports.limit_violations import LimitViolations
+from tools.fleet.stalls import stalls_of
+from tools.judge.reports.limit_violations import LimitViolations, together
 from tools.judge.reports.page_model import TimelineEvent
 from tools.judge.reports.run_data import RunData, module_of
 from tools.judge.reports.signals import GAP_S, Span, message_times
-from tools.judge.stalls import stalls_of, together
 from tools.logs.impairment_intervals import impairments
 
 TOGETHER_S: Final = 0.1
