@@ -85,14 +85,14 @@ def draw(log: RunLog, name: str, summary: Summary, path: Path) -> None:
     _modes(axes[-1], log, zero_ns, end_s)
     plots = [*axes[:4], *axes[-2:]]
     _events(plots, log.messages(topics.RUN_EVENT))
-    _stalls(plots, summary["stalls"])
+    _stalls(plots, summary.stalls)
     if network:
         _network(axes[4], network, zero_ns, end_s)
         _shade(plots, network, zero_ns, end_s)
     axes[-1].set_xlabel("scenario time in s" if began else "time since the hoist let go in s")
     axes[-1].set_xlim(0.0, end_s)
-    verdict = "stood" if summary["stood"] else "FELL" if fell(summary) else "not finished"
-    if summary["unsound"]:
+    verdict = "stood" if summary.stood else "FELL" if fell(summary) else "not finished"
+    if summary.unsound:
         verdict = "stood, but not soundly"
     figure.suptitle(f"{name}: {verdict}", fontsize=12, x=0.01, ha="left")
     save_figure(figure, path)

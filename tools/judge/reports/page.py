@@ -97,9 +97,7 @@ class Page:
         log = run.log
         events = self._timeline.events(run.span)
         plots, left_out = model.as_data(events)
-        verdict = self._judge.verdict(
-            log, self._losses.counts.values(), whole=self._has_first and self._has_last
-        )
+        verdict = self._judge.verdict(whole=self._has_first and self._has_last)
         name = log.metadata["run"].get("scenario") or log.path.name
         fell_s = next((row.t for row in events if row.kind == "fall"), None)
         parts = (

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import tomllib
-from collections.abc import Iterable
 from datetime import datetime
 from typing import Any, Final, NamedTuple
 
@@ -18,11 +17,7 @@ from shared.text_file import decoded
 from tools.judge import verdict, verdict_table
 from tools.judge.reports.run_data import RunData
 from tools.judge.verdict import Summary
-from tools.logs.run_log import RunLog
 from tools.terminal import Console
-
-REAL_TIME_ONLY: Final = ("pd_cycles_late_pct", "planner_tick_us")
-"""Figures without a meaning in virtual time."""
 
 MACHINE: Final = {
     "python": "Python", "platform": "platform", "cpu_model": "CPU", "cpu_count": "CPUs",
@@ -59,10 +54,12 @@ class Judge:
 
     def __init__(self) -> None:
         self._summaries: list[Summary] = []
+        self._counts: dict[str, KeyCount] = {}
         self._why_not = ""
 
     def add(self, run: RunData) -> None:
         """Add a run, or the next part of it."""
+        run.log.count_into(self._counts)
         if run.course is None:
             self._why_not = self._why_not or run.without_course
             return
@@ -70,26 +67,24 @@ class Judge:
             planned = _scenario_of(run).get("duration")
             last_s = float(run.course.t[-1])
             duration_s = float(planned) if isinstance(planned, int | float) else last_s
-            self._summaries.append(verdict.summarise(run.log, duration_s))
+            self._summaries.append(verdict.summarise(run.log, duration_s, self._counts))
         except XrlError as error:
             self._why_not = str(error)
 
-    def verdict(self, log: RunLog, counts: Iterable[KeyCount], *, whole: bool = True) -> RunVerdict:
+    def verdict(self, *, whole: bool = True) -> RunVerdict:
         """Return the verdict; a part of a run (`whole` is False) has figures alone."""
         if not self._summaries:
             return RunVerdict(f"No verdict: {self._why_not}", None, [])
-        summary = verdict.joined(self._summaries, counts)
-        if log.metadata["run"].get("lockstep"):
-            summary |= dict.fromkeys(REAL_TIME_ONLY) | {"in_real_time": True}
+        summary = verdict.merged(self._summaries)
         if not whole:
             return RunVerdict(
                 "A part of a run, and its figures: no verdict", None, verdict_table.rows(summary)
             )
         lines = _verdict_lines(summary)
         cautions = verdict_table.stalls(summary)
-        cautions += [] if summary["in_real_time"] else [lines[-2]]
+        cautions += [] if summary.in_real_time else [lines[-2]]
         caution = " ".join(f"{line.rstrip('.')}." for line in cautions)
-        return RunVerdict(lines[-1], bool(summary["sound"]), verdict_table.rows(summary), caution)
+        return RunVerdict(lines[-1], summary.sound, verdict_table.rows(summary), caution)
 
 
 def _scenario_of(run: RunData) -> dict[str, Any]:
