@@ -24,7 +24,7 @@ from shared.config.scenarios import Scenario
 from shared.mcap_log import provenance
 from shared.mcap_log.writer import SCHEMA_VERSION, RunWriter
 from shared.robot.robot_model import mjcf
-from tools.judge.judgement import judge_run
+from tools.judge.figure import judge_run
 from tools.judge.verdict import Summary
 from tools.live import experiment
 from tools.logs.hand_path import HandRow

@@ -24,7 +24,7 @@ from tools.fleet.pace import PaceFlags
 from tools.fleet.status_table import warn_of_others
 from tools.fleet.supervise import SupervisedFleet
 from tools.judge import verdict, verdict_table
-from tools.judge.judgement import judge_run
+from tools.judge.figure import judge_run
 from tools.live import experiment
 from tools.live.live import run_live
 from tools.live.live_view import LiveView
