@@ -18,7 +18,7 @@ from tools.judge import verdict
 from tools.judge.reports.events import Event, Events
 from tools.judge.reports.panels import COLOURS, GAP_S, Line, Panel, panels_of
 from tools.judge.reports.run_data import RunData
-from tools.judge.verdict import Summary, fell
+from tools.judge.verdict import ShownStall, Summary, fell
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import PICTURE_MAX_S, RunLog, RunPart
 from tools.output import new_figure, save_figure
@@ -177,12 +177,11 @@ def _events(axes: Any, events: Sequence[Event], length_s: float) -> None:
         )  # fmt: skip
 
 
-def _stalls(axes: Any, stalls: Sequence[dict[str, Any]]) -> None:
+def _stalls(axes: Any, stalls: Sequence[ShownStall]) -> None:
     """Shade stalls, and the time that is judged apart because of them."""
     for row in stalls:
-        begin, end = row["at_s"], row["at_s"] + row["lasted_ms"] / 1e3
+        end = row.at_s + row.lasted_ms / 1e3
+        apart = row.apart_until_s if row.modules_held else end
         for axis in axes:
-            axis.axvspan(begin, end, color=STALLED_COLOUR, alpha=0.8, lw=0.0, zorder=0)
-            if row["modules_held"]:
-                axis.axvspan(begin, row["apart_until_s"], alpha=0.15,
-                             color=STALLED_COLOUR, lw=0.0, zorder=0)  # fmt: skip
+            axis.axvspan(row.at_s, end, color=STALLED_COLOUR, alpha=0.8, lw=0.0, zorder=0)
+            axis.axvspan(end, apart, color=STALLED_COLOUR, alpha=0.15, lw=0.0, zorder=0)

@@ -24,18 +24,8 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE, ConfigError, RunError
 from shared.joints import MODULES
 from shared.mcap_log.sequence_stats import KeyCount
-from tools.judge.stalls import (
-    WORLD_STOPS,
-    Disturbance,
-    Stall,
-    as_dicts,
-    disturbances,
-    drop_outs,
-    goes_to_hold,
-    inside,
-    stalls_of,
-)
-from tools.judge.standing import BY_KEY, soundness, tracking, why_not_sound, why_not_standing
+from tools.fleet.stalls import Disturbance, disturbances, goes_to_hold, inside, stalls_of
+from tools.judge.standing import soundness, tracking, why_not_sound, why_not_standing
 from tools.logs.impairment_intervals import Impaired, impairments, touches
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import RunLog, parts_of, robot_of
@@ -73,6 +63,18 @@ class ShownImpairment(msgspec.Struct, frozen=True):
     """All of it as a line for people."""
 
 
+class ShownStall(msgspec.Struct, frozen=True):
+    """One stall of the machine; times in scenario time."""
+
+    at_s: float
+    lasted_ms: float
+    apart_until_s: float
+    """The run is judged apart until then."""
+    modules_held: int
+    said: str
+    """All of it as a line for people."""
+
+
 def _worst(found: Sequence[Percentiles]) -> Percentiles:
     """Return the median of the medians and the worst 99th percentile."""
     return Percentiles(
@@ -80,14 +82,9 @@ def _worst(found: Sequence[Percentiles]) -> Percentiles:
     )
 
 
-def _each_line(found: Sequence[list[str]]) -> list[str]:
-    """Return the lines of all parts without repetitions, in their order."""
-    return list(dict.fromkeys(line for part in found for line in part))
-
-
-def _each_stall(found: Sequence[list[dict[str, Any]]]) -> list[dict[str, Any]]:
+def _each_stall(found: Sequence[list[ShownStall]]) -> list[ShownStall]:
     """Return the stalls of all parts; the later part knows more of one that is in two."""
-    return list({(row["at_s"], row["who"]): row for part in found for row in part}.values())
+    return list({row.at_s: row for part in found for row in part}.values())
 
 
 Largest: TypeAlias = Annotated[float | None, max]
@@ -165,9 +162,7 @@ class Summary(msgspec.Struct, kw_only=True):
     messages_recorded: int = 0
     """Up to the end of the last part; so are the gaps."""
     sequence_gaps: int = 0
-    stalls: Annotated[list[dict[str, Any]], _each_stall] = []
-    across_stalls: Annotated[list[str], _each_line] = []
-    drop_outs: Annotated[list[str], _each_line] = []
+    stalls: Annotated[list[ShownStall], _each_stall] = []
     fleet_cpu_pct: float | None = None
     """Of a live run."""
     speed: float | None = None
@@ -229,11 +224,11 @@ def summarise(log: RunLog, duration_s: float, counts: dict[str, KeyCount] | None
     events: list[RunEvent] = log.messages(topics.RUN_EVENT)
     kills = [row for row in events if row.kind == KILLED]
     network = impairments(log.messages(topics.LINK_EVENT))
-    disturbed = disturbances(log, truth[0].t_ns, truth[-1].t_ns)
+    changes = [row for name in MODULES for row in log.messages(topics.JOINT_EVENT, name)]
+    disturbed = disturbances(events, changes, truth[-1].t_ns)
     _add_end(summary, log, t, truth, duration_s)
-    stalls = [row for row in stalls_of(events) if zero_ns < row.end_ns <= truth[-1].t_ns]
     if not _is_virtual(log):
-        _add_real_time(summary, log, truth, stalls, disturbed)
+        _add_real_time(summary, log, truth, zero_ns, disturbed)
     _add_motion(summary, log, t, truth, kills, disturbed)
     _add_handover(summary, log, kills)
     summary.reengage_s = _reengage(log, events)
@@ -242,14 +237,22 @@ def summarise(log: RunLog, duration_s: float, counts: dict[str, KeyCount] | None
     summary.links_impaired = len(network)
     summary.impairments = [shown(row, zero_ns) for row in network]
     summary.stopped = sorted({row.subject for row in kills if row.detail == "STOP"})
-    summary.stalls = as_dicts(log, disturbed, truth, zero_ns)
-    summary.across_stalls = _across(summary, events, disturbed)
-    if not network and not _is_virtual(log):
-        ends_ns = [row.t_ns for row in events if row.kind in (KILLED, FAULTED)]
-        until_ns = min([*ends_ns, truth[-1].t_ns])
-        begin_ns = max(zero_ns, truth[0].t_ns)
-        summary.drop_outs = drop_outs(log, disturbed, zero_ns, begin_ns, until_ns)
+    summary.stalls = [
+        _shown_stall(row, zero_ns) for row in disturbed if row.stall.begin_ns >= truth[0].t_ns
+    ]
     return summary
+
+
+def _shown_stall(row: Disturbance, zero_ns: int) -> ShownStall:
+    at_s, held = (row.stall.begin_ns - zero_ns) / NS_PER_S, row.held
+    who = f": {'all six' if held == len(MODULES) else held} held" if held else ""
+    return ShownStall(
+        at_s=at_s,
+        lasted_ms=row.stall.lasted_ms,
+        apart_until_s=(row.end_ns - zero_ns) / NS_PER_S,
+        modules_held=held,
+        said=f"{at_s:.2f} s: {row.stall.words}{who}",
+    )
 
 
 def summarise_parts(index: RunIndex, duration_s: float) -> Summary:
@@ -279,8 +282,6 @@ def merged(parts: Sequence[Summary]) -> Summary:
         found = [value for part in parts if (value := getattr(part, name)) is not None]
         if merge and found:
             setattr(summary, name, merge[0](found))
-    across = set(summary.across_stalls) - {"sequence_gaps"}
-    summary.across_stalls = sorted(across) + _lost_in_stalls(summary)
     summary.stood = last.stood and summary.fallen_at_s is None
     summary.unsound = why_not_sound(summary) if summary.stood else ""
     summary.sound = summary.stood and not summary.unsound
@@ -328,12 +329,14 @@ def _add_real_time(
     summary: Summary,
     log: RunLog,
     truth: Sequence[SimTruth],
-    stalls: Sequence[Stall],
+    zero_ns: int,
     disturbed: Sequence[Disturbance],
 ) -> None:
     """Add what only a live run has."""
     start_ns, last = truth[0].t_ns, truth[-1]
-    summary.in_real_time = _in_real_time(last, stalls)
+    stalls = stalls_of(log.messages(topics.RUN_EVENT))
+    stalled_ms = sum(row.lasted_ms for row in stalls if zero_ns < row.end_ns <= last.t_ns)
+    summary.in_real_time = _in_real_time(last, stalled_ms / 1e3)
     summary.real_time_factor, summary.world_time_lost_s = last.real_time_factor, last.late_s
     summary.pd_cycles_late_pct = _late_share(log, start_ns, disturbed)
     statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
@@ -341,40 +344,13 @@ def _add_real_time(
     summary.planner_tick_us = _percentiles(np.array(ticks_us))
 
 
-def _in_real_time(last: SimTruth, stalls: Sequence[Stall]) -> bool:
-    """Return True if the world kept up with the clock, but for the stalls in which it stopped."""
-    stood_still_s = sum(row.lasted_ms for row in stalls if row.who in WORLD_STOPS) / 1e3
+def _in_real_time(last: SimTruth, stalled_s: float) -> bool:
+    """Return True if the world kept up with the clock, but for the stalls of the machine."""
     factor = last.real_time_factor
-    if stood_still_s and last.scenario_s > 0.0:
+    if stalled_s and last.scenario_s > 0.0:
         wall_s = last.scenario_s / max(factor, 1e-9)
-        factor = last.scenario_s / max(wall_s - stood_still_s, 1e-9)
-    return factor >= REAL_TIME_FACTOR_MIN and last.late_s - stood_still_s <= LATE_MAX_S
-
-
-def _across(
-    summary: Summary, events: Sequence[RunEvent], disturbed: Sequence[Disturbance]
-) -> list[str]:
-    """Return the keys of figures over their limits that would be within them but for a stall."""
-    found = []
-    for kind, key, unit_s in ((KILLED, "handover_max_ms", 1e-3), (RESTARTED, "reengage_s", 1.0)):
-        begins_ns = [event.t_ns for event in events if event.kind == kind]
-        value: float | None = getattr(summary, key)
-        if not begins_ns or value is None:
-            continue
-        begin_ns, end_ns = begins_ns[0], begins_ns[0] + value * unit_s * NS_PER_S
-        overlaps_ns = [
-            max(0.0, min(end_ns, row.stall.end_ns) - max(begin_ns, row.begin_ns))
-            for row in disturbed
-        ]
-        without = value - sum(overlaps_ns) / NS_PER_S / unit_s
-        if without <= BY_KEY[key].limit < value:
-            found.append(key)
-    return found + _lost_in_stalls(summary)
-
-
-def _lost_in_stalls(summary: Summary) -> list[str]:
-    lost = sum(row["messages_lost"] for row in summary.stalls)
-    return ["sequence_gaps"] if lost and lost >= summary.sequence_gaps else []
+        factor = last.scenario_s / max(wall_s - stalled_s, 1e-9)
+    return factor >= REAL_TIME_FACTOR_MIN and last.late_s - stalled_s <= LATE_MAX_S
 
 
 def _add_motion(

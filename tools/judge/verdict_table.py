@@ -84,31 +84,23 @@ def mark(row: VerdictLimit, summary: Summary) -> str:
         return OK
     if row.key == "sequence_gaps" and summary.stopped:
         return "of a service that was stopped"
-    if row.key in summary.across_stalls:
-        return "in a stall"
     if row.key in OF_THE_MACHINE:
         return f"{OVER}, a busy machine" if row.key != "sequence_gaps" else OVER
     return f"{OVER}, links impaired" if summary.links_impaired else OVER
 
 
 def stalls(summary: Summary) -> list[str]:
-    """Return a line for each stall that made something of the run, and one for the others.
-
-    After them each drop-out that no stall explains.
-    """
-    rows = summary.stalls
-    told = [row for row in rows if row["modules_held"] or row["messages_lost"]]
-    rest = [row["lasted_ms"] for row in rows if row not in told]
-    lines = [row["said"] for row in told[:STALLS_MAX]]
+    """Return a line for each stall that made modules hold, and one for the others."""
+    told = [row.said for row in summary.stalls if row.modules_held]
+    rest = [row.lasted_ms for row in summary.stalls if not row.modules_held]
+    lines = told[:STALLS_MAX]
     if len(told) > STALLS_MAX:
         lines.append(f"{len(told) - STALLS_MAX} more stalls with consequences")
     if rest:
-        stalls_are = "stall was" if len(rest) == 1 else "stalls were"
-        lines.append(f"{len(rest)} {'more ' if told else ''}{stalls_are} without consequence: "
-                     f"{max(rest):.0f} ms{' at most' if len(rest) > 1 else ''}")  # fmt: skip
+        lines.append(f"Stalls of the machine without consequence: {len(rest)}, at most "
+                     f"{max(rest):.0f} ms")  # fmt: skip
     if told:
         lines.append("Figures marked led or held leave out what a stall made of the run.")
-    lines += summary.drop_outs
     return lines
 
 

@@ -33,8 +33,8 @@ from shared.joints import MODULES
 from shared.robot.frames import ORIGIN, capture_point
 from shared.robot.robot_model import ankle_positions
 from tools.fleet.fleet_status import module_status
+from tools.fleet.stalls import STALL_SHOWN_NS, stalls_of
 from tools.judge.reports.robot_pose import pose_of_legs
-from tools.judge.stalls import STALL_SHOWN_NS, stalls_of
 from tools.topic_keys import every_key
 
 LEAST_N: Final = 20.0

@@ -93,7 +93,7 @@ def test_a_run_in_virtual_time_has_no_stalls_and_says_nothing_of_them(
     assert led_again.reengage_s is not None
     sound = verdict.summarise(impaired, 2.0)
     for run in (led_again, sound):
-        assert (run.stalls, run.across_stalls, run.drop_outs) == ([], [], [])
+        assert run.stalls == []
     assert sound.operator_side_peak_n is None, "nobody holds it sideways"
     assert verdict_table.stalls(sound) == []
 
@@ -190,17 +190,16 @@ def test_every_limit_is_one_of_a_figure() -> None:
 def test_figures_of_parts_merge_as_their_fields_declare() -> None:
     first = Summary(
         shaking_nm=3.0, torso_height_min_m=0.9, duration_s=10.0, in_real_time=False,
-        command_age_ms=Percentiles(3.0, 9.0), messages_recorded=5, drop_outs=["a", "b"],
+        command_age_ms=Percentiles(3.0, 9.0), messages_recorded=5,
         links_impaired=1,
     )  # fmt: skip
     last = Summary(
         stood=True, sound=True, shaking_nm=2.0, torso_height_min_m=1.0, duration_s=20.0,
-        command_age_ms=Percentiles(5.0, 8.0), messages_recorded=9, drop_outs=["b", "c"],
+        command_age_ms=Percentiles(5.0, 8.0), messages_recorded=9,
     )  # fmt: skip
     assert merged([first, last]) == Summary(
         stood=True, sound=True, shaking_nm=3.0, torso_height_min_m=0.9, duration_s=20.0,
         in_real_time=False, command_age_ms=Percentiles(4.0, 9.0), messages_recorded=9,
-        drop_outs=["a", "b", "c"],
     )  # fmt: skip
 
 

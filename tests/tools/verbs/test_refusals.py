@@ -164,20 +164,13 @@ REFUSALS: Final = {
     "log explain --p -0.01,0,1.4,0,0,0": "COM z 1.40 m wanted",
     "log explain --p 0,0,0.8,0,0,0 --q 0": "one of them",
     "log explain no_such.mcap": "cannot be read",
-    "log play --topics 'joint/*/state' LOG": "write it first",
-    "log play LOG --start-paused --listen none": "there is no terminal here",
     "log play LOG --rate 0": "a number from 0.001 to 1000",
     "log play LOG --rate -1": "a number from 0.001 to 1000",
     "log play LOG --start-offset -0.1": "'-0.1': a number of at least 0 s",
     "log play LOG --start-offset 9": "the log is 0.04 s long",
+    "log play LOG --topic joint/*/sate": "no topic is so named",
+    "log play LOG --topic estop": "none of these topics has a message",
     "log play LOG --duration 0": "a number of at least 1e-09 s",
-    "log play LOG --clock-hz 0": "a number from 0.001 to 1000 Hz",
-    "log play LOG --topics joint/*/sate": "the nearest is joint/*/state",
-    "log play LOG --topics estop": "nothing is left to play; the log holds joint/*/state",
-    "log play LOG --exclude wrenchh": "the nearest is harness/wrench",
-    "log play LOG --remap joint/knee_right/state": "OLD=NEW is right",
-    "log play LOG --prefix xrl/lab": "--prefix",
-    "log play LOG --config nowhere.toml": "nowhere.toml",
     "topic hz foo": "foo",
     "topic hz estop --for 0": "a number of at least 0.001 s",
     "topic echo": "TOPIC",
@@ -262,6 +255,6 @@ def test_what_cannot_be_meant_is_refused_with_what_is_right(
     lines = err.splitlines()
     assert REFUSALS[typed] in " ".join(" ".join(lines).split())
     assert len(lines) == 1 or lines[0].startswith("usage: xrl ")
-    assert out == "" or typed.startswith("log play"), "which says first what it plays"
+    assert out == ""
     assert list(tmp_path.iterdir()) == [], "nothing was begun"
     assert log.read_bytes() == before, "a record is never touched"

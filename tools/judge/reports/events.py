@@ -195,7 +195,7 @@ _RUN_EVENTS: Final[Mapping[int, tuple[str, str, str]]] = {
     RunEventKind.RESTARTED: ("restart", "{0} restarts", "{0} back"),
     RunEventKind.PUSHED: ("push", "push {1}", "push {2}"),
     RunEventKind.FAULTED: ("fault", "{0}: fault {1} begins", "{0} {1}"),
-    RunEventKind.STALLED: ("stall", "{0} stood still: {1}", "stall"),
+    RunEventKind.STALLED: ("stall", "{0} stalled for {1}", "stall"),
 }
 """Kind, text and mark of a run's event: {0} subject, {1} detail, {2} the force of a push."""
 

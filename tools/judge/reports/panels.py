@@ -18,7 +18,7 @@ from shared.bus import topics
 from shared.bus.messages import Mode, PlannerMode, name_of
 from shared.clock import NS_PER_MS
 from shared.joints import MODULES
-from tools.judge import stalls
+from tools.fleet import stalls
 from tools.judge.reports.run_data import RunData
 from tools.judge.standing import BY_KEY
 from tools.judge.verdict import leading
@@ -283,7 +283,9 @@ class _Judged:
         if run.course is not None:
             begin_ns, end_ns = run.course.rows[0].t_ns, run.course.rows[-1].t_ns
             judged = (times_ns >= begin_ns) & (times_ns <= end_ns)
-            judged &= ~stalls.inside(stalls.disturbances(run.log, begin_ns, end_ns), times_ns)
+            changes = [row for m in MODULES for row in run.log.messages(topics.JOINT_EVENT, m)]
+            events = run.log.messages(topics.RUN_EVENT)
+            judged &= ~stalls.inside(stalls.disturbances(events, changes, end_ns), times_ns)
             led = leading(run.log, times_ns)
             self._led, self._held = led & judged, ~led & judged
 

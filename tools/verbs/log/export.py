@@ -21,7 +21,7 @@ from tools.export.tables import (
     write_grid,
     write_tables,
 )
-from tools.flags import RUN_HELP, Arg, Folder, Rate, option, positional
+from tools.flags import RUN_HELP, Arg, Folder, Rate, positional
 from tools.judge.run_parts import PartFlags, part_of
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import SEE_INFO, RunLog, RunPart, read_part, robot_of
