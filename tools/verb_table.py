@@ -114,7 +114,6 @@ VERBS: Final = (
         "hanging, its services down: dry and viscous friction, reflected inertia",
         "drive.identify:joint",
     ),
-    Verb("drive tune", "offset a reference by step and sines: rise, damping, margin; gains"),
     Verb("log info", "show what is in a log: topics, rates, gaps, losses"),
     Verb("log recover", "make a complete log from one that was cut off"),
     Verb("log play", "put a log back onto a bus of its own, under replay/"),
@@ -174,7 +173,7 @@ RENAMED: Final = {
     **{
         word: f"{noun} {word}"
         for noun, words in (
-            ("drive", "configure zero jog tare can identify tune"),
+            ("drive", "configure zero jog tare can identify"),
             ("log", "info recover join play report export explain resim whatif"),
         )
         for word in words.split()

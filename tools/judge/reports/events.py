@@ -28,6 +28,7 @@ from shared.bus.messages import (
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS
 from shared.joints import MODULES
+from tools.fleet.stalls import stalls_of
 from tools.judge.reports.panels import GAP_S, Beyond, Panel, panels_of
 from tools.judge.reports.run_data import RunData, Span
 from tools.logs.impairment_intervals import impairments
@@ -201,6 +202,8 @@ _RUN_EVENTS: Final[Mapping[int, tuple[str, str, str]]] = {
 
 
 def _told(event: RunEvent) -> tuple[str, str, str]:
+    for stall in stalls_of([event]):
+        return "stall", stall.words, "stall"
     unknown = ("note", f"{{0}} {name_of(RunEventKind, event.kind)} {{1}}", "")
     kind, *texts = _RUN_EVENTS.get(event.kind, unknown)
     words = event.subject, event.detail, event.detail.partition(" for ")[0]
