@@ -17,8 +17,7 @@ from typing import IO, Final, NamedTuple
 
 import msgspec
 
-from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, RunError
-from tools.dev.changed import changed_since, selection
+from shared.exceptions import FAULT_EXIT_CODE
 
 CHECKS: Final = (("ruff", "check"), ("ruff", "format", "--check"), ("mypy",))
 PYTEST: Final = ("pytest", "--durations=12", "--durations-min=2")
@@ -47,7 +46,6 @@ class Plan(NamedTuple):
     """Begun before these, and followed after them."""
 
 
-CHANGED: Final = "--changed"
 INTERRUPTED: Final = 128 + signal.SIGINT
 ENDS_BY: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """The first is ignored where a shell put us behind."""
@@ -108,12 +106,6 @@ def main(argv: Sequence[str]) -> int:
         signal.signal(number, signal.default_int_handler)
     begun_s = time.monotonic()
     plan = Plan((PYTEST + tuple(argv),)) if argv else _everything()
-    if CHANGED in argv[:1]:
-        try:
-            plan = Plan(_touched(*argv[1:]))
-        except RunError as error:
-            print(f"deploy/test: {error}", file=sys.stderr)
-            return DECLINED_EXIT_CODE
     running: list[Check] = []
     with ExitStack() as stack:
         stack.callback(_stop, running)
@@ -143,22 +135,6 @@ def _everything() -> Plan:
     files = sorted(Path("tests").rglob("test_*.py"))
     marked = [str(file) for file in files if "pytest.mark.system" in file.read_text("utf-8")]
     return Plan((LIVE, (*WAITING, *marked)), beside=PATIENT)
-
-
-def _touched(revision: str = "HEAD", *others: str) -> tuple[tuple[str, ...], ...]:
-    """Return the command for what a change can have touched, if that is anything."""
-    if others:
-        raise RunError(f"{CHANGED} takes one revision, or none for what is not committed")
-    changed = changed_since(revision)
-    whole, first = selection(changed)
-    print(
-        f"== {len(changed)} files differ from {revision}: {len(whole)} test files name them and run"
-        f" whole, {len(first)} reach them and run one test; none with processes or real time"
-    )
-    if not whole + first:
-        return ()
-    of = [f"--first-of={name}" for name in first]
-    return ((*PATIENT[0], "-p", changed_since.__module__, *of, *whole, *first),)
 
 
 def _start(command: tuple[str, ...], to: IO[bytes] | int, *, beside: bool = False) -> Check:
