@@ -124,7 +124,6 @@ VERBS: Final = (
         "hanging, its services down: dry and viscous friction, reflected inertia",
         "drive.identify:joint",
     ),
-    Verb("drive tune", "offset a reference by step and sines: rise, damping, margin; gains"),
     Verb("log info", "show what is in a log: topics, rates, gaps, losses"),
     Verb("log recover", "make a complete log from one that was cut off"),
     Verb("log join", "join the records of several hosts into one run"),
