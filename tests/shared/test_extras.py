@@ -96,9 +96,8 @@ def test_a_lock_of_some_robots_holds_what_it_adds_to_a_robots_lock(extra: str) -
 
 def test_the_whole_lock_holds_every_extra_that_is_said_to_be_in_it() -> None:
     held = locked("requirements.lock")
-    for extra in set(EXTRAS) - {*UNLOCKED, "pad"}:
+    for extra in set(EXTRAS) - UNLOCKED:
         assert packages_of(extra) <= held, extra
-    assert "evdev-binary" in held
 
 
 def test_what_is_absent_is_told_with_its_extra_and_what_brings_it(

@@ -60,7 +60,6 @@ REFUSALS: Final = {
     "estop --local --partly elbow": "'elbow': one of",
     "estop --local --wait": "--wait is for the bus",
     "lead --hold a --stop a": "give two buttons",
-    "lead --calibrate --keys": "--calibrate is for a pad",
     "lead --for 5": "go with --assist N",
     "lead --assist 5 --shift 1,2": "2 numbers; 4 are right; such as 0.02,0,0,0",
     "lead --assist 5 --keys": "not allowed with",

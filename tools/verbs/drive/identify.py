@@ -100,9 +100,9 @@ class BodyFlags(MotionFlags):
 class JointFlags(MotionFlags):
     """Which joints, and how hard they are moved."""
 
-    module: Annotated[tuple[str, ...], positional("MODULE", exclusive="which!")] = ()
+    module: Annotated[tuple[str, ...], positional("MODULE", one_of="which")] = ()
     """which; or --all"""
-    all: Annotated[bool, Arg(exclusive="which!")] = False
+    all: Annotated[bool, Arg(one_of="which")] = False
     """all six, one joint after the other"""
     axis: Annotated[str | None, Arg(choices=AXES)] = None
     """only this one (default: both)"""

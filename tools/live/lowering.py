@@ -1,4 +1,4 @@
-"""Lowers a robot that is up, over the bus, before its drives go limp (`tools.fleet.descent`)."""
+"""Lowers a robot that is up, over the bus, before its drives go limp (`tools.live.descent`)."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from shared.clock import now_ns
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import BusError, FleetError
 from shared.joints import MODULES
-from tools.fleet.descent import WAYS, Ask, Descent, Phase
 from tools.fleet.led_planner import asker, other_asker
+from tools.live.descent import WAYS, Ask, Descent, Phase
 
 LOOK_S: Final = 0.02
 """An intent that is not repeated ends within `assist.stale_ms`."""

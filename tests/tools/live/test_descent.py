@@ -16,8 +16,9 @@ from shared.exceptions import FleetError
 from shared.joints import MODULES, kind_of
 from shared.robot.robot_model import stand_pose
 from tests.messages import joint_state, planner_status
-from tools.fleet import descent, procfs
-from tools.fleet.descent import HEARD_S, LIGHT_S, PATIENCE_S, STALLED_S, Ask, Descent, LegLoad
+from tools.fleet import procfs
+from tools.live import descent
+from tools.live.descent import HEARD_S, LIGHT_S, PATIENCE_S, STALLED_S, Ask, Descent, LegLoad
 from tools.verbs import down
 from tools.verbs.down import DownFlags
 
