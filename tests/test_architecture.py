@@ -86,7 +86,6 @@ VENDORS = {
     "matplotlib": [
         "tools/output.py",
         "tools/judge/figure.py",
-        "tools/lab/design/damping_picture.py",
         "tools/lab/studies/sweeps/kill.py",
         "tools/lab/studies/sweeps/latency_report.py",
     ],
@@ -304,7 +303,7 @@ def test_no_files_import_each_other_in_a_circle_not_even_for_a_type() -> None:
 
 
 def test_the_design_of_the_gains_knows_the_planners_law_and_no_other_service() -> None:
-    allowed = ("services.planner.", "shared.", "tools.lab.design.", "tools.output.")
+    allowed = ("services.planner.", "shared.", "tools.lab.design.")
 
     def is_foreign(_: str, i: Import) -> bool:
         return i.top in PACKAGES and not f"{i.full}.".startswith(allowed)
