@@ -31,7 +31,6 @@ EXTRAS: Final = {
     "usb": ("odrive",),
     "parquet": ("pyarrow",),
     "pad": ("evdev",),
-    "learn": ("gymnasium",),
     "cluster": ("distributed",),
     "bench": ("cyclonedds", "iceoryx2", "lcm", "zmq"),
 }

@@ -71,7 +71,6 @@ VENDORS = {
     "getpass": ["shared/user.py"],
     "zenoh": ["shared/bus/session.py", "services/ros2_gateway/ros_session.py"],
     "rosbags": ["services/ros2_gateway/ros_types.py", "tools/export/ros2_bag.py"],
-    "gymnasium": ["tools/lab/learning/environment.py"],
     "shtab": ["tools/verbs/completion.py"],
     "pyarrow": ["tools/export/tables.py"],
     "mujoco": [
@@ -121,7 +120,6 @@ NEEDS_EXTRA = {
     "tools/view/foxglove_server.py": "foxglove",
     "tools/export/ros2_bag.py": "ros2",
     "tools/judge/reports/moving_picture.py": "plot",
-    "tools/lab/learning/environment.py": "learn",
 }
 """Modules that cannot be imported without an extra. Whoever imports one, by a function, has called
 `require` there. All others can be imported with the packages of `dependencies` alone."""
@@ -161,7 +159,6 @@ TOOL_LAWS = [
     "tools/bringup/tune/response.py",
     "tools/bringup/whole_turns.py",
     "tools/lab/design/*.py",
-    "tools/lab/learning/policy.py",
     "tools/logs/reexecution/compare.py",
     "tools/logs/reexecution/inputs.py",
     "tools/logs/reexecution/params.py",
