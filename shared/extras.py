@@ -30,7 +30,6 @@ EXTRAS: Final = {
     "usb": ("odrive",),
     "parquet": ("pyarrow",),
     "pad": ("sdl2", "sdl2dll"),
-    "learn": ("gymnasium",),
     "cluster": ("distributed",),
     "bench": ("cyclonedds", "iceoryx2", "lcm", "zmq"),
 }
