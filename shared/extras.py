@@ -21,9 +21,9 @@ from shared.places import CHECKOUT
 _PLOT: Final = ("matplotlib", "PIL")
 
 EXTRAS: Final = {
-    "sim": ("mujoco", *_PLOT),
+    "sim": ("mujoco", "scipy", *_PLOT),
     "plot": _PLOT,
-    "design": ("cvxpy",),
+    "design": ("cvxpy", "scipy"),
     "view": ("aiohttp",),
     "foxglove": ("foxglove",),
     "ros2": ("rosbags",),

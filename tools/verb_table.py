@@ -70,7 +70,6 @@ class Verb(NamedTuple):
 NOUNS: Final = {
     "drive": "set up, move and measure drives",
     "drive can": "bring the CAN buses up, listen to them, measure how fast drives answer",
-    "drive identify": "measure what the robot file assumes: masses, zeros, friction, scale",
     "log": "inspect, export, replay records",
     "topic": "show what is on the bus",
     "study": "run many cases: who falls, and why",
@@ -114,16 +113,7 @@ VERBS: Final = (
     Verb("drive can setup", "bring the kernel's CAN interfaces up", "drive.can:set_up"),
     Verb("drive can test", "listen and count what each drive and sensor sends", "drive.can:test"),
     Verb("drive can latency", "measure how long each axis takes to answer", "drive.can:latency"),
-    Verb(
-        "drive identify body",
-        "standing: payload and its centre, harness point, torque constant, encoder zeros",
-        "drive.identify:body",
-    ),
-    Verb(
-        "drive identify joint",
-        "hanging, its services down: dry and viscous friction, reflected inertia",
-        "drive.identify:joint",
-    ),
+    Verb("drive identify", "measure a hanging joint's friction and reflected inertia"),
     Verb("log info", "show what is in a log: topics, rates, gaps, losses"),
     Verb("log recover", "make a complete log from one that was cut off"),
     Verb("log play", "put a log back onto a bus of its own, under replay/"),

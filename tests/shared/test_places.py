@@ -20,8 +20,8 @@ from tools.verbs import estop
 
 SAID = "config: ./robot.toml\n"
 DECIDE_LATER = {
-    "doctor", "drive configure", "drive identify body", "drive identify joint", "drive jog",
-    "drive zero", "estop", "log explain", "view",
+    "doctor", "drive configure", "drive identify", "drive jog", "drive zero", "estop",
+    "log explain", "view",
 }  # fmt: skip
 """Verbs that take a running fleet's or a record's robot before they look for a file."""
 

@@ -1,4 +1,4 @@
-"""Friction and reflected inertia of one joint, from small sines of a hanging leg. Pure.
+"""`xrl drive identify`: friction and reflected inertia, from small sines of a hanging leg. Pure.
 
 The drive's own loop follows sines of a few frequencies, one after the other. Where q moves steadily
 its Fourier series gives rate and acceleration without a filter's lag, and
@@ -19,12 +19,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from enum import StrEnum
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from shared.arrays import Array
 from shared.bus.messages import Pair
+from shared.config.robot_config import RobotConfig
 from tools.bringup.hanging_leg import HEAVY, HangingJoint
 from tools.bringup.motion import MotionPlan, Sample
 
@@ -52,6 +54,8 @@ DRY_SD: Final = 0.04
 """N m; cogging and play show as dry friction of this size."""
 MASS_SD: Final = 0.03
 """Fraction of the leg's inertia in the robot file."""
+HALF_WIDTH: Final = 1.96
+"""Standard deviations on either side: 95 %."""
 HARMONICS: Final = 9
 MOVING: Final = 0.3
 """Fraction of a tone's fastest rate; slower samples, where a joint sticks, are not used."""
@@ -137,12 +141,6 @@ class JointFit(NamedTuple):
     """N m"""
     stiffness: tuple[float, float]
     """Gravity's, N m/rad."""
-    q: Array
-    """Angle from its mean (n,), rad, at the samples used."""
-    tau: Array
-    """Torque there (n,), N m."""
-    fitted: Array
-    """Torque of the fit (n,), N m."""
 
 
 def plan_for(axis: int, torque: float, armature: float, joint: HangingJoint) -> SinePlan:
@@ -174,7 +172,7 @@ def fit_sines(samples: Sequence[Sample], plan: SinePlan) -> JointFit | None:
         if len(rows) < 20 * (tone.cycles - 2):
             return None
         parts.append(_steady(rows, begin_s, tone, plan.axis))
-    q, regressors, tau, cycle, weight = map(np.concatenate, zip(*parts, strict=True))
+    regressors, tau, cycle, weight = map(np.concatenate, zip(*parts, strict=True))
     weighted = regressors * weight[:, None]
     H = np.linalg.inv(weighted.T @ regressors)
     x = H @ (weighted.T @ tau)
@@ -189,15 +187,17 @@ def fit_sines(samples: Sequence[Sample], plan: SinePlan) -> JointFit | None:
     viscous_sd = math.hypot(viscous_sd, k_p * TIME_SD)
     dry_sd = math.hypot(dry_sd, DRY_SD)
     return JointFit(
-        inertia=(inertia, inertia_sd), viscous=(viscous, viscous_sd), dry=(dry, dry_sd),
-        stiffness=(stiffness, stiffness_sd), q=q, tau=tau, fitted=regressors @ x,
-    )  # fmt: skip
+        inertia=(inertia, inertia_sd),
+        viscous=(viscous, viscous_sd),
+        dry=(dry, dry_sd),
+        stiffness=(stiffness, stiffness_sd),
+    )
 
 
 def _steady(
     samples: Sequence[Sample], begin_s: float, tone: Tone, axis: int
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Return angle (n,), regressors (n, 5), torque, cycle and weight of a tone's steady part.
+) -> tuple[Array, Array, Array, Array]:
+    """Return regressors (n, 5), torque (n,), cycle and weight of a tone's steady part.
 
     A sample weighs as the way that it stands for: cogging slows a joint where it opposes, and to
     count by time would take it for friction.
@@ -221,4 +221,84 @@ def _steady(
     cycle = np.floor(t * tone.frequency_hz) + 1000.0 * tone.frequency_hz
     moving = np.abs(v) > MOVING * np.max(np.abs(v))
     way = np.abs(np.gradient(q)) / np.mean(np.abs(v)) / np.mean(np.diff(t))
-    return (smooth - a[0])[moving], rows[moving], tau[moving], cycle[moving], way[moving]
+    return rows[moving], tau[moving], cycle[moving], way[moving]
+
+
+class Verdict(StrEnum):
+    """What an estimate says of the robot file's value."""
+
+    CHANGE = "change"
+    """It lies outside the interval."""
+    AGREES = "agrees"
+    """It lies inside."""
+    MEASURED = "measured"
+    """The file has no such value."""
+    UNKNOWN = "not shown"
+    """The interval is too wide to say anything."""
+
+
+class Estimate(NamedTuple):
+    """One number of a joint."""
+
+    what: str
+    unit: str
+    file: float | None
+    """Value of the robot file; None if it has none."""
+    value: float
+    half_width: float
+    """Half the width of the 95 % interval."""
+    verdict: Verdict
+
+    @property
+    def digits(self) -> int:
+        """Decimals worth printing: a tenth of the interval."""
+        return max(0, 1 - math.floor(math.log10(max(self.half_width, 1e-9))))
+
+    def describes(self, truth: float) -> bool:
+        """Return True if a value lies within the interval."""
+        return abs(truth - self.value) <= self.half_width
+
+
+class JointResult(NamedTuple):
+    """What the sines of one joint showed."""
+
+    joint: str
+    fit: JointFit
+    leg_inertia: float
+    """Inertia of what hangs on it by the robot file, without its rotor, kg m^2."""
+
+    @property
+    def rotor(self) -> tuple[float, float]:
+        """Reflected inertia of the rotors and its standard deviation, kg m^2."""
+        total, sd = self.fit.inertia
+        return total - self.leg_inertia, math.hypot(sd, MASS_SD * self.leg_inertia)
+
+
+def estimates_of(results: Sequence[JointResult], robot: RobotConfig) -> list[Estimate]:
+    """Return what the sines say; the last row is the rotors' inertia, one for all joints.
+
+    It is not shown if its interval is wider than half of the robot file's value.
+    """
+    armature, rows = robot.joint.armature, []
+    for joint, fit, leg_inertia in results:
+        inertia = fit.inertia[0], math.hypot(fit.inertia[1], MASS_SD * leg_inertia)
+        rows += [
+            _estimate(f"dry friction {joint}", "N m", fit.dry),
+            _estimate(f"viscous friction {joint}", "N m s/rad", fit.viscous),
+            _estimate(f"inertia {joint}", "kg m^2", inertia, leg_inertia + armature),
+        ]
+    rotors = [result.rotor for result in results]
+    weight = sum(1.0 / sd**2 for _, sd in rotors)
+    mean = sum(value / sd**2 for value, sd in rotors) / weight
+    sd = max(weight**-0.5, YIELDS * armature)
+    last = _estimate("reflected inertia", "kg m^2", (mean, sd), armature)
+    known = HALF_WIDTH * sd < 0.5 * armature
+    return [*rows, last if known else last._replace(verdict=Verdict.UNKNOWN)]
+
+
+def _estimate(what: str, unit: str, of: tuple[float, float], file: float | None = None) -> Estimate:
+    value, half_width = of[0], HALF_WIDTH * of[1]
+    verdict = Verdict.MEASURED
+    if file is not None:
+        verdict = Verdict.AGREES if abs(value - file) <= half_width else Verdict.CHANGE
+    return Estimate(what, unit, file, value, half_width, verdict)
