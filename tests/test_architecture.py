@@ -158,7 +158,6 @@ TOOL_LAWS = [
     "tools/logs/reexecution/params.py",
 ]
 
-
 LAWS = [
     file
     for file in SOURCES
@@ -536,7 +535,6 @@ def test_only_simulations_know_the_centralised_baseline_and_no_robot_file_names_
         "tools/sim/recorded_lockstep.py",
         "tools/verbs/sim.py",
         "tools/lab/studies/sweeps/latency_trial.py",
-        "tools/sim/centralised/fleet.py",
     }
     for file in (ROOT / "deploy").rglob("*.toml"):
         assert "centralised" not in file.read_text(encoding="utf-8"), file

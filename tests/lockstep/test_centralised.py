@@ -27,8 +27,7 @@ from tests.lockstep import runs
 from tests.lockstep.runs import push, variant
 from tests.planner.states import state
 from tools import cli
-from tools.sim.centralised.control import CentralPlanner, PassThrough
-from tools.sim.centralised.fleet import CONTROLS, SHIPPED, torques_only
+from tools.sim.centralised import CONTROLS, SHIPPED, CentralPlanner, PassThrough, torques_only
 from tools.sim.lockstep import Lockstep
 
 TAU: Pair = (3.0, -41.0)

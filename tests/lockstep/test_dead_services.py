@@ -16,7 +16,7 @@ from shared.exceptions import RunError
 from shared.joints import MODULE_INDEX, MODULES
 from tests.lockstep.runs import kill, modes_of, push, restart, run, still, variant
 from tools.lab.studies.sweeps.figures import Ending, ending_of
-from tools.sim.centralised.fleet import torques_only
+from tools.sim.centralised import torques_only
 from tools.sim.lockstep import Lockstep
 
 # ---- no planner: the joint services hold

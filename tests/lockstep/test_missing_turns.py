@@ -18,7 +18,7 @@ from services.joint.drivers.base import DriveReading, DriveStatus
 from services.joint.drivers.wired_drive import MotorFrame, WiredDrive
 from services.joint.rearm_guard import LastState
 from services.simulator.drives.axis_bank import AxisBank
-from services.simulator.drives.odd_encoder import Words
+from services.simulator.drives.axis_encoders import Words
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES

@@ -28,7 +28,7 @@ from tools.judge.figure import judge_run
 from tools.judge.verdict import Summary
 from tools.live import experiment
 from tools.logs.hand_path import HandRow
-from tools.sim.centralised.fleet import CONTROLS, SHIPPED
+from tools.sim.centralised import CONTROLS, SHIPPED
 from tools.sim.lockstep import Watch
 from tools.sim.virtual_time import Record
 

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tools.judge.reports.page_model import Line, PageModel, PageWindow, Plot
+from tools.judge.reports.signals import Span
 
 from shared.bus import topics
 from shared.bus.messages import DriveStatus
@@ -19,8 +21,6 @@ from tools import cli
 from tools.judge import verdict
 from tools.judge.reports import scene
 from tools.judge.reports.page import render, render_parts
-from tools.judge.reports.page_model import Line, PageModel, PageWindow, Plot
-from tools.judge.reports.signals import Span
 from tools.judge.run_parts import zero_ns
 from tools.judge.verdict import summarise_parts
 from tools.logs.run_index import RunIndex

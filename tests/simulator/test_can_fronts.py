@@ -1,7 +1,8 @@
-"""The CAN front of the emulated drives: both dialects, silence, periods."""
+"""The CAN fronts of drives and IMU: dialects, silence, periods, and an IMU in any mounting."""
 
 from __future__ import annotations
 
+import math
 import struct
 import tempfile
 from collections import Counter
@@ -9,8 +10,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import can
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from services.imu.attitude import AttitudeLaw
 from services.simulator.drives.axis_faults import BUS_FAULTS, FAULTS
 from services.simulator.fronts.cansimple_dialects import (
     SDO_ENDPOINTS,
@@ -18,12 +22,22 @@ from services.simulator.fronts.cansimple_dialects import (
     errors_06,
 )
 from services.simulator.fronts.cansimple_front import CanSimpleFront
+from services.simulator.fronts.sensor_fronts import ImuFront
 from services.simulator.fronts.unix_can_hub import UnixCanHub
+from services.simulator.physics.body import body_of
+from services.simulator.physics.plant import ImuErrors, PlantConfig, changed
+from services.simulator.physics.world import World
+from shared.bus.messages import Vector3
 from shared.can import cansimple, cansimple_06
 from shared.can.cansimple import AxisState, Command, arbitration_id, pack_float, pack_u32
 from shared.can.cansimple_06 import Command06, DriveError06, ProcedureResult, SdoOpcode
+from shared.can.imu_can import ImuAssembler
 from shared.can.unix_can import REMOTE_FLAG, UnixCanBus
+from shared.config.robot_config import RobotConfig
+from tests.imu.robots import with_imu
+from tests.lockstep.runs import still
 from tests.simulator.banks import CPR, DT, ZERO, make_bank
+from tools.sim.virtual_services import VirtualCan
 
 NODE, AXIS = 5, 3  # axis1 of knee_right
 
@@ -119,7 +133,7 @@ def test_0_5_answers_for_its_sensorless_estimator_and_its_pins(old: Bench) -> No
 
 
 @pytest.mark.parametrize("length", [0, 1, 8])
-def test_a_controllers_error_is_told_to_a_frame_of_any_length_a_motors_to_an_empty_one(
+def test_0_5_answers_requests_of_any_length_only_for_its_controller(
     old: Bench, length: int
 ) -> None:
     old.bank.inject("knee_right.axis1", "OVERSPEED")
@@ -142,12 +156,19 @@ def test_of_requests_at_1_khz_six_in_a_thousand_have_no_answer(old: Bench) -> No
     assert 2000 - answers == 12
 
 
-def test_a_frame_of_another_node_changes_nothing(old: Bench) -> None:
+def test_only_its_own_node_changes_a_drive_and_a_current_has_the_calibrated_sign(
+    old: Bench,
+) -> None:
     can_id = arbitration_id(NODE + 4, Command.SET_INPUT_TORQUE)
     data = struct.pack("<f", 9.0)
     old.client.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
     old.front.receive()
     assert not old.bank.input_torque.any()
+    # CAN of 0.5 has no way to ask for it; `test_axis_settings.py` has the rule.
+    old.bank.input_torque[AXIS] = 0.0827
+    old.bank.settings.set(AXIS // 2, "axis1.encoder.config.direction", -1)
+    old.step()
+    assert cansimple.unpack_two_floats(old.ask(Command.GET_IQ)) == pytest.approx((-1.0, -1.0))
 
 
 # ---- dialects
@@ -215,7 +236,10 @@ def read(bench: Bench, name: str) -> bytes:
     return value
 
 
-def test_an_endpoint_is_written_for_the_axis_asked_and_read_back(new: Bench) -> None:
+def test_an_endpoint_has_its_type_and_is_written_for_its_own_axis(new: Bench) -> None:
+    assert read(new, "motor.config.pre_calibrated")[0] == 1
+    assert struct.unpack("<I", read(new, "encoder.config.cpr")) == (16384,)
+    assert struct.unpack("<f", read(new, "vbus_voltage")) == (48.0,)
     name = "controller.config.vel_limit"
     written = cansimple_06.pack_sdo(SdoOpcode.WRITE, endpoint(name), struct.pack("<f", 7.5))
     new.send(Command06.RX_SDO, written)
@@ -224,12 +248,6 @@ def test_an_endpoint_is_written_for_the_axis_asked_and_read_back(new: Bench) -> 
     assert new.bank.vel_limit[AXIS] == 7.5
     assert new.bank.vel_limit[AXIS - 1] == 60.0
     assert struct.unpack("<f", read(new, name)) == (7.5,)
-
-
-def test_endpoints_come_in_their_own_types(new: Bench) -> None:
-    assert read(new, "motor.config.pre_calibrated")[0] == 1
-    assert struct.unpack("<I", read(new, "encoder.config.cpr")) == (16384,)
-    assert struct.unpack("<f", read(new, "vbus_voltage")) == (48.0,)
 
 
 def test_an_endpoint_that_does_not_exist_and_a_value_that_is_no_number_change_nothing(
@@ -285,14 +303,6 @@ def test_a_silent_drive_neither_sends_nor_receives_nor_feeds(old: Bench, why: st
     assert sent(old).total() == (2 if why == "link" else 0), "it sends again"
 
 
-def test_a_current_has_the_sign_that_the_encoders_calibration_found(old: Bench) -> None:
-    """CAN of 0.5 has no way to ask for it; `test_axis_settings.py` has the rule."""
-    old.bank.input_torque[AXIS] = 0.0827
-    old.bank.settings.set(AXIS // 2, "axis1.encoder.config.direction", -1)
-    old.step()
-    assert cansimple.unpack_two_floats(old.ask(Command.GET_IQ)) == pytest.approx((-1.0, -1.0))
-
-
 def sent(bench: Bench, steps: int = 1) -> Counter[int]:
     """Return how often each id is sent in so many steps."""
     counts: Counter[int] = Counter()
@@ -306,14 +316,11 @@ def sent(bench: Bench, steps: int = 1) -> Counter[int]:
 # ---- periods
 
 
-def test_estimates_are_sent_as_often_as_each_axis_is_set_to(old: Bench) -> None:
+def test_estimates_are_sent_at_each_axis_s_period_and_never_at_a_period_of_zero(old: Bench) -> None:
     assert old.bank.settings.get(1, "axis1.config.can.node_id") == NODE
     old.bank.settings.set(1, "axis0.config.can.encoder_rate_ms", 10)
     ids = [arbitration_id(node, Command.GET_ENCODER_ESTIMATES) for node in (4, NODE)]
     assert sent(old, 100) == dict(zip(ids, (10, 100), strict=True))
-
-
-def test_a_period_of_zero_is_never(old: Bench) -> None:
     old.bank.settings.fill("config.can.encoder_rate_ms", 0)
     old.bank.settings.fill("config.can.heartbeat_rate_ms", 0)
     assert not sent(old, 50)
@@ -323,7 +330,9 @@ def test_a_period_of_zero_is_never(old: Bench) -> None:
     assert sent(old).total() == 2
 
 
-def test_a_drive_that_is_back_gets_what_was_written_while_it_was_away(old: Bench) -> None:
+def test_a_silent_drive_gets_what_waited_on_its_bus_unless_another_node_acknowledged_it(
+    old: Bench,
+) -> None:
     """Nobody acknowledged it: the kernel kept it, an arming request too."""
     old.bank.request_state(AXIS, AxisState.IDLE)
     old.step()
@@ -337,12 +346,46 @@ def test_a_drive_that_is_back_gets_what_was_written_while_it_was_away(old: Bench
     old.step()
     assert old.bank.state[AXIS] == AxisState.CLOSED_LOOP_CONTROL
     assert old.bank.input_torque[AXIS] == 0.5
-
-
-def test_a_bus_with_another_node_acknowledges_what_a_silent_drive_never_gets(old: Bench) -> None:
     old.hub.shared = True
     old.bank.conditions.link(AXIS >> 1, up=False)
-    old.send(Command.SET_INPUT_TORQUE, pack_float(0.5))
+    old.send(Command.SET_INPUT_TORQUE, pack_float(0.75))
     old.bank.conditions.link(AXIS >> 1, up=True)
     old.front.receive()
-    assert old.bank.input_torque[AXIS] == 0.0
+    assert old.bank.input_torque[AXIS] == 0.5, "the other node acknowledged it"
+
+
+EXACT = ImuErrors(tilt=(0.0, 0.0), noise=0.0)
+
+
+@pytest.mark.parametrize("mounting", [(0.0, 0.0, 0.0), (0.3, -0.2, 1.5), (3.1, 0.0, 0.4)])
+@pytest.mark.parametrize("slope", [(0.0, 0.0), (0.0873, -0.05)])
+def test_however_the_sensor_is_mounted_the_service_finds_up_and_the_torsos_rates(
+    robot: RobotConfig, mounting: Vector3, slope: tuple[float, float]
+) -> None:
+    fitted = with_imu(robot, mounting=mounting)
+    plant = changed(PlantConfig(), {"floor.slope": list(slope)})
+    world = World(body_of(fitted, plant), still(1.0))
+    torso = Rotation.from_euler("ZXY", (0.4, 0.1, -0.3))
+    x, y, z, w = torso.as_quat().tolist()
+    world.data.qpos[3:7] = w, x, y, z
+    world.data.qvel[3:6] = 0.5, -1.0, 0.25
+    frames = VirtualCan(ImuAssembler())
+    ImuFront(fitted.imu, EXACT, frames, 1).send(world)
+    reading = AttitudeLaw(fitted.imu).step(1, frames.newest(1))
+    gravity = world.model.opt.gravity
+    np.testing.assert_allclose(
+        reading.up, torso.inv().apply(-gravity / np.linalg.norm(gravity)), atol=2e-4
+    )
+    np.testing.assert_allclose(reading.rate, (0.5, -1.0, 0.25), atol=4e-3)
+
+
+@pytest.mark.parametrize("slope", [(0.0873, 0.0), (0.0, -0.0873), (0.05, 0.05)])
+def test_on_a_slope_the_hoist_holds_the_com_over_the_ankles_by_gravity(
+    robot: RobotConfig, slope: tuple[float, float]
+) -> None:
+    level = World(body_of(robot, PlantConfig()), still(1.0)).truth(0, 1.0, 0.0)
+    plant = changed(PlantConfig(), {"floor.slope": list(slope)})
+    truth = World(body_of(robot, plant), still(1.0)).truth(0, 1.0, 0.0)
+    assert truth.over == pytest.approx(level.com[:2], abs=1e-3)
+    assert max(truth.foot_left_tilt, truth.foot_right_tilt) < 1e-6
+    assert math.hypot(truth.com[0] - level.com[0], truth.com[1] - level.com[1]) > 0.05

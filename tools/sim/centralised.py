@@ -1,6 +1,8 @@
-"""Planner and joint modules of the centralised control.
+"""A baseline to compare with: the planner computes every torque, the joint services none.
 
-The planner's law is the shipped one. The planner also computes the joint services' part,
+It runs in virtual time only. No service imports it and no robot file names it: `xrl sim --control`
+and `xrl study latency --control` select it by name. The planner's law is the shipped one. The
+planner also computes the joint services' part,
 
     tau = D (q_ref - q) + D_B (v_ref - v) + tau_ff + tau_coupled
 
@@ -11,7 +13,8 @@ unchanged until the next one comes. Pure.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
 
 import msgspec
 
@@ -25,7 +28,10 @@ from services.planner.planner import Planner
 from services.planner.watch.engagement_fsm import Engagement
 from shared.bus.messages import JointCommand, JointState, Mode, PlannerMode, PlannerStatus
 from shared.clock import NS_PER_MS
+from shared.config.gain_schedule import believing
 from shared.config.robot_config import RobotConfig
+from shared.robot.trip_table import untripped
+from tools.sim.lockstep import Lockstep
 
 
 class LeadsOn(Engagement):
@@ -125,3 +131,31 @@ class PassThrough(DriveManager):
     def _passes(self, now_ns: int) -> bool:
         since_ns = self._tracks_since_ns
         return since_ns is not None and now_ns - since_ns >= self._blend_ns
+
+
+def torques_only(config: RobotConfig) -> RobotConfig:
+    """Return the robot with drives that take torques and hold nothing by themselves.
+
+    Its joint services accept any command, because this planner sends gains of zero.
+    """
+    service = msgspec.structs.replace(config.joint_service, loop="service")
+    return msgspec.structs.replace(untripped(believing(config)), joint_service=service)
+
+
+class CentralisedLockstep(Lockstep):
+    """A whole fleet in virtual time, each torque computed by the planner."""
+
+    planner_type = CentralPlanner
+    module_type = PassThrough
+
+    def __init__(self, config: RobotConfig, *args: Any, **how: Any) -> None:
+        """Put the robot on the hoist; arguments as for `Lockstep`."""
+        super().__init__(torques_only(config), *args, **how)
+
+
+SHIPPED: Final = "distributed"
+CONTROLS: Final[Mapping[str, type[Lockstep]]] = {
+    SHIPPED: Lockstep,
+    "centralised": CentralisedLockstep,
+}
+"""By who computes the torques."""

@@ -1,20 +1,141 @@
-"""The CAN bus over UNIX sockets: framing, batching, and never waiting for a slow client."""
+"""CANSimple's layouts, the CAN bus over UNIX sockets, and an interface's queue."""
 
 from __future__ import annotations
 
 import errno
+import math
+import os
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from enum import Enum, IntEnum
 from pathlib import Path
 
 import can
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from services.simulator.fronts.unix_can_hub import TXQUEUELEN, UnixCanHub
+from shared.can import cansimple, cansimple_06
+from shared.can.cansimple import AxisError, AxisState, Command, Heartbeat
+from shared.can.cansimple_06 import (
+    Command06,
+    DriveError06,
+    Heartbeat06,
+    ProcedureResult,
+    SdoOpcode,
+    Version,
+)
+from shared.can.interface import QUEUED_MAX, limit_queue, restart
 from shared.can.unix_can import REMOTE_FLAG, UnixCanBus, pack_frames, unpack_frames
 from shared.exceptions import FleetError
+
+float32 = st.floats(width=32, allow_nan=False)
+HEARTBEAT_06 = Heartbeat06(
+    DriveError06.WATCHDOG_TIMER_EXPIRED, AxisState.IDLE, ProcedureResult.DISARMED, True
+)
+VERSION = Version(2, (4, 4, 58), (0, 6, 10), 0)
+
+NUMBERS: dict[type[IntEnum], dict[str, int]] = {
+    Command: {
+        "HEARTBEAT": 0x001, "ESTOP": 0x002, "GET_MOTOR_ERROR": 0x003, "GET_ENCODER_ERROR": 0x004,
+        "SET_AXIS_STATE": 0x007, "GET_ENCODER_ESTIMATES": 0x009, "GET_ENCODER_COUNT": 0x00A,
+        "SET_CONTROLLER_MODE": 0x00B, "SET_INPUT_POS": 0x00C, "SET_INPUT_VEL": 0x00D,
+        "SET_INPUT_TORQUE": 0x00E, "SET_LIMITS": 0x00F, "GET_IQ": 0x014, "REBOOT": 0x016,
+        "GET_VBUS": 0x017, "CLEAR_ERRORS": 0x018, "SET_POS_GAIN": 0x01A, "SET_VEL_GAINS": 0x01B,
+        "GET_CONTROLLER_ERROR": 0x01D,
+    },
+    Command06: {
+        "GET_VERSION": 0x000, "GET_ERROR": 0x003, "RX_SDO": 0x004, "TX_SDO": 0x005,
+        "ADDRESS": 0x006, "GET_TEMPERATURE": 0x015, "SET_ABSOLUTE_POSITION": 0x019,
+        "GET_TORQUES": 0x01C, "GET_POWERS": 0x01D,
+    },
+    DriveError06: {  # type: ignore[dict-item]  # flags are integers as well
+        "DRV_FAULT": 32, "DC_BUS_OVER_VOLTAGE": 256, "DC_BUS_OVER_REGEN_CURRENT": 2048,
+        "INVERTER_OVER_TEMP": 16_384, "VELOCITY_LIMIT_VIOLATION": 32_768,
+        "WATCHDOG_TIMER_EXPIRED": 16_777_216, "ESTOP_REQUESTED": 33_554_432,
+        "SPINOUT_DETECTED": 67_108_864,
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", NUMBERS)
+def test_commands_and_errors_have_the_numbers_of_the_documents(kind: type[IntEnum]) -> None:
+    assert {name: int(kind[name]) for name in NUMBERS[kind]} == NUMBERS[kind]
+
+
+@pytest.mark.parametrize(
+    ("ours", "name"),
+    [(DriveError06, "ODriveError"), (ProcedureResult, "ProcedureResult"), (AxisState, "AxisState")],
+)
+def test_what_0_6_reports_is_named_as_in_the_odrive_package(ours: type[Enum], name: str) -> None:
+    enums = pytest.importorskip("odrive.enums")
+    theirs = {each.name: each.value for each in getattr(enums, name).__members__.values()}
+    assert {each.name: each.value for each in ours.__members__.values()} == theirs
+
+
+def test_arbitration_id_and_heartbeat_are_read_from_bytes_written_by_hand() -> None:
+    assert cansimple.arbitration_id(3, Command.SET_INPUT_TORQUE) == 0x06E
+    assert cansimple.arbitration_id(63, 0x1F) == 0x7FF
+    assert cansimple.split_id(0x06E) == (3, Command.SET_INPUT_TORQUE)
+    heartbeat = cansimple.unpack_heartbeat(bytes.fromhex("40000000 01 01 01 80"))
+    assert heartbeat == Heartbeat(AxisError.MOTOR_FAILED, AxisState.IDLE, True, True, False, True)
+    heartbeat = Heartbeat(0, AxisState.IDLE, True, False, True, False)
+    assert heartbeat.errors == AxisError.MOTOR_FAILED | AxisError.CONTROLLER_FAILED
+    assert Heartbeat(0, AxisState.IDLE, False, False, False, True).errors == 0
+
+
+@pytest.mark.parametrize(
+    ("packed", "by_hand"),
+    [
+        (cansimple.pack_u32(AxisState.CLOSED_LOOP_CONTROL), "08000000"),
+        (cansimple.pack_two_floats(1.5, -2.0), "0000c03f 000000c0"),
+        (cansimple.pack_float(-0.25), "000080be"),
+        (cansimple.pack_i32(-2), "feffffff"),
+        (cansimple.pack_two_ints(1, -2), "01000000 feffffff"),
+        (cansimple.pack_input_pos(1.5, 1.0, -0.5), "0000c03f e803 0cfe"),
+        (cansimple.pack_motor_error(0x2_0000_0001), "01000000 02000000"),
+        (cansimple.pack_heartbeat(Heartbeat(0x800, 8, True, False, True, True)),
+         "00080000 08 01 00 81"),
+        (cansimple_06.pack_heartbeat(HEARTBEAT_06), "00000001 01 03 01 00"),
+        (cansimple_06.pack_version(VERSION), "02 04 04 3a 00 06 0a 00"),
+        (cansimple_06.pack_error(0x20, 0x0100_0000), "20000000 00000001"),
+        (cansimple_06.pack_sdo(SdoOpcode.WRITE, 0x0123, b"\x01\x02"), "01 2301 00 0102"),
+    ],
+)  # fmt: skip
+def test_payload_equals_the_bytes_written_by_hand(packed: bytes, by_hand: str) -> None:
+    assert packed == bytes.fromhex(by_hand)
+
+
+@given(float32, float32)
+def test_two_floats_survive_the_round_trip(first: float, second: float) -> None:
+    data = cansimple.pack_two_floats(first, second)
+    assert cansimple.unpack_two_floats(data) == (first, second)
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from(AxisState), st.tuples(*[st.booleans()] * 4))
+def test_heartbeat_survives_the_round_trip(
+    error: int, state: AxisState, flags: tuple[bool, bool, bool, bool]
+) -> None:
+    heartbeat = Heartbeat(error, state, *flags)
+    assert cansimple.unpack_heartbeat(cansimple.pack_heartbeat(heartbeat)) == heartbeat
+
+
+def test_what_is_packed_for_0_6_comes_back() -> None:
+    assert cansimple_06.unpack_heartbeat(cansimple_06.pack_heartbeat(HEARTBEAT_06)) == HEARTBEAT_06
+    assert cansimple_06.unpack_version(cansimple_06.pack_version(VERSION)) == VERSION
+    assert cansimple_06.unpack_sdo(cansimple_06.pack_sdo(0, 77, b"abcd")) == (0, 77, b"abcd")
+
+
+@given(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6))
+def test_feedforward_of_input_pos_saturates_and_never_wraps(vel: float, torque: float) -> None:
+    _, vel_back, torque_back = cansimple.unpack_input_pos(cansimple.pack_input_pos(0, vel, torque))
+    for asked, got in ((vel, vel_back), (torque, torque_back)):
+        assert math.isclose(got, max(-32.767, min(32.767, asked)), abs_tol=0.0006)
 
 
 @pytest.fixture
@@ -129,7 +250,7 @@ def test_send_to_a_hub_that_does_not_read_raises_and_counts(hub: UnixCanHub) -> 
 # ---- a bus on which nobody acknowledges
 
 
-def test_frames_that_nobody_acknowledges_wait_in_order_and_outlive_their_sender(
+def test_what_nobody_acknowledges_waits_in_order_and_a_restart_throws_it_away(
     hub: UnixCanHub,
 ) -> None:
     hub.acknowledged = False
@@ -162,7 +283,7 @@ def test_a_restart_of_the_interface_throws_away_what_all_clients_have_waiting(
         assert hub.clients == 1
 
 
-def test_the_send_queue_is_full_after_as_many_frames_as_the_interface_holds(
+def test_a_send_queue_holds_as_many_frames_as_the_interface_and_refuses_more(
     hub: UnixCanHub,
 ) -> None:
     hub.acknowledged = False
@@ -176,9 +297,7 @@ def test_the_send_queue_is_full_after_as_many_frames_as_the_interface_holds(
         hub.acknowledged = True
         assert len(hub.poll()) == TXQUEUELEN
         bus.send(message(1, b""))
-
-
-def test_a_queue_full_of_others_frames_refuses_ours_until_it_has_room(hub: UnixCanHub) -> None:
+        assert len(hub.poll()) == 1
     with connect(hub) as bus:
         hub.choked = True
         hub.poll()
@@ -222,16 +341,6 @@ def test_what_a_client_sent_before_it_left_arrives(hub: UnixCanHub, broadcast_to
         assert hub.clients == 1
 
 
-def test_client_learns_that_the_hub_has_closed(path: Path) -> None:
-    hub = UnixCanHub(path)
-    with connect(hub) as bus:
-        hub.close()
-        with pytest.raises(can.CanOperationError):
-            bus.recv_many(1.0)
-        with pytest.raises(can.CanOperationError):
-            bus.send(message(1, b""))
-
-
 def test_receiving_gives_up_after_the_timeout_and_connecting_without_a_hub_at_once(
     path: Path,
 ) -> None:
@@ -253,7 +362,7 @@ def test_connecting_does_not_wait_for_a_hub_that_does_not_accept(hub: UnixCanHub
     assert clients
 
 
-def test_stale_socket_file_is_replaced_and_removed_at_close(path: Path) -> None:
+def test_a_hub_replaces_a_stale_socket_and_its_clients_learn_that_it_closed(path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as dead:
         dead.bind(str(path))
     assert path.exists()
@@ -261,9 +370,18 @@ def test_stale_socket_file_is_replaced_and_removed_at_close(path: Path) -> None:
         bus.send(message(1, b""))
         assert hub.poll() == [(1, b"")]
     assert not path.exists()
+    hub = UnixCanHub(path)
+    with connect(hub) as bus:
+        hub.close()
+        with pytest.raises(can.CanOperationError):
+            bus.recv_many(1.0)
+        with pytest.raises(can.CanOperationError):
+            bus.send(message(1, b""))
 
 
-def test_path_that_cannot_be_the_hubs_is_refused_with_the_reason(path: Path) -> None:
+def test_a_path_that_cannot_be_the_hubs_is_refused_and_a_successors_socket_stays(
+    path: Path,
+) -> None:
     file, long = path.parent / "file", path.parent / ("x" * 120)
     file.write_text("precious")
     with UnixCanHub(path) as hub:
@@ -274,11 +392,55 @@ def test_path_that_cannot_be_the_hubs_is_refused_with_the_reason(path: Path) -> 
             bus.send(message(1, b"z"))
             assert hub.poll() == [(1, b"z")]
     assert file.read_text() == "precious"
-
-
-def test_closing_leaves_the_socket_of_a_successor(path: Path) -> None:
     old = UnixCanHub(path)
     path.unlink()
     with UnixCanHub(path):
         old.close()
         assert path.exists()
+
+
+RESTART = """
+import subprocess
+from shared.can.interface import restart
+subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
+subprocess.run(["ip", "route", "add", "10.9.9.0/24", "dev", "lo"], check=True)
+restart(None, "lo")
+print(subprocess.run(["ip", "route"], capture_output=True, text=True, check=True).stdout.strip())
+print(subprocess.run(["ip", "-o", "link", "show", "lo", "up"], capture_output=True).stdout != b"")
+"""
+
+
+@pytest.fixture
+def pair() -> Iterator[tuple[socket.socket, socket.socket]]:
+    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with near, far:
+        yield near, far
+
+
+def test_a_row_of_frames_waits_and_not_many_more(
+    pair: tuple[socket.socket, socket.socket],
+) -> None:
+    class Bus:
+        socket = pair[0]
+
+    limit_queue(Bus())
+    taken = 0
+    with suppress(BlockingIOError):
+        while taken < 1000:
+            pair[0].send(bytes(16), socket.MSG_DONTWAIT)
+            taken += 1
+    assert QUEUED_MAX <= taken <= 2 * QUEUED_MAX + 1
+    limit_queue(object())  # of an interface without a socket nothing is known
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root has network namespaces")
+def test_a_restart_takes_an_interface_down_and_up() -> None:
+    """Of the loopback in a namespace of its own: going down loses its route."""
+    words = ["unshare", "-n", sys.executable, "-c", RESTART]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60)
+    assert done.stdout.splitlines() == ["", "True"], done.stderr
+
+
+def test_an_interface_that_is_not_there_is_an_error() -> None:
+    with pytest.raises(OSError, match="No such device"):
+        restart(None, "can_nowhere")

@@ -1,7 +1,12 @@
+"""Messages and keys: bit-exact or refused; endpoints and their placeholders."""
+
+from __future__ import annotations
+
 import itertools
 import math
 import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 import msgspec
@@ -13,8 +18,12 @@ from hypothesis import strategies as st
 from shared.bus.codec import Decoder, encode
 from shared.bus.messages import JointCommand, Message, OperatorIntent
 from shared.bus.topics import JOINT_STATE, TOPICS, WRENCH, Topic, all_keys, keys
-from shared.exceptions import EncodeError, NonFiniteError
+from shared.config import endpoints
+from shared.config.endpoints import host_and_port, is_endpoint, stray_braces
+from shared.config.robot_config import expand
+from shared.exceptions import BusError, EncodeError, NonFiniteError
 from shared.joints import MODULES
+from shared.run_directory import live_dir
 from tests.messages import filled
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
@@ -138,14 +147,11 @@ def test_no_message_has_an_optional_field() -> None:
         assert '"null"' not in msgspec.json.encode(schema).decode()
 
 
-def test_keys_name_the_robot_and_the_module() -> None:
+def test_a_key_names_robot_and_module_and_has_one_topic() -> None:
     assert JOINT_STATE.key("lab", "ankle_right") == "xrl/lab/joint/ankle_right/state"
     assert WRENCH.key("lab") == "xrl/lab/harness/wrench"
     assert keys(WRENCH, "lab") == ("xrl/lab/harness/wrench",)
     assert keys(JOINT_STATE, "lab") == tuple(f"xrl/lab/joint/{name}/state" for name in MODULES)
-
-
-def test_every_key_has_one_topic() -> None:
     every = [key for topic in TOPICS for key in keys(topic, "lab")]
     assert len(set(every)) == len(every) == len(all_keys("lab"))
     assert not [key for key in every if "*" in key]
@@ -165,3 +171,56 @@ def test_no_field_of_any_message_takes_an_integer_beyond_64_bits(
     for place in places:
         damaged = f"{payload[: place.start()]}{number}{payload[place.end() :]}"
         assert decoder.decode(damaged.encode()) is None, damaged[:400]
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "found"),
+    [
+        ("tcp/legs:7447", ("legs", 7447)),
+        ("tls/10.0.0.1:1", ("10.0.0.1", 1)),
+        ("tls/[::1]:65535", ("::1", 65535)),
+        ("tcp/[fe80::1%eth0]:7447", ("fe80::1%eth0", 7447)),
+        ("tcp/legs:7447?prio=1#x", ("legs", 7447)),
+    ],
+)
+def test_host_and_port_are_found(endpoint: str, found: tuple[str, int]) -> None:
+    assert host_and_port(endpoint) == found
+
+
+@given(st.integers())
+def test_a_port_is_from_1_to_65535(port: int) -> None:
+    assert is_endpoint(f"tcp/legs:{port}") is (1 <= port <= 65_535)
+
+
+@pytest.mark.parametrize(
+    "endpoint", ["tcp/legs", "tcp/:7447", "tcp/::1:7447", "udp/legs:7447", "tcp/legs:\u0664", ""]
+)
+def test_what_is_no_host_and_port_is_refused(endpoint: str) -> None:
+    assert not is_endpoint(endpoint)
+    with pytest.raises(BusError, match="tcp/HOST:PORT is right, a port from 1 to 65535"):
+        host_and_port(endpoint)
+
+
+def test_a_placeholder_is_filled_in_once_whatever_it_is_filled_with() -> None:
+    assert endpoints.filled("{a}/{b}/{c}", {"{a}": "{b}", "{b}": "2"}) == "{b}/2/{c}"
+    run_dir = Path("/tmp/{run}")
+    assert expand("unixsock-stream/{run}/x", run_dir) == f"unixsock-stream/{live_dir(run_dir)}/x"
+    assert expand("tcp/10.0.0.1:7447", Path("/tmp")) == "tcp/10.0.0.1:7447"
+
+
+@pytest.mark.parametrize(
+    ("text", "stray"),
+    [("{run}/a/{run}", ""), ("{Run}/a", "{Run}"), ("{run/a", "{run/a"), ("run}/a", "}"),
+     ("{}/a", "{}"), ("{ru{run}n}", "{run}")],
+)  # fmt: skip
+def test_braces_that_nothing_is_filled_into_are_found_and_refused(text: str, stray: str) -> None:
+    assert stray_braces(text, ["{run}"]) == stray
+    if stray:
+        with pytest.raises(BusError, match=r"is no placeholder; only \{run\} is filled in"):
+            expand(text, Path("/tmp"))
+
+
+@pytest.mark.parametrize("path", ["/tmp/a?b", "/tmp/a#b", "/tmp/a #b"])
+def test_a_socket_path_that_the_bus_would_take_apart_is_no_endpoint(path: str) -> None:
+    assert not is_endpoint(f"unixsock-stream/{path}")
+    assert is_endpoint(f"unixsock-stream/{re.sub('[?#]', '', path)} 50% ;")

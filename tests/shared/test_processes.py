@@ -1,19 +1,25 @@
-"""Each process gets its row of the table, and without privilege the next best."""
+"""Each process's priority and processors, and the planner's end as its joint services see it."""
 
 from __future__ import annotations
 
 import os
 import resource
+import signal
 import subprocess
 import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from shared import scheduling
 from shared.joints import MODULES
-from shared.places import FILES
+from shared.places import CHECKOUT, FILES
+from shared.planner_life import OwnLife, PlannerLife, if_possible, path_of
 from shared.scheduling import SLICE_NS, TABLE, TIMER_SLACK_NS, half_of
+from tests.waiting import comes_true
 from tools.fleet.process_table import TABLE as PROCESSES
 from tools.fleet.process_table import load_table
 
@@ -41,12 +47,9 @@ def test_a_short_slice_and_exact_timers_need_no_privilege() -> None:
     assert f"slice {SLICE_NS} ns" in granted
 
 
-def test_every_process_of_the_fleet_has_a_row() -> None:
+def test_every_process_has_a_row_and_what_a_step_needs_first_the_higher_priority() -> None:
     """The gateway to ROS 2 is off the control path: it is nicer than all others."""
     assert {row.kind for row in load_table(PROCESSES).process} - {"ros2_gateway"} == set(TABLE)
-
-
-def test_what_a_step_needs_first_has_the_higher_priority() -> None:
     order = ("simulator", "joint", "planner", "harness", "recorder")
     priorities = [TABLE[kind].fifo for kind in order]
     assert priorities == sorted(priorities, reverse=True)
@@ -159,13 +162,100 @@ def test_how_long_the_kernel_stops_what_fills_a_processor_is_read(
     assert scheduling.real_time_pause_ms(tmp_path) == pause_ms
 
 
-def test_the_shipped_setting_is_the_one_that_the_doctor_asks_for() -> None:
+def test_the_shipped_setting_is_the_doctors_and_real_time_is_seen() -> None:
     lines = (FILES / "sysctl/90-xrl.conf").read_text(encoding="utf-8").splitlines()
     assert [line.replace(" ", "") for line in lines if not line.startswith("#")] == [
         scheduling.NO_PAUSE
     ]
-
-
-def test_who_has_real_time_is_seen() -> None:
     assert scheduling.has_real_time(os.getpid()) is False
     assert scheduling.has_real_time(2**22 + 1) is None
+
+
+pytestmark = [pytest.mark.system]
+
+PLANNER = """
+import sys, time
+from pathlib import Path
+from shared.planner_life import OwnLife
+own = OwnLife(Path(sys.argv[1]))
+own.announce(int(sys.argv[2]))
+print("up", flush=True)
+time.sleep(60)
+"""
+
+
+@contextmanager
+def planner(run_dir: Path, session: int) -> Iterator[subprocess.Popen[str]]:
+    words = [sys.executable, "-c", PLANNER, str(run_dir), str(session)]
+    with subprocess.Popen(words, cwd=CHECKOUT, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "up\n"
+            yield process
+        finally:
+            process.kill()
+
+
+def told(life: PlannerLife) -> int:
+    """Wait until a session has ended; return it."""
+    session = 0
+
+    def ended() -> int:
+        nonlocal session
+        session = life.ended()
+        return session
+
+    assert comes_true(ended)
+    return session
+
+
+def test_each_service_is_told_once_of_a_process_that_was_killed(short_dir: Path) -> None:
+    first, second = PlannerLife(short_dir), PlannerLife(short_dir)
+    assert first.ended() == 0, "there is no planner"
+    with planner(short_dir, 7) as process:
+        assert (first.ended(), second.ended()) == (0, 0)
+        process.kill()
+        assert (told(first), told(second)) == (7, 7)
+        assert (first.ended(), second.ended()) == (0, 0)
+
+
+def test_a_planner_that_hangs_is_left_to_the_age_rule_and_one_that_is_gone_is_reported(
+    short_dir: Path,
+) -> None:
+    life = PlannerLife(short_dir)
+    with planner(short_dir, 7) as process:
+        life.ended()
+        process.send_signal(signal.SIGSTOP)
+        time.sleep(0.2)
+        assert life.ended() == 0
+    with planner(short_dir, 7) as process:
+        process.kill()
+    assert told(PlannerLife(short_dir)) == 7
+
+
+def test_the_next_planner_and_another_session_take_its_place(short_dir: Path) -> None:
+    life = PlannerLife(short_dir)
+    with planner(short_dir, 7) as process:
+        life.ended()
+        process.kill()
+        assert told(life) == 7
+    with planner(short_dir, 9) as process:
+        assert life.ended() == 0
+        process.kill()
+        assert told(life) == 9
+    own = OwnLife(short_dir)
+    own.announce(10)
+    assert life.ended() == 0
+    own.announce(11)
+    assert life.ended() == 0, "the process goes on in another session"
+
+
+def test_without_shared_memory_a_service_does_without(
+    short_dir: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for end in (OwnLife, PlannerLife):
+        assert if_possible(end, short_dir) is not None
+    path_of(short_dir / "other").mkdir(parents=True)  # in the way
+    for end in (OwnLife, PlannerLife):
+        assert if_possible(end, short_dir / "other") is None
+    assert caplog.text.count("a planner's end is seen by the age of its commands") == 2
