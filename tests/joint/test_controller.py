@@ -95,7 +95,6 @@ def test_track_blends_in_over_its_blend_time(robot: RobotConfig, share: float) -
 
 SWING, OMEGA = 0.02, 5.0  # rad, rad/s: the references' motion
 
-
 COUPLED: Pair = (12.0, -9.0)
 
 
@@ -127,9 +126,7 @@ def largest_step(robot: RobotConfig, reach: float) -> float:
 
 KINDS = ("fresh", "hold", "silent")
 
-
 scripts = st.lists(st.tuples(st.sampled_from(KINDS), st.integers(1, 60)), min_size=1, max_size=12)
-
 
 FIG_7 = [("fresh", 200), ("silent", 40), ("fresh", 300), ("hold", 30), ("fresh", 60)]
 

@@ -32,7 +32,6 @@ from tests.joint.helpers import firmware
 
 gear_ratios = st.floats(1.0, 200.0)
 
-
 motor_pairs = st.tuples(st.floats(-300.0, 300.0), st.floats(-300.0, 300.0))
 
 
@@ -69,31 +68,22 @@ def test_first_motor_turns_both_axes_forward_and_the_second_turns_phi_back() -> 
 
 N = 17.5
 
-
 VEL_LIMIT = 60.0
-
 
 NOW = 5_000_000_000
 
-
 CYCLE_NS = 2 * NS_PER_MS
-
 
 TORQUE_MAX = 3.3
 """What current_lim gives, N m a motor; the firmware clamps input_torque to it."""
 
-
 angle = st.floats(-3.0, 3.0)
-
 
 rate = st.floats(-5.0, 5.0)
 
-
 gain = st.floats(0.0, 6000.0)
 
-
 damping = st.floats(0.0, 400.0)
-
 
 torque = st.floats(-115.0, 115.0)
 

@@ -25,13 +25,10 @@ from tests.joint.helpers import SESSION, T0, Bench, command
 
 Q: Pair = (0.02, -1.0)
 
-
 V: Pair = (0.01, -0.2)
-
 
 MODULE = "knee_right"
 ANKLE = "ankle_left"
-
 
 BY_NAME = {
     "k_p": Outside.K_P,

@@ -15,7 +15,6 @@ from tests.joint.helpers import FULL
 
 shares = st.floats(0.0, 1.0)
 
-
 gains = st.just(0.0) | st.floats(1e-3, 6000.0)
 
 
@@ -25,15 +24,11 @@ def pairs(elements: st.SearchStrategy[float]) -> st.SearchStrategy[Pair]:
 
 angles = pairs(st.floats(-6.0, 6.0))
 
-
 rates = pairs(st.floats(-20.0, 20.0))
-
 
 torques = pairs(st.floats(-200.0, 200.0))
 
-
 setpoints = st.builds(Setpoint, angles, rates, torques, torques, pairs(gains), pairs(gains))
-
 
 SOFT = Setpoint((0.1, -1.0), (0.2, -0.4), (3.0, -20.0), (5.0, -6.0), (100.0, 0.0), (10.0, 0.0))
 SLACK = msgspec.structs.replace(SOFT, k_p=(0.5, 0.4), k_d=(0.3, 0.2))

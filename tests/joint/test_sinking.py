@@ -18,10 +18,8 @@ from tests.joint.helpers import FULL
 
 Q: Pair = (0.02, -0.4)
 
-
 LONG_NS = 10 * NS_PER_S
 """All has faded and risen by then."""
-
 
 UNHEARD = NeighbourView(sinks=False)
 
@@ -137,7 +135,6 @@ def test_an_ankle_reaches_as_far_as_its_leg_does(robot: RobotConfig) -> None:
 
 BELOW_ITS_STOP = -2.6
 """rad, of a knee."""
-
 
 PLACES = {
     "ankle": ("ankle_right", -0.4, UNKNOWN),

@@ -18,15 +18,11 @@ from tests.joint.helpers import Bench
 
 SOFT_P: Pair = (500.0, 12.0)
 
-
 SOFT_D: Pair = (20.0, 0.8)
-
 
 POSES = {"ankle": (0.02, 0.1), "knee": (0.02, -1.0), "hip": (0.02, 0.4)}
 
-
 gain = st.floats(0.0, 3000.0)
-
 
 damping = st.floats(0.0, 200.0)
 

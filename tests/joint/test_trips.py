@@ -20,7 +20,6 @@ from tests.joint.helpers import T0, Bench
 
 CYCLE_NS = 2 * NS_PER_MS
 
-
 STILL: Pair = (0.0, 0.0)
 
 

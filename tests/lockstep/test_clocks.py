@@ -30,9 +30,7 @@ from tools.sim.virtual_time import HostClock
 
 HOUR_NS = 3600 * NS_PER_S
 
-
 HOSTS = ("planner", "harness", *MODULES)
-
 
 PUSH = push(1.2, 28.0, 28.0, 0.0)
 SQUAT = led_to((2.5, 0.948), (5.0, 1.188), duration=3.4, push=(PUSH,))

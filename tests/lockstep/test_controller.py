@@ -27,7 +27,6 @@ from tools.sim.lockstep import Lockstep
 
 LQR = Path(__file__).parents[2] / "examples" / "lqr_controller.py"
 
-
 BEGINS_S = 0.3
 
 

@@ -30,7 +30,6 @@ AT, OVER, RESTARTED = 0.5, 1.1, 2.0
 LATE, AT_REST = 1.09, 1.99
 """s; while a fault still lasts, and long after it."""
 
-
 BLIND_S = 0.052
 """s for which a drive stays armed without words from its encoder."""
 OLD_NS = 50_000_000

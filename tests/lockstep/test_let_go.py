@@ -21,7 +21,6 @@ from tools.sim.lockstep import Lockstep
 
 LET_GO_S = 3.0
 
-
 REFUSED_ROWS = 300
 """Rows of the simulated world, which come at 100 Hz: 3 s, the last 1.5 without the hoist."""
 

@@ -39,7 +39,6 @@ from tools.sim.lockstep import Lockstep
 RESTS_TWICE = changed(PlantConfig(), {"person.load_scale": 2.0})
 PUSHED = (push(3.0, 40.0, 0.0, 0.0),)
 
-
 SHAKEN = [name for name in PLANTS if name != "rigid"]
 
 

@@ -35,10 +35,8 @@ UNEVEN = {
     ),
 }
 
-
 IN_STEP = (push(2.4, 0.0, 40.0, 0.0), push(4.4, 0.0, 40.0, 0.0))
 """Two seconds apart: in step with the sway of the certified gains."""
-
 
 ALL_WAYS = (
     push(1.0, 28.0, 28.0, 0.0),

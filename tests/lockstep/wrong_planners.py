@@ -37,7 +37,6 @@ DELAYS: Final = (10, 25, 75)
 BITS: Final = (0, 40, 50, 51, 52, 55, 60, 62, 63)
 """Which bit of a float64 flips: from what nobody notices to the sign."""
 
-
 CONSPIRACIES: Final = (
     (0, 0, 0, 1, 0, 1), (0, 0, 0, -1, 0, -1), (0, 0, 0, 1, 0, -1), (1, -1, -1, -1, -1, -1),
     (-1, 0, 1, 0, 0, 1), (1, 1, -1, 0, 1, 1), (0, -1, -1, -1, 1, 0),

@@ -19,7 +19,6 @@ from tests.joint.helpers import SESSION, T0, Bench, command
 
 OTHER = 8
 
-
 THIRD = 9
 
 

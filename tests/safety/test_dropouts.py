@@ -184,9 +184,7 @@ def brute_force(arrivals: dict[int, Arrival], cycles: int, timing: Timing) -> li
 # mostly fresh commands, sometimes an old one or a gap that is too long
 ages = st.one_of(st.integers(0, 3), st.integers(0, 3), st.integers(0, 8))
 
-
 gaps = st.one_of(*[st.integers(1, 3)] * 8, st.integers(1, 9))
-
 
 streams = st.lists(st.tuples(gaps, ages, st.sampled_from([False] * 19 + [True])), max_size=80)
 

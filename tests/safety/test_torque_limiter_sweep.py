@@ -17,7 +17,6 @@ from shared.joints import KINDS
 
 ROUNDING = 1e-9
 
-
 HUGE = 1.7e308
 
 
@@ -106,24 +105,18 @@ def test_soft_stop_pushes_only_inwards_and_only_beyond_the_stop(limits: TorqueLi
 
 MAX = 115.6
 
-
 STEP = 40.0
 
-
 K_STOP = 400.0
-
 
 LIMITS = TorqueLimits(
     phi=(-0.6, 0.6), theta=(-3.0, -0.2), soft_stop_k_p=K_STOP, tau_module_max=MAX, tau_step_max=STEP
 )
 
-
 FREE: Pair = (0.0, -1.0)
 """A pose away from every stop."""
 
-
 torques = st.tuples(st.floats(-300.0, 300.0), st.floats(-300.0, 300.0))
-
 
 sent = torques.map(lambda tau: limit_differential(tau, MAX))
 """What can have gone out in the last cycle."""

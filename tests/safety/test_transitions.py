@@ -34,12 +34,9 @@ DRIVE_EVENTS = (
     Event.POSITION_LOST,
 )
 
-
 TRIP_EVENTS = (Event.NONE, *TRIPS)
 
-
 FLAGS = (False, True)
-
 
 SITUATIONS = [
     Situation(mode, drive, *flags, trip)

@@ -38,14 +38,11 @@ from tests.joint.drivers.rig import (
 
 CLOSED, IDLE = AxisState.CLOSED_LOOP_CONTROL, AxisState.IDLE
 
-
 AWAY_FROM_ZERO = pack_two_floats(0.25, 0.0)
 """An estimate that is believed: at 0, 0 the driver asks for the count (`replies`)."""
 
-
 ASK = Command.GET_ENCODER_COUNT
 IDLING = [Command.SET_INPUT_TORQUE] * 2 + [Command.SET_AXIS_STATE] * 2
-
 
 N = 17.5
 

@@ -24,9 +24,7 @@ from tests.joint.drivers.rig import AXES, DRIVE, MS, TARGET, Shed
 
 LOSS = 0.3
 
-
 STEP_MS = 4
-
 
 ASK_EVERY_MS = 500
 """How often a joint service repeats a request that has shown no effect."""
@@ -164,29 +162,21 @@ def test_an_axis_that_disarms_shows_though_heartbeats_are_lost(bench: Bench) -> 
 
 HERE = (0.1, -0.2)
 
-
 HOLD = MotorTarget((0.15, -0.15), (0.0, 0.0), (0.2, -0.1), (60.0, 40.0), (0.2, 0.3))
 
-
 SPRING = np.array([60.0 * 0.2 * 0.05, 40.0 * 0.3 * 0.05])
-
 
 DAMP = MotorTarget((0.15, -0.15), (0.0, 0.0), (0.8, 0.5), (0.0, 0.0), (0.4, 0.4))
 """With HOLD's spring, at this position, as torque."""
 
-
 HOLD_MS, DAMP_MS = 40, 40
-
 
 CYCLE_MS = 2
 
-
 LISTEN_MS = 20
-
 
 EXCESS_MAX = 1.02 * 0.4 / 0.2
 """As a ratio of the spring's torque: without DAMP's pos_gain, HOLD's acts with DAMP's vel_gain."""
-
 
 ENTERING = 14
 """Frames of the order to arm."""

@@ -22,7 +22,6 @@ from tests.joint.drivers.rig import DRIVE, NODES, Rig, Shed, arm
 
 ZERO = (0.0, 0.0)
 
-
 COUNTED = (0.5, -64.25)
 
 
@@ -103,7 +102,6 @@ def test_a_drive_armed_by_this_driver_reports_no_torques(rig: Rig, driver: Odriv
 # ---- which estimates of two axes make a sample
 
 PERIOD_NS = 2_000_000
-
 
 BEHIND_NS = 130_000
 """Axis1's frame comes after axis0's, back to back on a bus of 1 Mbit/s."""

@@ -17,7 +17,6 @@ from tests.joint.drivers.rig import NODES, TARGET
 
 GAINS: list[int] = [Command.SET_POS_GAIN, Command.SET_VEL_GAINS, Command.SET_INPUT_POS]
 
-
 INPUTS: list[int] = [Command.SET_INPUT_POS]
 
 

@@ -14,7 +14,6 @@ from shared.bus.messages import Pair
 
 MARK = 64.0
 
-
 TARGET = MotorTarget((0.5, -1.5), (1.0, 2.0), (0.1, 0.2), (20.0, 20.0), (0.3, 0.3))
 
 
