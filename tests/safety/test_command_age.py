@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import msgspec
 import pytest
@@ -18,8 +19,8 @@ from shared.config.robot_config import RobotConfig
 from tests.joint.helpers import SESSION, T0, Bench, command
 
 OTHER = 8
-
-THIRD = 9
+AGE_NS = 50 * NS_PER_MS
+"""Maximum age of a command."""
 
 
 def taken(timing: Timing, **changes: object) -> Failsafe:
@@ -29,126 +30,113 @@ def taken(timing: Timing, **changes: object) -> Failsafe:
     return failsafe
 
 
-def test_the_limit_is_fifty_milliseconds(timing: Timing) -> None:
-    assert timing.max_command_age_ns == 50 * NS_PER_MS
+class Offer(NamedTuple):
+    """A command that is offered some time after T0, of an age, with some fields changed."""
+
+    refusal: Refusal
+    age_ns: int = 0
+    after_ns: int = 0
+    told: dict[str, Any] = {}  # noqa: RUF012 - never changed
 
 
-@pytest.mark.parametrize(
-    ("off_ns", "refusal"), [(-1, Refusal.NONE), (0, Refusal.NONE), (1, Refusal.TOO_OLD)]
-)
-def test_a_command_is_taken_to_a_nanosecond(off_ns: int, refusal: Refusal, timing: Timing) -> None:
-    sent = command(echo_t_ns=T0 - timing.max_command_age_ns - off_ns)
-    assert Failsafe().offer(sent, T0, timing) is refusal
+FIRST = {
+    "as old as it may be": Offer(Refusal.NONE, AGE_NS),
+    "a nanosecond younger": Offer(Refusal.NONE, AGE_NS - 1),
+    "a nanosecond too old": Offer(Refusal.TOO_OLD, AGE_NS + 1),
+    "a nanosecond ahead": Offer(Refusal.FROM_THE_FUTURE, -1),
+    "a second ahead": Offer(Refusal.FROM_THE_FUTURE, -NS_PER_S),
+    "a century ahead": Offer(Refusal.FROM_THE_FUTURE, -(1 << 62)),
+    **{f"a planner's clock at {t_ns} ns": Offer(Refusal.NONE, told={"t_ns": t_ns})
+       for t_ns in (0, T0 - NS_PER_S, T0 + 10 * NS_PER_S)},
+}  # fmt: skip
+"""Offered before any other: only the echoed stamp gives the age."""
+
+LATER = {
+    "an older number": Offer(Refusal.NOT_NEWER, 1, 2, {"seq": 9}),
+    "the same number": Offer(Refusal.NOT_NEWER, 1, 2, {"seq": 10}),
+    "the next number": Offer(Refusal.NONE, 1, 2, {"seq": 11}),
+    "not a number": Offer(Refusal.OUT_OF_LIMITS, 0, 0, {"seq": 11, "k_p": (math.nan, 0.0)}),
+    "the farthest number ahead": Offer(Refusal.NONE, 0, 0, {"seq": 510}),
+    "one too far ahead": Offer(Refusal.TOO_FAR_AHEAD, 0, 0, {"seq": 511}),
+    # one such message had six modules in HOLD until the planner was restarted
+    "a number far ahead": Offer(Refusal.TOO_FAR_AHEAD, 0, 0, {"seq": 2**61}),
+    # a planner unheard for a while ticks on, at up to 1 kHz
+    **{f"unheard for {s} s": Offer(Refusal.NONE, 0, s * NS_PER_S, {"seq": 11 + 1000 * s})
+       for s in (1, 60, 3600)},
+    "another session, the last usable": Offer(
+        Refusal.FOREIGN_SESSION, 0, AGE_NS, {"session": OTHER, "seq": 99}
+    ),
+    "another session, the last stale": Offer(
+        Refusal.NONE, 0, AGE_NS + 1, {"session": OTHER, "seq": 1}
+    ),
+    "another session beyond limits": Offer(
+        Refusal.OUT_OF_LIMITS, 0, AGE_NS + 1, {"session": OTHER, "k_p": (math.nan, 1.0)}
+    ),
+}  # fmt: skip
+"""Offered after number 10 was taken."""
+
+
+@pytest.mark.parametrize("offer", [*FIRST, *LATER])
+def test_a_command_is_taken_by_its_age_number_and_session_or_leaves_the_one_in_use(
+    offer: str, timing: Timing
+) -> None:
+    refusal, age_ns, after_ns, told = (FIRST | LATER)[offer]
+    failsafe = taken(timing, seq=10) if offer in LATER else Failsafe()
+    before, now_ns = (failsafe.command, failsafe.session), T0 + after_ns
+    sent = command(echo_t_ns=now_ns - age_ns, **told)
+    assert failsafe.offer(sent, now_ns, timing) is refusal
+    taken_now = refusal is Refusal.NONE
+    expected = (sent, sent.session) if taken_now else before
+    assert (failsafe.command, failsafe.session) == expected
+    assert failsafe.refused == (not taken_now)
 
 
 @pytest.mark.parametrize(("off_ns", "usable"), [(-1, True), (0, True), (1, False)])
-def test_a_command_is_usable_to_a_nanosecond(off_ns: int, usable: bool, timing: Timing) -> None:
-    failsafe = taken(timing)
-    assert failsafe.is_fresh(T0 + timing.max_command_age_ns + off_ns, timing) is usable
-
-
-@pytest.mark.parametrize(("off_ns", "mode"), [(-1, Mode.TRACK), (0, Mode.TRACK), (1, Mode.HOLD)])
-def test_track_is_left_a_nanosecond_after(off_ns: int, mode: Mode, timing: Timing) -> None:
-    failsafe = taken(timing)
-    failsafe.mode = Mode.TRACK
-    failsafe.fresh_since_ns = T0
-    failsafe.advance(T0 + timing.max_command_age_ns + off_ns, timing, Event.NONE, estop=False)
-    assert failsafe.mode is mode
-
-
-@pytest.mark.parametrize(
-    ("ahead_ns", "refusal"),
-    [
-        (0, Refusal.NONE),
-        (1, Refusal.FROM_THE_FUTURE),
-        (NS_PER_S, Refusal.FROM_THE_FUTURE),
-        (1 << 62, Refusal.FROM_THE_FUTURE),
-    ],
-)
-def test_a_stamp_not_given_yet_is_refused(ahead_ns: int, refusal: Refusal, timing: Timing) -> None:
-    assert Failsafe().offer(command(echo_t_ns=T0 + ahead_ns), T0, timing) is refusal
-
-
-def test_only_the_echoed_stamp_gives_the_age_and_not_the_planners_clock(timing: Timing) -> None:
-    for t_ns in (0, T0 - NS_PER_S, T0 + 10 * NS_PER_S):
-        assert Failsafe().offer(command(t_ns=t_ns), T0, timing) is Refusal.NONE
-
-
-@pytest.mark.parametrize(
-    ("seq", "refusal"), [(4, Refusal.NOT_NEWER), (5, Refusal.NOT_NEWER), (6, Refusal.NONE)]
-)
-def test_only_a_newer_sequence_is_taken(seq: int, refusal: Refusal, timing: Timing) -> None:
-    failsafe = taken(timing, seq=5)
-    assert failsafe.offer(command(seq=seq, echo_t_ns=T0 + 1), T0 + 2, timing) is refusal
+def test_a_command_is_usable_and_tracked_to_a_nanosecond(
+    off_ns: int, usable: bool, timing: Timing
+) -> None:
+    failsafe, now_ns = taken(timing), T0 + AGE_NS + off_ns
+    assert failsafe.is_fresh(now_ns, timing) is usable
+    failsafe.mode, failsafe.fresh_since_ns = Mode.TRACK, T0
+    failsafe.advance(now_ns, timing, Event.NONE, estop=False)
+    assert failsafe.mode is (Mode.TRACK if usable else Mode.HOLD)
 
 
 @pytest.mark.parametrize("seconds", [1, 3, 3600])
 def test_a_packet_sent_again_after_seconds_is_refused(seconds: int, timing: Timing) -> None:
     now_ns = T0 + seconds * NS_PER_S
     failsafe = taken(timing, seq=5)
-    assert failsafe.offer(command(seq=5), now_ns, timing) is not Refusal.NONE
-    # seconds in a stalled link: never seen before, and still too old
-    assert failsafe.offer(command(seq=6), now_ns, timing) is Refusal.TOO_OLD
+    for seq in (5, 6):  # the second was seconds in a stalled link: never seen before
+        assert failsafe.offer(command(seq=seq), now_ns, timing) is Refusal.TOO_OLD
     assert not failsafe.is_fresh(now_ns, timing)
 
 
-def test_a_foreign_session_is_refused_while_the_current_one_is_usable(timing: Timing) -> None:
-    failsafe = taken(timing, seq=5)
-    last_ns = T0 + timing.max_command_age_ns
-    foreign = command(session=OTHER, seq=99, echo_t_ns=last_ns)
-    assert failsafe.offer(foreign, last_ns, timing) is Refusal.FOREIGN_SESSION
-    assert failsafe.session == SESSION
-
-
-def test_a_restarted_planner_is_taken_once_the_old_session_is_stale(timing: Timing) -> None:
-    failsafe = taken(timing, seq=5_000)
-    now_ns = T0 + timing.max_command_age_ns + 1
-    restarted = command(session=OTHER, seq=1, echo_t_ns=now_ns)
-    assert failsafe.offer(restarted, now_ns, timing) is Refusal.NONE
-    assert (failsafe.session, failsafe.command) == (OTHER, restarted)
-
-
 def test_a_retired_session_never_comes_back(timing: Timing) -> None:
-    failsafe = taken(timing)
-    now_ns = T0
-    for session in (OTHER, THIRD):
-        now_ns += timing.max_command_age_ns + 1
-        sent = command(session=session, echo_t_ns=now_ns)
-        assert failsafe.offer(sent, now_ns, timing) is Refusal.NONE
+    """Not while the last 256 are remembered."""
+    failsafe, now_ns = Failsafe(), T0
+    for session in range(1, RETIRED_SESSIONS_KEPT + 4):
+        now_ns += AGE_NS + 1
+        told = command(session=session, echo_t_ns=now_ns)
+        assert failsafe.offer(told, now_ns, timing) is Refusal.NONE
+    assert failsafe.retired == tuple(range(3, RETIRED_SESSIONS_KEPT + 3))
     now_ns += NS_PER_S
-    for session in (SESSION, OTHER):
+    for session in (3, RETIRED_SESSIONS_KEPT + 2):
         back = command(session=session, seq=9_999, echo_t_ns=now_ns)
         assert failsafe.offer(back, now_ns, timing) is Refusal.FOREIGN_SESSION
-    assert failsafe.session == THIRD
 
 
-def test_the_command_that_brings_a_new_session_must_itself_be_within_limits(timing: Timing) -> None:
-    failsafe = taken(timing)
-    now_ns = T0 + timing.max_command_age_ns + 1
-    bad = command(session=OTHER, echo_t_ns=now_ns, k_p=(math.nan, 1.0))
-    assert failsafe.offer(bad, now_ns, timing) is Refusal.OUT_OF_LIMITS
-    assert failsafe.session == SESSION
-
-
-def test_a_new_session_waits_for_its_own_unbroken_time_before_track(timing: Timing) -> None:
-    failsafe = taken(timing)
-    failsafe.fresh_since_ns = T0 - NS_PER_S
-    now_ns = T0 + timing.max_command_age_ns + 1
-    failsafe.offer(command(session=OTHER, echo_t_ns=now_ns), now_ns, timing)
-    failsafe.advance(now_ns, timing, Event.NONE, estop=False)
-    assert failsafe.mode is Mode.HOLD
-    assert not failsafe.ready(now_ns + timing.engage_after_ns - 1, timing)
-
-
-def test_a_new_session_never_leads_in_track_without_its_own_unbroken_time(timing: Timing) -> None:
+@pytest.mark.parametrize("mode", [Mode.HOLD, Mode.TRACK])
+def test_a_new_session_never_leads_without_its_own_unbroken_time(
+    mode: Mode, timing: Timing
+) -> None:
     """Two planners run and the first dies: the second one's commands are there at once."""
     failsafe = taken(timing)
-    failsafe.mode = Mode.TRACK
-    failsafe.fresh_since_ns = T0 - NS_PER_S
-    now_ns = T0 + timing.max_command_age_ns + 1
+    failsafe.mode, failsafe.fresh_since_ns = mode, T0 - NS_PER_S
+    now_ns = T0 + AGE_NS + 1
     assert failsafe.offer(command(session=OTHER, echo_t_ns=now_ns), now_ns, timing) is Refusal.NONE
     failsafe.advance(now_ns, timing, Event.NONE, estop=False)
     assert failsafe.mode is Mode.HOLD
+    assert not failsafe.ready(now_ns + timing.engage_after_ns - 1, timing)
 
 
 # field; the limit it goes up to, by its name in Timing, and times how much; may it be negative?
@@ -178,28 +166,10 @@ def test_each_field_is_taken_up_to_its_limit_and_refused_beyond(
     beyond = math.nextafter(top, math.inf)
     good = [0.0, top, *([-top] if signed else [])]
     bad = [beyond, math.inf, -math.inf, math.nan, -beyond if signed else -5e-324]
-    for value, refusal in [(v, Refusal.NONE) for v in good] + [
-        (v, Refusal.OUT_OF_LIMITS) for v in bad
-    ]:
-        pair = (value, 0.0) if axis == 0 else (0.0, value)
-        failsafe = Failsafe()
-        assert failsafe.offer(command(**{field: pair}), T0, timing) is refusal, value
-        assert failsafe.refused == (refusal is not Refusal.NONE)
-
-
-def test_a_refused_command_leaves_the_one_in_use_alone(timing: Timing) -> None:
-    failsafe = taken(timing, seq=5)
-    in_use = failsafe.command
-    for bad in (
-        command(seq=6, k_p=(math.nan, 0.0)),
-        command(seq=4),
-        command(seq=6, echo_t_ns=T0 + 1),
-        command(session=OTHER, seq=6),
-        command(seq=6, echo_t_ns=0),
-    ):
-        assert failsafe.offer(bad, T0, timing) is not Refusal.NONE
-    assert failsafe.command is in_use
-    assert failsafe.refused == 5
+    for values, refusal in ((good, Refusal.NONE), (bad, Refusal.OUT_OF_LIMITS)):
+        for value in values:
+            pair = (value, 0.0) if axis == 0 else (0.0, value)
+            assert Failsafe().offer(command(**{field: pair}), T0, timing) is refusal, value
 
 
 @given(
@@ -236,36 +206,13 @@ def test_whatever_is_in_use_met_the_whole_rule_when_it_was_taken(
             retired.add(current)
 
 
-def test_a_number_far_ahead_is_refused_and_the_right_ones_after_it_are_not(timing: Timing) -> None:
-    """One message with seq = 2^61 had six modules in HOLD until the planner was restarted."""
-    failsafe = taken(timing, seq=10)
-    assert failsafe.offer(command(seq=2**61), T0, timing) is Refusal.TOO_FAR_AHEAD
-    assert failsafe.offer(command(seq=11), T0, timing) is Refusal.NONE
-
-
-def test_the_step_of_a_number_may_be_500_and_not_one_more(timing: Timing) -> None:
-    assert taken(timing, seq=10).offer(command(seq=510), T0, timing) is Refusal.NONE
-    assert taken(timing, seq=10).offer(command(seq=511), T0, timing) is Refusal.TOO_FAR_AHEAD
-
-
-@pytest.mark.parametrize("away_s", [0.0, 1.0, 60.0, 3600.0])
-def test_a_planner_unheard_for_a_while_is_heard_again(timing: Timing, away_s: float) -> None:
-    """It ticks on at 250 Hz, or at any rate up to 1 kHz, while its link is cut."""
-    failsafe = taken(timing, seq=10)
-    now_ns = T0 + round(away_s * NS_PER_S)
-    told = command(seq=11 + round(1000 * away_s), echo_t_ns=now_ns)
-    assert failsafe.offer(told, now_ns, timing) is Refusal.NONE
-
-
 @given(ahead=st.integers(1, 2**62), away_ns=st.integers(0, 3600 * NS_PER_S))
-def test_no_message_locks_a_planner_out_longer_than_away(ahead: int, away_ns: int) -> None:
+def test_no_message_locks_a_planner_out_longer_than_away(
+    robot: RobotConfig, ahead: int, away_ns: int
+) -> None:
     """Whatever was accepted, a planner of 250 Hz has counted beyond it soon after."""
-    timing = Timing(
-        max_command_age_ns=50 * NS_PER_MS, engage_after_ns=1, engage_after_max_ns=1,
-        dropout_forget_ns=1, dropouts_max=1, k_p_max=1e6, k_d_max=1e6, v_max=1e6, tau_max=1e6,
-    )  # fmt: skip
+    timing, now_ns = timing_of(robot), T0 + away_ns
     failsafe = taken(timing, seq=10)
-    now_ns = T0 + away_ns
     accepted = failsafe.offer(command(seq=10 + ahead, echo_t_ns=now_ns), now_ns, timing)
     if accepted is Refusal.NONE:
         assert ahead <= 500 + 2000 * away_ns / NS_PER_S
@@ -314,25 +261,10 @@ def test_a_drive_is_taken_over_on_the_commands_gains_only_while_the_command_is_u
     assert (controller.setpoint.k_p == told.k_p) is taken
 
 
-def test_a_clock_that_starts_at_nought_is_a_clock(timing: Timing) -> None:
-    failsafe = Failsafe(mode=Mode.HOLD, fresh_since_ns=0)
-    assert failsafe.ready(timing.engage_after_ns, timing)
-    assert not failsafe.ready(timing.engage_after_ns - 1, timing)
-
-
-def test_the_last_256_sessions_never_become_current_again(timing: Timing) -> None:
-    failsafe, now_ns = Failsafe(), T0
-    for session in range(1, RETIRED_SESSIONS_KEPT + 4):
-        now_ns += timing.max_command_age_ns + 1
-        told = command(session=session, echo_t_ns=now_ns)
-        assert failsafe.offer(told, now_ns, timing) is Refusal.NONE
-    assert failsafe.retired == tuple(range(3, RETIRED_SESSIONS_KEPT + 3))
-
-
 def test_the_failsafes_times_and_limits_are_the_robot_files(robot: RobotConfig) -> None:
     service = robot.joint_service
     assert timing_of(robot) == Timing(
-        max_command_age_ns=round(1e6 * service.max_command_age_ms),
+        max_command_age_ns=AGE_NS,
         engage_after_ns=round(1e6 * service.engage_after_ms),
         engage_after_max_ns=round(1e6 * service.engage_after_max_ms),
         dropout_forget_ns=round(1e9 * service.dropout_forget_s),
@@ -342,6 +274,7 @@ def test_the_failsafes_times_and_limits_are_the_robot_files(robot: RobotConfig) 
         v_max=service.v_max,
         tau_max=4.0 * robot.joint.tau_module_max,
     )
+    assert service.max_command_age_ms == 50.0
 
 
 def test_at_the_first_instant_of_a_clock_commands_are_fresh_as_at_any_other(timing: Timing) -> None:
@@ -350,6 +283,8 @@ def test_at_the_first_instant_of_a_clock_commands_are_fresh_as_at_any_other(timi
         failsafe.offer(command(seq=seq, echo_t_ns=seq), seq, timing)
         failsafe.advance(seq, timing, Event.NONE, estop=False)
         assert failsafe.fresh_since_ns == 0
+    assert failsafe.ready(timing.engage_after_ns, timing)
+    assert not failsafe.ready(timing.engage_after_ns - 1, timing)
     tracking = Failsafe(mode=Mode.TRACK, session=SESSION, fresh_since_ns=0)
     tracking.offer(command(echo_t_ns=1), 1, timing)
     assert tracking.advance(1, timing, Event.NONE, estop=False) is not Cause.COMMAND_STALE
