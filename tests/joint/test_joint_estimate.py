@@ -74,33 +74,26 @@ def test_a_speed_beyond_any_motors_excuses_no_jump(samples: JointEstimate, speed
     assert samples.pos == before
 
 
-def test_a_few_odd_samples_in_a_row_and_the_position_is_lost(samples: JointEstimate) -> None:
-    events = [
-        samples.take(reading(T0 + (k + 1) * PERIOD, (5.0, -2.0)), armed=True)
-        for k in range(REJECTED_MAX)
-    ]
-    assert events == [Event.NONE] * (REJECTED_MAX - 1) + [Event.POSITION_LOST]
-    assert samples.pos == (1.0, -2.0)
-
-
-def test_odd_samples_that_are_not_in_a_row_are_only_left_out(samples: JointEstimate) -> None:
-    for k in range(4 * REJECTED_MAX):
-        pos = (5.0 if k % REJECTED_MAX else 1.0, -2.0)
-        event = samples.take(reading(T0 + (k + 1) * PERIOD, pos), armed=True)
-        assert event is not Event.POSITION_LOST
-    assert samples.pos == (1.0, -2.0)
-
-
-def test_an_axis_that_disarms_is_reported_even_by_an_odd_sample(samples: JointEstimate) -> None:
-    rejected_count = reading(T0 + PERIOD, (0.0, 0.0), status=DriveStatus.ERROR)
-    assert samples.take(rejected_count, armed=True) is Event.DRIVE_DISARMED
+@pytest.mark.parametrize("in_a_row", [True, False])
+def test_a_few_odd_samples_in_a_row_and_the_position_is_lost(
+    samples: JointEstimate, in_a_row: bool
+) -> None:
+    """Those that are not in a row are only left out."""
+    events = []
+    for k in range(1, REJECTED_MAX + 1 if in_a_row else 4 * REJECTED_MAX):
+        pos = (5.0 if in_a_row or k % REJECTED_MAX else 1.0, -2.0)
+        events.append(samples.take(reading(T0 + k * PERIOD, pos), armed=True))
+    assert (Event.POSITION_LOST in events) is in_a_row
+    assert events[: REJECTED_MAX - 1] == [Event.NONE] * (REJECTED_MAX - 1)
     assert samples.pos == (1.0, -2.0)
 
 
 def test_a_module_that_is_not_controlled_may_be_found_anywhere(samples: JointEstimate) -> None:
-    idle = reading(T0 + PERIOD, (9.0, 9.0), status=DriveStatus.IDLE)
-    assert samples.take(idle, armed=False) is Event.DRIVE_DISARMED
-    assert samples.pos == (9.0, 9.0)
+    """An axis that disarms is reported even by an odd sample."""
+    odd = reading(T0 + PERIOD, (9.0, 9.0), status=DriveStatus.ERROR)
+    for armed in (True, False):
+        assert samples.take(odd, armed=armed) is Event.DRIVE_DISARMED
+        assert samples.pos == ((1.0, -2.0) if armed else (9.0, 9.0))
 
 
 @pytest.mark.parametrize(
@@ -122,16 +115,13 @@ def test_a_position_that_is_old_or_means_nothing_is_not_taken(
 def test_a_drive_without_a_zero_may_lack_turns_on_both_axes_if_it_was_controlled(
     samples: JointEstimate, armed: bool
 ) -> None:
+    """Only a joint that nobody controls has moved by a jump."""
+    jumped = JointEstimate(N)
+    jumped.take(reading(T0), armed=True)
+    jumped.take(reading(T0 + PERIOD, (9.0, 9.0)), armed=armed)
+    assert (jumped.first.moved, jumped.second.moved) == (not armed, not armed)
     samples.take(reading(T0 + PERIOD, status=DriveStatus.UNZEROED), armed=armed)
     assert (samples.first.lost, samples.second.lost, samples.accepted_ns) == (armed, armed, 0)
-
-
-@pytest.mark.parametrize("armed", [True, False])
-def test_only_a_joint_that_nobody_controls_has_moved_by_a_jump(
-    samples: JointEstimate, armed: bool
-) -> None:
-    samples.take(reading(T0 + PERIOD, (9.0, 9.0)), armed=armed)
-    assert (samples.first.moved, samples.second.moved) == (not armed, not armed)
 
 
 @given(speed=st.floats(-40.0, 40.0), gained=st.floats(-8.0, 8.0), gap_ms=st.integers(1, 100))

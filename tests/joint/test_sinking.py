@@ -29,51 +29,39 @@ def begun(robot: RobotConfig, module: str, q: Pair = Q) -> tuple[Sinking, Setpoi
     return sinking, sinking.begin(FULL, q)
 
 
-@pytest.mark.parametrize("theta", [-0.4, -0.45, -0.35])
-def test_a_hip_holds_the_torso_while_its_leg_folds(robot: RobotConfig, theta: float) -> None:
+def test_a_hip_holds_the_torso_while_its_leg_folds_as_softly_as_its_stiffness_has_risen(
+    robot: RobotConfig,
+) -> None:
     sinking, frozen = begun(robot, "hip_right")
-    sinking.law(frozen, frozen, 0, Q, NeighbourView((0.3, 0.05)))
-    assert sinking.state.upright == pytest.approx(0.3 - 0.4)
-    found = sinking.law(frozen, frozen, LONG_NS, (0.02, theta), NeighbourView((0.32, 0.07)))
-    assert found.q_ref == pytest.approx((0.1, -0.42)), "0.02 rad farther back than it stood"
-    assert found.v_ref == pytest.approx((0.0, -0.07))
-    assert found.k_p[1] == robot.stand_gains("hip_right").k_p[1]
-
-
-@pytest.mark.parametrize(("below", "clipped"), [(0.9, -0.4 - LEVEL_MAX), (-0.9, -0.4 + LEVEL_MAX)])
-def test_a_torso_far_off_returns_gently(robot: RobotConfig, below: float, clipped: float) -> None:
-    sinking, frozen = begun(robot, "hip_right")
-    sinking.law(frozen, frozen, 0, Q, NeighbourView((0.3, 0.0)))
-    assert sinking.law(frozen, frozen, LONG_NS, Q, NeighbourView((below, 0.0))).q_ref[
-        1
-    ] == pytest.approx(clipped)
-
-
-def test_a_hip_levels_as_softly_as_its_stiffness_has_risen(robot: RobotConfig) -> None:
-    sinking, frozen = begun(robot, "hip_left")
-    most = robot.stand_gains("hip_left").k_p[1]
-    blend_ns = round(robot.joint_service.blend_ms * 1e6)
+    most = robot.stand_gains("hip_right").k_p[1]
     for share in (0.0, 0.25, 1.0):
-        found = sinking.law(frozen, frozen, round(share * blend_ns), Q, NeighbourView((0.3, 0.0)))
+        since_ns = round(share * robot.joint_service.blend_ms * 1e6)
+        found = sinking.law(frozen, frozen, since_ns, Q, NeighbourView((0.3, 0.05)))
         assert found.k_p[1] == pytest.approx(share * most)
+    assert sinking.state.upright == pytest.approx(0.3 - 0.4)
+    for theta in (-0.4, -0.45, -0.35):
+        found = sinking.law(frozen, frozen, LONG_NS, (0.02, theta), NeighbourView((0.32, 0.07)))
+        assert found.q_ref == pytest.approx((0.1, -0.42)), "0.02 rad farther back than it stood"
+        assert found.v_ref == pytest.approx((0.0, -0.07))
+        assert found.k_p[1] == most
+    for below, clipped in ((0.9, -0.4 - LEVEL_MAX), (-0.9, -0.4 + LEVEL_MAX)):
+        found = sinking.law(frozen, frozen, LONG_NS, Q, NeighbourView((below, 0.0)))
+        assert found.q_ref[1] == pytest.approx(clipped), "a torso far off returns gently"
 
 
-def test_a_hip_that_never_received_its_legs_states_damps(robot: RobotConfig) -> None:
+def test_a_hip_that_never_received_its_legs_states_damps_and_a_leg_fallen_silent_stays(
+    robot: RobotConfig,
+) -> None:
     sinking, frozen = begun(robot, "hip_right")
     found = sinking.law(frozen, frozen, LONG_NS, Q, UNKNOWN)
-    assert found.k_p[1] == 0.0
+    assert (found.k_p[1], found.tau_ff[1]) == (0.0, 0.0)
     assert found.k_d[1] == robot.joint_service.damp_k_d
-    assert found.tau_ff[1] == 0.0
     assert sinking.state.upright is None
-
-
-def test_a_leg_without_fresh_states_is_taken_to_stay(robot: RobotConfig) -> None:
     sinking, frozen = begun(robot, "hip_right")
-    sinking.law(frozen, frozen, 0, Q, NeighbourView((0.3, 0.05)))
-    sinking.law(frozen, frozen, 1, Q, NeighbourView((0.35, 0.05)))
+    for since_ns, leg in ((0, 0.3), (1, 0.35)):
+        sinking.law(frozen, frozen, since_ns, Q, NeighbourView((leg, 0.05)))
     found = sinking.law(frozen, frozen, LONG_NS, Q, UNKNOWN)
-    assert found.q_ref[1] == pytest.approx(-0.45)
-    assert found.v_ref[1] == 0.0
+    assert (found.q_ref[1], found.v_ref[1]) == (pytest.approx(-0.45), 0.0)
 
 
 def hip_ahead(robot: RobotConfig, ankle: float, knee: float) -> float:
@@ -216,7 +204,9 @@ def test_a_reason_that_passes_is_none(robot: RobotConfig) -> None:
         assert (sinking.state.doubt_ns == -1) is (near is UNKNOWN)
 
 
-def test_a_knee_beside_one_that_does_not_sink_is_caught_where_it_is(robot: RobotConfig) -> None:
+def test_a_knee_beside_one_that_does_not_sink_is_caught_where_it_is_and_nothing_else_is(
+    robot: RobotConfig,
+) -> None:
     sinking, frozen = begun(robot, "knee_left", (0.02, -1.0))
     stand = robot.stand_gains("knee_left")
     assert sinking.law(frozen, frozen, 0, (0.02, -1.1), UNHEARD).k_p[1] == 0.0
@@ -226,19 +216,12 @@ def test_a_knee_beside_one_that_does_not_sink_is_caught_where_it_is(robot: Robot
     found = sinking.law(frozen, frozen, LONG_NS, (0.02, -1.25), UNHEARD)
     assert (found.q_ref[1], found.k_p[1], found.k_d[1]) == (-1.2, stand.k_p[1], stand.k_d[1])
     assert sinking.state.stop == -1.2, "where it was caught it stays"
-    below_its_stop = robot.joint_service.damp_knee_stop - 0.1
-    sinking, frozen = begun(robot, "knee_left", (0.02, -1.0))
-    sinking.law(frozen, frozen, 0, (0.02, below_its_stop), UNHEARD)
-    sinking.law(frozen, frozen, DOUBT_NS, (0.02, below_its_stop), UNHEARD)
-    assert sinking.state.stop == robot.joint_service.damp_knee_stop
-
-
-@pytest.mark.parametrize("module", ["ankle_right", "hip_right"])
-def test_only_knees_are_caught(robot: RobotConfig, module: str) -> None:
-    sinking, frozen = begun(robot, module)
-    for since_ns in (0, DOUBT_NS):
-        sinking.law(frozen, frozen, since_ns, Q, UNHEARD)
-        assert (sinking.state.caught, sinking.state.stop) == (False, None)
+    below, stop = robot.joint_service.damp_knee_stop - 0.1, robot.joint_service.damp_knee_stop
+    for module, caught_at in (("knee_left", stop), ("ankle_right", None), ("hip_right", None)):
+        sinking, frozen = begun(robot, module, (0.02, -1.0))
+        for since_ns in (0, DOUBT_NS):
+            sinking.law(frozen, frozen, since_ns, (0.02, below), UNHEARD)
+        assert (sinking.state.caught, sinking.state.stop) == (caught_at is not None, caught_at)
 
 
 def test_a_second_stop_begins_anew(robot: RobotConfig) -> None:

@@ -62,7 +62,9 @@ def test_shaking_is_the_mean_square_above_its_band_of_either_axis(robot: RobotCo
             assert trips.mean[1 - axis] == 0.0
 
 
-def test_limits_are_the_robot_files(robot: RobotConfig) -> None:
+def test_limits_are_the_robot_files_and_every_trip_has_its_row_and_its_cause(
+    robot: RobotConfig,
+) -> None:
     weaker = msgspec.structs.replace(robot.trips, torque_limit=TripLimit(limit=0.8, after_ms=700.0))
     found = limits_of(msgspec.structs.replace(robot, trips=weaker))
     assert found.slow_share == pytest.approx(1.0 - math.exp(-2.0 * math.pi * 8.0 * 0.002))
@@ -70,6 +72,7 @@ def test_limits_are_the_robot_files(robot: RobotConfig) -> None:
     assert found.torque == pytest.approx(0.995 * 0.8 * robot.joint.tau_module_max)
     assert (found.torque_ns, found.speed_ns) == (700_000_000, 20_000_000)
     assert (found.shaking, found.speed) == (15.0**2, robot.trips.speed.limit)
+    assert {event.name for event in TRIPS} == {cause.name for cause in JOINT_TRIPS}
 
 
 def test_at_its_limit_shaking_and_speed_are_none_and_torque_is(robot: RobotConfig) -> None:
@@ -110,10 +113,6 @@ def test_motors_at_their_limit_trip_when_it_lasts_and_not_before(robot: RobotCon
 def test_a_joint_that_turns_too_fast_trips(robot: RobotConfig, v: Pair) -> None:
     assert tripped_ms(robot, [STILL] * 50, v) == (Event.TOO_FAST, robot.trips.speed.after_ms)
     assert tripped_ms(robot, [STILL] * 50, (7.9, -7.9)) == (Event.NONE, None)
-
-
-def test_every_trip_has_its_row_and_its_cause() -> None:
-    assert {event.name for event in TRIPS} == {cause.name for cause in JOINT_TRIPS}
 
 
 @pytest.mark.parametrize(
