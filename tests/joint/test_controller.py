@@ -17,16 +17,15 @@ from services.joint.neighbours import SILENT_NS, NeighbourRow, NeighbourView
 from services.joint.torque_limiter import limits_of
 from shared.bus.messages import Cause, JointCommand, Mode, Pair, Refusal
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config.robot_config import RobotConfig
-from tests.joint.helpers import SESSION, T0, Bench, command, with_service
+from tests.joint.helpers import ROBOT, SESSION, T0, Bench, command, with_service
 
 K_P_STAND, K_D_STAND = (900.0, 1500.0), (30.0, 30.0)
 """[stand.knee] of this folder's robot, as the bench is a knee."""
 
 
 @pytest.fixture
-def bench(robot: RobotConfig) -> Bench:
-    return Bench(robot)
+def bench() -> Bench:
+    return Bench(ROBOT)
 
 
 def pd(sent: JointCommand, q: Pair, v: Pair, age_s: float = 0.0) -> npt.NDArray[np.float64]:
@@ -73,14 +72,14 @@ def test_track_gives_the_commands_torque_at_its_age_up_to_thirty_milliseconds(be
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 0.5, 1.0])
-def test_track_blends_in_over_its_blend_time(robot: RobotConfig, share: float) -> None:
-    bench = Bench(robot)
+def test_track_blends_in_over_its_blend_time(share: float) -> None:
+    bench = Bench(ROBOT)
     bench.to_hold()
     bench.q = (0.03, -1.02)
     first = bench.until(Mode.TRACK, lambda: bench.cycle(bench.fresh()))
     assert first is not None
     held = first.tau
-    entered_ns, blend_ns = bench.now_ns, robot.joint_service.blend_ms * NS_PER_MS
+    entered_ns, blend_ns = bench.now_ns, ROBOT.joint_service.blend_ms * NS_PER_MS
     while bench.now_ns - entered_ns < share * blend_ns:
         bench.cycle(bench.fresh())
     share = min(1.0, (bench.now_ns - entered_ns) / blend_ns)  # to the whole cycle
@@ -104,9 +103,9 @@ def moving(bench: Bench, *, hold: bool = False) -> JointCommand:
     )
 
 
-def largest_step(robot: RobotConfig, reach: float) -> float:
+def largest_step(reach: float) -> float:
     """Return what the ramps allow from one cycle to the next, N m, at most `reach` rad off."""
-    service = robot.joint_service
+    service = ROBOT.joint_service
     dt_ms = 1e3 / service.rate_hz
     k_p, k_d, v_ref = max(K_P_STAND), 50.0, SWING * OMEGA
     coupled_out = (max(map(abs, COUPLED)) + k_d * v_ref) * dt_ms / service.coupled_ramp_ms
@@ -142,13 +141,11 @@ def play(bench: Bench, script: list[tuple[str, int]]) -> tuple[list[Pair], set[t
 
 @given(script=scripts)
 @example(script=FIG_7)
-def test_torque_makes_no_larger_step_than_the_ramps_allow(
-    robot: RobotConfig, script: list[tuple[str, int]]
-) -> None:
-    quick = with_service(robot, engage_after_ms=10.0, engage_after_max_ms=20.0)
+def test_torque_makes_no_larger_step_than_the_ramps_allow(script: list[tuple[str, int]]) -> None:
+    quick = with_service(ROBOT, engage_after_ms=10.0, engage_after_max_ms=20.0)
     taus, changes = play(Bench(quick), script)
     steps = np.abs(np.diff(np.array(taus), axis=0))
-    most = largest_step(robot, reach=0.02 + SWING)
+    most = largest_step(reach=0.02 + SWING)
     assert steps.max() <= most
     assert most < 5.0 < max(map(abs, COUPLED)), "the bound bites"
     if script == FIG_7:
@@ -171,9 +168,9 @@ def test_hold_freezes_references_and_drops_the_coupled_torque_over_its_ramp(benc
     ("module", "theta_rises"), [("ankle_left", True), ("knee_left", False), ("hip_left", False)]
 )
 def test_in_hold_ankles_and_every_phi_stiffen_and_the_rest_stays_as_it_was_certified(
-    robot: RobotConfig, module: str, theta_rises: bool
+    module: str, theta_rises: bool
 ) -> None:
-    bench = Bench(robot, module)
+    bench = Bench(ROBOT, module)
     bench.q = (0.02, -0.3)  # inside each kind's limits
     sent = {"k_p": (100.0, 200.0), "k_d": (1.0, 1.0), "q_ref": bench.q}
     bench.to_track(**sent)
@@ -181,7 +178,7 @@ def test_in_hold_ankles_and_every_phi_stiffen_and_the_rest_stays_as_it_was_certi
     before = np.array(bench.run(400)[-1].tau)
     bench.q = (0.03, -0.31)
     change = np.array(bench.run(50)[-1].tau) - before
-    phi, theta = robot.stand_gains(module).k_p
+    phi, theta = ROBOT.stand_gains(module).k_p
     expected = (-0.01 * phi, 0.01 * (theta if theta_rises else 200.0))
     np.testing.assert_allclose(change, expected, atol=1e-9)
 
@@ -308,10 +305,10 @@ def test_an_event_holds_the_torque_on_both_sides_of_the_change(bench: Bench) -> 
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_a_joint_is_inside_up_to_its_soft_stop(robot: RobotConfig, axis: int) -> None:
-    limits = limits_of(robot, "knee_right")
+def test_a_joint_is_inside_up_to_its_soft_stop(axis: int) -> None:
+    limits = limits_of(ROBOT, "knee_right")
     low, high = (limits.phi, limits.theta)[axis]
-    controller = JointController(robot, "knee_right")
+    controller = JointController(ROBOT, "knee_right")
     for angle, inside in ((low - 1e-6, False), (low, True), (high, True), (high + 1e-6, False)):
         at = [0.5 * sum(limits.phi), 0.5 * sum(limits.theta)]
         at[axis] = angle

@@ -27,8 +27,7 @@ from services.joint.sinking import DOUBT_NS
 from shared.bus.messages import Mode, Pair
 from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config.robot_config import RobotConfig
-from tests.joint.helpers import LoopName, ModuleBench
+from tests.joint.helpers import ROBOT, LoopName, ModuleBench
 
 MODES = (Mode.HOLD, Mode.TRACK, Mode.DAMP)
 LOOPS: tuple[LoopName, ...] = ("onboard", "service")
@@ -36,8 +35,8 @@ MOVED: Pair = (0.05, -0.97)
 
 
 @pytest.fixture
-def bench(robot: RobotConfig) -> ModuleBench:
-    return ModuleBench(robot)
+def bench() -> ModuleBench:
+    return ModuleBench(ROBOT)
 
 
 @pytest.fixture
@@ -57,14 +56,14 @@ def orders(bench: ModuleBench, lasting_ns: int) -> list[DriveCommand]:
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("loop", LOOPS)
 def test_after_a_freeze_the_drives_torque_goes_on_without_a_step(
-    robot: RobotConfig, mode: Mode, loop: LoopName
+    mode: Mode, loop: LoopName
 ) -> None:
-    bench = ModuleBench(robot, loop)
+    bench = ModuleBench(ROBOT, loop)
     bench.to(mode)
     bench.freeze(2 * NS_PER_S, MOVED)
     last = bench.carried()
     orders = []
-    for _ in range(round(robot.joint_service.blend_ms * NS_PER_MS / bench.cycle_ns) + 30):
+    for _ in range(round(ROBOT.joint_service.blend_ms * NS_PER_MS / bench.cycle_ns) + 30):
         orders.append(bench.cycle().command)
         now = bench.carried()
         assert max(abs(b - a) for a, b in zip(last, now, strict=True)) < 0.7
@@ -75,8 +74,8 @@ def test_after_a_freeze_the_drives_torque_goes_on_without_a_step(
 
 
 @pytest.mark.parametrize("loop", LOOPS)
-def test_at_last_it_holds_as_if_never_frozen(robot: RobotConfig, loop: LoopName) -> None:
-    frozen, twin = ModuleBench(robot, loop), ModuleBench(robot, loop)
+def test_at_last_it_holds_as_if_never_frozen(loop: LoopName) -> None:
+    frozen, twin = ModuleBench(ROBOT, loop), ModuleBench(ROBOT, loop)
     for each in (frozen, twin):
         each.to(Mode.TRACK)
     frozen.freeze(NS_PER_S, MOVED)
@@ -132,10 +131,10 @@ def test_an_emergency_stop_and_a_lost_torque_that_came_meanwhile_are_obeyed_at_o
 @pytest.mark.parametrize("loop", LOOPS)
 @pytest.mark.parametrize("frozen_ns", [0, 3 * NS_PER_S])
 def test_a_jump_is_believed_only_as_the_link_is_read_out_after_a_freeze(
-    robot: RobotConfig, loop: LoopName, frozen_ns: int
+    loop: LoopName, frozen_ns: int
 ) -> None:
     """The first sample is of the time before, the next is where the hand has led the joint."""
-    bench = ModuleBench(robot, loop)
+    bench = ModuleBench(ROBOT, loop)
     bench.to(Mode.HOLD)
     bench.now_ns += frozen_ns
     bench.cycle()
@@ -177,8 +176,8 @@ def test_uncontrolled_it_listens_to_nothing(bench: ModuleBench, status: DriveSta
 # ---- arming
 
 
-def test_a_drive_that_never_arms_is_asked_so_often_and_reported_once(robot: RobotConfig) -> None:
-    bench, told = ModuleBench(robot, obeys=False), []
+def test_a_drive_that_never_arms_is_asked_so_often_and_reported_once() -> None:
+    bench, told = ModuleBench(ROBOT, obeys=False), []
     for _ in range((ARM_TRIES + 4) * ARM_EVERY_NS // bench.cycle_ns):
         step = bench.cycle()
         assert step.torque == (0.0, 0.0)
@@ -192,9 +191,9 @@ def test_a_drive_that_never_arms_is_asked_so_often_and_reported_once(robot: Robo
     assert bench.mode is Mode.DISARMED
 
 
-def marked(robot: RobotConfig, mark_turns: float = 40.0) -> ModuleBench:
-    drive = msgspec.structs.replace(robot.drive, zero_mark_turns=mark_turns)
-    return ModuleBench(msgspec.structs.replace(robot, drive=drive))
+def marked(mark_turns: float = 40.0) -> ModuleBench:
+    drive = msgspec.structs.replace(ROBOT.drive, zero_mark_turns=mark_turns)
+    return ModuleBench(msgspec.structs.replace(ROBOT, drive=drive))
 
 
 @pytest.mark.parametrize("mark_turns", [0.0, 0.5, 40.0])
@@ -208,14 +207,14 @@ def marked(robot: RobotConfig, mark_turns: float = 40.0) -> ModuleBench:
     ],
 )
 def test_a_drive_that_may_lack_turns_is_idled_and_forgets_its_zero_after_each_heartbeat(
-    robot: RobotConfig, mark_turns: float, status: DriveStatus, error: AxisError, jump: float,
+    mark_turns: float, status: DriveStatus, error: AxisError, jump: float,
     lacks: bool,
 ) -> None:  # fmt: skip
     """An encoder that reads 0 disarms its axis by overspeed, before three samples are rejected.
 
     Until the drive shows that it has no zero.
     """
-    bench = marked(robot, mark_turns)
+    bench = marked(mark_turns)
     bench.to(Mode.HOLD)
     bench.status, bench.error, bench.q = status, error, (bench.q[0] + jump, bench.q[1])
     every = FORGET_EVERY_NS // bench.cycle_ns
@@ -234,11 +233,9 @@ def test_a_drive_that_may_lack_turns_is_idled_and_forgets_its_zero_after_each_he
     assert status is DriveStatus.UNZEROED or DriveCommand.CLEAR_ZERO not in orders(bench, NS_PER_S)
 
 
-def test_a_disarmed_drive_forgets_its_zero_if_its_encoder_fails_and_obeys_a_stop_at_once(
-    robot: RobotConfig,
-) -> None:
+def test_a_disarmed_drive_forgets_its_zero_if_its_encoder_fails_and_obeys_a_stop_at_once() -> None:
     """Where no drive is to be taken over."""
-    bench = marked(robot)
+    bench = marked()
     bench.obeys = False
     bench.run(10 * bench.cycle_ns)
     bench.status, bench.error = DriveStatus.ERROR, AxisError.ENCODER_FAILED
@@ -249,10 +246,8 @@ def test_a_disarmed_drive_forgets_its_zero_if_its_encoder_fails_and_obeys_a_stop
 
 
 @pytest.mark.parametrize("zeroed", [True, False])
-def test_an_idle_joint_that_jumps_is_armed_only_once_a_new_zero_explains_it(
-    robot: RobotConfig, zeroed: bool
-) -> None:
-    bench = marked(robot)
+def test_an_idle_joint_that_jumps_is_armed_only_once_a_new_zero_explains_it(zeroed: bool) -> None:
+    bench = marked()
     bench.status, bench.zero = DriveStatus.LOST, (0.25, 0.75)
     bench.cycle()
     bench.status, bench.obeys = DriveStatus.IDLE, False
@@ -266,10 +261,8 @@ def test_an_idle_joint_that_jumps_is_armed_only_once_a_new_zero_explains_it(
     assert (DriveCommand.CLEAR_ZERO in found) is not zeroed
 
 
-def test_samples_that_jump_as_the_link_is_read_out_after_a_freeze_lack_no_turns(
-    robot: RobotConfig,
-) -> None:
-    bench = marked(robot)
+def test_samples_that_jump_as_the_link_is_read_out_after_a_freeze_lack_no_turns() -> None:
+    bench = marked()
     bench.zero = (0.25, 0.75)
     bench.to(Mode.HOLD)
     bench.zero = None
@@ -292,12 +285,12 @@ def test_what_the_neighbours_do_comes_through(bench: ModuleBench) -> None:
     assert bench.controller.caught
 
 
-def test_a_module_knows_its_bus_and_its_motors_limit(robot: RobotConfig, held: ModuleBench) -> None:
+def test_a_module_knows_its_bus_and_its_motors_limit(held: ModuleBench) -> None:
     """N m of the motor: current limit times torque constant, not over it."""
-    most = robot.drive.current_lim * robot.drive.torque_constant
+    most = ROBOT.drive.current_lim * ROBOT.drive.torque_constant
     assert held.module._law._input_max == pytest.approx(INPUT_TORQUE_SHARE * most)
-    for row in robot.module:
-        assert DriveManager(robot, row.name).bus == row.bus
+    for row in ROBOT.module:
+        assert DriveManager(ROBOT, row.name).bus == row.bus
 
 
 # ---- what a drive does that is left alone: its service has died, or its cable is out
@@ -316,9 +309,9 @@ def joint_gains(bench: ModuleBench) -> Pair:
     return scale * pos_gain * vel_gain, scale * vel_gain
 
 
-def soft_in_track(robot: RobotConfig, module: str) -> ModuleBench:
+def soft_in_track(module: str) -> ModuleBench:
     """Bring a module to TRACK on gains far below HOLD's, off its reference and moving."""
-    bench = ModuleBench(robot, module=module)
+    bench = ModuleBench(ROBOT, module=module)
     bench.q = (0.02, -1.0) if module.startswith("knee") else (0.02, 0.1)
     bench.until(Mode.HOLD, bench.cycle)
     soft = {"q_ref": (bench.q[0] + OFF[0], bench.q[1] + OFF[1]), "k_p": SOFT_P, "k_d": SOFT_D}
@@ -330,15 +323,15 @@ def soft_in_track(robot: RobotConfig, module: str) -> ModuleBench:
 
 
 @pytest.mark.parametrize("module", ["ankle_right", "ankle_left", "knee_right", "hip_left"])
-def test_only_an_ankles_drive_is_left_with_holds_gains(robot: RobotConfig, module: str) -> None:
+def test_only_an_ankles_drive_is_left_with_holds_gains(module: str) -> None:
     """With 4 N m s/rad on each ankle 7 of 26 pairs of pushes fell, all six services dead.
 
     At the sample it changes nothing: TRACK's law is the command's, to the last of its torque.
     """
-    bench = soft_in_track(robot, module)
+    bench = soft_in_track(module)
     k_p, k_d = SOFT_P, SOFT_D
     if module.startswith("ankle"):
-        k_p, k_d = robot.hold_gains(module)
+        k_p, k_d = ROBOT.hold_gains(module)
         assert min(k_p) > max(SOFT_P)
         assert min(k_d) > max(SOFT_D)
     assert joint_gains(bench) == pytest.approx((sum(k_p) / 2.0, sum(k_d) / 2.0), rel=0.03)
@@ -347,9 +340,9 @@ def test_only_an_ankles_drive_is_left_with_holds_gains(robot: RobotConfig, modul
 
 
 @pytest.mark.parametrize("module", ["ankle_right", "knee_right"])
-def test_a_drive_left_in_damp_goes_on_with_damps_own_gains(robot: RobotConfig, module: str) -> None:
+def test_a_drive_left_in_damp_goes_on_with_damps_own_gains(module: str) -> None:
     """A drive that is left sinks: with HOLD's gains it would be the one that does not."""
-    bench = soft_in_track(robot, module)
+    bench = soft_in_track(module)
     bench.cycle(estop=True)
     bench.run(1000 * bench.cycle_ns)
     assert bench.mode is Mode.DAMP
@@ -402,9 +395,9 @@ BEGINS = {
 @pytest.mark.parametrize("begins", BEGINS)
 @pytest.mark.parametrize("cycles", [0, 1, 5, 60])
 def test_a_module_goes_on_from_its_snapshot_bit_for_bit_and_shares_nothing_with_it(
-    robot: RobotConfig, begins: str, cycles: int
+    begins: str, cycles: int
 ) -> None:
-    bench, twin = ModuleBench(robot), ModuleBench(robot)
+    bench, twin = ModuleBench(ROBOT), ModuleBench(ROBOT)
     mode, told = BEGINS[begins]
     bench.to(mode)
     if begins == "frozen":

@@ -22,6 +22,7 @@ from shared.config.robot_config import RobotConfig
 from shared.joints import kind_of
 from tests.conftest import ROBOT_FILE
 from tests.joint.helpers import SESSION, T0, Bench, command
+from tests.robots import ROBOT
 
 Q: Pair = (0.02, -1.0)
 V: Pair = (0.01, -0.2)
@@ -38,8 +39,8 @@ def robot() -> RobotConfig:
 
 
 @pytest.fixture
-def knee(robot: RobotConfig) -> Envelope:
-    return Envelope(robot, MODULE)
+def knee() -> Envelope:
+    return Envelope(ROBOT, MODULE)
 
 
 def bounds_of(robot: RobotConfig, module: str = MODULE) -> ModuleBounds:
@@ -83,9 +84,9 @@ def changed(told: JointCommand, name: str, axis: int, value: float) -> JointComm
 )
 @pytest.mark.parametrize("axis", [0, 1])
 def test_each_number_is_believed_up_to_its_bound_and_not_beyond(
-    robot: RobotConfig, module: str, name: str, axis: int
+    module: str, name: str, axis: int
 ) -> None:
-    bounds, own, told = bounds_of(robot, module), robot.envelope, middle(robot, module)
+    bounds, own, told = bounds_of(ROBOT, module), ROBOT.envelope, middle(ROBOT, module)
     (k_p, k_p_most), (k_d, k_d_most) = (
         [pair[axis] for pair in x] for x in (bounds.k_p, bounds.k_d)
     )
@@ -101,7 +102,7 @@ def test_each_number_is_believed_up_to_its_bound_and_not_beyond(
         "v_ref": (-v_ref, v_ref),
         "q_ref": (Q[axis] - distance, Q[axis] + distance),
     }[name]
-    small, envelope = 1e-6 * max(1.0, abs(low), abs(high)), Envelope(robot, module)
+    small, envelope = 1e-6 * max(1.0, abs(low), abs(high)), Envelope(ROBOT, module)
     # a reference's distance is rounded: its very bound is not told
     within = (low + small, high - small, *((low, high) if name != "q_ref" else ()))
     beyond = (low - small, high + small, math.nan, math.inf, -math.inf)
@@ -112,41 +113,37 @@ def test_each_number_is_believed_up_to_its_bound_and_not_beyond(
 
 
 @pytest.mark.parametrize("name", ["margin", "margin_onboard"])
-def test_a_margin_below_the_least_is_not_believed(
-    robot: RobotConfig, knee: Envelope, name: str
-) -> None:
-    limits = robot.certificate
+def test_a_margin_below_the_least_is_not_believed(knee: Envelope, name: str) -> None:
+    limits = ROBOT.certificate
     least = limits.margin_min if name == "margin" else limits.onboard_margin_min
     believed = (0.981 * least, (1.0 - ROUNDING) * least)
     for value in (*believed, 0.979 * least, 0.0, -1.0, math.nan):
         outside = NOTHING if value in believed else Outside.MARGIN
-        assert knee.judge(middle(robot, **{name: value}), None, Q, V) is outside, value
+        assert knee.judge(middle(ROBOT, **{name: value}), None, Q, V) is outside, value
 
 
 @pytest.mark.parametrize("theta", [-4.0, -2.9, -2.0, -1.0, -0.31, 0.5])
-def test_the_feedforward_is_that_of_the_joints_own_angle(
-    robot: RobotConfig, knee: Envelope, theta: float
-) -> None:
+def test_the_feedforward_is_that_of_the_joints_own_angle(knee: Envelope, theta: float) -> None:
     """A knee that is bent to a right angle carries more than one that is straight."""
-    (_, low), (_, high) = tau_ff_at(bounds_of(robot), theta)
-    room = robot.envelope.tau_ff_margin
+    (_, low), (_, high) = tau_ff_at(bounds_of(ROBOT), theta)
+    room = ROBOT.envelope.tau_ff_margin
     for tau, outside in (
         (low - room - 0.01, Outside.TAU_FF),
         (low - room + 0.01, NOTHING),
         (high + room - 0.01, NOTHING),
         (high + room + 0.01, Outside.TAU_FF),
     ):
-        told = middle(robot, q_ref=(0.02, theta), tau_ff=(0.0, tau))
+        told = middle(ROBOT, q_ref=(0.02, theta), tau_ff=(0.0, tau))
         assert knee.judge(told, None, (0.02, theta), V) is outside
 
 
 @pytest.mark.parametrize("signs", [(1, 1), (1, -1), (-1, 1), (-1, -1)])
 @pytest.mark.parametrize("settled", [True, False])
 def test_a_coupled_torque_that_drives_the_joint_from_its_reference_is_not_believed(
-    robot: RobotConfig, knee: Envelope, signs: tuple[int, int], settled: bool
+    knee: Envelope, signs: tuple[int, int], settled: bool
 ) -> None:
     """One axis may pull the wrong way if the other pulls harder: the work of both counts."""
-    away, most = (0.05, 0.04), robot.envelope.coupled_work
+    away, most = (0.05, 0.04), ROBOT.envelope.coupled_work
     for phi_work, theta_work, outside in (
         (-0.5 * most, -0.49 * most, NOTHING),
         (-0.5 * most, -0.51 * most, Outside.COUPLED_WORK),
@@ -154,38 +151,36 @@ def test_a_coupled_torque_that_drives_the_joint_from_its_reference_is_not_believ
         (2.0 * most, 1.0 * most, NOTHING),
     ):
         told = middle(
-            robot, q_ref=tuple(q + s * d for q, s, d in zip(Q, signs, away, strict=True)),
+            ROBOT, q_ref=tuple(q + s * d for q, s, d in zip(Q, signs, away, strict=True)),
             tau_coupled=(signs[0] * phi_work / away[0], signs[1] * theta_work / away[1]),
         )  # fmt: skip
         assert knee.judge(told, None, Q, V, settled=settled) is outside
 
 
-def test_the_work_of_a_coupled_torque_is_about_the_aged_reference(
-    robot: RobotConfig, knee: Envelope
-) -> None:
-    told = middle(robot, v_ref=(0.0, 1.0), tau_coupled=(0.0, -55.0))
+def test_the_work_of_a_coupled_torque_is_about_the_aged_reference(knee: Envelope) -> None:
+    told = middle(ROBOT, v_ref=(0.0, 1.0), tau_coupled=(0.0, -55.0))
     for age_s, outside in ((0.01, NOTHING), (0.03, Outside.COUPLED_WORK)):
         assert knee.judge(told, None, Q, V, age_s=age_s) is outside
 
 
-def test_while_track_blends_in_the_reference_may_be_twice_as_far(robot: RobotConfig) -> None:
-    k_p = bounds_of(robot, ANKLE).k_p[1]
-    envelope, farthest = Envelope(robot, ANKLE), robot.envelope.spring_torque / k_p[1]
+def test_while_track_blends_in_the_reference_may_be_twice_as_far() -> None:
+    k_p = bounds_of(ROBOT, ANKLE).k_p[1]
+    envelope, farthest = Envelope(ROBOT, ANKLE), ROBOT.envelope.spring_torque / k_p[1]
     for share, settled, blending in (
         (0.99, NOTHING, NOTHING),
         (1.01, Outside.Q_REF, NOTHING),
         (1.99, Outside.Q_REF, NOTHING),
         (2.01, Outside.Q_REF, Outside.Q_REF),
     ):
-        told = middle(robot, ANKLE, k_p=k_p, q_ref=(Q[0], Q[1] + share * farthest))
+        told = middle(ROBOT, ANKLE, k_p=k_p, q_ref=(Q[0], Q[1] + share * farthest))
         assert envelope.judge(told, None, Q, V) is settled
         assert envelope.judge(told, None, Q, V, settled=False) is blending
 
 
-def test_without_bounds_everything_is_believed(robot: RobotConfig) -> None:
+def test_without_bounds_everything_is_believed() -> None:
     wild = command(k_p=(0.0, 0.0), tau_ff=(-90.0, 90.0), margin=-1.0)
-    law = msgspec.structs.replace(robot.law, split="diagonal")
-    for config in (believing(robot), msgspec.structs.replace(robot, law=law)):
+    law = msgspec.structs.replace(ROBOT.law, split="diagonal")
+    for config in (believing(ROBOT), msgspec.structs.replace(ROBOT, law=law)):
         assert Envelope(config, MODULE).judge(wild, None, Q, V) is NOTHING
 
 
@@ -197,10 +192,10 @@ def test_without_bounds_everything_is_believed(robot: RobotConfig) -> None:
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 @pytest.mark.parametrize("apart_ms", [-1000, 0, 4, 16, 48])
 def test_a_torque_that_jumps_within_a_planners_lead_is_not_believed(
-    robot: RobotConfig, knee: Envelope, name: str, axis: int, sign: float, apart_ms: int
+    knee: Envelope, name: str, axis: int, sign: float, apart_ms: int
 ) -> None:
     """A stamp that goes back leaves no more room than none."""
-    last, own = middle(robot), robot.envelope
+    last, own = middle(ROBOT), ROBOT.envelope
     most = own.torque_step + own.torque_rate * max(0, min(apart_ms, 16)) / 1e3
     later = msgspec.structs.replace(last, t_ns=T0 + apart_ms * NS_PER_MS, seq=2)
     others = [msgspec.structs.replace(last, session=SESSION + 1, hold=False)]
@@ -215,7 +210,7 @@ def test_a_torque_that_jumps_within_a_planners_lead_is_not_believed(
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 @pytest.mark.parametrize("axis", [0, 1])
 def test_the_work_of_a_coupled_torque_on_a_joint_that_moves_is_what_it_puts_in_within_its_time(
-    robot: RobotConfig, knee: Envelope, sign: float, axis: int
+    knee: Envelope, sign: float, axis: int
 ) -> None:
     """100 W: the limit of 10 J after 122 ms, and 30 J in the end; what it takes out is lost."""
     v, tau = ((sign * 2.0, 0.0), (sign * 50.0, 0.0)) if axis == 0 else ((0.0, 2.0), (0.0, 50.0))
@@ -231,7 +226,7 @@ def test_the_work_of_a_coupled_torque_on_a_joint_that_moves_is_what_it_puts_in_w
     found = [0.0]
     for _ in range(1000):
         found.append(put(found[-1], v))
-    most = robot.envelope.coupled_energy
+    most = ROBOT.envelope.coupled_energy
     assert np.searchsorted(found, most) == pytest.approx(0.122 / 4e-3, abs=1.0)
     assert found[-1] == pytest.approx(100.0 * ENERGY_S, rel=1e-3)
     assert put(0.0, (-2.0 * v[0], -2.0 * v[1])) == 0.0
@@ -248,10 +243,8 @@ def going(tick: int, told: Pair, goes: Pair) -> JointCommand:
     return command(t_ns=T0 + tick * 4_000_000, seq=tick, q_ref=at, v_ref=told)
 
 
-def astray_after(
-    robot: RobotConfig, ticks: int, told: Pair, goes: Pair, every: int = 1, module: str = ANKLE
-) -> Pair:
-    envelope, lately, last = Envelope(robot, module), Lately(), going(0, told, goes)
+def astray_after(ticks: int, told: Pair, goes: Pair, every: int = 1, module: str = ANKLE) -> Pair:
+    envelope, lately, last = Envelope(ROBOT, module), Lately(), going(0, told, goes)
     for tick in range(every, ticks + 1, every):
         after = going(tick, told, goes)
         lately, last = envelope.lately(after, last, lately, V, T0), after
@@ -259,44 +252,42 @@ def astray_after(
 
 
 @pytest.mark.parametrize("every", [1, 10])
-def test_a_reference_that_goes_as_it_says_is_not_astray_however_far_and_seldom(
-    robot: RobotConfig, every: int
-) -> None:
-    assert astray_after(robot, 1000, (-2.0, 0.7), (-2.0, 0.7), every) == pytest.approx((0.0, 0.0))
+def test_a_reference_that_goes_as_it_says_is_not_astray_however_far_and_seldom(every: int) -> None:
+    assert astray_after(1000, (-2.0, 0.7), (-2.0, 0.7), every) == pytest.approx((0.0, 0.0))
 
 
 @pytest.mark.parametrize(("told", "goes"), [((0.0, 0.0), (0.3, -0.3)), ((1.0, 0.3), (1.3, 0.0))])
 def test_an_ankles_that_goes_another_way_is_found_within_a_fifth_of_a_second(
-    robot: RobotConfig, told: Pair, goes: Pair
+    told: Pair, goes: Pair
 ) -> None:
     """A knee's and a hip's go astray while the height follows a reference of its own."""
-    astray = astray_after(robot, 50, told, goes)
-    assert min(map(abs, astray)) > robot.envelope.q_ref_astray
+    astray = astray_after(50, told, goes)
+    assert min(map(abs, astray)) > ROBOT.envelope.q_ref_astray
     assert np.sign(astray).tolist() == [1.0, -1.0]
-    settled = astray_after(robot, 2000, told, goes)
+    settled = astray_after(2000, told, goes)
     assert np.abs(settled) == pytest.approx([0.3 * ASTRAY_S] * 2, rel=0.02), "it is forgotten"
-    assert astray_after(robot, 50, told, goes, module=MODULE) == pd_law.ZERO
+    assert astray_after(50, told, goes, module=MODULE) == pd_law.ZERO
 
 
-def test_where_nothing_of_this_planner_is_tracked_nothing_is_astray(robot: RobotConfig) -> None:
+def test_where_nothing_of_this_planner_is_tracked_nothing_is_astray() -> None:
     after = command(q_ref=(9.0, 9.0), seq=2)
     held = msgspec.structs.replace(after, hold=True)
     pairs = [(after, None), (after, command(hold=True)), (after, command(session=SESSION + 1))]
     for told, last in (*pairs, (held, command())):
-        lately = Envelope(robot, ANKLE).lately(told, last, Lately(astray=(0.5, 0.5)), V, T0)
+        lately = Envelope(ROBOT, ANKLE).lately(told, last, Lately(astray=(0.5, 0.5)), V, T0)
         assert lately.astray == pd_law.ZERO
 
 
 @pytest.mark.parametrize("share", [1.0, 1.001, math.nan])
-def test_what_went_before_is_believed_up_to_its_bound(robot: RobotConfig, share: float) -> None:
+def test_what_went_before_is_believed_up_to_its_bound(share: float) -> None:
     """The work of a coupled torque; and each way in which a reference may be astray."""
-    own, inside = robot.envelope, share == 1.0
+    own, inside = ROBOT.envelope, share == 1.0
     rows = [(Lately(energy=share * own.coupled_energy), MODULE, Outside.COUPLED_ENERGY)]
     far = share * own.q_ref_astray
     for astray in ((far, 0.0), (-far, 0.0), (0.0, far), (0.0, -far)):
         rows += [(Lately(astray=astray), ANKLE, Outside.Q_REF_ASTRAY)]
     for lately, module, outside in rows:
-        found = Envelope(robot, module).judge(middle(robot, module), None, Q, V, lately=lately)
+        found = Envelope(ROBOT, module).judge(middle(ROBOT, module), None, Q, V, lately=lately)
         assert found is (NOTHING if inside else outside)
 
 
@@ -304,14 +295,12 @@ def test_what_went_before_is_believed_up_to_its_bound(robot: RobotConfig, share:
 
 
 @pytest.mark.parametrize("name", ["k_p", "k_d", "q_ref", "tau_ff"])
-def test_hold_is_obeyed_and_wild_numbers_make_none_ready(
-    robot: RobotConfig, knee: Envelope, name: str
-) -> None:
-    failsafe, timing = Failsafe(mode=Mode.HOLD), timing_of(robot)
+def test_hold_is_obeyed_and_wild_numbers_make_none_ready(knee: Envelope, name: str) -> None:
+    failsafe, timing = Failsafe(mode=Mode.HOLD), timing_of(ROBOT)
     wild = {"tau_ff": (0.5, -90.0), "q_ref": (0.5, -2.0)}.get(name, (0.0, 0.0))
     for seq in range(400):
         now_ns = T0 + seq * 2_000_000
-        told = middle(robot, hold=True, seq=seq, echo_t_ns=now_ns)
+        told = middle(ROBOT, hold=True, seq=seq, echo_t_ns=now_ns)
         if seq % 2 or seq < 200:
             told = msgspec.structs.replace(told, **{name: wild})
         outside = knee.judge(told, None, Q, V)
@@ -331,12 +320,12 @@ def test_hold_is_obeyed_and_wild_numbers_make_none_ready(
     ids=["not believed", "what no service takes", "another reason"],
 )
 def test_what_is_not_believed_is_refused_counted_and_told_unless_it_is_for_another_reason(
-    robot: RobotConfig, changes: dict[str, Any], refusal: Refusal, told: Outside
+    changes: dict[str, Any], refusal: Refusal, told: Outside
 ) -> None:
-    failsafe, timing = Failsafe(), timing_of(robot)
-    assert failsafe.offer(middle(robot, **changes), T0, timing, Outside.K_P) is refusal
+    failsafe, timing = Failsafe(), timing_of(ROBOT)
+    assert failsafe.offer(middle(ROBOT, **changes), T0, timing, Outside.K_P) is refusal
     assert (failsafe.command, failsafe.refused, failsafe.outside) == (None, 1, told)
-    good = middle(robot)
+    good = middle(ROBOT)
     assert failsafe.offer(good, T0, timing) is Refusal.NONE
     assert (failsafe.command, failsafe.refused, failsafe.outside) == (good, 1, NOTHING)
 
@@ -369,8 +358,8 @@ class Wary(Bench):
 
 
 @pytest.fixture
-def wary(robot: RobotConfig) -> Wary:
-    return Wary(robot)
+def wary() -> Wary:
+    return Wary(ROBOT)
 
 
 def test_a_torque_that_jumps_is_refused_while_it_tracks_and_only_then(wary: Wary) -> None:
@@ -410,11 +399,9 @@ def test_a_spring_may_pull_harder_while_track_blends_in_and_not_after(wary: Wary
 
 
 @pytest.mark.parametrize("goes", [0.0, 0.3])
-def test_a_controller_remembers_how_far_astray_its_reference_is(
-    robot: RobotConfig, goes: float
-) -> None:
+def test_a_controller_remembers_how_far_astray_its_reference_is(goes: float) -> None:
     """A third of a second: at 0.3 rad/s that the commands do not tell, twice the bound."""
-    wary = Wary(robot, ANKLE)
+    wary = Wary(ROBOT, ANKLE)
     wary.tracks(400)
     steps = goes * wary.cycle_ns / NS_PER_S * np.arange(166)
     refused = {wary.told(q_ref=(Q[0], Q[1] + along)) for along in steps.tolist()}
@@ -434,18 +421,18 @@ def test_a_controller_remembers_what_the_coupled_torque_has_put_into_its_joint(
     assert (Outside.COUPLED_ENERGY in refused) is (rate > 0.0)
 
 
-def test_a_state_reports_what_is_not_believed(robot: RobotConfig) -> None:
+def test_a_state_reports_what_is_not_believed() -> None:
     """Until 50 ms have passed in which nothing came: the planner that said it is gone."""
-    controller = JointController(robot, MODULE)
-    controller.step(T0, None, middle(robot, k_p=(0.0, 0.0)), estop=False)
+    controller = JointController(ROBOT, MODULE)
+    controller.step(T0, None, middle(ROBOT, k_p=(0.0, 0.0)), estop=False)
     limit_ns = controller.timing.max_command_age_ns
     assert controller.state(T0 + limit_ns).outside == Outside.K_P
     assert controller.state(T0 + limit_ns + 1).outside == NOTHING
 
 
-def test_hold_stiffens_about_the_joint_and_track_about_the_reference(robot: RobotConfig) -> None:
+def test_hold_stiffens_about_the_joint_and_track_about_the_reference() -> None:
     """A knee 0.2 rad off its reference, with a tenth of HOLD's stiffness."""
-    bench = Bench(robot)
+    bench = Bench(ROBOT)
     soft = {"k_p": (300.0, 300.0), "q_ref": (bench.q[0], bench.q[1] + 0.2)}
     bench.to_track(**soft)
     assert bench.controller.setpoint.q_ref[1] == pytest.approx(bench.q[1] + 0.2)

@@ -28,7 +28,7 @@ from shared.bus.ports import M
 from shared.bus.traces import JointTrace
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
-from tests.joint.helpers import SESSION, T0, command, with_service
+from tests.joint.helpers import ROBOT, SESSION, T0, command, with_service
 
 
 class Inbox(Generic[M]):
@@ -152,13 +152,13 @@ class Rig:
 
 
 @pytest.fixture(params=["onboard", "service"])
-def rig(robot: RobotConfig, request: pytest.FixtureRequest) -> Rig:
-    return Rig(with_service(robot, loop=request.param))
+def rig(request: pytest.FixtureRequest) -> Rig:
+    return Rig(with_service(ROBOT, loop=request.param))
 
 
 @pytest.fixture
-def onboard(robot: RobotConfig) -> Rig:
-    return Rig(with_service(robot, loop="onboard"))
+def onboard() -> Rig:
+    return Rig(with_service(ROBOT, loop="onboard"))
 
 
 class Stop:
@@ -202,10 +202,8 @@ def test_a_drive_is_armed_once_and_only_when_nothing_speaks_against_it(rig: Rig,
     assert (drive.armed, rig.mode) == (1, Mode.HOLD)
 
 
-def test_a_torque_drive_armed_by_another_is_armed_by_us_before_it_is_held(
-    robot: RobotConfig,
-) -> None:
-    rig = Rig(with_service(robot, loop="service"))
+def test_a_torque_drive_armed_by_another_is_armed_by_us_before_it_is_held() -> None:
+    rig = Rig(with_service(ROBOT, loop="service"))
     rig.drive.status = DriveStatus.ARMED
     for mode in (Mode.DISARMED, Mode.HOLD):
         rig.run(1)
@@ -219,11 +217,11 @@ def test_a_torque_drive_armed_by_another_is_armed_by_us_before_it_is_held(
     [(Mode.DISARMED, "NOTHING"), (Mode.HOLD, "HELD"), (Mode.DAMP, "DAMP")],
 )
 def test_a_fleet_that_goes_down_leaves_idle_drives_and_a_service_ended_alone_one_that_holds(
-    robot: RobotConfig, tmp_path: Path, mode: Mode, left: str, interrupted: bool, loop: str
+    tmp_path: Path, mode: Mode, left: str, interrupted: bool, loop: str
 ) -> None:
     """A fleet that goes down leaves nothing, a service that ends alone that it held or sank."""
     guard = RearmGuard(tmp_path, "knee_right")
-    rig = Rig(with_service(robot, loop=loop), guard)
+    rig = Rig(with_service(ROBOT, loop=loop), guard)
     rig.drive.obeys = mode is not Mode.DISARMED
     rig.run(20)
     if mode is Mode.DAMP:

@@ -25,9 +25,8 @@ from services.joint.rearm_guard import (
 )
 from shared.bus.messages import Estop, Mode, Pair
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
-from tests.joint.helpers import ModuleBench
+from tests.joint.helpers import ROBOT, ModuleBench
 from tests.joint.test_loop import Rig
 
 MODULE = "knee_right"
@@ -36,14 +35,11 @@ CARRIED: Pair = (0.3, 1.4)
 
 
 def successor(
-    robot: RobotConfig,
-    last_state: LastState,
-    status: DriveStatus = DriveStatus.ARMED,
-    carries: Pair | None = CARRIED,
+    last_state: LastState, status: DriveStatus = DriveStatus.ARMED, carries: Pair | None = CARRIED
 ) -> ModuleBench:
     """Return a service after one that left `last_state`, and the drive that it finds."""
     carries = carries if status is DriveStatus.ARMED else None
-    return ModuleBench(robot, last_state=last_state, status=status, carries=carries, obeys=False)
+    return ModuleBench(ROBOT, last_state=last_state, status=status, carries=carries, obeys=False)
 
 
 def orders(service: ModuleBench, lasting_ns: int) -> set[DriveCommand]:
@@ -51,10 +47,8 @@ def orders(service: ModuleBench, lasting_ns: int) -> set[DriveCommand]:
 
 
 @pytest.mark.parametrize("stopped", [True, False])
-def test_a_service_that_faults_leaves_that_it_held_or_was_stopped(
-    robot: RobotConfig, stopped: bool
-) -> None:
-    service = successor(robot, LastState.NOTHING, DriveStatus.IDLE)
+def test_a_service_that_faults_leaves_that_it_held_or_was_stopped(stopped: bool) -> None:
+    service = successor(LastState.NOTHING, DriveStatus.IDLE)
     assert service.cycle().command is DriveCommand.ARM
     assert service.module.last_state is LastState.NOTHING, "asked for, but it may not come to hold"
     service.status = DriveStatus.ARMED
@@ -74,10 +68,10 @@ def test_a_service_that_faults_leaves_that_it_held_or_was_stopped(
 @pytest.mark.parametrize("last_state", [LastState.HELD, LastState.DAMP])
 @pytest.mark.parametrize("led", [True, False])
 def test_a_drive_that_held_and_has_let_go_is_not_armed_by_a_service_that_was_not_asked_for(
-    robot: RobotConfig, status: DriveStatus, last_state: LastState, led: bool
+    status: DriveStatus, last_state: LastState, led: bool
 ) -> None:
     """The supervisor starts what crashes: it armed under load, with a step of 28 N m."""
-    service = successor(robot, last_state, status)
+    service = successor(last_state, status)
     steps = service.lead(2000) if led else service.run(4 * NS_PER_S)
     assert DriveCommand.ARM not in {step.command for step in steps}
     assert service.module.last_state is last_state, "nor by the next"
@@ -90,13 +84,13 @@ def test_a_drive_that_held_and_has_let_go_is_not_armed_by_a_service_that_was_not
 @pytest.mark.parametrize("carries", [CARRIED, None])
 @pytest.mark.parametrize("last_state", [LastState.NOTHING, LastState.HELD])
 def test_what_holds_waits_for_a_planner_to_send(
-    robot: RobotConfig, last_state: LastState, carries: Pair | None
+    last_state: LastState, carries: Pair | None
 ) -> None:
     """Taken over with stand gains, beside a knee on soft ones, it tipped the robot.
 
     Unknown torques are not taken over, nor are they a reason to wait for a planner.
     """
-    service = successor(robot, last_state, carries=carries)
+    service = successor(last_state, carries=carries)
     steps = service.run(2 * NS_PER_S)
     waits = {ArmingInhibit.WAITING} if carries is not None else set()
     assert {step.command for step in steps} == {DriveCommand.NOTHING}
@@ -118,9 +112,9 @@ def test_what_holds_waits_for_a_planner_to_send(
 @pytest.mark.parametrize("last_state", [LastState.NOTHING, LastState.HELD])
 @pytest.mark.parametrize("k_p", [(600.0, 800.0), (900.0, 12.0)])
 def test_it_is_taken_over_with_the_commands_gains_and_the_torque_that_it_carries(
-    robot: RobotConfig, last_state: LastState, k_p: Pair
+    last_state: LastState, k_p: Pair
 ) -> None:
-    service = successor(robot, last_state)
+    service = successor(last_state)
     service.run(100 * NS_PER_MS)
     told = {"hold": True, "k_p": k_p, "k_d": (40.0, 3.0)}
     listens, takes_over = service.lead(2, **told)
@@ -143,9 +137,9 @@ def test_it_is_taken_over_with_the_commands_gains_and_the_torque_that_it_carries
     assert risen.k_p[1] == k_p[1], "theta of a knee as soft as the other knee's"
 
 
-def test_what_found_nothing_or_let_go_leaves_nothing_holding(robot: RobotConfig) -> None:
-    assert not DriveManager(robot, "knee_left").leaves_holding
-    service = successor(robot, LastState.HELD)
+def test_what_found_nothing_or_let_go_leaves_nothing_holding() -> None:
+    assert not DriveManager(ROBOT, "knee_left").leaves_holding
+    service = successor(LastState.HELD)
     service.run(ARM_EVERY_NS)
     assert service.module.leaves_holding
     service.status = DriveStatus.IDLE
@@ -154,25 +148,25 @@ def test_what_found_nothing_or_let_go_leaves_nothing_holding(robot: RobotConfig)
     assert not service.module.leaves_holding
 
 
-def test_after_a_stop_a_drive_that_holds_is_taken_over_and_sinks(robot: RobotConfig) -> None:
+def test_after_a_stop_a_drive_that_holds_is_taken_over_and_sinks() -> None:
     """Without a planner too: in HOLD it would be the one strut while five sink."""
-    service = successor(robot, LastState.DAMP)
+    service = successor(LastState.DAMP)
     before = joint_torque(CARRIED, service.gear_ratio)
     first = service.run(20 * NS_PER_MS)[0].event
     assert service.mode is Mode.DAMP
     assert first is not None
     assert first.mode_after == Mode.HOLD, "first it is taken over"
     assert service.controller.tau == pytest.approx(before, abs=2.0)
-    service.run(round(robot.joint_service.damp_fade_s) * NS_PER_S)
+    service.run(round(ROBOT.joint_service.damp_fade_s) * NS_PER_S)
     assert service.controller.tau == pytest.approx((before[0], 0.0), abs=1e-6)
     assert service.module.last_state is LastState.DAMP
 
 
 @pytest.mark.parametrize("unknown", ["silent", "LOST", "HOLDING"])
-def test_an_emergency_stop_waits_until_the_drive_is_known(robot: RobotConfig, unknown: str) -> None:
+def test_an_emergency_stop_waits_until_the_drive_is_known(unknown: str) -> None:
     """A law made of a joint that was never seen would pull it to zero."""
     status = DriveStatus.LOST if unknown == "LOST" else DriveStatus.ARMED
-    service = successor(robot, LastState.NOTHING, status, carries=None)
+    service = successor(LastState.NOTHING, status, carries=None)
     silent = unknown == "silent"
     steps = [service.cycle(estop=True, silent=silent)]
     steps += [service.cycle(silent=silent) for _ in range(100)]
@@ -187,8 +181,8 @@ def test_an_emergency_stop_waits_until_the_drive_is_known(robot: RobotConfig, un
 
 
 @pytest.mark.parametrize("last_state", [LastState.NOTHING, LastState.HELD])
-def test_a_drive_is_armed_only_once_it_is_zeroed(robot: RobotConfig, last_state: LastState) -> None:
-    service = successor(robot, last_state, DriveStatus.UNZEROED)
+def test_a_drive_is_armed_only_once_it_is_zeroed(last_state: LastState) -> None:
+    service = successor(last_state, DriveStatus.UNZEROED)
     assert DriveCommand.ARM not in orders(service, NS_PER_S)
     assert service.controller.state(service.now_ns).drive == DriveStatus.UNZEROED
     service.status = DriveStatus.IDLE
@@ -201,9 +195,9 @@ Start = Callable[[], Rig]
 
 
 @pytest.fixture
-def start(robot: RobotConfig, tmp_path: Path) -> Start:
+def start(tmp_path: Path) -> Start:
     """Return how a service of MODULE is started, over a new drive."""
-    return lambda: Rig(robot, RearmGuard(tmp_path, MODULE))
+    return lambda: Rig(ROBOT, RearmGuard(tmp_path, MODULE))
 
 
 @pytest.mark.parametrize("asked", [True, False])
@@ -252,14 +246,14 @@ def test_a_stop_acts_at_once_for_good_and_outlives_its_service_until_a_person_as
     ("laid_down", "mode"), [(True, Mode.HOLD), (False, Mode.DAMP)], ids=["laid down", "left"]
 )
 def test_a_pendant_of_before_is_missed_unless_it_was_laid_down(
-    robot: RobotConfig, start: Start, tmp_path: Path, laid_down: bool, mode: Mode
+    start: Start, tmp_path: Path, laid_down: bool, mode: Mode
 ) -> None:
     """The pendant beats before the service starts, and falls silent later."""
     RearmGuard(tmp_path, MODULE)
     pendant = Pendant(tmp_path, MODULES)
     pendant.beat()
     process = start()
-    silent_cycles = round(robot.joint_service.pendant_ms / 2.0)
+    silent_cycles = round(ROBOT.joint_service.pendant_ms / 2.0)
     for _ in range(3):
         process.run(silent_cycles)
         assert process.mode is Mode.HOLD

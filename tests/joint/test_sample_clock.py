@@ -13,7 +13,7 @@ from services.joint.sample_clock import SampleClock
 from shared.bus.messages import JointCommand
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
-from tests.joint.helpers import T0, Bench, command, with_service
+from tests.joint.helpers import ROBOT, T0, Bench, command, with_service
 
 PERIOD_NS = 2 * NS_PER_MS
 
@@ -82,18 +82,14 @@ def test_each_due_period_passes_once_despite_losses(every: int, phase: int, rate
 
 
 def sent(
-    robot: RobotConfig,
-    commands: dict[int, JointCommand],
-    *,
-    late_ns: dict[int, int] | None = None,
-    cycles: int = 400,
-) -> list[int]:
+    commands: dict[int, JointCommand], *, late_ns: dict[int, int] | None = None, cycles: int = 400,
+    robot: RobotConfig = ROBOT,
+) -> list[int]:  # fmt: skip
     """Return the numbers of the periods in which a service sends a state.
 
     Commands come, and cycles are late, by period.
     """
-    bench = Bench(robot)
-    periods = []
+    bench, periods = Bench(robot), []
     for number in range(1, cycles + 1):
         bench.now_ns = T0 + number * PERIOD_NS + (late_ns or {}).get(number, 0)
         bench.controller.step(bench.now_ns, bench.reading(), commands.get(number), estop=False)
@@ -109,11 +105,9 @@ def asked(phase: int, number: int) -> JointCommand:
 
 @pytest.mark.parametrize("every", [1, 2, 4])
 @pytest.mark.parametrize("phase", [0, 1, 2, 3, -1, 2**40 + 1])
-def test_it_keeps_the_phase_that_a_command_names(
-    robot: RobotConfig, every: int, phase: int
-) -> None:
-    robot = with_service(robot, state_rate_hz=500.0 / every)
-    periods = sent(robot, {101: asked(phase, 101)})
+def test_it_keeps_the_phase_that_a_command_names(every: int, phase: int) -> None:
+    robot = with_service(ROBOT, state_rate_hz=500.0 / every)
+    periods = sent({101: asked(phase, 101)}, robot=robot)
     before = [number for number in periods if number <= 100]
     after = [number for number in periods if number > 101 + every]
     assert {number % every for number in before} == {0}
@@ -121,10 +115,10 @@ def test_it_keeps_the_phase_that_a_command_names(
     assert len(after) >= 299 // every - 1, "and none is left out, though no other command comes"
 
 
-def test_cycles_that_are_held_up_lose_no_state(robot: RobotConfig) -> None:
+def test_cycles_that_are_held_up_lose_no_state() -> None:
     """Late by more than half a period, a cycle counts as the next; the due one was left out."""
     dice = random.Random(2)
     late = {number: dice.randrange(1_000_000, 1_400_000) for number in range(5, 1000, 20)}
-    periods = sent(robot, {}, late_ns=late, cycles=1000)
+    periods = sent({}, late_ns=late, cycles=1000)
     assert len(periods) >= 499
     assert max(later - earlier for earlier, later in itertools.pairwise(periods)) <= 3

@@ -14,7 +14,7 @@ from services.joint.sinking import DOUBT_NS, LEVEL_MAX, Sinking, SinkingState
 from shared.bus.messages import Pair
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
-from tests.joint.helpers import FULL
+from tests.joint.helpers import FULL, ROBOT
 
 Q: Pair = (0.02, -0.4)
 
@@ -29,13 +29,11 @@ def begun(robot: RobotConfig, module: str, q: Pair = Q) -> tuple[Sinking, Setpoi
     return sinking, sinking.begin(FULL, q)
 
 
-def test_a_hip_holds_the_torso_while_its_leg_folds_as_softly_as_its_stiffness_has_risen(
-    robot: RobotConfig,
-) -> None:
-    sinking, frozen = begun(robot, "hip_right")
-    most = robot.stand_gains("hip_right").k_p[1]
+def test_a_hip_holds_the_torso_while_its_leg_folds_as_softly_as_its_stiffness_has_risen() -> None:
+    sinking, frozen = begun(ROBOT, "hip_right")
+    most = ROBOT.stand_gains("hip_right").k_p[1]
     for share in (0.0, 0.25, 1.0):
-        since_ns = round(share * robot.joint_service.blend_ms * 1e6)
+        since_ns = round(share * ROBOT.joint_service.blend_ms * 1e6)
         found = sinking.law(frozen, frozen, since_ns, Q, NeighbourView((0.3, 0.05)))
         assert found.k_p[1] == pytest.approx(share * most)
     assert sinking.state.upright == pytest.approx(0.3 - 0.4)
@@ -49,31 +47,29 @@ def test_a_hip_holds_the_torso_while_its_leg_folds_as_softly_as_its_stiffness_ha
         assert found.q_ref[1] == pytest.approx(clipped), "a torso far off returns gently"
 
 
-def test_a_hip_that_never_received_its_legs_states_damps_and_a_leg_fallen_silent_stays(
-    robot: RobotConfig,
-) -> None:
-    sinking, frozen = begun(robot, "hip_right")
+def test_a_hip_that_never_received_its_legs_states_damps_and_a_leg_fallen_silent_stays() -> None:
+    sinking, frozen = begun(ROBOT, "hip_right")
     found = sinking.law(frozen, frozen, LONG_NS, Q, UNKNOWN)
     assert (found.k_p[1], found.tau_ff[1]) == (0.0, 0.0)
-    assert found.k_d[1] == robot.joint_service.damp_k_d
+    assert found.k_d[1] == ROBOT.joint_service.damp_k_d
     assert sinking.state.upright is None
-    sinking, frozen = begun(robot, "hip_right")
+    sinking, frozen = begun(ROBOT, "hip_right")
     for since_ns, leg in ((0, 0.3), (1, 0.35)):
         sinking.law(frozen, frozen, since_ns, Q, NeighbourView((leg, 0.05)))
     found = sinking.law(frozen, frozen, LONG_NS, Q, UNKNOWN)
     assert (found.q_ref[1], found.v_ref[1]) == (pytest.approx(-0.45), 0.0)
 
 
-def hip_ahead(robot: RobotConfig, ankle: float, knee: float) -> float:
+def hip_ahead(ankle: float, knee: float) -> float:
     """Return how far ahead of its ankle a leg's hip joint is, m."""
-    return robot.geometry.l2 * math.sin(ankle) + robot.geometry.l1 * math.sin(ankle + knee)
+    return ROBOT.geometry.l2 * math.sin(ankle) + ROBOT.geometry.l1 * math.sin(ankle + knee)
 
 
 @pytest.mark.parametrize("ankle", [0.03, 0.14, 0.3])
 @pytest.mark.parametrize("knee", [-0.2, -0.37, -1.0, -2.0])
-def test_an_ankle_keeps_the_hip_where_it_was(robot: RobotConfig, ankle: float, knee: float) -> None:
+def test_an_ankle_keeps_the_hip_where_it_was(ankle: float, knee: float) -> None:
     """Held stiffly, it let the robot fall over backwards from nearly straight legs."""
-    sinking, frozen = begun(robot, "ankle_left", (0.02, ankle))
+    sinking, frozen = begun(ROBOT, "ankle_left", (0.02, ankle))
     first = sinking.law(frozen, frozen, LONG_NS, (0.02, ankle), NeighbourView((knee, -0.3)))
     assert first.q_ref[1] == pytest.approx(frozen.q_ref[1]), "its spring goes on carrying its load"
     spring = frozen.q_ref[1] - ankle
@@ -81,43 +77,41 @@ def test_an_ankle_keeps_the_hip_where_it_was(robot: RobotConfig, ankle: float, k
         near = NeighbourView((knee + turned, -0.3))
         found = sinking.law(frozen, frozen, LONG_NS, (0.02, ankle), near)
         place = found.q_ref[1] - spring
-        assert hip_ahead(robot, place, knee + turned) == pytest.approx(
-            hip_ahead(robot, ankle, knee)
-        )
+        assert hip_ahead(place, knee + turned) == pytest.approx(hip_ahead(ankle, knee))
         if turned == -0.001:
             assert found.v_ref[1] == pytest.approx(0.3 * (place - ankle) / 0.001, rel=5e-3)
         assert (found.k_p, found.tau_ff) == (first.k_p, first.tau_ff)
 
 
-def test_an_ankle_that_does_not_see_its_knee_stays_where_it_was(robot: RobotConfig) -> None:
-    sinking, frozen = begun(robot, "ankle_left", (0.02, 0.14))
+def test_an_ankle_that_does_not_see_its_knee_stays_where_it_was() -> None:
+    sinking, frozen = begun(ROBOT, "ankle_left", (0.02, 0.14))
     unseen = sinking.law(frozen, frozen, LONG_NS, (0.02, 0.14), UNKNOWN)
     assert unseen.q_ref == frozen.q_ref
     for knee in (-0.4, -2.9, 50.0, -1e6, math.inf, -math.inf):
         seen = sinking.law(frozen, frozen, LONG_NS, (0.02, 0.14), NeighbourView((knee, 1.0)))
-        low, high = robot.limits.ankle.theta
+        low, high = ROBOT.limits.ankle.theta
         assert low <= seen.q_ref[1] - frozen.q_ref[1] + 0.14 <= high
         lost = sinking.law(frozen, frozen, LONG_NS, (0.02, 0.14), UNKNOWN)
         assert (lost.q_ref, lost.v_ref[1]) == (seen.q_ref, 0.0)
 
 
-def test_a_leg_of_equal_links_that_folds_onto_itself_divides_by_nothing(robot: RobotConfig) -> None:
-    alike = msgspec.structs.replace(robot.geometry, l1=robot.geometry.l2)
-    sinking, frozen = begun(msgspec.structs.replace(robot, geometry=alike), "ankle_left")
+def test_a_leg_of_equal_links_that_folds_onto_itself_divides_by_nothing() -> None:
+    alike = msgspec.structs.replace(ROBOT.geometry, l1=ROBOT.geometry.l2)
+    sinking, frozen = begun(msgspec.structs.replace(ROBOT, geometry=alike), "ankle_left")
     for knee in (-math.pi, -3.0):
         found = sinking.law(frozen, frozen, LONG_NS, Q, NeighbourView((knee, 1.0)))
         assert all(map(math.isfinite, (*found.q_ref, *found.v_ref)))
         assert (found.v_ref[1] == 0.0) is (knee == -math.pi), "from a hip so low no rate follows"
 
 
-def test_an_ankle_reaches_as_far_as_its_leg_does(robot: RobotConfig) -> None:
+def test_an_ankle_reaches_as_far_as_its_leg_does() -> None:
     """The hip was farther ahead than a leg that has folded since can bring it."""
-    sinking, frozen = begun(robot, "ankle_left", (0.02, 0.9))
+    sinking, frozen = begun(ROBOT, "ankle_left", (0.02, 0.9))
     sinking.law(frozen, frozen, LONG_NS, (0.02, 0.9), NeighbourView((0.0, 0.0)))
     assert sinking.state.ahead is not None
     assert sinking.state.ahead > 0.8
     found = sinking.law(frozen, frozen, LONG_NS, (0.02, 0.9), NeighbourView((-3.0, 0.0)))
-    low, high = robot.limits.ankle.theta
+    low, high = ROBOT.limits.ankle.theta
     assert low <= found.q_ref[1] - frozen.q_ref[1] + 0.9 <= max(high, 0.9)
 
 
@@ -138,12 +132,12 @@ PLACES = {
 
 @pytest.mark.parametrize("when", [0.5, 2.0], ids=["while it fades", "when all has faded"])
 @pytest.mark.parametrize("place", PLACES)
-def test_for_a_limp_module_it_holds_its_load(robot: RobotConfig, place: str, when: float) -> None:
+def test_for_a_limp_module_it_holds_its_load(place: str, when: float) -> None:
     """From then on, whatever it is told: a robot under load never softens by itself."""
     module, theta, near = PLACES[place]
-    sinking, frozen = begun(robot, module)
-    now_ns = round(when * robot.joint_service.damp_fade_s * NS_PER_S)
-    rise_ns = round(robot.joint_service.stiffen_ms * 1e6)
+    sinking, frozen = begun(ROBOT, module)
+    now_ns = round(when * ROBOT.joint_service.damp_fade_s * NS_PER_S)
+    rise_ns = round(ROBOT.joint_service.stiffen_ms * 1e6)
     q = (0.02, theta)
     before = frozen
     for since_ns, at in ((0, Q), (DOUBT_NS, Q), (now_ns, q)):
@@ -153,7 +147,7 @@ def test_for_a_limp_module_it_holds_its_load(robot: RobotConfig, place: str, whe
     load = pd_law.torque(before, q, pd_law.ZERO)
     assert pd_law.torque(current, q, pd_law.ZERO) == pytest.approx(load)
     assert (current.k_p, current.k_d) == (before.k_p, before.k_d)
-    k_p, k_d = robot.support_gains(module)
+    k_p, k_d = ROBOT.support_gains(module)
     half_way = sinking.law(frozen, current, now_ns + rise_ns // 2, q, limp)
     assert half_way.k_p[1] == pytest.approx(0.5 * (before.k_p[1] + k_p[1]))
     for later_ns in (rise_ns, LONG_NS):
@@ -167,11 +161,11 @@ def test_for_a_limp_module_it_holds_its_load(robot: RobotConfig, place: str, whe
             assert found.tau_ff[1] == pytest.approx(before.tau_ff[1] + spring)
 
 
-def test_rates_and_coupling_fade_in_a_module_that_stiffens(robot: RobotConfig) -> None:
-    sinking, frozen = begun(robot, "knee_right")
+def test_rates_and_coupling_fade_in_a_module_that_stiffens() -> None:
+    sinking, frozen = begun(ROBOT, "knee_right")
     limp = NeighbourView(stiffen=True)
-    ramp_ns = round(robot.joint_service.coupled_ramp_ms * 1e6)
-    rise_ns = round(robot.joint_service.stiffen_ms * 1e6)
+    ramp_ns = round(ROBOT.joint_service.coupled_ramp_ms * 1e6)
+    rise_ns = round(ROBOT.joint_service.stiffen_ms * 1e6)
     sinking.law(frozen, FULL, 0, Q, limp)
     for part in (0.0, 0.5, 1.0):
         found = sinking.law(frozen, FULL, round(part * ramp_ns), Q, limp)
@@ -180,18 +174,18 @@ def test_rates_and_coupling_fade_in_a_module_that_stiffens(robot: RobotConfig) -
     assert found.v_ref == pd_law.ZERO
 
 
-def test_for_a_limp_knee_only_a_hips_theta_is_stiffer(robot: RobotConfig) -> None:
-    stand, (k_p, k_d) = robot.stand_gains("hip_left"), robot.support_gains("hip_left")
+def test_for_a_limp_knee_only_a_hips_theta_is_stiffer() -> None:
+    stand, (k_p, k_d) = ROBOT.stand_gains("hip_left"), ROBOT.support_gains("hip_left")
     assert (k_p[0], k_d[0]) == (stand.k_p[0], stand.k_d[0])
     assert k_p[1] >= 2.0 * stand.k_p[1]
     assert k_d[1] > stand.k_d[1]
     for module in ("ankle_right", "knee_left"):
-        stand = robot.stand_gains(module)
-        assert robot.support_gains(module) == (stand.k_p, stand.k_d)
+        stand = ROBOT.stand_gains(module)
+        assert ROBOT.support_gains(module) == (stand.k_p, stand.k_d)
 
 
-def test_a_reason_that_passes_is_none(robot: RobotConfig) -> None:
-    sinking, frozen = begun(robot, "knee_right")
+def test_a_reason_that_passes_is_none() -> None:
+    sinking, frozen = begun(ROBOT, "knee_right")
     for since_ns, near, caught in (
         (0, UNHEARD, False),
         (DOUBT_NS - 1, UNKNOWN, False),
@@ -204,11 +198,9 @@ def test_a_reason_that_passes_is_none(robot: RobotConfig) -> None:
         assert (sinking.state.doubt_ns == -1) is (near is UNKNOWN)
 
 
-def test_a_knee_beside_one_that_does_not_sink_is_caught_where_it_is_and_nothing_else_is(
-    robot: RobotConfig,
-) -> None:
-    sinking, frozen = begun(robot, "knee_left", (0.02, -1.0))
-    stand = robot.stand_gains("knee_left")
+def test_a_knee_beside_one_that_does_not_sink_is_caught_where_it_is_and_nothing_else_is() -> None:
+    sinking, frozen = begun(ROBOT, "knee_left", (0.02, -1.0))
+    stand = ROBOT.stand_gains("knee_left")
     assert sinking.law(frozen, frozen, 0, (0.02, -1.1), UNHEARD).k_p[1] == 0.0
     found = sinking.law(frozen, frozen, DOUBT_NS, (0.02, -1.2), UNHEARD)
     assert sinking.state.stop == -1.2
@@ -216,34 +208,34 @@ def test_a_knee_beside_one_that_does_not_sink_is_caught_where_it_is_and_nothing_
     found = sinking.law(frozen, frozen, LONG_NS, (0.02, -1.25), UNHEARD)
     assert (found.q_ref[1], found.k_p[1], found.k_d[1]) == (-1.2, stand.k_p[1], stand.k_d[1])
     assert sinking.state.stop == -1.2, "where it was caught it stays"
-    below, stop = robot.joint_service.damp_knee_stop - 0.1, robot.joint_service.damp_knee_stop
+    below, stop = ROBOT.joint_service.damp_knee_stop - 0.1, ROBOT.joint_service.damp_knee_stop
     for module, caught_at in (("knee_left", stop), ("ankle_right", None), ("hip_right", None)):
-        sinking, frozen = begun(robot, module, (0.02, -1.0))
+        sinking, frozen = begun(ROBOT, module, (0.02, -1.0))
         for since_ns in (0, DOUBT_NS):
             sinking.law(frozen, frozen, since_ns, (0.02, below), UNHEARD)
         assert (sinking.state.caught, sinking.state.stop) == (caught_at is not None, caught_at)
 
 
-def test_a_second_stop_begins_anew(robot: RobotConfig) -> None:
-    sinking, frozen = begun(robot, "hip_right")
+def test_a_second_stop_begins_anew() -> None:
+    sinking, frozen = begun(ROBOT, "hip_right")
     sinking.law(frozen, frozen, DOUBT_NS, Q, NeighbourView((0.3, 0.2), stiffen=True))
     assert sinking.state.held_ns == DOUBT_NS
     sinking.begin(FULL, Q)
     assert sinking.state == SinkingState(doubt_ns=-1)
-    knee, frozen = begun(robot, "knee_right", (0.0, -1.0))
+    knee, frozen = begun(ROBOT, "knee_right", (0.0, -1.0))
     knee.law(frozen, frozen, 0, Q, UNHEARD)
     knee.law(frozen, frozen, DOUBT_NS, Q, UNHEARD)
     knee.begin(FULL, (0.0, -1.0))
     assert (knee.state.caught, knee.state.doubt_ns) == (False, -1)
 
 
-def test_what_sinks_lets_go_of_its_feedforward_and_holds_the_rest(robot: RobotConfig) -> None:
-    service = robot.joint_service
-    sinking, frozen = begun(robot, "knee_right")
+def test_what_sinks_lets_go_of_its_feedforward_and_holds_the_rest() -> None:
+    service = ROBOT.joint_service
+    sinking, frozen = begun(ROBOT, "knee_right")
     assert frozen == pd_law.load_to_feedforward(FULL, (False, True), Q)
     half_ns = round(0.5 * service.damp_fade_s * NS_PER_S)
     found = sinking.law(frozen, frozen, half_ns, Q, UNKNOWN)
-    stand = robot.stand_gains("knee_right")
+    stand = ROBOT.stand_gains("knee_right")
     assert found.tau_ff == pytest.approx((3.0, 0.5 * frozen.tau_ff[1]))
     assert found.k_p == pytest.approx((100.0 + 0.5 * (stand.k_p[0] - 100.0), 0.0))
     assert found.k_d[1] == service.damp_k_d

@@ -14,6 +14,7 @@ from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Scenario
 from tests.lockstep.runs import Heard, led_to, modes_of, run, standing_as, still, variant
+from tests.robots import ROBOT
 from tools.sim.lockstep import Lockstep
 
 M = TypeVar("M", bound=Message)
@@ -33,9 +34,9 @@ def with_keys(robot: RobotConfig, section: str, **changes: object) -> RobotConfi
     ids=["by its integral", "by the load found", "by neither"],
 )
 def test_the_assist_comes_true_with_a_payload_the_planner_does_not_know(
-    robot: RobotConfig, weighed: bool, integrates: bool, duration: float, comes_true: bool
+    weighed: bool, integrates: bool, duration: float, comes_true: bool
 ) -> None:
-    start = standing_as(robot, LIGHT)
+    robot, start = ROBOT, standing_as(ROBOT, LIGHT)
     if not weighed:
         robot = with_keys(robot, "law", load_correction=(0.0, 0.0))
     if not integrates:
@@ -48,10 +49,10 @@ def test_the_assist_comes_true_with_a_payload_the_planner_does_not_know(
 
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("delay_ms", [1.0, 20.0])
-def test_the_eased_lead_is_lighter_and_as_steady(robot: RobotConfig, delay_ms: float) -> None:
+def test_the_eased_lead_is_lighter_and_as_steady(delay_ms: float) -> None:
     squat = variant("squat", duration=3.0, kill=(), push=())
     plain, eased = (
-        run(with_keys(robot, "law", lead_easing=alpha), squat, delay_ms, start=standing_as(robot))
+        run(with_keys(ROBOT, "law", lead_easing=alpha), squat, delay_ms, start=standing_as(ROBOT))
         for alpha in (0.0, 0.5)
     )
     assert eased.stood
@@ -59,17 +60,17 @@ def test_the_eased_lead_is_lighter_and_as_steady(robot: RobotConfig, delay_ms: f
     assert np.abs(eased.com_mm[:, 0]).max() < np.abs(plain.com_mm[:, 0]).max() + 1.0
 
 
-def test_an_overloaded_harness_makes_all_hold_and_lead_again(robot: RobotConfig) -> None:
+def test_an_overloaded_harness_makes_all_hold_and_lead_again() -> None:
     held = []
 
     def look(fleet: Lockstep, truth: SimTruth) -> None:
         if 2.4 < truth.scenario_s < 3.3:
             held.append(set(modes_of(fleet)))
 
-    tight = with_keys(robot, "harness", overload_force=170.0)
+    tight = with_keys(ROBOT, "harness", overload_force=170.0)
     rests = ((2.0, 1.188, 0.0, 190.0), (3.0, 1.188, 0.0, 190.0), (5.0, 1.188))
     overloading = led_to(*rests, duration=8.0)
-    outcome = run(tight, overloading, start=standing_as(robot), each=look)
+    outcome = run(tight, overloading, start=standing_as(ROBOT), each=look)
     assert outcome.stood
     assert held
     assert all(modes == {Mode.HOLD} for modes in held)
@@ -85,9 +86,9 @@ def heard_in(robot: RobotConfig, scenario: Scenario, **how: Any) -> list[Message
 
 
 @pytest.fixture(scope="module")
-def from_hoist(robot: RobotConfig) -> list[Message]:
+def from_hoist() -> list[Message]:
     """A stand-up with 8 ms on each link, each way."""
-    return heard_in(robot, still(0.5), delay_ms=8.0, stands=False)
+    return heard_in(ROBOT, still(0.5), delay_ms=8.0, stands=False)
 
 
 def of(kind: type[M], heard: list[Message]) -> list[M]:
@@ -98,7 +99,7 @@ TARED_S = 3.3
 
 
 @pytest.fixture(scope="module")
-def leaned(robot: RobotConfig) -> list[Message]:
+def leaned() -> list[Message]:
     """The torso pitches while a load comes to rest on it; at `TARED_S` a new zero is asked for."""
     leaning = led_to((2.0, 1.1, 0.4, 150.0), duration=4.1)
     asked: list[int] = []
@@ -108,15 +109,13 @@ def leaned(robot: RobotConfig) -> list[Message]:
             asked.append(fleet.now_ns)
             fleet.harness.tare(TareRequest(t_ns=fleet.now_ns, seq=1, source="a test"))
 
-    return heard_in(unheeded(robot), leaning, start=standing_as(robot), each=tare)
+    return heard_in(unheeded(ROBOT), leaning, start=standing_as(ROBOT), each=tare)
 
 
-def test_the_wrench_is_what_acts_on_the_torso_and_comes_at_its_rate(
-    robot: RobotConfig, leaned: list[Message]
-) -> None:
+def test_the_wrench_is_what_acts_on_the_torso_and_comes_at_its_rate(leaned: list[Message]) -> None:
     wrenches = {m.t_ns: m for m in of(Wrench, leaned)}
     stamps = sorted(wrenches)
-    assert set(np.diff(stamps)) == {round(1e9 / robot.harness.rate_hz)}
+    assert set(np.diff(stamps)) == {round(1e9 / ROBOT.harness.rate_hz)}
     errors = []
     for truth in of(SimTruth, leaned):
         if 2.8 < truth.scenario_s < TARED_S:
@@ -146,19 +145,15 @@ def test_a_tare_on_request_takes_what_rests_on_the_harness_for_its_zero(
     assert np.linalg.norm(after[-1].force) < 10.0
 
 
-def test_the_tare_is_done_on_the_hoist_before_anything_loads_it(
-    robot: RobotConfig, from_hoist: list[Message]
-) -> None:
+def test_the_tare_is_done_on_the_hoist_before_anything_loads_it(from_hoist: list[Message]) -> None:
     first_valid = next(m for m in from_hoist if isinstance(m, Wrench) and m.valid)
     begin_ns = from_hoist[0].t_ns
-    assert first_valid.t_ns - begin_ns == pytest.approx(robot.harness.tare_s * 1e9, abs=5e6)
+    assert first_valid.t_ns - begin_ns == pytest.approx(ROBOT.harness.tare_s * 1e9, abs=5e6)
     hoisted = [m for m in of(SimTruth, from_hoist) if m.t_ns <= first_valid.t_ns]
     assert all(m.hoist > 0.5 and m.harness_force_z == 0.0 for m in hoisted)
 
 
-def test_the_planner_receives_the_wrench_after_the_links_delay(
-    robot: RobotConfig, from_hoist: list[Message]
-) -> None:
+def test_the_planner_receives_the_wrench_after_the_links_delay(from_hoist: list[Message]) -> None:
     sent = {m.seq: m.t_ns for m in of(Wrench, from_hoist)}
     ages_ms = [
         (m.t_ns - sent[m.wrench_seq]) / 1e6
@@ -167,7 +162,7 @@ def test_the_planner_receives_the_wrench_after_the_links_delay(
     ]
     assert len(ages_ms) > 100
     assert min(ages_ms) >= 8.0
-    assert max(ages_ms) < 8.0 + 2e3 / robot.planner.rate_hz
+    assert max(ages_ms) < 8.0 + 2e3 / ROBOT.planner.rate_hz
 
 
 def unheeded(robot: RobotConfig) -> RobotConfig:
@@ -176,11 +171,11 @@ def unheeded(robot: RobotConfig) -> RobotConfig:
     return with_keys(robot, "assist", integral_max=0.0)
 
 
-def test_the_sensors_noise_reaches_the_robot_through_the_law_only(robot: RobotConfig) -> None:
-    deaf = unheeded(robot)
+def test_the_sensors_noise_reaches_the_robot_through_the_law_only() -> None:
+    deaf = unheeded(ROBOT)
     noiseless = with_keys(deaf, "simulation", harness_noise=0.0)
     truths = [
-        of(SimTruth, heard_in(config, still(0.5), start=standing_as(robot)))
+        of(SimTruth, heard_in(config, still(0.5), start=standing_as(ROBOT)))
         for config in (deaf, noiseless)
     ]
     assert truths[0] == truths[1]

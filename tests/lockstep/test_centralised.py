@@ -26,6 +26,7 @@ from tests.joint.helpers import ModuleBench, command
 from tests.lockstep import runs
 from tests.lockstep.runs import push, variant
 from tests.planner.states import state
+from tests.robots import ROBOT
 from tools import cli
 from tools.sim.centralised.control import CentralPlanner, PassThrough
 from tools.sim.centralised.fleet import CONTROLS, SHIPPED, torques_only
@@ -49,15 +50,15 @@ def beginning() -> Scenario:
 
 
 @pytest.fixture(scope="module")
-def distributed(robot: RobotConfig, beginning: Scenario) -> list[SimTruth]:
+def distributed(beginning: Scenario) -> list[SimTruth]:
     """Torques only there as well, from joint services that have the law."""
-    return run("distributed", torques_only(robot), beginning, IDEAL)
+    return run("distributed", torques_only(ROBOT), beginning, IDEAL)
 
 
 def test_without_delay_it_does_what_the_distributed_control_does(
-    robot: RobotConfig, beginning: Scenario, distributed: list[SimTruth]
+    beginning: Scenario, distributed: list[SimTruth]
 ) -> None:
-    centralised = run("centralised", robot, beginning, IDEAL)
+    centralised = run("centralised", ROBOT, beginning, IDEAL)
     assert len(centralised) == len(distributed)
     for name, unit, far in (("com", 1e3, 1.0), ("torso", 1e3, 1.0), ("angles", 1.0, 0.002)):
         a, b = (
@@ -75,10 +76,10 @@ def test_without_delay_it_does_what_the_distributed_control_does(
 
 
 @pytest.mark.parametrize(("control", "falls"), [("centralised", True), ("distributed", False)])
-def test_at_100_ms_only_the_shipped_stands(robot: RobotConfig, control: str, falls: bool) -> None:
+def test_at_100_ms_only_the_shipped_stands(control: str, falls: bool) -> None:
     late = (Inject(link="all", at=0.05, delay_ms=100.0),)
     happens = {"kill": (), "inject": late, "push": (push(0.2, 40.0, 0.0, 0.0),)}
-    rows = run(control, robot, variant("squat", duration=2.5, **happens))
+    rows = run(control, ROBOT, variant("squat", duration=2.5, **happens))
     assert rows[-1].fallen is falls
 
 
@@ -106,8 +107,8 @@ class Bench(ModuleBench):
 
 
 @pytest.fixture
-def bench(robot: RobotConfig) -> Bench:
-    return Bench(robot)
+def bench() -> Bench:
+    return Bench(ROBOT)
 
 
 def test_a_torque_goes_to_the_drive_unchanged_until_the_next_however_long(bench: Bench) -> None:
@@ -135,19 +136,19 @@ def test_of_the_gate_the_torque_diamond_is_left(bench: Bench, asked: Pair, given
     assert bench.torque_of(bench.passes(asked)) == pytest.approx(given)
 
 
-def test_an_estop_and_a_lost_drive_are_as_shipped(robot: RobotConfig, bench: Bench) -> None:
+def test_an_estop_and_a_lost_drive_are_as_shipped(bench: Bench) -> None:
     bench.cycle(estop=True)
     assert bench.mode is Mode.DAMP
-    other = Bench(robot)
+    other = Bench(ROBOT)
     other.status = DriveStatus.LOST
     other.passes(TAU)
     assert other.mode is Mode.FAULT
     assert other.passes(TAU).command is not DriveCommand.TORQUE
 
 
-def receive(robot: RobotConfig, now_ns: int, seq: int, *planners: Planner) -> list[JointState]:
+def receive(now_ns: int, seq: int, *planners: Planner) -> list[JointState]:
     """Have planners receive six states of a robot that stands on its feet, each joint moving."""
-    q = np.array(stand_pose(robot, 1.1))
+    q = np.array(stand_pose(ROBOT, 1.1))
     own = {"t_ns": now_ns, "session": 1, "age_ns": 2 * NS_PER_MS}
     states = [state(i, q, seq, v=(0.01 * i, -0.03 * i), **own) for i in range(N_MODULES)]
     for planner, (index, each) in itertools.product(planners, enumerate(states)):
@@ -155,12 +156,12 @@ def receive(robot: RobotConfig, now_ns: int, seq: int, *planners: Planner) -> li
     return states
 
 
-def test_a_command_is_all_of_the_shipped_one_as_a_torque(robot: RobotConfig) -> None:
-    shipped, central = Planner(robot, 1), CentralPlanner(robot, 1)
+def test_a_command_is_all_of_the_shipped_one_as_a_torque() -> None:
+    shipped, central = Planner(ROBOT, 1), CentralPlanner(ROBOT, 1)
     now = NS_PER_S
     for seq in range(1, 4):
         now += 4 * NS_PER_MS
-        received = receive(robot, now, seq, shipped, central)
+        received = receive(now, seq, shipped, central)
         for seen, whole, parts in zip(received, central.tick(now), shipped.tick(now), strict=True):
             wanted = pd_law.torque(pd_law.extrapolate(parts, 0.0), seen.q, seen.v)
             assert whole.tau_ff == pytest.approx(wanted, abs=1e-12)
@@ -170,10 +171,10 @@ def test_a_command_is_all_of_the_shipped_one_as_a_torque(robot: RobotConfig) -> 
             assert whole.echo_t_ns == parts.echo_t_ns
 
 
-def test_once_it_leads_the_planner_leads_whatever_it_receives(robot: RobotConfig) -> None:
+def test_once_it_leads_the_planner_leads_whatever_it_receives() -> None:
     modes = []
-    for planner in (Planner(robot, 1), CentralPlanner(robot, 1)):
-        receive(robot, NS_PER_S, 1, planner)
+    for planner in (Planner(ROBOT, 1), CentralPlanner(ROBOT, 1)):
+        receive(NS_PER_S, 1, planner)
         for tick in range(3):
             planner.tick(NS_PER_S + tick * 4 * NS_PER_MS)
         assert planner.status(NS_PER_S, 0.0).mode == PlannerMode.LEADING

@@ -19,6 +19,7 @@ from shared.exceptions import FleetError
 from shared.joints import MODULE_INDEX, MODULES
 from tests.lockstep.runs import Run, kill, led_to, modes_of, push, run, still
 from tests.planner.states import with_law
+from tests.robots import ROBOT
 from tools.fleet.descent import LIGHT_FRACTION, Ask, Descent, Phase
 from tools.lab.studies.sweeps import plants
 from tools.sim.lockstep import Lockstep
@@ -145,17 +146,17 @@ def hang(fleet: Descending, row: SimTruth) -> None:
 
 @pytest.mark.sampled(20)
 @pytest.mark.parametrize("number", range(20))
-def test_it_goes_down_and_holds_until_a_hoist_bears_it(robot: RobotConfig, number: int) -> None:
-    found = go_down(robot, alone(), plants.draw(f"down {number}"), hang)
+def test_it_goes_down_and_holds_until_a_hoist_bears_it(number: int) -> None:
+    found = go_down(ROBOT, alone(), plants.draw(f"down {number}"), hang)
     assert found.lockstep.asks[-1] is Ask.IDLE
     assert found.rows[-1].hoist == 1.0, "not before"
     assert found.sinking < 0.2
     assert found.height.min() < 0.85, "the lowest pose"
 
 
-def test_with_nothing_to_bear_it_it_holds_and_says_what_helps(robot: RobotConfig) -> None:
+def test_with_nothing_to_bear_it_it_holds_and_says_what_helps() -> None:
     """Idled there it tips: the torso meets the floor at 2.8 m/s, as from a stand."""
-    found = go_down(robot, alone(), fleet_type=Impatient)
+    found = go_down(ROBOT, alone(), fleet_type=Impatient)
     assert found.sinking < 0.2
     assert "still holds: the legs bear 9" in found.lockstep.error
     assert "stand under its torso" in found.lockstep.error
@@ -165,15 +166,15 @@ def test_with_nothing_to_bear_it_it_holds_and_says_what_helps(robot: RobotConfig
     assert 2.3 < floor_speed(found.lockstep) < 3.5
 
 
-def test_idled_in_a_stand_it_meets_the_floor_as_hard(robot: RobotConfig) -> None:
+def test_idled_in_a_stand_it_meets_the_floor_as_hard() -> None:
     """2.9 m/s from 1.19 m; from its lowest pose, 0.82 m, see above."""
-    fleet = Lockstep(robot, alone())
+    fleet = Lockstep(ROBOT, alone())
     assert begin_standing(fleet)
     assert 2.3 < floor_speed(fleet) < 3.5
 
 
-def test_a_robot_without_its_payload_is_not_taken_for_a_hanging_one(robot: RobotConfig) -> None:
-    led = with_law(robot, load_correction=(0.0, 0.0))  # whatever it carries
+def test_a_robot_without_its_payload_is_not_taken_for_a_hanging_one() -> None:
+    led = with_law(ROBOT, load_correction=(0.0, 0.0))  # whatever it carries
     light = changed(PlantConfig(), {"body.payload_scale": 0.0})
     found = go_down(led, alone(kill=kill(0.1)), light, fleet_type=Impatient)
     assert "still holds: the legs bear" in found.lockstep.error
@@ -181,8 +182,8 @@ def test_a_robot_without_its_payload_is_not_taken_for_a_hanging_one(robot: Robot
     assert LIGHT_FRACTION < 0.5, "what it still bears"
 
 
-def test_a_planner_that_dies_on_the_way_does_not_keep_it_up(robot: RobotConfig) -> None:
-    found = go_down(robot, alone(kill=kill(2.8)), each=hang)
+def test_a_planner_that_dies_on_the_way_does_not_keep_it_up() -> None:
+    found = go_down(ROBOT, alone(kill=kill(2.8)), each=hang)
     assert Ask.SIT in found.lockstep.asks
     assert found.lockstep.asks[-3:] == [Ask.STOP, Ask.NOTHING, Ask.IDLE], "it sinks in DAMP"
     assert found.sinking < 0.2
@@ -190,7 +191,7 @@ def test_a_planner_that_dies_on_the_way_does_not_keep_it_up(robot: RobotConfig) 
 
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("at", [1.8, 3.8])
-def test_interrupted_it_stands_where_it_is(robot: RobotConfig, at: float) -> None:
+def test_interrupted_it_stands_where_it_is(at: float) -> None:
     heights = []
 
     def stop(fleet: Descending, row: SimTruth) -> None:
@@ -198,28 +199,28 @@ def test_interrupted_it_stands_where_it_is(robot: RobotConfig, at: float) -> Non
             fleet.error = fleet.error or "interrupted"
             heights.append(row.torso[2])
 
-    found = go_down(robot, alone(), each=stop, interrupt_s=at)
+    found = go_down(ROBOT, alone(), each=stop, interrupt_s=at)
     assert heights[0] - found.height[-1] < 0.05
     assert found.height[-1] > 0.9
     assert not {*modes_of(found.lockstep)} - {Mode.TRACK, Mode.HOLD}
 
 
-def test_a_hand_that_holds_it_up_is_not_pressed_down(robot: RobotConfig) -> None:
-    found = go_down(robot, still(40.0))
+def test_a_hand_that_holds_it_up_is_not_pressed_down() -> None:
+    found = go_down(ROBOT, still(40.0))
     assert "held up" in found.lockstep.error
     assert max(abs(row.operator_force[2]) for row in found.rows) < 95.0
     assert found.height[-1] > 1.05
 
 
-def test_a_person_who_goes_along_takes_it_down(robot: RobotConfig) -> None:
+def test_a_person_who_goes_along_takes_it_down() -> None:
     scenario = led_to((AT_S, 1.188), (AT_S + 6.0, 0.83), duration=40.0)
-    found = go_down(robot, scenario, each=hang)
+    found = go_down(ROBOT, scenario, each=hang)
     assert found.lockstep.asks[-1] is Ask.IDLE
 
 
 @pytest.mark.sampled(8)
 @pytest.mark.parametrize("number", range(8))
-def test_pushed_on_its_way_it_does_not_tip(robot: RobotConfig, number: int) -> None:
+def test_pushed_on_its_way_it_does_not_tip(number: int) -> None:
     pushes = (push(2.3, 30.0, 0.0, 0.0), push(3.3, 0.0, 30.0, 0.0), push(4.8, -30.0, 0.0, 0.0))
-    found = go_down(robot, alone(push=pushes), plants.draw(f"pushed {number}"), hang)
+    found = go_down(ROBOT, alone(push=pushes), plants.draw(f"pushed {number}"), hang)
     assert found.lockstep.asks[-1] is Ask.IDLE

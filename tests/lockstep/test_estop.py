@@ -20,15 +20,16 @@ from shared.joints import MODULES
 from tests.lockstep import runs
 from tests.lockstep.runs import at_rest, kill, moment_of, restart, run, standing_as, variant
 from tests.planner.states import with_law
+from tests.robots import ROBOT
 from tools.lab.studies.sweeps import plants
 from tools.sim.lockstep import FleetMoment, Lockstep
 from tools.sim.standing_start import begin_standing
 
 
 @pytest.mark.parametrize(("name", "at"), [("squat", 0.6), ("squat", 1.5), ("crawl", 1.0)])
-def test_in_a_motion_no_joint_is_jerked(robot: RobotConfig, name: str, at: float) -> None:
+def test_in_a_motion_no_joint_is_jerked(name: str, at: float) -> None:
     """With damping, rates and coupling changed in one cycle, one had a blow of 18 to 33 N m."""
-    fleet = Lockstep(robot, variant(name, duration=at + 0.5, kill=(), push=()))
+    fleet = Lockstep(ROBOT, variant(name, duration=at + 0.5, kill=(), push=()))
     assert begin_standing(fleet)
     taus: list[list[float]] = []
     for _ in range(10_000):
@@ -70,15 +71,15 @@ def led(height: float, pitch: float, **happens: Any) -> Scenario:
 
 
 @pytest.fixture(scope="module")
-def heavy(robot: RobotConfig) -> RobotConfig:
+def heavy() -> RobotConfig:
     """A robot that is led whatever it carries."""
-    return with_law(robot, load_correction=(0.0, 0.0))
+    return with_law(ROBOT, load_correction=(0.0, 0.0))
 
 
 @pytest.fixture(scope="module")
-def led_to(robot: RobotConfig, heavy: RobotConfig) -> Callable[[float], FleetMoment]:
+def led_to(heavy: RobotConfig) -> Callable[[float], FleetMoment]:
     """What many stops begin with: the robot of the file, led to a height."""
-    start = standing_as(robot)
+    start = standing_as(ROBOT)
     return functools.cache(lambda height: moment_of(heavy, led(height, 0.0), LED_S, start=start))
 
 

@@ -11,8 +11,8 @@ from services.simulator.physics.led_hand import HEIGHT_MAX_RATE
 from shared.bus import topics
 from shared.bus.messages import HandLead, Mode
 from shared.bus.traces import SimTruth
-from shared.config.robot_config import RobotConfig
 from tests.lockstep.runs import run, still
+from tests.robots import ROBOT
 from tools import cli
 from tools.logs.hand_path import HandRow, hand_path
 from tools.logs.run_log import read_run
@@ -30,10 +30,10 @@ DURATION_S = 3.0
 
 
 @pytest.fixture(scope="module")
-def run_of_a_person(robot: RobotConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run_of_a_person(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("hand")
     rows = tuple(HandRow(at, hand) for at, hand in PATH)
-    recorded_lockstep.simulate(robot, still(DURATION_S), BASE, 0, out, hand=rows)
+    recorded_lockstep.simulate(ROBOT, still(DURATION_S), BASE, 0, out, hand=rows)
     return out / "run.mcap"
 
 
@@ -61,14 +61,14 @@ def test_the_same_path_is_the_same_run(run_of_a_person: Path, tmp_path: Path) ->
         assert again.messages(topic) == log.messages(topic)
 
 
-def test_a_moment_of_it_has_the_hand(robot: RobotConfig, run_of_a_person: Path) -> None:
+def test_a_moment_of_it_has_the_hand(run_of_a_person: Path) -> None:
     log = read_run(run_of_a_person)
     state = next(row for row in log.messages(topics.SIM_STATE) if row.scenario_s >= 1.0)
     assert state.hand[0] == 1.0, "somebody leads"
-    fleet = Lockstep(robot, still(DURATION_S), BASE, hand=hand_path(log))
+    fleet = Lockstep(ROBOT, still(DURATION_S), BASE, hand=hand_path(log))
     fleet.resume(FleetMoment(state, {}, None))
     assert fleet.world.outside.led_hand is not None
     assert fleet.world.outside.led_hand.numbers() == state.hand
-    led = run(robot, still(0.8), hand=hand_path(log))
+    led = run(ROBOT, still(0.8), hand=hand_path(log))
     assert led.lockstep.moment().state.hand != state.hand
     assert set(led.modes) == {Mode.TRACK}

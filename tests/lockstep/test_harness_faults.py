@@ -10,8 +10,8 @@ import pytest
 from services.simulator.fronts.sensor_fronts import HarnessFront
 from shared.bus.messages import PlannerMode
 from shared.bus.traces import SimTruth
-from shared.config.robot_config import RobotConfig
 from tests.lockstep.runs import Run, led_to, run, status_of
+from tests.robots import ROBOT
 from tools.sim.lockstep import Lockstep
 
 FAILS_S = 3.0
@@ -34,7 +34,7 @@ def stick_at_zero(front: HarnessFront, _since_s: float) -> None:
     front._G_inverse[3], front.bias[3] = 0.0, 0.0
 
 
-def carry(robot: RobotConfig, fail: Callable[[HarnessFront, float], None]) -> tuple[Run, list[str]]:
+def carry(fail: Callable[[HarnessFront, float], None]) -> tuple[Run, list[str]]:
     """Carry a person in a crouch while the sensor fails; return also what the planner says then."""
     said: list[str] = []
 
@@ -44,15 +44,15 @@ def carry(robot: RobotConfig, fail: Callable[[HarnessFront, float], None]) -> tu
             said.append(status_of(fleet).why)
 
     scenario = led_to((2.0, 1.0, 0.0, ASSIST_N), duration=FAILS_S + 9.0)
-    return run(robot, scenario, each=look), said
+    return run(ROBOT, scenario, each=look), said
 
 
 @pytest.mark.parametrize("fail", [drift, invert, stick_at_zero])
 def test_a_sensor_that_begins_to_lie_is_named_and_the_load_is_not_learnt(
-    robot: RobotConfig, fail: Callable[[HarnessFront, float], None]
+    fail: Callable[[HarnessFront, float], None],
 ) -> None:
     """It said that the robot carried 8 to 12 kg more than its file, and led on with the force."""
-    outcome, said = carry(robot, fail)
+    outcome, said = carry(fail)
     assert outcome.stood
     first = next(i for i, why in enumerate(said) if "harness and joints disagree" in why)
     assert first < 500, "within 5 s"
@@ -62,8 +62,8 @@ def test_a_sensor_that_begins_to_lie_is_named_and_the_load_is_not_learnt(
     assert not led or outcome.status.assist_n < 0.7 * ASSIST_N, "the assist goes"
 
 
-def test_a_sensor_that_is_right_is_believed_through_a_squat_with_assist(robot: RobotConfig) -> None:
-    outcome, said = carry(robot, lambda _front, _since_s: None)
+def test_a_sensor_that_is_right_is_believed_through_a_squat_with_assist() -> None:
+    outcome, said = carry(lambda _front, _since_s: None)
     assert not any("disagree" in why for why in said)
     assert outcome.status.assist_n == pytest.approx(ASSIST_N, abs=50.0)
     assert np.ptp(outcome.height[-500:]) < 0.01

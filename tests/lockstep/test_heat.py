@@ -11,6 +11,7 @@ from shared.bus.messages import HeatAction, PlannerMode
 from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
 from tests.lockstep.runs import led_to, standing_as, status_of
+from tests.robots import ROBOT
 from tools.sim.lockstep import FleetMoment, Lockstep
 
 HELD_S = 5.5
@@ -48,10 +49,8 @@ def hold(
 
 
 @pytest.mark.parametrize("hand", [True, False], ids=["a hand that clings", "nobody's hand"])
-def test_a_robot_too_hot_for_its_squat_stands_up_by_itself_and_derates_nowhere(
-    robot: RobotConfig, hand: bool
-) -> None:
-    held = hold(robot, standing_as(robot), hand=hand)
+def test_a_robot_too_hot_for_its_squat_stands_up_by_itself_and_derates_nowhere(hand: bool) -> None:
+    held = hold(ROBOT, standing_as(ROBOT), hand=hand)
     assert list(dict.fromkeys(held.actions)) == [
         HeatAction.NONE, HeatAction.EASES, HeatAction.STANDS_UP, HeatAction.RESTS,
     ]  # fmt: skip
@@ -66,9 +65,9 @@ def test_a_robot_too_hot_for_its_squat_stands_up_by_itself_and_derates_nowhere(
     assert max(law.heat.state.winding[0] for law in held.fleet.controllers) < 100.0
 
 
-def test_without_an_estimate_nothing_is_said_and_nothing_done(robot: RobotConfig) -> None:
-    heat = msgspec.structs.replace(robot.heat, estimate=False)
-    deaf = msgspec.structs.replace(robot, heat=heat)
+def test_without_an_estimate_nothing_is_said_and_nothing_done() -> None:
+    heat = msgspec.structs.replace(ROBOT.heat, estimate=False)
+    deaf = msgspec.structs.replace(ROBOT, heat=heat)
     held = hold(deaf, standing_as(deaf), skip=False, until_s=1.0)
     assert set(held.actions) == {HeatAction.NONE}
     assert status_of(held.fleet).heat_left_s == -1.0

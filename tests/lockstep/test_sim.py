@@ -15,10 +15,10 @@ from shared.bus.messages import PlannerStatus
 from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_S
 from shared.config.impairment import Impairment
-from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Fault, Scenario
 from shared.joints import MODULES
 from tests.lockstep.runs import kill, push, restart, still
+from tests.robots import ROBOT
 from tests.tools.exit_codes import exit_code
 from tools import cli
 from tools.logs.run_log import read_run
@@ -117,12 +117,12 @@ BROWN_OUT = Fault(module="hip_left", kind="brown_out", at=1.2)
 HARD = still(1.5, height=1.0, kill=kill(0.4), restart=restart(0.9), fault=(BROWN_OUT,))
 
 
-def test_two_robots_side_by_side_run_as_each_alone_to_the_last_bit(robot: RobotConfig) -> None:
+def test_two_robots_side_by_side_run_as_each_alone_to_the_last_bit() -> None:
     """Twelve joint services and two planners in one process: neither knows of the other."""
 
     def rows_of(scenario: Scenario, seed: int) -> Iterator[SimTruth]:
         network = Impairment(delay_ms=2.0, jitter_ms=1.0, loss=0.01)
-        fleet = lockstep.Lockstep(robot, scenario, network, seed=seed)
+        fleet = lockstep.Lockstep(ROBOT, scenario, network, seed=seed)
         assert begin_standing(fleet)
         return fleet.run()
 

@@ -8,8 +8,8 @@ import pytest
 
 from shared.bus.messages import Mode
 from shared.bus.traces import SimTruth
-from shared.config.robot_config import RobotConfig
 from tests.lockstep.runs import modes_of, run, status_of, still
+from tests.robots import ROBOT
 from tools.lab.studies.sweeps import plants
 from tools.sim.lockstep import Lockstep
 
@@ -20,9 +20,7 @@ BEGINS_V, UNDERVOLTAGE_V = 45.0, 38.0
 
 @pytest.mark.sampled(8)
 @pytest.mark.parametrize("number", range(8))
-def test_it_is_told_and_the_robot_is_down_before_the_drives_disarm(
-    robot: RobotConfig, number: int
-) -> None:
+def test_it_is_told_and_the_robot_is_down_before_the_drives_disarm(number: int) -> None:
     told: dict[str, float] = {}
 
     def empties(fleet: Lockstep, row: SimTruth) -> bool:
@@ -41,7 +39,7 @@ def test_it_is_told_and_the_robot_is_down_before_the_drives_disarm(
 
     scenario = msgspec.structs.replace(still(40.0), hand=False)
     plant = plants.draw(f"battery {number}")
-    outcome = run(robot, scenario, plant=plant, each=empties)
+    outcome = run(ROBOT, scenario, plant=plant, each=empties)
     disarmed = outcome.rows[-1].scenario_s
     assert told["low"] < told["sits"] - 2.0
     assert told["down"] < disarmed - 2.0

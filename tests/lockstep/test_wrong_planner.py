@@ -20,6 +20,7 @@ from shared.config.gain_schedule import believing
 from shared.config.robot_config import RobotConfig
 from tests.lockstep.runs import moment_of, push, run, variant
 from tests.lockstep.wrong_planners import faults, wrong
+from tests.robots import ROBOT
 from tools.sim.lockstep import FleetMoment, Lockstep
 
 NAMES: Final = tuple(faults())
@@ -52,8 +53,8 @@ class End(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def begins(robot: RobotConfig) -> list[Begin]:
-    return [begin(robot, name, at) for name, at in MOMENTS]
+def begins() -> list[Begin]:
+    return [begin(ROBOT, name, at) for name, at in MOMENTS]
 
 
 def begin(robot: RobotConfig, name: str, at: float) -> Begin:
@@ -87,11 +88,9 @@ def test_there_are_300_wrong_planners() -> None:
 
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("number", range(0, len(NAMES) * len(MOMENTS), EVERY))
-def test_it_stands_whatever_its_planner_sends(
-    robot: RobotConfig, begins: list[Begin], number: int
-) -> None:
+def test_it_stands_whatever_its_planner_sends(begins: list[Begin], number: int) -> None:
     which, moment = divmod(number, len(MOMENTS))
-    ended = end(robot, begins[moment], NAMES[which])
+    ended = end(ROBOT, begins[moment], NAMES[which])
     assert not ended.fell, NAMES[which]
     assert ended.step_nm < STEP_NM, NAMES[which]
 
@@ -110,9 +109,9 @@ def test_it_stands_whatever_its_planner_sends(
     ],
 )
 def test_it_holds_and_reports_what_it_does_not_believe(
-    robot: RobotConfig, begins: list[Begin], name: str, outside: Outside, lasts_s: float
+    begins: list[Begin], name: str, outside: Outside, lasts_s: float
 ) -> None:
-    ended = end(robot, begins[0], name, lasts_s)
+    ended = end(ROBOT, begins[0], name, lasts_s)
     assert not ended.fell
     assert outside in ended.outside
     assert ended.modes == {Mode.HOLD}
@@ -122,32 +121,32 @@ def test_it_holds_and_reports_what_it_does_not_believe(
 @pytest.mark.parametrize("module", ["ankle_left", "ankle_right"])
 @pytest.mark.parametrize("moment", range(len(MOMENTS)))
 def test_it_stands_though_a_planner_whose_reference_drifts_leads_again_and_again(
-    robot: RobotConfig, begins: list[Begin], module: str, moment: int
+    begins: list[Begin], module: str, moment: int
 ) -> None:
     """Before references had to go as their rates say, it fell in the squat and in the stand."""
-    assert not end(robot, begins[moment], f"q_ref of {module} theta drifts", 3.0).fell
+    assert not end(ROBOT, begins[moment], f"q_ref of {module} theta drifts", 3.0).fell
 
 
 @pytest.mark.parametrize("moment", range(len(MOMENTS)))
 def test_coupled_torques_that_take_the_robot_along_do_not_throw_it(
-    robot: RobotConfig, begins: list[Begin], moment: int
+    begins: list[Begin], moment: int
 ) -> None:
     """Without `envelope.coupled_energy` it left the floor on its way into the crawl, and fell."""
-    ended = end(robot, begins[moment], "tau_coupled of all ramps up in 0.3 s, +0 +0 +0 +1 +0 -1")
+    ended = end(ROBOT, begins[moment], "tau_coupled of all ramps up in 0.3 s, +0 +0 +0 +1 +0 -1")
     assert not ended.fell
     assert ended.rise < 1.5
 
 
 @pytest.mark.parametrize(("rate", "moment"), [("+0.1", 1), ("-0.1", 2)])
 def test_a_reference_that_drifts_as_its_rate_says_trips_before_the_com_is_over_the_toes(
-    robot: RobotConfig, begins: list[Begin], rate: str, moment: int
+    begins: list[Begin], rate: str, moment: int
 ) -> None:
     """Without `trips.balance` both fall: no module can see what is wrong."""
     name = f"q_ref of ankle_right theta drifts and says so, {rate} rad/s"
-    assert not end(robot, begins[moment], name, 3.0).fell
+    assert not end(ROBOT, begins[moment], name, 3.0).fell
 
 
-def test_without_the_envelope_it_falls(robot: RobotConfig, begins: list[Begin]) -> None:
+def test_without_the_envelope_it_falls(begins: list[Begin]) -> None:
     """A robot that stands here would prove nothing above, where this planner is the first."""
     assert NAMES[0] == "q_ref of all negative"
-    assert end(believing(robot), begins[0], NAMES[0]).fell
+    assert end(believing(ROBOT), begins[0], NAMES[0]).fell

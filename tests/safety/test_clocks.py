@@ -12,11 +12,10 @@ from typing import NamedTuple
 
 import pytest
 
-from services.joint.failsafe import timing_of
 from shared.bus.messages import Mode
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config.robot_config import RobotConfig
-from tests.joint.helpers import SESSION, Bench
+from tests.joint.helpers import SESSION, TIMING, Bench
+from tests.robots import ROBOT
 
 ROOT = Path(__file__).resolve().parents[2]
 HOUR_NS = 3600 * NS_PER_S
@@ -62,13 +61,13 @@ FORGERIES = {
 }
 
 
-def bench_in(mode: Mode, robot: RobotConfig) -> Bench:
+def bench_in(mode: Mode) -> Bench:
     """Return a bench whose planner replaced another one."""
-    bench = Bench(robot)
+    bench = Bench(ROBOT)
     bench.to_hold()
     bench.cycle(bench.fresh(session=RETIRED))
     bench.run(30)
-    assert not bench.controller.failsafe.is_fresh(bench.now_ns, timing_of(robot))
+    assert not bench.controller.failsafe.is_fresh(bench.now_ns, TIMING)
     bench.run(300, fresh=True, hold=mode is Mode.HOLD)
     assert bench.mode is mode
     return bench
@@ -77,14 +76,14 @@ def bench_in(mode: Mode, robot: RobotConfig) -> Bench:
 @pytest.mark.parametrize("mode", [Mode.HOLD, Mode.TRACK])
 @pytest.mark.parametrize("forgery", FORGERIES.values(), ids=FORGERIES)
 def test_what_cannot_be_a_planners_is_refused_counted_and_moves_nothing(
-    forgery: Forgery, mode: Mode, robot: RobotConfig
+    forgery: Forgery, mode: Mode
 ) -> None:
     """Between good commands, as wild as the limits allow; a twin that is left alone beside it.
 
     So is a record of the same robot, in the same session and pose, played by somebody: it is older
     or, if the host has restarted since, ahead.
     """
-    bench, twin = (bench_in(mode, robot) for _ in range(2))
+    bench, twin = (bench_in(mode) for _ in range(2))
     before = bench.controller.failsafe.refused
     for n in range(1, 101):
         for one in (bench, twin):

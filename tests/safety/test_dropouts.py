@@ -7,12 +7,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from services.joint.failsafe import Event, Failsafe, Timing, timing_of
+from services.joint.failsafe import Event, Failsafe, Timing
 from shared.bus.messages import Cause, Mode
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config.robot_config import RobotConfig
 from shared.robot.hold_rules import Dropouts
-from tests.joint.helpers import T0, command
+from tests.joint.helpers import T0, TIMING, command
 
 CYCLE_NS = 2 * NS_PER_MS
 
@@ -52,8 +51,8 @@ class Module:
 
 
 @pytest.fixture
-def module(timing: Timing) -> Module:
-    return Module(timing)
+def module() -> Module:
+    return Module(TIMING)
 
 
 def test_each_drop_out_doubles_the_wait_of_100_ms_up_to_its_maximum(module: Module) -> None:
@@ -64,10 +63,10 @@ def test_each_drop_out_doubles_the_wait_of_100_ms_up_to_its_maximum(module: Modu
     assert [wait // NS_PER_MS for wait in waits] == [100, 200, 400, 800, 1600, 3200, 3200, 3200]
 
 
-def test_no_number_of_drop_outs_makes_the_wait_overflow_or_shrink(timing: Timing) -> None:
+def test_no_number_of_drop_outs_makes_the_wait_overflow_or_shrink() -> None:
     for dropouts in (5, 16, 17, 63, 64, 10_000):
         failsafe = Failsafe(dropouts=Dropouts(count=dropouts))
-        assert failsafe.engage_after_ns(timing) == timing.engage_after_max_ns
+        assert failsafe.engage_after_ns(TIMING) == TIMING.engage_after_max_ns
 
 
 @pytest.mark.parametrize("drop_outs", [1, 3, 8])
@@ -156,11 +155,9 @@ STEADY = [(1, 0, False)]
 @example(stream=STEADY * 30)
 @example(stream=STEADY * 15 + [(9, 0, False)] + STEADY * 40)
 @settings(max_examples=200)
-def test_track_is_entered_and_left_as_in_a_slow_model(
-    robot: RobotConfig, stream: list[tuple[int, int, bool]]
-) -> None:
+def test_track_is_entered_and_left_as_in_a_slow_model(stream: list[tuple[int, int, bool]]) -> None:
     timing = msgspec.structs.replace(
-        timing_of(robot),
+        TIMING,
         max_command_age_ns=5 * CYCLE_NS,
         engage_after_ns=10 * CYCLE_NS,
         engage_after_max_ns=40 * CYCLE_NS,

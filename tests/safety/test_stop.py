@@ -9,9 +9,9 @@ from services.joint.controller import CycleResult
 from services.joint.drivers.base import DriveStatus
 from shared.bus.messages import Mode
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config.robot_config import RobotConfig
 from shared.joints import kind_of
 from tests.joint.helpers import Bench
+from tests.robots import ROBOT
 
 POSES = {"ankle": (0.02, 0.14), "knee": (0.02, -1.0), "hip": (0.02, 0.9)}
 """Inside the limits."""
@@ -20,13 +20,13 @@ FADED = 3000
 
 
 @pytest.fixture
-def bench(robot: RobotConfig) -> Bench:
-    return Bench(robot)
+def bench() -> Bench:
+    return Bench(ROBOT)
 
 
-def stopped(robot: RobotConfig, module: str, mode: Mode = Mode.HOLD, cycles: int = FADED) -> Bench:
+def stopped(module: str, mode: Mode = Mode.HOLD, cycles: int = FADED) -> Bench:
     """Return a bench that was stopped in a mode, some cycles later."""
-    bench = Bench(robot, module)
+    bench = Bench(ROBOT, module)
     bench.q = POSES[kind_of(module)]
     bench.to(mode)
     bench.cycle(estop=True)
@@ -53,8 +53,8 @@ def test_torque_is_zero_after_drive_fault_whatever_comes(
 
 @pytest.mark.parametrize("before", [Mode.HOLD, Mode.TRACK])
 @pytest.mark.parametrize("module", ["knee_right", "hip_left"])
-def test_what_sinks_has_no_stiffness(robot: RobotConfig, before: Mode, module: str) -> None:
-    bench = stopped(robot, module, before, cycles=20)
+def test_what_sinks_has_no_stiffness(before: Mode, module: str) -> None:
+    bench = stopped(module, before, cycles=20)
     here = bench.cycle().tau
     bench.q = (bench.q[0], bench.q[1] - 0.2)
     np.testing.assert_allclose(bench.cycle().tau, here, atol=0.05)
@@ -63,22 +63,20 @@ def test_what_sinks_has_no_stiffness(robot: RobotConfig, before: Mode, module: s
 @pytest.mark.parametrize(
     ("module", "axis"), [("ankle_left", 0), ("ankle_left", 1), ("knee_right", 0), ("hip_right", 0)]
 )
-def test_ankles_and_frontal_axes_hold_in_damp(robot: RobotConfig, module: str, axis: int) -> None:
+def test_ankles_and_frontal_axes_hold_in_damp(module: str, axis: int) -> None:
     """With every stiffness off, an inverted pendulum is left: it toppled."""
-    bench = stopped(robot, module)
+    bench = stopped(module)
     moved = [bench.q[0], bench.q[1]]
     moved[axis] += 0.01
     bench.q = (moved[0], moved[1])
-    stand = robot.stand_gains(module).k_p[axis]
+    stand = ROBOT.stand_gains(module).k_p[axis]
     assert bench.run(5)[-1].tau[axis] == pytest.approx(-0.01 * stand)
 
 
-def test_torque_in_damp_is_the_feedforward_left_until_what_sinks_has_none(
-    robot: RobotConfig, bench: Bench
-) -> None:
+def test_torque_in_damp_is_the_feedforward_left_until_what_sinks_has_none(bench: Bench) -> None:
     bench.to_track(tau_ff=(3.0, -25.0), tau_coupled=(12.0, -9.0))
     bench.cycle(estop=True)
-    entered_ns, service = bench.now_ns, robot.joint_service
+    entered_ns, service = bench.now_ns, ROBOT.joint_service
     for cycle in range(round(service.damp_fade_s * service.rate_hz) + 100):
         tau = bench.cycle(bench.fresh()).tau  # a planner that has not heard changes nothing
         since_ns = bench.now_ns - entered_ns
@@ -90,32 +88,30 @@ def test_torque_in_damp_is_the_feedforward_left_until_what_sinks_has_none(
     assert (left, tau[1]) == (0.0, 0.0)
 
 
-def test_a_stop_never_drops_what_springs_carried_and_damps(
-    bench: Bench, robot: RobotConfig
-) -> None:
+def test_a_stop_never_drops_what_springs_carried_and_damps(bench: Bench) -> None:
     """A slow sink, never a drop: a stand without a planner has no feedforward to fade."""
     bench.to_hold()
     bench.q = (0.02, -1.02)
     bench.run(5)
     carried = bench.controller.tau[1]
-    assert carried == pytest.approx(robot.stand_gains("knee_right").k_p[1] * 0.02)
+    assert carried == pytest.approx(ROBOT.stand_gains("knee_right").k_p[1] * 0.02)
     bench.cycle(estop=True)
     assert bench.run(5)[-1].tau[1] > 0.9 * carried
     still = bench.run(FADED)[-1].tau[1]
     bench.v = (0.0, -0.3)
-    resists = bench.run(round(robot.joint_service.blend_ms / 2) + 10)[-1].tau[1] - still
-    assert resists == pytest.approx(robot.joint_service.damp_k_d * 0.3)
+    resists = bench.run(round(ROBOT.joint_service.blend_ms / 2) + 10)[-1].tau[1] - still
+    assert resists == pytest.approx(ROBOT.joint_service.damp_k_d * 0.3)
 
 
 @pytest.mark.parametrize("module", ["ankle_left", "knee_left", "hip_right"])
-def test_in_damp_the_rest_comes_to_the_stand_gains(robot: RobotConfig, module: str) -> None:
-    bench = Bench(robot, module)
+def test_in_damp_the_rest_comes_to_the_stand_gains(module: str) -> None:
+    bench = Bench(ROBOT, module)
     soft = {"k_p": (100.0, 90.0), "k_d": (5.0, 4.0), "tau_ff": (3.0, -5.0)}
     bench.to_track(**soft)
     bench.cycle(estop=True)
     bench.run(FADED)
-    setpoint, stand = bench.controller.setpoint, robot.stand_gains(module)
-    sinks = kind_of(module) in robot.joint_service.damp_sinks
+    setpoint, stand = bench.controller.setpoint, ROBOT.stand_gains(module)
+    sinks = kind_of(module) in ROBOT.joint_service.damp_sinks
     for axis in (0,) if sinks else (0, 1):
         assert setpoint.k_p[axis] == pytest.approx(max(stand.k_p[axis], soft["k_p"][axis]))
         assert setpoint.k_d[axis] == pytest.approx(max(stand.k_d[axis], soft["k_d"][axis]))
@@ -123,19 +119,19 @@ def test_in_damp_the_rest_comes_to_the_stand_gains(robot: RobotConfig, module: s
 
 @pytest.mark.parametrize("carried", [(200.0, 0.0), (-90.0, 90.0), (1e4, -1e4)])
 def test_what_a_drive_carried_in_a_gap_goes_on_within_the_motors_limits(
-    robot: RobotConfig, bench: Bench, carried: tuple[float, float]
+    bench: Bench, carried: tuple[float, float]
 ) -> None:
     bench.to_hold()
     phi, theta = bench.controller.resume(bench.now_ns, carried)
-    most = robot.joint.tau_module_max + 1e-9
+    most = ROBOT.joint.tau_module_max + 1e-9
     assert abs(phi + theta) <= most
     assert abs(theta - phi) <= most
     assert np.sign(theta) == np.sign(carried[1]) or carried[1] == 0.0
 
 
-def test_a_knee_is_caught_and_damped_before_it_topples(robot: RobotConfig) -> None:
-    stand, sunk = robot.stand_gains("knee_left"), stopped(robot, "knee_left")
-    sunk.move((sunk.q[0], robot.joint_service.damp_knee_stop - 0.02))
+def test_a_knee_is_caught_and_damped_before_it_topples() -> None:
+    stand, sunk = ROBOT.stand_gains("knee_left"), stopped("knee_left")
+    sunk.move((sunk.q[0], ROBOT.joint_service.damp_knee_stop - 0.02))
     still = sunk.run(5)[-1].tau[1]
     assert still == pytest.approx(0.02 * stand.k_p[1])
     sunk.v = (0.0, -0.1)
@@ -144,13 +140,13 @@ def test_a_knee_is_caught_and_damped_before_it_topples(robot: RobotConfig) -> No
 
 
 def test_a_knee_that_is_lower_than_the_stop_is_caught_where_it_is(
-    robot: RobotConfig, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Not pushed up to the stop: the robot would rise by itself after an emergency stop."""
-    low = robot.joint_service.damp_knee_stop - 0.1
+    low = ROBOT.joint_service.damp_knee_stop - 0.1
     monkeypatch.setitem(POSES, "knee", (0.02, low))
-    bench = stopped(robot, "knee_left")
+    bench = stopped("knee_left")
     assert bench.cycle().tau[1] == pytest.approx(0.0, abs=1e-6)
     bench.move((0.02, low - 0.01))
     caught = bench.run(5)[-1].tau[1]
-    assert caught == pytest.approx(0.01 * robot.stand_gains("knee_left").k_p[1], rel=1e-3)
+    assert caught == pytest.approx(0.01 * ROBOT.stand_gains("knee_left").k_p[1], rel=1e-3)

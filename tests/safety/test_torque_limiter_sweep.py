@@ -12,16 +12,16 @@ from hypothesis import strategies as st
 
 from services.joint.torque_limiter import TorqueLimits, limit_differential, limit_torque, limits_of
 from shared.bus.messages import Pair
-from shared.config.robot_config import RobotConfig
 from shared.joints import KINDS
+from tests.robots import ROBOT
 
 ROUNDING = 1e-9
 HUGE = 1.7e308
 
 
 @pytest.fixture(params=KINDS)
-def limits(request: pytest.FixtureRequest, robot: RobotConfig) -> TorqueLimits:
-    return limits_of(robot, f"{request.param}_left")
+def limits(request: pytest.FixtureRequest) -> TorqueLimits:
+    return limits_of(ROBOT, f"{request.param}_left")
 
 
 def around(value: float) -> tuple[float, ...]:
@@ -128,7 +128,7 @@ def test_a_torque_that_is_no_number_changes_nothing(bad: float, axis: int) -> No
 @pytest.mark.parametrize(
     ("module", "theta"), [("ankle_left", (-0.6, 0.9)), ("knee_right", (-3.0, -0.2))]
 )
-def test_limits_are_those_of_its_kind(robot: RobotConfig, module: str, theta: Pair) -> None:
-    limits = limits_of(robot, module)
+def test_limits_are_those_of_its_kind(module: str, theta: Pair) -> None:
+    limits = limits_of(ROBOT, module)
     assert (limits.theta, limits.tau_module_max) == (theta, MAX)
     assert limits.tau_step_max == pytest.approx(20_000.0 / 500.0)

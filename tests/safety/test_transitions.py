@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import pytest
 
-from services.joint.failsafe import TRANSITIONS, TRIPS, Event, Failsafe, Timing
+from services.joint.failsafe import TRANSITIONS, TRIPS, Event, Failsafe
 from shared.bus.messages import Cause, Mode
-from tests.joint.helpers import SESSION, T0, command
+from tests.joint.helpers import SESSION, T0, TIMING, command
 
 GONE = (Event.DRIVE_LOST, Event.DRIVE_DISARMED, Event.POSITION_LOST)
 
@@ -63,20 +63,18 @@ def by_the_docs(s: Situation) -> tuple[Mode, Cause | None]:
 
 
 @pytest.mark.parametrize("mode", Mode)
-def test_every_situation_leads_to_its_state_for_its_cause_by_the_age_rule(
-    mode: Mode, timing: Timing
-) -> None:
+def test_every_situation_leads_to_its_state_for_its_cause_by_the_age_rule(mode: Mode) -> None:
     found = set()
     for s in situations(mode):
         failsafe = Failsafe(
             mode=s.mode,
-            command=command(echo_t_ns=T0 - timing.max_command_age_ns - (not s.fresh), hold=s.hold),
+            command=command(echo_t_ns=T0 - TIMING.max_command_age_ns - (not s.fresh), hold=s.hold),
             session=SESSION,
-            fresh_since_ns=T0 - timing.engage_after_ns + (not s.waited),
+            fresh_since_ns=T0 - TIMING.engage_after_ns + (not s.waited),
         )
         if s.ended:
             failsafe.end_session(SESSION)
-        cause = failsafe.advance(T0, timing, s.drive, s.estop, s.trip)
+        cause = failsafe.advance(T0, TIMING, s.drive, s.estop, s.trip)
         assert (failsafe.mode, cause) == by_the_docs(s), s
         found |= {(failsafe.mode, cause)} if cause is not None else set()
     assert found == set(TRANSITIONS[mode].values()), "the sweep brings about every transition"
