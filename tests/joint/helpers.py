@@ -230,10 +230,7 @@ class ModuleBench(BenchJoint):
     def reading(self) -> DriveReading:
         """Return what the drive measures and tells."""
         return msgspec.structs.replace(
-            super().reading(),
-            error=int(self.error),
-            torque=self.carries,
-            encoder_zero=self.zero,
+            super().reading(), error=int(self.error), torque=self.carries, encoder_zero=self.zero
         )
 
     def cycle(

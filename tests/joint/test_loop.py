@@ -213,8 +213,7 @@ def test_a_torque_drive_armed_by_another_is_armed_by_us_before_it_is_held() -> N
 @pytest.mark.parametrize("loop", ["onboard", "service"])
 @pytest.mark.parametrize("interrupted", [True, False])
 @pytest.mark.parametrize(
-    ("mode", "left"),
-    [(Mode.DISARMED, "NOTHING"), (Mode.HOLD, "HELD"), (Mode.DAMP, "DAMP")],
+    ("mode", "left"), [(Mode.DISARMED, "NOTHING"), (Mode.HOLD, "HELD"), (Mode.DAMP, "DAMP")]
 )
 def test_a_fleet_that_goes_down_leaves_idle_drives_and_a_service_ended_alone_one_that_holds(
     tmp_path: Path, mode: Mode, left: str, interrupted: bool, loop: str

@@ -16,25 +16,9 @@ from services.joint.drivers.frame_times import ARM_GRACE_MS, INSIST_MS, REBOOT_M
 from services.joint.drivers.odrive_can import OdriveCan
 from services.joint.pd_law import Setpoint
 from shared.bus.messages import Pair
-from shared.can.cansimple import (
-    AxisState,
-    Command,
-    ControlMode,
-    arbitration_id,
-    pack_two_floats,
-)
+from shared.can.cansimple import AxisState, Command, ControlMode, arbitration_id, pack_two_floats
 from tests.joint.drivers.can_bench import Bench
-from tests.joint.drivers.rig import (
-    AXES,
-    DRIVE,
-    MS,
-    NODES,
-    TARGET,
-    Rig,
-    Shed,
-    arm,
-    read,
-)
+from tests.joint.drivers.rig import AXES, DRIVE, MS, NODES, TARGET, Rig, Shed, arm, read
 
 CLOSED, IDLE = AxisState.CLOSED_LOOP_CONTROL, AxisState.IDLE
 
