@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import product
 from pathlib import Path
 
 import msgspec
@@ -11,7 +12,6 @@ import pytest
 from services.joint.heat import HeatEstimate, HeatFile
 from shared.bus.messages import LEFT_MAX_S, Pair
 from shared.clock import NS_PER_S
-from shared.config.robot_config import RobotConfig
 from shared.run_directory import make_live_dir
 from tests.joint.helpers import ROBOT
 
@@ -21,26 +21,21 @@ LIGHT: Pair = (12.5 * 0.0827, 7.1 * 0.0827)
 """At 1.25 m."""
 
 
-def with_heat(**changes: object) -> RobotConfig:
-    """Return the robot with some keys of [heat] changed."""
-    return msgspec.structs.replace(ROBOT, heat=msgspec.structs.replace(ROBOT.heat, **changes))
-
-
 class Loaded:
     """An estimate under a load, by one cycle each 0.1 s."""
 
     def __init__(self, **changes: object) -> None:
-        self.heat = HeatEstimate(with_heat(**changes))
+        """Take the robot with some keys of [heat] changed."""
+        heat = msgspec.structs.replace(ROBOT.heat, **changes)
+        self.heat = HeatEstimate(msgspec.structs.replace(ROBOT, heat=heat))
         self.now_s = 1.0
 
     def run(
         self, torque: Pair, seconds: float, fet: Pair | None = None, motor: Pair | None = None
     ) -> None:
         for k in range(round(10.0 * seconds)):
-            once = k % 10 == 0
-            self.heat.advance(
-                round(self.now_s * NS_PER_S), torque, fet if once else None, motor if once else None
-            )
+            told = (fet, motor) if k % 10 == 0 else (None, None)
+            self.heat.advance(round(self.now_s * NS_PER_S), torque, *told)
             self.now_s += 0.1
 
 
@@ -57,14 +52,10 @@ def test_the_seconds_left_are_those_until_a_limit(before_s: float) -> None:
     assert loaded.heat.state.left_s == 0.0
 
 
-def test_a_light_load_can_last() -> None:
-    loaded = Loaded()
-    loaded.run(LIGHT, 20.0)
-    assert loaded.heat.state.left_s == LEFT_MAX_S
-
-
-def test_a_load_taken_off_leaves_more_time_within_seconds() -> None:
-    loaded = Loaded()
+def test_a_light_load_can_last_and_a_load_taken_off_leaves_more_time_within_seconds() -> None:
+    light, loaded = Loaded(), Loaded()
+    light.run(LIGHT, 20.0)
+    assert light.heat.state.left_s == LEFT_MAX_S
     loaded.run(SQUAT, 60.0)
     loaded.heat.skip(400.0)
     assert loaded.heat.state.left_s < 200.0
@@ -74,16 +65,14 @@ def test_a_load_taken_off_leaves_more_time_within_seconds() -> None:
 
 def test_no_seconds_left_are_negative_or_no_number_at_any_load_and_temperature() -> None:
     heat = HeatEstimate(ROBOT)
-    for winding in (-20.0, 40.0, 80.0, 94.99, 95.0, 250.0):
-        for housing in (-20.0, 40.0, 95.0, 140.0):
-            for amperes in (0.0, 1e-6, 5.0, 20.0, 40.0, 48.0, 400.0):
-                state = heat.state
-                state.winding = (winding, 40.0)
-                state.housing = (housing, 40.0)
-                state.load = ((amperes * 0.0827) ** 2, 0.0)
-                left_s = heat._left_s(0)
-                assert 0.0 <= left_s <= LEFT_MAX_S
-                assert (left_s == 0.0) == (winding >= ROBOT.heat.winding_max)
+    windings, housings = (-20.0, 40.0, 80.0, 94.99, 95.0, 250.0), (-20.0, 40.0, 95.0, 140.0)
+    for winding, housing, amperes in product(windings, housings, (0.0, 1e-6, 5.0, 20.0, 48.0, 4e2)):
+        state = heat.state
+        state.winding, state.housing = (winding, 40.0), (housing, 40.0)
+        state.load = ((amperes * 0.0827) ** 2, 0.0)
+        left_s = heat._left_s(0)
+        assert 0.0 <= left_s <= LEFT_MAX_S
+        assert (left_s == 0.0) == (winding >= ROBOT.heat.winding_max)
 
 
 def test_what_the_drive_reports_counts_more_than_the_estimate() -> None:
@@ -97,35 +86,28 @@ def test_what_the_drive_reports_counts_more_than_the_estimate() -> None:
 
 
 def test_a_thermistor_shows_how_warm_the_housing_is_and_with_it_how_much_time_is_left() -> None:
+    """The air is taken 20 K too cool: of that, the thermistor knows nothing."""
     truth, told, deaf = (Loaded(ambient=air) for air in (45.0, 25.0, 25.0))
-    for _ in range(240):
+    for second in range(420):
         truth.run(SQUAT, 1.0)
         told.run(SQUAT, 1.0, motor=truth.heat.state.winding)
-        deaf.run(SQUAT, 1.0)
-    left_s = truth.heat.state.left_s
-    assert told.heat.state.left_s == pytest.approx(left_s, rel=0.4), (
-        "the air is taken 20 K too cool"
-    )
-    assert deaf.heat.state.left_s > 2.0 * left_s
-    for _ in range(180):
-        truth.run(SQUAT, 1.0)
-        told.run(SQUAT, 1.0, motor=truth.heat.state.winding)
-    assert told.heat.state.left_s == pytest.approx(truth.heat.state.left_s, abs=20.0)
+        left_s = truth.heat.state.left_s
+        if second < 240:
+            deaf.run(SQUAT, 1.0)
+        if second == 239:
+            assert told.heat.state.left_s == pytest.approx(left_s, rel=0.4)
+            assert deaf.heat.state.left_s > 2.0 * left_s
+    assert told.heat.state.left_s == pytest.approx(left_s, abs=20.0)
 
 
 def test_a_process_that_stood_still_takes_its_last_load_for_a_while_only() -> None:
-    loaded = Loaded()
+    loaded, off = Loaded(), Loaded(estimate=False)
     loaded.run(SQUAT, 10.0)
     before = loaded.heat.state.winding
     loaded.now_s += 3600.0
     loaded.run(SQUAT, 0.1)
     assert math.dist(before, loaded.heat.state.winding) < 6.0
-
-
-def test_a_robot_file_without_heat_estimates_nothing() -> None:
-    heat = HeatEstimate(with_heat(estimate=False))
-    assert not heat.enabled
-    assert heat.state.left_s == -1.0
+    assert (off.heat.enabled, off.heat.state.left_s) == (False, -1.0), "by the robot file"
 
 
 def restarted(run_dir: Path, now_s: float) -> HeatEstimate:

@@ -184,25 +184,22 @@ def test_stiffened_it_goes_on_holding_when_stopped(module: str) -> None:
     bench = holding(module)
     bench.run(300, fresh=True, hold=True, stiffen=True)
     bench.cycle(bench.fresh(hold=True, stiffen=True), estop=True)
-    assert bench.mode is Mode.DAMP
     bench.run(2 * blended(bench))
-    assert bench.is_stiffened
+    assert (bench.mode, bench.is_stiffened) == (Mode.DAMP, True)
     assert bench.controller.setpoint.k_p == pytest.approx(ROBOT.support_gains(module)[0])
 
 
 @pytest.mark.parametrize("mode", [Mode.HOLD, Mode.DAMP])
 @pytest.mark.parametrize("module", ["ankle_left", "knee_right", "hip_right"])
 def test_a_limp_neighbour_braces_it_alone(module: str, mode: Mode) -> None:
+    """Once is enough: its row may be lost with its service."""
     bench = holding(module)
-    if mode is Mode.DAMP:
-        bench.cycle(estop=True)
+    bench.cycle(estop=mode is Mode.DAMP)
     bench.run(10)
     assert not bench.is_stiffened
     bench.cycle(near=NeighbourView(stiffen=True))
-    assert bench.is_stiffened
     bench.run(2 * blended(bench))
-    assert bench.mode is mode
-    assert bench.is_stiffened, "once is enough: its row may be lost with its service"
+    assert (bench.mode, bench.is_stiffened) == (mode, True)
     k_p, k_d = at_least(module, (0.0, 0.0), (0.0, 0.0))
     assert bench.controller.setpoint.k_p == pytest.approx(k_p)
     assert bench.controller.setpoint.k_d == pytest.approx(k_d)
