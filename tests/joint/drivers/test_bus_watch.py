@@ -9,7 +9,7 @@ from pathlib import Path
 import can
 import pytest
 
-from services.joint.drivers.base import DriveReading, DriveStatus
+from services.joint.drivers.base import DriveStatus, MotorTarget
 from services.joint.drivers.bus_watch import (
     BLOCKED_MS,
     PROBE_MS,
@@ -25,7 +25,7 @@ from shared.can.cansimple_06 import Command06
 from shared.can.unix_can import Frame, UnixCanBus
 from shared.clock import NS_PER_MS
 from tests.joint.drivers.can_bench import Bench
-from tests.joint.drivers.rig import AXES, TARGET, Shed
+from tests.joint.drivers.rig import AXES, TARGET, Line, Shed
 
 OLD_MS = 50
 """No frame that is older reaches a drive."""
@@ -198,15 +198,11 @@ STAMPS: list[tuple[Frame, float]] = []
 """Frames that were sent and neither taken nor thrown away, with their times, ms."""
 
 
-class Cut:
-    """An emulated drive, its driver as a service uses it, and the power of their bus."""
+class Cut(Line):
+    """A line whose bus loses its power, is full, and is restarted by its driver."""
 
     def __init__(self, shed: Shed, monkeypatch: pytest.MonkeyPatch) -> None:
         STAMPS.clear()
-        self.shed = shed
-        self.rig = shed.rig(hub=StampingHub)
-        assert isinstance(self.rig.hub, StampingHub)
-        self.hub = self.rig.hub
         send_many, restart = UnixCanBus.send_many, UnixCanBus.restart
 
         def stamped(bus: UnixCanBus, messages: list[can.Message]) -> None:
@@ -224,18 +220,11 @@ class Cut:
         monkeypatch.setattr(UnixCanBus, "send_many", stamped)
         monkeypatch.setattr(UnixCanBus, "restart", restarted)
         self.restarts = 0
-        self.driver = shed.driver()
-        self.reading: DriveReading | None = None
+        super().__init__(shed, StampingHub)
 
     @property
     def ms(self) -> float:
         return self.shed.now_s * 1e3
-
-    @property
-    def status(self) -> DriveStatus:
-        """Status by the reading of the last cycle, which had one."""
-        assert self.reading is not None
-        return self.reading.status
 
     def power(self, *, on: bool) -> None:
         self.rig.bank.conditions.link(AXES[0] >> 1, up=on)
@@ -248,38 +237,35 @@ class Cut:
         self.hub.now_ms = self.ms
         self.rig.step()
 
-    def cycle(self, write: bool = True) -> None:
+    def cycle(self, target: MotorTarget | None = TARGET, ms: int = 2) -> None:
         """Run a cycle of the service: two milliseconds with the drive, five without."""
-        heard = self.rig.bank.is_responding(AXES[0])
-        for _ in range(2 if heard else CYCLE_MS):
+        for _ in range(ms if self.rig.bank.is_responding(AXES[0]) else CYCLE_MS):
             self.step()
-        self.reading = self.driver.read(0.0)
-        if write:
-            self.driver.write(TARGET)
+        super().cycle(target, ms=0)
 
-    def run(self, ms: float, write: bool = True) -> None:
+    def run(self, ms: float, target: MotorTarget | None = TARGET) -> None:
         until = self.ms + ms
         while self.ms < until:
-            self.cycle(write)
+            self.cycle(target)
 
     def oldest_ms(self) -> float:
         """Return the age of the oldest frame that reached the drive, and forget them."""
         oldest = max((age for _, age in self.hub.ages_ms), default=0.0)
         self.hub.ages_ms.clear()
-        return oldest
+        return float(oldest)
 
 
 @pytest.fixture
 def cut(shed: Shed, monkeypatch: pytest.MonkeyPatch) -> Cut:
     cut = Cut(shed, monkeypatch)
-    cut.run(50, write=False)
+    cut.run(50, target=None)
     return cut
 
 
 @pytest.fixture
 def armed(cut: Cut) -> Cut:
     cut.driver.arm(onboard=True)
-    cut.run(40, write=False)
+    cut.run(40, target=None)
     assert cut.rig.states == [AxisState.CLOSED_LOOP_CONTROL] * 2
     cut.run(40)
     assert cut.oldest_ms() <= CYCLE_MS
@@ -314,7 +300,7 @@ def test_a_bus_without_acknowledgements_or_that_stays_full_is_told_within_a_fift
 def test_nothing_is_sent_into_a_dead_bus_and_it_is_told_there_too(cut: Cut) -> None:
     """A service that is not armed sends nothing: one probe shows that nobody is there."""
     cut.power(on=False)
-    cut.run(190, write=False)
+    cut.run(190, target=None)
     assert cut.status is DriveStatus.UNACKNOWLEDGED
     assert (cut.restarts, STAMPS) == (1, [])
     cut.driver.arm(onboard=True)
@@ -322,7 +308,7 @@ def test_nothing_is_sent_into_a_dead_bus_and_it_is_told_there_too(cut: Cut) -> N
     cut.run(3000)
     assert STAMPS == []
     cut.power(on=True)
-    cut.run(50, write=False)
+    cut.run(50, target=None)
     assert cut.oldest_ms() <= CYCLE_MS
     assert cut.rig.states == [AxisState.IDLE] * 2
 
@@ -343,10 +329,10 @@ def test_no_arming_request_from_before_a_power_cut_reaches_the_drive(
         cut.driver.read(0.0)
     before = cut.rig.states
     cut.power(on=False)
-    cut.run(500, write=False)
+    cut.run(500, target=None)
     assert STAMPS == [], "nothing is left to be delivered"
     cut.power(on=True)
-    cut.run(300, write=False)
+    cut.run(300, target=None)
     assert cut.rig.states == before
     assert cut.oldest_ms() < OLD_MS
 
@@ -358,7 +344,7 @@ def test_frames_of_a_service_that_died_in_the_cut_are_thrown_away_by_the_next(ar
     armed.driver.close()
     assert STAMPS != []
     armed.driver = armed.shed.driver()
-    armed.run(200, write=False)
+    armed.run(200, target=None)
     assert STAMPS == []
     assert armed.status is DriveStatus.UNACKNOWLEDGED
 
