@@ -85,12 +85,6 @@ def heard_in(robot: RobotConfig, scenario: Scenario, **how: Any) -> list[Message
     return heard
 
 
-@pytest.fixture(scope="module")
-def from_hoist() -> list[Message]:
-    """A stand-up with 8 ms on each link, each way."""
-    return heard_in(ROBOT, still(0.5), delay_ms=8.0, stands=False)
-
-
 def of(kind: type[M], heard: list[Message]) -> list[M]:
     return [message for message in heard if isinstance(message, kind)]
 
@@ -98,8 +92,7 @@ def of(kind: type[M], heard: list[Message]) -> list[M]:
 TARED_S = 3.3
 
 
-@pytest.fixture(scope="module")
-def leaned() -> list[Message]:
+def test_the_wrench_is_what_acts_on_the_torso_and_a_tare_takes_it_for_its_zero() -> None:
     """The torso pitches while a load comes to rest on it; at `TARED_S` a new zero is asked for."""
     leaning = led_to((2.0, 1.1, 0.4, 150.0), duration=4.1)
     asked: list[int] = []
@@ -109,10 +102,7 @@ def leaned() -> list[Message]:
             asked.append(fleet.now_ns)
             fleet.harness.tare(TareRequest(t_ns=fleet.now_ns, seq=1, source="a test"))
 
-    return heard_in(unheeded(ROBOT), leaning, start=standing_as(ROBOT), each=tare)
-
-
-def test_the_wrench_is_what_acts_on_the_torso_and_comes_at_its_rate(leaned: list[Message]) -> None:
+    leaned = heard_in(unheeded(ROBOT), leaning, start=standing_as(ROBOT), each=tare)
     wrenches = {m.t_ns: m for m in of(Wrench, leaned)}
     stamps = sorted(wrenches)
     assert set(np.diff(stamps)) == {round(1e9 / ROBOT.harness.rate_hz)}
@@ -125,41 +115,30 @@ def test_the_wrench_is_what_acts_on_the_torso_and_comes_at_its_rate(leaned: list
             x, y, z = wrench.force
             up = np.cos(roll) * (z * np.cos(pitch) - x * np.sin(pitch)) + np.sin(roll) * y
             errors.append(up + truth.harness_force_z)
-            assert wrench.valid
-            assert truth.harness_force_z > 100.0
-            assert pitch > 0.3
+            assert (wrench.valid, truth.harness_force_z > 100.0, pitch > 0.3) == (True,) * 3
     assert np.abs(np.mean(errors)) < 1.0
     assert np.abs(errors).max() < 4.0
-
-
-def test_a_tare_on_request_takes_what_rests_on_the_harness_for_its_zero(
-    leaned: list[Message],
-) -> None:
-    asked = next(i for i, m in enumerate(leaned) if getattr(m, "scenario_s", 0.0) >= TARED_S)
-    *_, before = of(Wrench, leaned[:asked])
+    at = next(i for i, m in enumerate(leaned) if getattr(m, "scenario_s", 0.0) >= TARED_S)
+    *_, before = of(Wrench, leaned[:at])
     assert before.valid
     assert np.linalg.norm(before.force) > 100.0
-    after = of(Wrench, leaned[asked:])
+    after = of(Wrench, leaned[at:])
     assert {m.tare for m in after if not m.valid} == {Tare.RUNNING}
     assert after[-1].valid
     assert np.linalg.norm(after[-1].force) < 10.0
 
 
-def test_the_tare_is_done_on_the_hoist_before_anything_loads_it(from_hoist: list[Message]) -> None:
-    first_valid = next(m for m in from_hoist if isinstance(m, Wrench) and m.valid)
-    begin_ns = from_hoist[0].t_ns
-    assert first_valid.t_ns - begin_ns == pytest.approx(ROBOT.harness.tare_s * 1e9, abs=5e6)
-    hoisted = [m for m in of(SimTruth, from_hoist) if m.t_ns <= first_valid.t_ns]
+def test_the_tare_is_done_on_the_hoist_and_the_planner_hears_the_wrench_after_the_delay() -> None:
+    """A stand-up with 8 ms on each link, each way."""
+    heard = heard_in(ROBOT, still(0.5), delay_ms=8.0, stands=False)
+    first_valid = next(m for m in heard if isinstance(m, Wrench) and m.valid)
+    since_ns = first_valid.t_ns - heard[0].t_ns
+    assert since_ns == pytest.approx(ROBOT.harness.tare_s * 1e9, abs=5e6)
+    hoisted = [m for m in of(SimTruth, heard) if m.t_ns <= first_valid.t_ns]
     assert all(m.hoist > 0.5 and m.harness_force_z == 0.0 for m in hoisted)
-
-
-def test_the_planner_receives_the_wrench_after_the_links_delay(from_hoist: list[Message]) -> None:
-    sent = {m.seq: m.t_ns for m in of(Wrench, from_hoist)}
-    ages_ms = [
-        (m.t_ns - sent[m.wrench_seq]) / 1e6
-        for m in of(PlannerStatus, from_hoist)
-        if m.wrench_seq >= 0
-    ]
+    sent = {m.seq: m.t_ns for m in of(Wrench, heard)}
+    statuses = [m for m in of(PlannerStatus, heard) if m.wrench_seq >= 0]
+    ages_ms = [(m.t_ns - sent[m.wrench_seq]) / 1e6 for m in statuses]
     assert len(ages_ms) > 100
     assert min(ages_ms) >= 8.0
     assert max(ages_ms) < 8.0 + 2e3 / ROBOT.planner.rate_hz

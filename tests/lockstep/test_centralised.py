@@ -43,32 +43,22 @@ def run(
     return runs.run(robot, scenario, 0.0, plant, stands=stands, fleet_type=fleet_type).rows
 
 
-@pytest.fixture(scope="module")
-def beginning() -> Scenario:
-    """The first of the squat's way down, with the hand's largest force, and a push."""
-    return variant("squat", duration=1.6, kill=(), push=(push(0.8, 30.0, 20.0, 0.0),))
+def test_without_delay_it_does_what_the_distributed_control_does() -> None:
+    """The first of the squat's way down, with the hand's largest force, and a push.
 
-
-@pytest.fixture(scope="module")
-def distributed(beginning: Scenario) -> list[SimTruth]:
-    """Torques only there as well, from joint services that have the law."""
-    return run("distributed", torques_only(ROBOT), beginning, IDEAL)
-
-
-def test_without_delay_it_does_what_the_distributed_control_does(
-    beginning: Scenario, distributed: list[SimTruth]
-) -> None:
-    centralised = run("centralised", ROBOT, beginning, IDEAL)
-    assert len(centralised) == len(distributed)
-    for name, unit, far in (("com", 1e3, 1.0), ("torso", 1e3, 1.0), ("angles", 1.0, 0.002)):
-        a, b = (
-            unit * np.array([getattr(r, name) for r in rows]) for rows in (centralised, distributed)
-        )
-        assert np.abs(a - b).max() < far, name
-    com, hand = (
-        [1e3 * max(np.hypot(*row.com[:2]) for row in rows) for rows in (centralised, distributed)],
-        [max(abs(r.operator_force[2]) for r in rows) for rows in (centralised, distributed)],
+    Joint services that have the law write torques only there as well.
+    """
+    beginning = variant("squat", duration=1.6, kill=(), push=(push(0.8, 30.0, 20.0, 0.0),))
+    both = (
+        run("centralised", ROBOT, beginning, IDEAL),
+        run("distributed", torques_only(ROBOT), beginning, IDEAL),
     )
+    assert len(both[0]) == len(both[1])
+    for name, unit, far in (("com", 1e3, 1.0), ("torso", 1e3, 1.0), ("angles", 1.0, 0.002)):
+        a, b = (unit * np.array([getattr(row, name) for row in rows]) for rows in both)
+        assert np.abs(a - b).max() < far, name
+    com = [1e3 * max(np.hypot(*row.com[:2]) for row in rows) for rows in both]
+    hand = [max(abs(row.operator_force[2]) for row in rows) for rows in both]
     assert com[1] > 8.0, "the push is felt"
     assert com[0] == pytest.approx(com[1], abs=0.5)
     assert hand[1] > 12.0, "the hand leads"
@@ -112,6 +102,7 @@ def bench() -> Bench:
 
 
 def test_a_torque_goes_to_the_drive_unchanged_until_the_next_however_long(bench: Bench) -> None:
+    """Also one made from an old state. Of the gate the torque diamond is left, in one cycle."""
     assert bench.torque_of(bench.passes((5.0, -60.0))) == pytest.approx((5.0, -60.0))
     for _ in range(500):  # 1 s, where the shipped module holds after 50 ms
         step = bench.cycle()
@@ -120,30 +111,20 @@ def test_a_torque_goes_to_the_drive_unchanged_until_the_next_however_long(bench:
     assert bench.mode is Mode.TRACK
     step = bench.passes((math.nan, 0.0))
     assert bench.torque_of(step) == pytest.approx((5.0, -60.0)), "NaN is not passed on"
-
-
-def test_a_torque_made_from_an_old_state_is_taken(bench: Bench) -> None:
     step = bench.passes((1.0, -2.0), age_ns=400 * NS_PER_MS)
     assert bench.torque_of(step) == pytest.approx((1.0, -2.0))
     assert bench.module.controller.state(bench.now_ns).age_ns == 400 * NS_PER_MS
-
-
-@pytest.mark.parametrize(
-    ("asked", "given"), [((0.0, -500.0), (0.0, -115.6)), ((80.0, 80.0), (57.8, 57.8))]
-)
-def test_of_the_gate_the_torque_diamond_is_left(bench: Bench, asked: Pair, given: Pair) -> None:
-    """In one cycle: no limit on its step."""
-    assert bench.torque_of(bench.passes(asked)) == pytest.approx(given)
+    for asked, given in (((0.0, -500.0), (0.0, -115.6)), ((80.0, 80.0), (57.8, 57.8))):
+        assert bench.torque_of(bench.passes(asked)) == pytest.approx(given)
 
 
 def test_an_estop_and_a_lost_drive_are_as_shipped(bench: Bench) -> None:
     bench.cycle(estop=True)
     assert bench.mode is Mode.DAMP
-    other = Bench(ROBOT)
-    other.status = DriveStatus.LOST
-    other.passes(TAU)
-    assert other.mode is Mode.FAULT
-    assert other.passes(TAU).command is not DriveCommand.TORQUE
+    bench.status = DriveStatus.LOST
+    bench.passes(TAU)
+    assert bench.mode is Mode.FAULT
+    assert bench.passes(TAU).command is not DriveCommand.TORQUE
 
 
 def receive(now_ns: int, seq: int, *planners: Planner) -> list[JointState]:

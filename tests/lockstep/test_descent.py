@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import msgspec
@@ -38,10 +39,8 @@ class Descending(Lockstep):
         interrupt: Ctrl-C at a scenario's time.
     """
 
-    wait_s = 5.0
-
-    def __init__(self, robot: RobotConfig, *args: Any, **how: Any) -> None:
-        self.descent = Descent(robot, wait_s=self.wait_s)
+    def __init__(self, robot: RobotConfig, *args: Any, wait_s: float, **how: Any) -> None:
+        self.descent = Descent(robot, wait_s=wait_s)
         self.states: list[JointState | None] = [None] * len(MODULES)
         self.status: PlannerStatus | None = None
         self.asks: list[Ask] = []
@@ -78,19 +77,13 @@ class Descending(Lockstep):
         return ask
 
 
-class Impatient(Descending):
-    """Nothing is going to bear its weight."""
-
-    wait_s = 1.0
-
-
 def go_down(
     robot: RobotConfig,
     scenario: Scenario,
     plant: PlantConfig | None = None,
     each: Any = lambda _fleet, _row: None,
     interrupt_s: float = np.inf,
-    fleet_type: type[Descending] = Descending,
+    wait_s: float = 5.0,
 ) -> Run:
     """Type `xrl down` at `AT_S`; go on for half a second after its end."""
     ended: list[float] = []
@@ -104,7 +97,8 @@ def go_down(
             ended.append(row.scenario_s)
         return bool(ended) and row.scenario_s > ended[0] + 0.5
 
-    outcome = run(robot, scenario, plant=plant, fleet_type=fleet_type, each=look)
+    how = {"fleet_type": functools.partial(Descending, wait_s=wait_s), "each": look}
+    outcome = run(robot, scenario, plant=plant, **how)
     assert not outcome.rows[-1].fallen
     on_feet = [row for row in outcome.rows if row.hoist == 0.0]
     assert max(max(row.foot_left_tilt, row.foot_right_tilt) for row in on_feet) < 0.05
@@ -156,7 +150,7 @@ def test_it_goes_down_and_holds_until_a_hoist_bears_it(number: int) -> None:
 
 def test_with_nothing_to_bear_it_it_holds_and_says_what_helps() -> None:
     """Idled there it tips: the torso meets the floor at 2.8 m/s, as from a stand."""
-    found = go_down(ROBOT, alone(), fleet_type=Impatient)
+    found = go_down(ROBOT, alone(), wait_s=1.0)
     assert found.sinking < 0.2
     assert "still holds: the legs bear 9" in found.lockstep.error
     assert "stand under its torso" in found.lockstep.error
@@ -176,7 +170,7 @@ def test_idled_in_a_stand_it_meets_the_floor_as_hard() -> None:
 def test_a_robot_without_its_payload_is_not_taken_for_a_hanging_one() -> None:
     led = with_law(ROBOT, load_correction=(0.0, 0.0))  # whatever it carries
     light = changed(PlantConfig(), {"body.payload_scale": 0.0})
-    found = go_down(led, alone(kill=kill(0.1)), light, fleet_type=Impatient)
+    found = go_down(led, alone(kill=kill(0.1)), light, wait_s=1.0)
     assert "still holds: the legs bear" in found.lockstep.error
     assert found.lockstep.asks == [Ask.NOTHING, Ask.STOP, Ask.NOTHING]
     assert LIGHT_FRACTION < 0.5, "what it still bears"

@@ -24,6 +24,7 @@ from tests.robots import ROBOT
 from tools.sim.lockstep import FleetMoment, Lockstep
 
 NAMES: Final = tuple(faults())
+assert len(NAMES) >= 300
 EVERY: Final = 1 if os.environ.get("XRL_ALL_WRONG") else 47
 MOMENTS: Final = (("squat", 1.0), ("stand", 0.5), ("crawl", 3.0))
 """On the way down, standing, and low with the torso pitched."""
@@ -80,10 +81,6 @@ def end(robot: RobotConfig, begin: Begin, name: str, lasts_s: float = WRONG_S) -
     step_nm = max(ended.steps_nm(), default=0.0)
     fell = ended.rows[-1].fallen
     return End(fell, step_nm, outside - {Outside.NOTHING}, set(ended.modes), ended.rising)
-
-
-def test_there_are_300_wrong_planners() -> None:
-    assert len(NAMES) >= 300
 
 
 @pytest.mark.sampled(2)
