@@ -158,8 +158,6 @@ TOOL_LAWS = [
     "tools/bringup/identify/sines.py",
     "tools/bringup/jog.py",
     "tools/bringup/motion.py",
-    "tools/bringup/tune/excitation.py",
-    "tools/bringup/tune/response.py",
     "tools/bringup/whole_turns.py",
     "tools/lab/design/*.py",
     "tools/lab/learning/policy.py",

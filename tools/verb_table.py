@@ -114,7 +114,6 @@ VERBS: Final = (
         "hanging, its services down: dry and viscous friction, reflected inertia",
         "drive.identify:joint",
     ),
-    Verb("drive tune", "offset a reference by step and sines: rise, damping, margin; gains"),
     Verb("log info", "show what is in a log: topics, rates, gaps, losses"),
     Verb("log recover", "make a complete log from one that was cut off"),
     Verb("log join", "join the records of several hosts into one run"),
@@ -175,7 +174,7 @@ RENAMED: Final = {
     **{
         word: f"{noun} {word}"
         for noun, words in (
-            ("drive", "configure zero jog tare can identify tune"),
+            ("drive", "configure zero jog tare can identify"),
             ("log", "info recover join play report export explain resim whatif"),
         )
         for word in words.split()

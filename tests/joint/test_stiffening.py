@@ -206,6 +206,7 @@ def test_a_limp_neighbour_braces_it_alone(module: str, mode: Mode) -> None:
     bench.cycle(near=NeighbourView(stiffen=True))
     bench.run(2 * blended(bench))
     assert (bench.mode, bench.is_stiffened) == (mode, True)
+    assert bench.controller.caught is (mode is Mode.DAMP), "no longer sinks: the knees are told"
     k_p, k_d = at_least(module, (0.0, 0.0), (0.0, 0.0))
     assert bench.controller.setpoint.k_p == pytest.approx(k_p)
     assert bench.controller.setpoint.k_d == pytest.approx(k_d)

@@ -47,6 +47,7 @@ def test_in_a_motion_no_joint_is_jerked(name: str, at: float) -> None:
         assert after == pytest.approx(before, abs=5.0), "nor a moment later"
 
 
+KNEE = MODULES.index("knee_left")
 LED_S, STOP_S = 3.5, 3.8
 BEGUN_S = STOP_S + 5.0
 """The stop and its fade: from straight legs a light robot sinks by less than 1 mm until its end."""
@@ -251,3 +252,25 @@ def test_nothing_that_happens_on_the_way_down_tips_it(
     assert found.turned < turned
     assert sinks is None or (found.sank > 0.1) is sinks
     assert not sinks or found.speed < 0.25
+
+
+def test_a_knee_silent_for_a_moment_on_the_way_down_stops_with_the_others(
+    heavy: RobotConfig, led_to: Callable[[float], FleetMoment]
+) -> None:
+    """The other five stiffened for it, which latches; it sank on beside the other knee."""
+    axes = {2 * KNEE, 2 * KNEE + 1}
+
+    def stop_and_pause(fleet: Lockstep, truth: SimTruth) -> None:
+        if truth.scenario_s >= STOP_S and not fleet.estop:
+            fleet.estop = True
+            fleet.world.let_go()
+        silent = fleet.bank.conditions.silent
+        is_silent = STOP_S + 0.7 <= truth.scenario_s < STOP_S + 0.75
+        (silent.update if is_silent else silent.difference_update)(axes)
+        if truth.scenario_s >= STOP_S + 1.0:
+            seen.append([each.samples.q[1] for each in fleet.controllers])
+
+    seen: list[list[float]] = []
+    scenario = msgspec.structs.replace(led(1.0, 0.0), duration=STOP_S + 3.0)
+    assert run(heavy, scenario, start=led_to(1.0), each=stop_and_pause).stood
+    assert np.ptp(np.array(seen)[:, KNEE]) < 0.01

@@ -21,7 +21,7 @@ from tools.verbs import estop
 SAID = "config: ./robot.toml\n"
 DECIDE_LATER = {
     "doctor", "drive configure", "drive identify body", "drive identify joint", "drive jog",
-    "drive tune", "drive zero", "estop", "log explain", "log play", "view",
+    "drive zero", "estop", "log explain", "log play", "view",
 }  # fmt: skip
 """Verbs that take a running fleet's or a record's robot before they look for a file."""
 

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from services.planner.law.probe import NO_ROW
 from shared.bus import topics
 from shared.bus.messages import (
     STRAIGHT,
@@ -113,14 +112,11 @@ class LedPlanner:
         *,
         assist_n: float = 0.0,
         shift: Vector4 = STRAIGHT,
-        probe_row: int = NO_ROW,
-        probe: float = 0.0,
     ) -> None:
-        """Ask once; what is not repeated fades out, and a probe ends."""
+        """Ask once; what is not repeated fades out."""
         self._sent += 1
         self._intents.put(
             OperatorIntent(
                 t_ns=now_ns(), seq=self._sent, assist_n=assist_n, shift=shift, source=self.source,
-                probe_row=probe_row, probe=probe,
             )
         )  # fmt: skip

@@ -20,7 +20,7 @@ PLANTED = (
 )  # fmt: skip
 PAYLOAD = 0.88 * 20.4
 TORSO = PAYLOAD + 39.66 - 20.4
-STAND = Path(__file__).parents[1] / "logs" / "reexecution" / "golden" / "stand-v6h.mcap"
+STAND = Path(__file__).parents[1] / "logs" / "reexecution" / "golden" / "stand.mcap"
 """A second of a stand."""
 
 

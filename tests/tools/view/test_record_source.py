@@ -18,7 +18,7 @@ from tools.logs.run_log import RunLog, read_run, robot_of
 from tools.view.record import RecordSource
 from tools.view.source import COURSE_FRAMES, Order
 
-LOG = Path(__file__).parents[1] / "logs" / "reexecution" / "golden" / "stand-v6c.mcap"
+LOG = Path(__file__).parents[1] / "logs" / "reexecution" / "golden" / "stand.mcap"
 
 
 @pytest.fixture(scope="module")
