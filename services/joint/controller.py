@@ -195,8 +195,9 @@ class JointController:
 
     @property
     def caught(self) -> bool:
-        """True for a knee in DAMP that stopped sinking for the sake of the other modules."""
-        return self._law.state.sinking.caught
+        """True in DAMP for a module that no longer sinks: caught, or stiffened for a limp one."""
+        sinking = self._law.state.sinking
+        return sinking.caught or sinking.held is not None
 
     @property
     def cause(self) -> Cause:

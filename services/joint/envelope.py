@@ -14,9 +14,8 @@ second, because the eased part of a lead comes with it. One that does more takes
 ramped up in 0.3 s, knees and hips threw it off the floor.
 
 A reference comes with its rate, so an ankle's goes the way its rate says: to 0.3 mrad while a
-person leads, 20 mrad while the height follows a reference of its own or is probed. One that goes
-another way by more than `q_ref_astray` / `ASTRAY_S` is wrong: drifting by 0.3 rad/s it took the
-robot over.
+person leads, 20 mrad while the height follows a reference of its own. One that goes another way by
+more than `q_ref_astray` / `ASTRAY_S` is wrong: drifting by 0.3 rad/s it took the robot over.
 
 A command with `hold` is obeyed anyway, but a module that refused its numbers is not ready to track
 (`Failsafe.ready`), so no planner leads with such numbers.

@@ -63,7 +63,7 @@ class NeighbourRow(NamedTuple):
     mode: int
     """`Mode`."""
     caught: int = 0
-    """1: a knee that does not sink any more."""
+    """1: in DAMP it no longer sinks: a knee that was caught, or a module that has stiffened."""
     silent: int = 0
     """1: its drive has been silent for `SILENT_NS`, and is not yet lost."""
 

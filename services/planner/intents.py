@@ -4,34 +4,27 @@ An intent that is not repeated goes stale: an operator who requested 100 N and l
 lifted forever. It fades out slowly, because somebody may still lean on the robot:
 
     request = intent                                       younger than `assist.stale_ms`
-    request = intent max(0, 1 - (age - stale) / fade)      older; a probe, or sinking, ends then
+    request = intent max(0, 1 - (age - stale) / fade)      older; sinking ends then
 """
 
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
-from services.planner.law.probe import NO_ROW
 from shared.bus.messages import STRAIGHT, OperatorIntent, Vector4
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import AssistConfig
 
-P_ROWS: Final = 6
-
 
 class OperatorRequest(NamedTuple):
-    """Assist force, shift and probe that the operator requests."""
+    """Assist force and shift that the operator requests."""
 
     assist_n: float = 0.0
     shift: Vector4 = STRAIGHT
     """x, y in m; roll, yaw in rad."""
     source: str = ""
     """Name of the requester; "" if nobody requests anything, or the intent is stale."""
-    probe_row: int = NO_ROW
-    """Row of p that is probed; `NO_ROW`: none."""
-    probe: float = 0.0
-    """Its offset, m or rad."""
     sit: bool = False
     """Go down by itself to the lowest pose (`services.planner.law.height`)."""
 
@@ -47,15 +40,9 @@ class Intents:
 
     def receive(self, intent: OperatorIntent, now_ns: int) -> None:
         """Store an intent that has arrived; ignore one with a value that cannot be."""
-        finite = all(map(math.isfinite, (intent.assist_n, *intent.shift, intent.probe)))
-        if finite and NO_ROW <= intent.probe_row < P_ROWS:
+        if all(map(math.isfinite, (intent.assist_n, *intent.shift))):
             self._request = OperatorRequest(
-                intent.assist_n,
-                intent.shift,
-                intent.source,
-                intent.probe_row,
-                intent.probe,
-                intent.sit,
+                intent.assist_n, intent.shift, intent.source, intent.sit
             )
             self._received_ns = now_ns
 

@@ -256,8 +256,7 @@ class RunEventKind(IntEnum):
     FAULTED = 5
     """A drive's fault began; the subject is the module, the detail the kind."""
     STALLED = 6
-    """The machine, a core of it, all joint services or the simulator stood still until then; the
-    subject says which, the detail for how long."""
+    """The machine stalled until then; the detail says for how long."""
 
 
 def name_of(kind: type[IntEnum], code: int) -> str:
@@ -499,10 +498,6 @@ class PlannerStatus(Message, frozen=True):
     (`services.planner.law.load`)."""
     requested_by: str = ""
     """Source of the intent in use; empty: none, or it is stale."""
-    probe_row: Int64 = -1
-    """Row of p that is asked to be offset; -1: none."""
-    probe: float = 0.0
-    """The offset that is asked for, m or rad."""
     refused: Int64 = 0
     """States, wrenches and attitudes refused so far: no sensor can have measured them."""
     sit: bool = False
@@ -524,10 +519,6 @@ class OperatorIntent(Message, frozen=True):
     """Requested offset from a straight stand: COM x and y, m; torso's roll and yaw, rad."""
     source: str = ""
     """Name of the sender."""
-    probe_row: Int64 = -1
-    """Row of p whose reference is offset to measure the answer; -1: none (`xrl drive tune`)."""
-    probe: float = 0.0
-    """Its offset, m or rad."""
     sit: bool = False
     """The robot is to go down by itself to its lowest pose, and hold there (`xrl down`)."""
 

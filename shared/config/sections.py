@@ -27,7 +27,7 @@ class MassConfig(Section, frozen=True):
     payload_max: Mass
     """The largest `payload` that the file may name."""
     payload_com: tuple[PayloadPlace, PayloadPlace, PayloadPlace] = (0.0, 0.0, 0.0)
-    """Centre of the payload, m, torso axes, from the torso's origin: `xrl drive identify`."""
+    """Centre of the payload, m, torso axes, from the torso's origin."""
 
 
 class GeometryConfig(Section, frozen=True):
@@ -99,9 +99,6 @@ ShiftAngle = Annotated[float, Range(0.0, 0.3, "rad")]
 StanceLength = Annotated[float, Range(0.0, 0.3, "m")]
 StanceAngle = Annotated[float, Range(0.0, 0.8, "rad")]
 Stance6 = tuple[StanceLength, StanceLength, StanceLength, StanceAngle, StanceAngle, StanceAngle]
-ProbeLength = Annotated[float, Range(0.0, 0.03, "m")]
-ProbeAngle = Annotated[float, Range(0.0, 0.1, "rad")]
-Probe6 = tuple[ProbeLength, ProbeLength, ProbeLength, ProbeAngle, ProbeAngle, ProbeAngle]
 
 
 class LawConfig(Section, frozen=True):
@@ -124,7 +121,6 @@ class LawConfig(Section, frozen=True):
     push_integral_max: Annotated[float, Range(0.0, 200.0, "N")] = 0.0
     """Most of that force; HOLD drops it, and must stand the step."""
     shift_max: tuple[ShiftLength, ShiftLength, ShiftAngle, ShiftAngle] = (0.0, 0.0, 0.0, 0.0)
-    probe_max: Probe6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     stance_max: Stance6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     load_correction: tuple[
         Annotated[float, Range(0.0, 50.0, "kg")], Annotated[float, Range(0.0, 100.0, "N m")]

@@ -14,7 +14,6 @@ from services.planner.intents import OperatorRequest
 from services.planner.law.coupling import CoupledTorque, PushIntegral
 from services.planner.law.levelling import Levelling, up_of
 from services.planner.law.load import Load
-from services.planner.law.probe import ReferenceProbe
 from services.planner.law.shift import ShiftReference
 from services.planner.planner import Planner, PlannerState
 from services.planner.state_phases import StatePhases
@@ -62,11 +61,6 @@ def shift(follower: ShiftReference, tick: int) -> Any:
     return *p, *pdot
 
 
-def probe(reference: ReferenceProbe, tick: int) -> Any:
-    reference.advance(2, 0.01 if tick < 300 else -0.01, P, REST, DT)
-    return reference.state.row, reference.state.offset
-
-
 def level(levelling: Levelling, tick: int) -> Any:
     told = up_of((0.05, 0.01) if tick < 50 else (0.02, 0.0))
     levelling.advance(told, np.zeros(3), DT, jump=True)
@@ -96,14 +90,12 @@ def loaded(kg: float) -> Part:
     )
 
 
-MOST = (0.01,) * 6
 PARTS = {
     "coupling": Part(lambda robot: CoupledTorque(3.0, PushIntegral(robot.law)), couple),
     "levelling": Part(lambda _: Levelling(1.0), level),
     "a load of 9 kg": loaded(9.0),
     "3 kg less": loaded(-3.0),
     "phases": Part(lambda _: StatePhases(500.0, 250.0), phase, 120),
-    "probe": Part(lambda _: ReferenceProbe(MOST, (0, 0, 1, 0, 1, 0)), probe, 500),
     "shift": Part(lambda _: ShiftReference((0.03, 0.04, 0.06, 0.12)), shift),
     "trips": Part(PlannerTrips, trip, 24),
     "unattended": Part(lambda _: Unattended(), drift),

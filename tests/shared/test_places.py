@@ -35,8 +35,8 @@ from tools.verbs import estop
 
 SAID = "config: ./robot.toml\n"
 DECIDE_LATER = {
-    "doctor", "drive configure", "drive identify body", "drive identify joint", "drive jog",
-    "drive tune", "drive zero", "estop", "log explain", "log play", "view",
+    "doctor", "drive configure", "drive identify", "drive jog", "drive zero", "estop",
+    "log explain", "view",
 }  # fmt: skip
 """Verbs that take a running fleet's or a record's robot before they look for a file."""
 

@@ -394,14 +394,11 @@ def test_a_port_opened_in_so_many_words_is_taken_and_a_log_of_one_is_read(tmp_pa
     assert config_file.parse(config_file.to_toml(silent), "log").bus.endpoints == PORT
 
 
-def test_a_service_starts_though_another_hosts_name_is_not_known(
-    bus: Bus, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_service_starts_though_another_hosts_name_is_not_known(bus: Bus, tmp_path: Path) -> None:
     endpoints = bus.robot.bus.endpoints | {"imu": "tls/no-such-host.invalid:7447"}
     other = msgspec.structs.replace(bus.robot.bus, endpoints=endpoints)
     with open_session(msgspec.structs.replace(bus.robot, bus=other), "planner", tmp_path):
         pass
-    assert "no-such-host.invalid" in caplog.text
 
 
 @pytest.mark.parametrize("umask", [0o000, 0o022])

@@ -11,7 +11,7 @@ import pytest
 
 from shared.exceptions import RunError
 from tests.tools.exit_codes import exit_code
-from tests.tools.logs.reexecution.test_golden import NEWEST
+from tests.tools.logs.reexecution.test_golden import GOLDEN
 from tests.tools.test_bad_input import made_up
 from tools.judge import verdict
 from tools.logs.run_log import read_run
@@ -29,7 +29,6 @@ RECORDS: Final = {
     "recorder": ("flush_ms",),
     "recovered": ("from",),
     "packages": ("xrl", HOSTILE),
-    "joined": (HOSTILE,),
     HOSTILE: (HOSTILE,),
 }  # fmt: skip
 """Metadata that a verb prints."""
@@ -65,7 +64,7 @@ def with_hostile_words(_key: str, t_ns: int, data: bytes) -> tuple[int, bytes]:
 
 @pytest.fixture(scope="module")
 def hostile(tmp_path_factory: pytest.TempPathFactory) -> str:
-    robot = read_run(NEWEST).robot
+    robot = read_run(GOLDEN).robot
     return made_up(
         tmp_path_factory.mktemp("hostile") / "run.mcap",
         {name: dict.fromkeys(fields, HOSTILE) for name, fields in RECORDS.items()},

@@ -40,7 +40,6 @@ from services.planner.law.kinematics import Measured
 from services.planner.law.law_terms import LawAtReference
 from services.planner.law.levelling import Levelling
 from services.planner.law.load import Load, LoadState
-from services.planner.law.probe import NO_ROW, ProbeState, ReferenceProbe
 from services.planner.law.reference import Reference
 from services.planner.law.shift import ShiftReference, ShiftState
 from services.planner.law.split import GainSplit, LocalGains
@@ -110,7 +109,6 @@ class LawState(msgspec.Struct):
     stance: tuple[Vector6, bool] = (AS_CONFIGURED, False)
     """State of `Stance`: the adopted stance, m and rad, and True if it is refused."""
     load: LoadState = msgspec.field(default_factory=LoadState)
-    probe: ProbeState = msgspec.field(default_factory=ProbeState)
     height: HeightState = msgspec.field(default_factory=HeightState)
 
 
@@ -137,7 +135,6 @@ class Hocca:
         self._S_perp = 1.0 - self._S
         self._levelling = Levelling(config.imu.levelling_s)
         self._shift = ShiftReference(config.law.shift_max)
-        self._probe = ReferenceProbe(config.law.probe_max, config.law.S)
         low, high = config.joint_service.damp_knee_stop, config.limits.knee.theta[1]
         self._height = HeightReference((low, high))
         self.stance = Stance(config.law.stance_max)
@@ -158,7 +155,6 @@ class Hocca:
             easing=self._easing.state,
             shift=self._shift.state,
             load=self.load.state,
-            probe=self._probe.state,
             height=self._height.state,
         )
 
@@ -170,7 +166,6 @@ class Hocca:
         dt: float,
         *,
         shift_requested: Vector4 = STRAIGHT,
-        probe: tuple[int, float] = (NO_ROW, 0.0),
         toward: Toward = Toward.PERSON,
         released: Released = (False, False),
         pitch_drive: float = 0.0,
@@ -187,8 +182,6 @@ class Hocca:
                 except in the first tick, which takes over the assist that HOLD carries.
             dt: time since the last tick, s.
             shift_requested: requested x, y (m), roll and yaw (rad) of the shift; limited here.
-            probe: row of p whose reference is offset, and by how much, m or rad
-                (`services.planner.law.probe`).
             toward: where to go without a hand (`services.planner.law.height`).
             released: nobody leads the height, the pitch.
             pitch_drive: acceleration of a pitch that nobody leads, rad/s^2.
@@ -215,11 +208,9 @@ class Hocca:
         if align or not self._state.aligned:
             self._align(q)
             self._shift.rest()
-            self._probe.reset()
             self._height.reset()
         else:
             self._state.has_led = True
-            self._probe.advance(*probe, measured.p, measured.pdot, dt)
             self._shift.advance(shift_requested, dt)
         pdot = measured.pdot
         p_C, pdot_C = self._closed_loop_reference(dt)
@@ -229,7 +220,6 @@ class Hocca:
         pdot_C[:2] += lean * pdot[2]
         p_ref = self._S_perp * p_C + self._S * measured.p
         pdot_ref = self._S_perp * pdot_C + self._S * pdot
-        self._probe.apply(p_ref, pdot_ref, measured.p, pdot)
         force, moment_pitch = None, 0.0
         if wrench is not None:
             force = force_up(wrench.force, measured.p[3], measured.p[4])
@@ -267,8 +257,7 @@ class Hocca:
         e_p, e_pdot = p_ref - measured.p, pdot_ref - pdot
         terms = self._terms.evaluate(reference, e_p, e_pdot)
         integral = self._coupling.integral
-        if self._probe.state.row != Y:  # it measures the body's answer to an error
-            integral.advance(float(e_p[Y]), float(e_pdot[Y]), dt)
+        integral.advance(float(e_p[Y]), float(e_pdot[Y]), dt)
         tau_unfiltered = terms.coupled + integral.force * reference.J[Y]
         tau_coupled = self._coupling.advance(tau_unfiltered, dt)
         # the eased lead goes into tau_coupled, which HOLD drops; in tau_ff it would outlive the
@@ -354,7 +343,7 @@ class Hocca:
             own.easing,
             own.shift,
         )
-        self.load.state, self._probe.state, self._height.state = own.load, own.probe, own.height
+        self.load.state, self._height.state = own.load, own.height
         self._p_C0 = np.array(own.p_C0)
         self.reference.start[:] = own.q
         self._coupling.restore(own.coupling)

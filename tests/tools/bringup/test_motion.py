@@ -15,7 +15,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
 from tests.tools.bringup.bench_drive import MODULE, PLAN, START, BenchDrive, jog_by
 from tools.bringup.hanging_leg import HangingJoint
-from tools.bringup.identify.sines import plan_for
+from tools.bringup.identify import plan_for
 from tools.bringup.jog import JogCheck, judge, what_to_see
 from tools.bringup.motion import (
     AnyPlan,
@@ -24,7 +24,6 @@ from tools.bringup.motion import (
     why_out_of_reach,
     within_stops,
 )
-from tools.bringup.tune.excitation import excitation
 
 LED = plan_for(1, 15.0, 0.0, HangingJoint(9.4, 88.0, (0.0, -0.3)))
 
@@ -43,7 +42,7 @@ def test_the_reference_is_smooth_stays_in_its_reach_and_ends_where_it_began(
     np.testing.assert_allclose(np.gradient(q, t), v, atol=2e-3)
 
 
-@pytest.mark.parametrize("course", [PLAN.course, LED.course, excitation(0.01)])
+@pytest.mark.parametrize("course", [PLAN.course, LED.course])
 def test_a_course_goes_as_far_as_its_span_says_and_no_farther(course: object) -> None:
     plan = PLAN._replace(course=course)  # type: ignore[arg-type]
     t = np.linspace(0.0, plan.course.duration_s, 60001)

@@ -165,8 +165,6 @@ class PlannerExecution:
             assist_n=status.assist_requested_n,
             shift=status.shift_requested,
             source=status.requested_by,
-            probe_row=status.probe_row,
-            probe=status.probe,
             sit=status.sit,
         )
         return given

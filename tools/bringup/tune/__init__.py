@@ -1,1 +1,0 @@
-"""What `xrl drive tune` does: offsets a reference by known amounts; how the robot answers."""
