@@ -112,10 +112,10 @@ class PassThrough(DriveManager):
                 tracks = step.event.mode_after == Mode.TRACK
                 self._tracks_since_ns = now_ns if tracks else None
             return step
-        controller = self.controller
+        controller = self.state.controller
         controller.cycle += 1
         if reading is not None:
-            controller.samples.take(reading, armed=True)
+            controller.estimate.take(reading, armed=True)
         if command is not None and all(map(math.isfinite, command.tau_ff)):
             controller.failsafe.command = command  # its age goes into the states
             controller.tau = limit_differential(command.tau_ff, self._tau_module_max)
