@@ -18,6 +18,7 @@ FILES = (
     "scenarios",
     "plants",
     "foxglove",
+    "nftables",
     "sysctl",
     "udev",
 )

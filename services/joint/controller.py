@@ -11,17 +11,21 @@ from typing import Final
 import msgspec
 
 from services.joint import pd_law
-from services.joint.differential import joint_torque, motor_torque
+from services.joint.differential import (
+    joint_torque,
+    limit_differential,
+    limit_torque,
+    limits_of,
+    motor_torque,
+)
 from services.joint.drivers.base import DriveReading
 from services.joint.envelope import NOTHING_YET, Envelope, Lately
 from services.joint.failsafe import Event, Failsafe, timing_of
 from services.joint.heat import HeatEstimate, HeatState
-from services.joint.joint_estimate import JointEstimate
+from services.joint.joint_estimate import JointEstimate, SampleClock
 from services.joint.neighbours import SILENT_NS, UNKNOWN, NeighbourRow, NeighbourView
 from services.joint.pd_law import Setpoint
-from services.joint.sample_clock import SampleClock
 from services.joint.setpoint_law import SetpointLaw, SetpointState
-from services.joint.torque_limiter import limit_differential, limit_torque, limits_of
 from services.joint.trips import JointTrips
 from services.joint.trips import limits_of as trip_limits_of
 from shared.bus.messages import Cause, JointCommand, JointEvent, JointState, Mode, Outside, Pair

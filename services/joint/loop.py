@@ -23,8 +23,7 @@ from services.joint.drive_manager import (
 from services.joint.drivers.base import Drive, DriveStatus
 from services.joint.heat import HeatFile
 from services.joint.neighbours import UNKNOWN, NeighbourRow, NeighbourView
-from services.joint.pendant import PendantWatch
-from services.joint.rearm_guard import PENDANT, LastState, RearmGuard
+from services.joint.rearm_guard import PENDANT, LastState, PendantWatch, RearmGuard
 from services.joint.tracer import Tracer
 from shared import log
 from shared.bus.messages import Cause, Estop, JointCommand, JointEvent, JointState, Mode

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from services.joint.torque_limiter import limits_of
+from services.joint.differential import limits_of
 from services.planner.law.model import HangingLegs
 from shared.bus.messages import Pair
 from shared.config.robot_config import RobotConfig

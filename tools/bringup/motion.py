@@ -13,10 +13,9 @@ from typing import Any, Final, Generic, NamedTuple, Protocol, TypeVar
 import msgspec
 
 from services.joint import pd_law
-from services.joint.differential import joint_from_motor
+from services.joint.differential import TorqueLimits, joint_from_motor, limit_torque, limits_of
 from services.joint.drive_setpoint import DriveGains, DriveSetpointLaw
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
-from services.joint.torque_limiter import TorqueLimits, limit_torque, limits_of
 from shared.bus.messages import Pair
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig

@@ -10,7 +10,7 @@ from shared.bus import security
 from shared.bus.credentials import Credentials, read_credentials
 from shared.bus.security import TCP
 from shared.bus.session import Session, peers_of
-from shared.bus.sockets import Arrivals, resolved
+from shared.bus.sockets import Arrivals, addresses_of
 from shared.bus.tls_probe import own_fault, refusal
 from shared.clock import now_ns
 from shared.config.endpoints import host_and_port
@@ -80,4 +80,4 @@ def _is_in(endpoint: str, linked: Collection[tuple[str, int]]) -> bool:
     if not endpoint.startswith(TCP):
         return True
     host, port = host_and_port(endpoint)
-    return any((str(address), port) in linked for address in resolved([host])[0])
+    return any((str(address), port) in linked for address in addresses_of(host))

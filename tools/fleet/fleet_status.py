@@ -61,18 +61,13 @@ _FRESH_S: Final = 1.0
 _POLL_S: Final = 0.002
 
 
-class ServiceStatus(msgspec.Struct, frozen=True):
+class ServiceStatus(ServiceInfo, frozen=True):
     """One service, by its supervisor and by its messages."""
 
-    pid: int | None
-    state: str
-    uptime_s: float
-    age_s: float | None
+    age_s: float | None = None
     """Age of its newest message; None if none has come, or it publishes none steadily."""
-    rate_hz: float | None
+    rate_hz: float | None = None
     """Its messages per second, by their sequence numbers; None as for `age_s`."""
-    restarts: int
-    last_exit: str
     real_time: bool | None = None
     """It has a real-time priority; None if it does not run, or is to have none."""
 
@@ -275,16 +270,8 @@ def read_status(
 def _service_status(
     info: ServiceInfo, age_s: float | None = None, rate_hz: float | None = None
 ) -> ServiceStatus:
-    return ServiceStatus(
-        pid=info.pid,
-        state=info.state,
-        uptime_s=info.uptime_s,
-        age_s=age_s,
-        rate_hz=rate_hz,
-        restarts=info.restarts,
-        last_exit=info.last_exit,
-        real_time=_real_time(info),
-    )
+    known = msgspec.structs.asdict(info)
+    return ServiceStatus(**known, age_s=age_s, rate_hz=rate_hz, real_time=_real_time(info))
 
 
 def _is_read_only(folder: Path) -> bool:

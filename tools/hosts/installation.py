@@ -14,23 +14,24 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError
 from tools.hosts.hosts_file import Host, Hosts, principals_on
 from tools.hosts.layout import (
+    FIREWALL,
     KEYS,
     LINK,
     NETWORK_UNIT,
+    NFT,
     ROBOT_FILE,
     RUN_DIR,
     SCHEDULE,
     UNIT,
+    firewall,
     network_unit,
     robot_on_hosts,
     unit,
 )
 from tools.hosts.probe import Probe, digest
-from tools.hosts.remote import ClockOffset, Remote
+from tools.hosts.remote import Remote
 from tools.keys.authority import Authority, bundle
 
-CLOCK_MAX_S: Final = 1.0
-"""Certificates and the names of records go by the clock; ages do not."""
 _AT_REST: Final = ("inactive", "failed", "unknown")
 """States of a unit whose services are down."""
 _UNIT_FOLDER: Final = "/etc/systemd/system"
@@ -49,9 +50,8 @@ class HostRow(NamedTuple):
     """One host in the table of `xrl hosts check`."""
 
     name: str
+    reached: bool = False
     revision: str = ""
-    clock: ClockOffset | None = None
-    """None: it was not reached."""
     unit: str = "-"
     """State of its unit by systemd."""
     made_from: tuple[str, str] = ("", "")
@@ -69,6 +69,7 @@ def files_of(
     files = [
         HostFile(f"{folder}/{ROBOT_FILE}", config_file.to_toml(spread).encode()),
         HostFile(f"{folder}/{SCHEDULE}", schedule),
+        HostFile(f"{folder}/{FIREWALL}", firewall(spread).encode()),
         HostFile(f"{_UNIT_FOLDER}/{UNIT}", unit(hosts, host).encode()),
     ]
     if host.private:
@@ -126,7 +127,7 @@ def check(hosts: Hosts, remote: Remote, files: list[HostFile]) -> HostRow:
     python, config = f"{hosts.checkout}/.venv/bin/python", f"{hosts.folder}/{ROBOT_FILE}"
     # the module is found in the installed package, wherever the command starts
     words = ("-P", "-m", "tools.hosts.probe", "--config", config, "--run-dir", RUN_DIR)
-    line, clock = remote.echoed(python, *words)
+    line = remote.must(python, *words, as_user=True)
     try:
         probe = msgspec.json.decode(line.encode(), type=Probe)
     except msgspec.DecodeError:
@@ -142,23 +143,22 @@ def check(hosts: Hosts, remote: Remote, files: list[HostFile]) -> HostRow:
         own_unit = remote.run("cat", f"{_UNIT_FOLDER}/{name}").out if name in wanted else ""
         if name in wanted and digest(own_unit.encode()) != wanted[name]:
             wrong.append(f"another {name}; `xrl hosts update`")
-    state = _state(remote)
+    state, warnings = _state(remote), list(probe.warnings)
     if remote.host.private and state not in _AT_REST:
         inside = remote.run("cat", "/proc/net/dev", on_bus=True).out
         outside = [n for n in (*remote.host.private, LINK) if f"{n}:" not in inside]
         if outside:
             wrong.append(f"not in the services' network: {', '.join(outside)} (docs/hosts.md)")
+    if state not in _AT_REST and remote.run(NFT, "list", "table", "inet", "xrl", on_bus=True).code:
+        warnings.append(f"no firewall at its ports: `nft -f {hosts.folder}/{FIREWALL}`")
     if not probe.revision:
         wrong.append(f"of no known version: {hosts.checkout} is no git checkout that can be read")
-    warnings = list(probe.warnings)
     if probe.revision.endswith("+"):
         warnings.append(f"{hosts.checkout} has changes of its own")
-    if abs(clock.offset_s) > CLOCK_MAX_S + clock.round_trip_s:
-        warnings.append(f"its clock is {clock.offset_s:+.1f} s off: certificates go by it")
     return HostRow(
         name=remote.host.name,
+        reached=True,
         revision=probe.revision,
-        clock=clock,
         unit=state,
         made_from=(probe.lock, probe.python),
         wrong=tuple(wrong),
@@ -190,7 +190,7 @@ def disagreements(rows: list[HostRow]) -> list[str]:
     """Return what is not the same on all hosts that were reached."""
     wrong = []
     for word, value_of in _SAME_ON_ALL.items():
-        found = {row.name: value_of(row) for row in rows if row.clock is not None}
+        found = {row.name: value_of(row) for row in rows if row.reached}
         if len(set(found.values())) > 1:
             rest = ", ".join(f"{name} {value or 'none'}" for name, value in found.items())
             wrong.append(f"several {word}: {rest}")

@@ -280,7 +280,7 @@ def test_real_time_is_expected_of_running_services_that_the_table_gives_it(
 
 def test_services_without_real_time_are_told() -> None:
     def row(real_time: bool | None) -> ServiceStatus:
-        return ServiceStatus(1, "running", 1.0, None, None, 0, "", real_time)
+        return ServiceStatus("x", 1, "running", 1.0, real_time=real_time)
 
     status = msgspec.structs.replace(
         fleet_with(7), services={"planner": row(False), "hip_left": row(True), "view": row(None)}

@@ -59,9 +59,9 @@ _PAIR: Final = numbers(2, "phi and theta in rad, such as 0,-0.5")
 class ZeroFlags(FleetRobotFlags):
     """Which modules, and where their joints are."""
 
-    module: Annotated[str | None, positional("MODULE", choices=MODULES, exclusive="which!")] = None
+    module: Annotated[str | None, positional("MODULE", choices=MODULES, one_of="which")] = None
     """one module"""
-    all: Annotated[bool, Arg(exclusive="which!")] = False
+    all: Annotated[bool, Arg(one_of="which")] = False
     """all six"""
     at: Annotated[Pair | None, parsed(_PAIR, "PHI,THETA", exclusive="where")] = None
     """the joint is at these angles now, rad, as 0,-0.5"""

@@ -16,13 +16,13 @@ from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
+from tools.judge.reports.page_model import PageModel, Panel
 
 from shared.arrays import Array
 from shared.bus import topics
 from shared.clock import NS_PER_S
 from tests.shared.mcap_log.runs import Queue, writer_like
 from tools import cli
-from tools.judge.reports.page_model import PageModel, Panel
 from tools.judge.reports.run_data import RunData
 from tools.logs.run_log import RunLog, Series, read_run
 

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tools.judge.reports.timeline import timeline_events
+from tools.judge.reports.torques import torque_terms
 
 from shared.bus import topics
 from shared.bus.messages import JointState, Mode
@@ -18,8 +20,6 @@ from tools.judge.reports import page as page_module
 from tools.judge.reports import panels
 from tools.judge.reports.page import render
 from tools.judge.reports.run_data import RunData
-from tools.judge.reports.timeline import timeline_events
-from tools.judge.reports.torques import torque_terms
 from tools.logs.run_log import RunLog, read_run
 
 PLOTS = {
