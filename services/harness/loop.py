@@ -70,7 +70,7 @@ _KEPT: Final = struct.Struct(f"<{N_LEGS}dI")
 _BOOT: Final = Path("/proc/sys/kernel/random/boot_id")
 
 
-def path_of(run_dir: Path) -> Path:
+def zero_path(run_dir: Path) -> Path:
     """Return where the zero is kept."""
     return live_dir(run_dir) / "harness.zero"
 
@@ -84,7 +84,7 @@ class ZeroFile:
         Raises:
             FleetError: it cannot be made.
         """
-        self._memory = mapped(path_of(run_dir), _KEPT.size)
+        self._memory = mapped(zero_path(run_dir), _KEPT.size)
         self._boot = _BOOT.read_bytes() if boot is None else boot
 
     def read(self) -> Array | None:

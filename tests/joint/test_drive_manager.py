@@ -27,6 +27,7 @@ from services.joint.sinking import DOUBT_NS
 from shared.bus.messages import Mode, Pair
 from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_MS, NS_PER_S
+from shared.state import copied
 from tests.joint.helpers import ROBOT, LoopName, ModuleBench
 
 MODES = (Mode.HOLD, Mode.TRACK, Mode.DAMP)
@@ -141,7 +142,7 @@ def test_a_jump_is_believed_only_as_the_link_is_read_out_after_a_freeze(
     bench.q = (0.02, -1.1)
     bench.run(100 * bench.cycle_ns)
     assert bench.mode is (Mode.HOLD if frozen_ns else Mode.FAULT)
-    assert (bench.controller.samples.q == pytest.approx(bench.q)) is (frozen_ns > 0)
+    assert (bench.controller.estimate.q == pytest.approx(bench.q)) is (frozen_ns > 0)
 
 
 def test_after_a_freeze_the_event_has_the_torques_carried(bench: ModuleBench) -> None:
@@ -169,7 +170,7 @@ def test_uncontrolled_it_listens_to_nothing(bench: ModuleBench, status: DriveSta
     bench.freeze(2 * GAP_NS, MOVED)
     for _ in range(3):
         bench.cycle(silent=status is DriveStatus.IDLE)
-        assert bench.module.snapshot().listen_until_ns == 0
+        assert bench.module.state.listen_until_ns == 0
     assert bench.mode in (Mode.FAULT, Mode.DISARMED)
 
 
@@ -273,7 +274,7 @@ def test_samples_that_jump_as_the_link_is_read_out_after_a_freeze_lack_no_turns(
     bench.zero = (0.25, 0.75)
     bench.cycle()
     bench.run(NS_PER_S // 10)
-    assert not bench.controller.samples.turns_lost
+    assert not bench.controller.estimate.turns_lost
     assert bench.mode is Mode.HOLD
 
 
@@ -282,7 +283,7 @@ def test_what_the_neighbours_do_comes_through(bench: ModuleBench) -> None:
     assert bench.module.needs_neighbours
     for _ in range(2 * DOUBT_NS // bench.cycle_ns):
         bench.cycle(silent=True, estop=True, near=NeighbourView(sinks=False))
-    assert bench.controller.caught
+    assert bench.controller.law.stays
 
 
 def test_a_module_knows_its_bus_and_its_motors_limit(held: ModuleBench) -> None:
@@ -346,7 +347,7 @@ def test_a_drive_left_in_damp_goes_on_with_damps_own_gains(module: str) -> None:
     bench.cycle(estop=True)
     bench.run(1000 * bench.cycle_ns)
     assert bench.mode is Mode.DAMP
-    own = bench.controller.setpoint
+    own = bench.controller.law.current
     wanted = (sum(own.k_p) / 2.0, sum(own.k_d) / 2.0)
     assert joint_gains(bench) == pytest.approx(wanted, rel=0.03)
 
@@ -404,17 +405,19 @@ def test_a_module_goes_on_from_its_snapshot_bit_for_bit_and_shares_nothing_with_
         bench.freeze(NS_PER_S, MOVED)
     bench.v = (0.6, -0.3) if begins == "shaking" else bench.v
     bench.run(cycles * bench.cycle_ns) if told is None else bench.lead(3 + cycles, **told)
-    snapshot = bench.module.snapshot()
-    assert min(snapshot.controller.state.trips.mean) > 0.0 or begins != "shaking"
-    assert min(*snapshot.gains, snapshot.gains_changed_ns) > 0
+    snapshot = copied(bench.module.state)
+    assert min(snapshot.controller.trips.mean) > 0.0 or begins != "shaking"
+    assert min(snapshot.gains.stiffness, snapshot.gains.damping, snapshot.gains.changed_ns) > 0
     text = msgspec.json.encode(snapshot)
     read = msgspec.json.decode(text, type=DriveManagerState)
-    twin.module.restore(read)
-    assert twin.module.snapshot() == snapshot
+    twin.module.state = copied(read)
+    assert twin.module.state == snapshot
     twin.now_ns, twin.q, twin.v, twin.status = bench.now_ns, bench.q, bench.v, bench.status
     for _ in range(200):
         assert bench.cycle() == twin.cycle()
-        assert bench.controller.is_state_due is twin.controller.is_state_due
-    assert bench.controller.state(bench.now_ns) == twin.controller.state(twin.now_ns)
-    assert bench.module.snapshot() == twin.module.snapshot()
+        assert bench.law.is_state_due(bench.controller) is twin.law.is_state_due(twin.controller)
+    assert bench.law.state(bench.controller, bench.now_ns) == twin.law.state(
+        twin.controller, twin.now_ns
+    )
+    assert bench.module.state == twin.module.state
     assert msgspec.json.encode(snapshot) == msgspec.json.encode(read) == text

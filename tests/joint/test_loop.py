@@ -112,7 +112,7 @@ class Rig:
         self.period_ns = round(1e9 / robot.joint_service.rate_hz)
         self.drive = FakeDrive(self)
         module = DriveManager(robot, "knee_right", file.read() if file else LastState.NOTHING)
-        self.controller = module.controller
+        self.law, self.controller = module.controller, module.state.controller
         self.commands, self.estops = Inbox[JointCommand](), Inbox[Estop]()
         self.states, self.events = Outbox[JointState](), Outbox[JointEvent]()
         self.traces = Outbox[JointTrace]()
@@ -302,7 +302,7 @@ def test_the_end_of_the_planners_process_is_hold_in_that_cycle_and_traced(onboar
     onboard.run(1)
     event = onboard.events.sent[-1]
     assert (onboard.mode, event.cause) == (Mode.HOLD, Cause.PLANNER_ENDED)
-    assert event.age_ns < onboard.controller.timing.max_command_age_ns, "it was not the age rule"
+    assert event.age_ns < onboard.law.timing.max_command_age_ns, "it was not the age rule"
     onboard.run(20)
     cycles = [each for trace in onboard.traces.sent for each in trace.cycles]
     ended = {at: each.ended for at, each in enumerate(cycles, 1) if each.ended}

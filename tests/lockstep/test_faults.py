@@ -109,7 +109,7 @@ def test_a_restart_arms_again_unless_the_zero_is_lost(faulted: Faulted) -> None:
     fleet = faulted.run.lockstep
     if faulted.row.zero_lost:
         assert faulted.run.modes[INDEX] is Mode.DISARMED
-        assert fleet.controllers[INDEX].samples.status is DriveStatus.UNZEROED
+        assert fleet.controllers[INDEX].estimate.status is DriveStatus.UNZEROED
         assert not fleet.bank.torque[AXES].any()
     else:
         assert faulted.run.modes == [Mode.TRACK] * 6
@@ -120,7 +120,7 @@ def test_what_a_lost_encoder_reports_is_never_taken_for_the_joint() -> None:
     scenario = still(AT + BLIND_S + 0.02, fault=fault("encoder", "knee_left", AT))
     thetas = []
     outcome = run(
-        ROBOT, scenario, each=lambda fleet, _: thetas.append(fleet.controllers[knee].samples.q[1])
+        ROBOT, scenario, each=lambda fleet, _: thetas.append(fleet.controllers[knee].estimate.q[1])
     )
     assert thetas[-1] == pytest.approx(thetas[-4], abs=0.02), "as before the fault"
     held = outcome.steps_nm("knee_left", after=Mode.HOLD)
@@ -157,7 +157,7 @@ def test_a_power_cut_of_all_buses_in_a_squat_brings_no_old_frame(lasts: float) -
     told_s = set()
 
     def look(fleet: Lockstep, row: SimTruth) -> None:
-        statuses = {each.samples.status for each in fleet.controllers}
+        statuses = {each.estimate.status for each in fleet.controllers}
         if statuses == {DriveStatus.UNACKNOWLEDGED}:
             told_s.add(row.scenario_s - 1.5)
 

@@ -136,7 +136,7 @@ def draw(seed: int) -> list[Outcome]:
         axes = [2 * i, 2 * i + 1]
         zeroed = bool(np.all(np.abs(bank.encoder_turns[axes] - mark) < 0.5 * mark))
         missing = bool(np.any(np.abs(off[axes] - mark) > 0.5)) or not zeroed
-        armed = module.controller.samples.status is DriveStatus.ARMED
+        armed = module.state.controller.estimate.status is DriveStatus.ARMED
         found.append(Outcome(missing, zeroed, armed))
     return found
 
