@@ -261,7 +261,7 @@ def begins() -> list[Begin]:
 
 def begin(robot: RobotConfig, name: str, at: float) -> Begin:
     scenario = variant(name, duration=20.0, kill=(), push=())
-    return Begin(name, at, moment_of(robot, scenario, at, stands=False))
+    return Begin(name, at, moment_of(robot, scenario, at))
 
 
 def end(robot: RobotConfig, begin: Begin, name: str, lasts_s: float = WRONG_S) -> End:
