@@ -157,11 +157,10 @@ def test_hold_freezes_references_and_drops_the_coupled_torque_over_its_ramp(benc
     bench.to_track(**sent)
     before = np.array(bench.controller.tau)
     bench.cycle(bench.fresh(hold=True, **sent))
-    np.testing.assert_allclose(bench.controller.tau, before, atol=1e-9)
-    bench.run(5)
-    np.testing.assert_allclose(bench.controller.tau, before - np.multiply(COUPLED, 0.5), atol=1e-9)
-    bench.run(400)
-    np.testing.assert_allclose(bench.controller.tau, before - np.array(COUPLED), atol=1e-9)
+    for cycles, dropped in ((0, 0.0), (5, 0.5), (400, 1.0)):
+        bench.run(cycles)
+        left = before - dropped * np.array(COUPLED)
+        np.testing.assert_allclose(bench.controller.tau, left, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -187,8 +186,8 @@ def test_a_new_session_in_track_makes_no_step_in_the_torque(bench: Bench) -> Non
     """Two planners run and the first dies: the second one's references are its own."""
     bench.to_track()
     bench.run(24)
-    assert bench.mode is Mode.TRACK
-    assert not bench.controller.failsafe.is_fresh(bench.now_ns + bench.cycle_ns, bench.law.timing)
+    next_ns, timing = bench.now_ns + bench.cycle_ns, bench.law.timing
+    assert (bench.mode, bench.controller.failsafe.is_fresh(next_ns, timing)) == (Mode.TRACK, False)
     taus = [bench.controller.tau]
     for _ in range(20):
         sent = bench.fresh(session=SESSION + 1, q_ref=(0.02, -0.97))
@@ -198,8 +197,7 @@ def test_a_new_session_in_track_makes_no_step_in_the_torque(bench: Bench) -> Non
 
 def test_late_cycles_are_counted_beyond_twice_the_period(bench: Bench) -> None:
     bench.to_hold()
-    period_ns = bench.cycle_ns
-    late = []
+    period_ns, late = bench.cycle_ns, []
     for after_ns in (period_ns, 2 * period_ns, 2 * period_ns + 1, 1, 10 * period_ns, period_ns):
         bench.cycle(after_ns=after_ns)
         late.append(bench.law.state(bench.controller, bench.now_ns).late)
@@ -259,9 +257,8 @@ def test_a_state_holds_what_the_cycle_saw_and_did(bench: Bench) -> None:
 
 def test_what_the_drive_tells_of_its_heat_is_heard(bench: Bench) -> None:
     bench.to_hold()
-    told = msgspec.structs.replace(
-        bench.reading(), fet_celsius=(71.0, 35.0), motor_celsius=(30.0, 90.0)
-    )
+    warm = {"fet_celsius": (71.0, 35.0), "motor_celsius": (30.0, 90.0)}
+    told = msgspec.structs.replace(bench.reading(), **warm)
     heat, before = bench.controller.heat, bench.controller.heat.winding
     bench.law.step(bench.controller, bench.now_ns + bench.cycle_ns, told, None, estop=False)
     assert heat.stage == (71.0, 35.0)

@@ -83,35 +83,24 @@ def test_at_last_it_holds_as_if_never_frozen(loop: LoopName) -> None:
     for share in (0.25, 0.5, 0.75, 1.0):  # a joint moves, and does not jump
         twin.q = tuple(a + share * (b - a) for a, b in zip((0.02, -1.0), MOVED, strict=True))
         twin.cycle()
-    for _ in range(700):
-        frozen.cycle()
-        twin.cycle()
+    for each in (frozen, twin):
+        each.run(700 * each.cycle_ns)
     assert frozen.mode is twin.mode is Mode.HOLD
     assert frozen.carried() == pytest.approx(twin.carried(), abs=1e-9)
 
 
-def test_a_gap_within_the_age_rule_goes_on_in_track_without_a_step(bench: ModuleBench) -> None:
+@pytest.mark.parametrize("gap_ns", [GAP_NS - 2 * NS_PER_MS, GAP_NS + NS_PER_MS])
+def test_a_gap_within_the_age_rule_goes_on_in_track_without_a_step(
+    bench: ModuleBench, gap_ns: int
+) -> None:
+    """A shorter one is no freeze."""
     bench.to(Mode.TRACK)
-    bench.freeze(GAP_NS + NS_PER_MS, (0.03, -0.98))
+    bench.freeze(gap_ns, (0.03, -0.98))
     carried = bench.carried()
-    for _ in range(20):
-        bench.lead(tau_coupled=(3.0, -4.0))
-        assert bench.carried() == pytest.approx(carried, abs=2.0)
+    orders = [bench.lead(tau_coupled=(3.0, -4.0))[0].command for _ in range(20)]
+    assert (orders[0] is DriveCommand.TARGET) is (gap_ns < GAP_NS)
+    assert bench.carried() == pytest.approx(carried, abs=2.0)
     assert bench.mode is Mode.TRACK
-
-
-def test_shorter_gaps_are_no_freeze(held: ModuleBench) -> None:
-    held.freeze(GAP_NS - held.cycle_ns, held.q)
-    assert held.cycle().command is DriveCommand.TARGET
-
-
-def test_it_sends_nothing_before_the_drive_has_sent(held: ModuleBench) -> None:
-    held.freeze(NS_PER_S, MOVED)
-    silent = [held.cycle(silent=True).command for _ in range(20)]
-    assert silent == [DriveCommand.NOTHING] * 20
-    before = held.carried()
-    assert held.cycle().command is DriveCommand.TARGET
-    assert held.carried() == pytest.approx(before, abs=1e-6)
 
 
 def test_an_emergency_stop_and_a_lost_torque_that_came_meanwhile_are_obeyed_at_once(
@@ -146,18 +135,22 @@ def test_a_jump_is_believed_only_as_the_link_is_read_out_after_a_freeze(
 
 
 def test_after_a_freeze_the_event_has_the_torques_carried(bench: ModuleBench) -> None:
+    """Nothing is sent before the drive has sent, and it is listened to first."""
     bench.to(Mode.TRACK)
     bench.freeze(2 * NS_PER_S, MOVED)
     carried = bench.carried()
-    step = bench.cycle()
-    assert step.command is DriveCommand.NOTHING, "it listens first"
-    assert (step.torque, step.target, step.inhibit) == ((0.0, 0.0), None, ArmingInhibit.NONE)
-    event = step.event
+    silent = [bench.cycle(), *(bench.cycle(silent=True) for _ in range(20))]
+    assert {step.command for step in silent} == {DriveCommand.NOTHING}
+    event = silent[0].event
+    assert (silent[0].torque, silent[0].target) == ((0.0, 0.0), None)
+    assert silent[0].inhibit is ArmingInhibit.NONE
     assert event is not None
     assert (event.mode_before, event.mode_after) == (Mode.TRACK, Mode.HOLD)
     assert event.tau_before == pytest.approx(carried)
-    assert event.tau_after == pytest.approx(bench.controller.tau)
     assert event.tau_after == pytest.approx(carried, abs=1.0)
+    assert event.tau_after == pytest.approx(bench.controller.tau)
+    assert bench.cycle().command is DriveCommand.TARGET
+    assert bench.carried() == pytest.approx(carried, abs=1.0)
 
 
 @pytest.mark.parametrize("status", [DriveStatus.IDLE, DriveStatus.ERROR])
