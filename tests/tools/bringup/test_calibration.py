@@ -19,7 +19,7 @@ from shared.joints import MODULES
 from tests.tools.bringup.bank_board import FIRST, BankBoard
 from tests.tools.bringup.board_in_memory import BoardInMemory, as_wanted
 from tests.tools.bringup.hung_robot import HungRobot
-from tools.bringup import calibrate_robot, calibration
+from tools.bringup import calibration
 from tools.bringup.boards import FoundBoards
 from tools.bringup.calibration import BoardResult, Found, Procedure
 from tools.bringup.can_monitor import BusTraffic, NodeTraffic
@@ -183,7 +183,7 @@ def boards(**readings: float) -> dict[str, BoardInMemory]:
 
 def refuse(robot: RobotConfig, made: dict[str, BoardInMemory], module: str, run_dir: Path) -> None:
     found = FoundBoards({b.serial_number: b for b in made.values()}, {}, ())
-    calibrate_robot.refuse_standing(robot, run_dir, found, {module: AXES})
+    calibration.refuse_standing(robot, run_dir, found, {module: AXES})
 
 
 def test_a_robot_one_of_whose_drives_is_armed_is_refused(
@@ -207,7 +207,7 @@ def test_a_drive_that_is_not_on_usb_is_listened_to_on_can(
     def listen(_: object, nodes: Sequence[int], **__: object) -> BusTraffic:
         return BusTraffic(nodes={node: NodeTraffic(heartbeat=beat) for node in nodes})
 
-    monkeypatch.setattr(calibrate_robot.can_monitor, "listen", listen)
+    monkeypatch.setattr(calibration.can_monitor, "listen", listen)
     if state != AxisState.CLOSED_LOOP_CONTROL:
         refuse(robot, made, "hip_right", tmp_path)
         return
@@ -240,9 +240,9 @@ def test_whoever_says_no_has_nothing_calibrated(
     robot: RobotConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     board = BankBoard()
-    monkeypatch.setattr(calibrate_robot.drive_access, "confirm", lambda *_, **__: False)
+    monkeypatch.setattr(calibration.drive_access, "confirm", lambda *_, **__: False)
     monkeypatch.setattr(calibration, "_await_still", lambda *_: "")
-    code = calibrate_robot.calibrate(
+    code = calibration.calibrate(
         Console(quiet=True), robot, {MODULE: (board, AXES)}, Interrupts(),
         yes=False, check=lambda: None,
     )  # fmt: skip
@@ -261,7 +261,7 @@ def test_a_board_that_is_unplugged_meanwhile_does_not_stop_the_others(
         return BoardResult({"axis0": Found(0.1, 4e-5, -1)})
 
     monkeypatch.setattr(calibration, "calibrate_board", calibrate)
-    code = calibrate_robot.calibrate(
+    code = calibration.calibrate(
         Console(), robot, {MODULE: (first, AXES), "hip_left": (second, AXES)}, Interrupts(),
         yes=True, check=lambda: None,
     )  # fmt: skip

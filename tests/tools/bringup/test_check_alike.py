@@ -8,7 +8,7 @@ from shared.joints import MODULES
 from tests.tools.bringup.board_in_memory import as_wanted, healthy
 from tests.tools.bringup.verdicts import OK, bad
 from tools.bringup.boards import Value
-from tools.bringup.check_alike import alike_rows
+from tools.bringup.check_board import alike_rows
 
 POLES, NAME = "axis0.motor.config.pole_pairs", "motor.config.pole_pairs"
 OHM, PHASE = "axis1.motor.config.phase_resistance", "motor.config.phase_resistance"

@@ -12,7 +12,7 @@ import pytest
 from shared import scheduling
 from shared.config.robot_config import RobotConfig
 from shared.places import DEFAULT_CONFIG
-from tools.bringup import check_machine
+from tools.bringup import check_host
 from tools.bringup.findings import Finding, FindingKind
 
 ROOT = DEFAULT_CONFIG.parents[1]
@@ -45,7 +45,7 @@ def test_a_slow_loop_is_a_warning_on_a_real_robot_and_a_note_on_an_emulated_one(
     write(tmp_path, f"{KERNEL}/sched_rt_period_us", "1000000")
     write(tmp_path, path, text)
     for config, verdict in ((real, FindingKind.WARNING), (robot, FindingKind.OK)):
-        row = row_of(check_machine.machine_rows(config, tmp_path), what)
+        row = row_of(check_host.machine_rows(config, tmp_path), what)
         assert row.verdict is verdict
         assert row.found != row.wanted
 
@@ -53,12 +53,12 @@ def test_a_slow_loop_is_a_warning_on_a_real_robot_and_a_note_on_an_emulated_one(
 def test_one_processor_that_sleeps_is_seen(real: RobotConfig, tmp_path: Path) -> None:
     for cpu, governor in enumerate(("performance", "powersave", "performance")):
         write(tmp_path, f"{CPU}/cpu{cpu}/cpufreq/scaling_governor", governor)
-    row = row_of(check_machine.machine_rows(real, tmp_path), "frequency governor")
+    row = row_of(check_host.machine_rows(real, tmp_path), "frequency governor")
     assert (row.verdict, row.found) == (FindingKind.WARNING, "performance and powersave")
 
 
 def test_a_kernel_without_the_figure_is_ok(robot: RobotConfig, tmp_path: Path) -> None:
-    rows = check_machine.machine_rows(robot, tmp_path)
+    rows = check_host.machine_rows(robot, tmp_path)
     assert row_of(rows, "frequency governor").found == "unknown here"
     assert {row.verdict for row in rows} == {FindingKind.OK}
 
@@ -79,7 +79,7 @@ def test_without_real_time_permission_the_services_fallback_is_named(
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
     monkeypatch.setattr(scheduling, "short_slice", lambda: granted)
-    row = check_machine._real_time(emulated=emulated)
+    row = check_host._real_time(emulated=emulated)
     assert row.verdict is verdict
     assert "refused" in row.found
     if verdict is FindingKind.OK:
@@ -88,7 +88,7 @@ def test_without_real_time_permission_the_services_fallback_is_named(
 
 def test_real_time_is_tried_and_not_kept(robot: RobotConfig, tmp_path: Path) -> None:
     before = os.sched_getscheduler(0)
-    check_machine.machine_rows(robot, tmp_path)
+    check_host.machine_rows(robot, tmp_path)
     assert os.sched_getscheduler(0) == before
 
 
@@ -106,23 +106,23 @@ def test_an_odrive_that_may_not_be_opened_wants_its_udev_rule(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     node = plug_in(tmp_path)
-    (row,) = check_machine.usb_node_rows(tmp_path)
+    (row,) = check_host.usb_node_rows(tmp_path)
     assert row.verdict is FindingKind.OK
     real_access: Callable[..., bool] = os.access
     monkeypatch.setattr(
         os, "access", lambda path, mode: Path(path) != node and real_access(path, mode)
     )
-    (row,) = check_machine.usb_node_rows(tmp_path)
+    (row,) = check_host.usb_node_rows(tmp_path)
     assert row.verdict is FindingKind.WRONG
     (rules,) = (ROOT / word for word in row.fix.split() if word.endswith(".rules"))
     ids = re.search(r'idVendor}=="1209", ATTR\{idProduct\}=="(0d3\[\d-\d\])"', rules.read_text())
     assert ids is not None
     named = [f"{i:04x}" for i in range(1 << 16) if re.fullmatch(ids[1], f"{i:04x}")]
-    assert tuple(named) == check_machine.ODRIVE_PRODUCTS, "the rule is for what the doctor finds"
+    assert tuple(named) == check_host.ODRIVE_PRODUCTS, "the rule is for what the doctor finds"
 
 
 def test_other_usb_devices_are_not_taken_for_odrives(tmp_path: Path) -> None:
     plug_in(tmp_path, product="beef")
-    (row,) = check_machine.usb_node_rows(tmp_path)
+    (row,) = check_host.usb_node_rows(tmp_path)
     assert row.verdict is FindingKind.WARNING
     assert "none plugged in" in row.found

@@ -11,7 +11,7 @@ import pytest
 
 from shared.config.robot_config import RobotConfig
 from tests.certified import certified, opened
-from tools.bringup.check_robot import security_rows
+from tools.bringup.check_host import security_rows
 from tools.bringup.findings import FindingKind
 from tools.keys import authority as authority_module
 

@@ -10,8 +10,8 @@ import pytest
 
 from shared.config.robot_config import RobotConfig
 from tests.tools.bringup.verdicts import OK, WARNING, WRONG, bad
-from tools.bringup import check_socketcan
-from tools.bringup.check_socketcan import socketcan_rows
+from tools.bringup import check_host
+from tools.bringup.check_host import socketcan_rows
 from tools.bringup.findings import Finding, FindingKind
 
 UP, DOWN = "0x40081", "0x40080"
@@ -126,4 +126,4 @@ def test_no_ip_command_or_its_unusable_output_yields_nothing(
         return subprocess.CompletedProcess([], 0, stdout=said)
 
     monkeypatch.setattr(subprocess, "run", run)
-    assert check_socketcan.query_ip() == {}
+    assert check_host.query_ip() == {}

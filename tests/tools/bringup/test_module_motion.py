@@ -14,7 +14,7 @@ from shared.can.cansimple import Command
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
 from tests.tools.bringup.board_in_memory import BoardInMemory, as_wanted, with_driver
-from tools.bringup import module_motion
+from tools.bringup import motion_runner
 from tools.bringup.boards import FoundBoards
 
 MODULE = "knee_left"
@@ -47,21 +47,21 @@ class Link:
 @pytest.fixture
 def link(monkeypatch: pytest.MonkeyPatch) -> Link:
     link = Link()
-    monkeypatch.setattr(module_motion, "CanLink", lambda *_: link)
+    monkeypatch.setattr(motion_runner, "CanLink", lambda *_: link)
     return link
 
 
 def test_over_can_both_axes_get_the_robot_files_limits_more_than_once(
     robot: RobotConfig, link: Link
 ) -> None:
-    module_motion.give_back(robot, MODULE, NOWHERE)
+    motion_runner.give_back(robot, MODULE, NOWHERE)
     wanted = (robot.drive.vel_limit, robot.drive.current_lim)
     sent = [(m.arbitration_id, cansimple.unpack_two_floats(bytes(m.data))) for m in link.sent]
     ids = [
         cansimple.arbitration_id(node, Command.SET_LIMITS)
         for node in robot.module_named(MODULE).node_ids
     ]
-    assert sorted(can_id for can_id, _ in sent) == sorted(ids * module_motion.LIMITS_TIMES), (
+    assert sorted(can_id for can_id, _ in sent) == sorted(ids * motion_runner.LIMITS_TIMES), (
         "nothing else"
     )
     assert all(limits == pytest.approx(wanted) for _, limits in sent)
@@ -71,13 +71,13 @@ def test_over_can_both_axes_get_the_robot_files_limits_more_than_once(
 def test_a_bus_that_is_gone_is_reported(robot: RobotConfig, link: Link) -> None:
     link.open = False
     with pytest.raises(DriveError, match="takes no frames"):
-        module_motion.give_back(robot, MODULE, NOWHERE)
+        motion_runner.give_back(robot, MODULE, NOWHERE)
 
 
 @pytest.fixture
 def found(monkeypatch: pytest.MonkeyPatch) -> FoundBoards:
     found = FoundBoards({SERIAL: BoardInMemory(as_wanted() | SMALL)}, {}, ())
-    monkeypatch.setattr(module_motion, "boards_on_usb", lambda *_: nullcontext(found))
+    monkeypatch.setattr(motion_runner, "boards_on_usb", lambda *_: nullcontext(found))
     return found
 
 
@@ -89,16 +89,16 @@ def on_usb(robot: RobotConfig) -> RobotConfig:
 def test_over_usb_they_are_written_and_read_back(on_usb: RobotConfig, found: FoundBoards) -> None:
     board = found.boards[SERIAL]
     assert isinstance(board, BoardInMemory)
-    module_motion.give_back(on_usb, MODULE, NOWHERE)
+    motion_runner.give_back(on_usb, MODULE, NOWHERE)
     assert board.now == as_wanted()
     assert board.saves == 0, "a board that saves restarts, and has lost its zero"
     board.now |= SMALL
     board.deaf.add("axis0.controller.config.vel_limit")
     with pytest.raises(DriveError, match="did not keep"):
-        module_motion.give_back(on_usb, MODULE, NOWHERE)
+        motion_runner.give_back(on_usb, MODULE, NOWHERE)
 
 
 def test_a_board_that_has_gone_is_reported(on_usb: RobotConfig, found: FoundBoards) -> None:
     found.boards.clear()
     with pytest.raises(DriveError, match=f"{SERIAL}: not there"):
-        module_motion.give_back(on_usb, MODULE, NOWHERE)
+        motion_runner.give_back(on_usb, MODULE, NOWHERE)

@@ -19,9 +19,9 @@ from shared.joints import MODULE_INDEX
 from tests.tools.bringup.bench_drive import MODULE, PLAN, START, BenchDrive, jog_by, move
 from tests.tools.bringup.hung_robot import HungRobot
 from tools.bringup import motion_runner
-from tools.bringup.jog import JogPlan, ThereAndBack, judge
 from tools.bringup.motion import APART_MAX, Sample, limit_drives, within_stops
 from tools.bringup.motion_runner import Interrupts, MotionResult, hanging_angles
+from tools.verbs.drive.jog import JogPlan, ThereAndBack, judge
 
 ANKLE = "ankle_left"
 HELD = JogPlan(0, ThereAndBack(0.02, 1.0, 1), 15.0)

@@ -15,10 +15,28 @@ from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, DriveError, FleetError
 from shared.joints import MODULES
-from tools.bringup import backup, calibrate_robot, calibration, changes, drive_access
-from tools.bringup.boards import FIRMWARE, Board, FoundBoards, describe_firmware, is_known
-from tools.bringup.changes import ChangeResult, SettingChange
-from tools.bringup.check_robot import joint_services_up
+from tools.bringup import calibration, drive_access
+from tools.bringup.boards import (
+    FIRMWARE,
+    Backup,
+    Board,
+    ChangeResult,
+    FoundBoards,
+    SettingChange,
+    against_backup,
+    backup_of,
+    changes_to_wanted,
+    describe_firmware,
+    describe_setting,
+    difference_table,
+    is_known,
+    read_backup,
+    refuse_armed,
+    settings_of,
+    write_backup,
+    write_changes,
+)
+from tools.bringup.check_host import joint_services_up
 from tools.bringup.drive_access import (
     DriveSettingFlags,
     boards_on_usb,
@@ -26,8 +44,7 @@ from tools.bringup.drive_access import (
     drives_within_reach,
     no_fleet_meanwhile,
 )
-from tools.bringup.module_motion import LIFTED, exit_if_interrupted
-from tools.bringup.motion_runner import Interrupts
+from tools.bringup.motion_runner import LIFTED, Interrupts, exit_if_interrupted
 from tools.flags import Arg, FleetRobotFlags, Folder, Module
 from tools.fleet.process_table import is_simulated
 from tools.terminal import Console, marked
@@ -85,7 +102,7 @@ def run(flags: ConfigureFlags) -> int:
     console = Console()
     path = drive_access.robot_file(flags)
     robot = config_file.load_without_schedule(path)
-    saved = backup.read(flags.restore) if flags.restore else None
+    saved = read_backup(flags.restore) if flags.restore else None
     modules = modules_of(flags, robot, saved)
     check_plants(robot, flags.run_dir, flags.plant)
     with contextlib.ExitStack() as stack:
@@ -101,7 +118,7 @@ def look_and_write(
     robot: RobotConfig,
     path: Path,
     modules: Sequence[str],
-    saved: backup.Backup | None,
+    saved: Backup | None,
 ) -> int:
     """Show what is to do; with `--apply` keep a backup, write, read back, and calibrate."""
     lifted = LIFTED if flags.calibrate else 0.0
@@ -111,7 +128,7 @@ def look_and_write(
         boards_on_usb(robot, flags.run_dir, looked_at) as found,
     ):
         boards = boards_of(robot, modules, found)
-        axes = calibrate_robot.to_calibrate(boards, again=flags.again) if flags.calibrate else {}
+        axes = calibration.to_calibrate(boards, again=flags.again) if flags.calibrate else {}
         marks = {
             (module, f"{axis}.{mark}")
             for module, those in axes.items()
@@ -120,7 +137,7 @@ def look_and_write(
         }
         difference = differences(robot, boards, saved)
         difference = [each for each in difference if (each.module, each.name) not in marks]
-        console.print(changes.difference_table(difference) if difference else "nothing to change")
+        console.print(difference_table(difference) if difference else "nothing to change")
         for module, those in axes.items():
             console.print(f"to be calibrated: {module}, {' and '.join(those)}")
         if flags.calibrate and not axes:
@@ -130,9 +147,9 @@ def look_and_write(
                 console.print("\nnothing was written; `--apply` does it")
             return FAULT_EXIT_CODE if difference or axes else 0
         for module, board in boards.items():
-            changes.refuse_armed(module, board)
+            refuse_armed(module, board)
         if axes:
-            calibrate_robot.refuse_standing(robot, flags.run_dir, found, axes)
+            calibration.refuse_standing(robot, flags.run_dir, found, axes)
         kept = keep(flags.out, boards, path)
         restore = f"`xrl drive configure --restore {shlex.quote(str(kept))}`"
         console.print(f"\nwhat the boards had: {kept}; {restore} shows it")
@@ -146,7 +163,7 @@ def look_and_write(
             console.print(f"stopped before {', '.join(rest)}" if rest else "nothing was left to do")
             sys.exit(128 + interrupts.number)
         if axes and not code:
-            code = calibrate_robot.calibrate(
+            code = calibration.calibrate(
                 console, robot, {module: (boards[module], axes[module]) for module in axes},
                 interrupts, yes=flags.yes,
                 check=lambda: refuse_services(robot, flags.run_dir, MODULES),
@@ -157,9 +174,7 @@ def look_and_write(
     return code
 
 
-def modules_of(
-    flags: ConfigureFlags, robot: RobotConfig, saved: backup.Backup | None
-) -> tuple[str, ...]:
+def modules_of(flags: ConfigureFlags, robot: RobotConfig, saved: Backup | None) -> tuple[str, ...]:
     """Return the modules that are meant: those that were named, or of the backup, or all.
 
     Raises:
@@ -224,7 +239,7 @@ def boards_of(robot: RobotConfig, modules: Sequence[str], found: FoundBoards) ->
 
 
 def differences(
-    robot: RobotConfig, boards: Mapping[str, Board], saved: backup.Backup | None
+    robot: RobotConfig, boards: Mapping[str, Board], saved: Backup | None
 ) -> list[SettingChange]:
     """Return everything that is to be changed, module by module.
 
@@ -236,7 +251,7 @@ def differences(
     for module, board in boards.items():
         if saved is None:
             wanted = drive_settings.of_module(robot, module)
-            rows += changes.changes_to_wanted(module, wanted, board)
+            rows += changes_to_wanted(module, wanted, board)
             continue
         firmware = describe_firmware(board.firmware)
         if firmware != kept[module].firmware:
@@ -244,7 +259,7 @@ def differences(
                 f"{module}: the backup is of firmware {kept[module].firmware}, the board has "
                 f"{firmware}: settings may mean something else there"
             )
-        rows += changes.against_backup(module, backup.settings_of(kept[module]), board)
+        rows += against_backup(module, settings_of(kept[module]), board)
     return rows
 
 
@@ -255,8 +270,8 @@ def keep(folder: Path, boards: Mapping[str, Board], robot_file: Path) -> Path:
         DriveError: it cannot be written, or a board does not answer.
     """
     path = folder / time.strftime("%Y%m%d-%H%M%S.json")
-    rows = [backup.of_board(module, board) for module, board in boards.items()]
-    backup.write(path, rows, time=time.strftime("%Y-%m-%dT%H:%M:%S%z"), robot_file=str(robot_file))
+    rows = [backup_of(module, board) for module, board in boards.items()]
+    write_backup(path, rows, time=time.strftime("%Y-%m-%dT%H:%M:%S%z"), robot_file=str(robot_file))
     return path
 
 
@@ -278,7 +293,7 @@ def apply(
             continue
         try:
             with console.status(f"{module}: writing, saving, restarting"):
-                outcomes += changes.apply(board, serial)
+                outcomes += write_changes(board, serial)
         except DriveError as error:
             console.print(marked("[bold red]{}[/]: {}", module, error))
             outcomes += [ChangeResult(change, None, good=False) for change in serial]
@@ -289,7 +304,7 @@ def conclude(console: Console, robot: RobotConfig, outcomes: Sequence[ChangeResu
     """Say what came of it and return the exit code."""
     bad = [outcome for outcome in outcomes if not outcome.good]
     for change, now, _ in bad:
-        what = change.inhibit or f"it is {changes.describe(now)} after the restart"
+        what = change.inhibit or f"it is {describe_setting(now)} after the restart"
         console.print(
             marked("[bold red]not as wanted[/]: {} {}: {}", change.module, change.name, what)
         )

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Final, NamedTuple
 
 import msgspec
+import numpy as np
 from rich import box
 from rich.table import Column, Table
 from rich.text import Text
@@ -20,23 +21,34 @@ from shared.bus.messages import JointState, Mode, Pair
 from shared.bus.session import open_session
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, DriveError, FleetError
-from shared.joints import MODULES, kind_of
-from tools.bringup import drive_access, resuming, swing, zero_record
+from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, DriveError, FleetError, RunError
+from shared.joints import MODULE_INDEX, MODULES, kind_of
+from shared.robot.robot_model import stand_pose
+from tools.bringup import drive_access, zero_record
 from tools.bringup.hanging_leg import leg_of
-from tools.bringup.motion import within_stops
-from tools.bringup.swing import Swing
 from tools.bringup.whole_turns import UNMOVED, Decision, decide
 from tools.bringup.zero_record import Identity, ZeroRecord
-from tools.bringup.zeroing import DriveLook, is_right, look, refusal, why_outside, zero
+from tools.bringup.zeroing import (
+    HOW,
+    DriveLook,
+    Swing,
+    is_right,
+    look,
+    refusal,
+    watch,
+    why_outside,
+    zero,
+)
 from tools.flags import Arg, FleetRobotFlags, Number, numbers, parsed, positional
 from tools.fleet.supervise import SupervisedFleet
 from tools.terminal import Console, marked
 
+HEIGHT_TOLERANCE: Final = 1e-7
+"""m of torso height"""
+ROUNDS: Final = 20
+"""Most rounds of the search for the COM height of a torso height; three are usual."""
 DEGREES_FROM: Final = 7.0
 """No joint has an angle of so many rad: more than a turn."""
-CORRECTION_MAX: Final = 0.1
-"""rad; more is no error of a protractor."""
 
 HEARD_S: Final = 2.0
 """Longest wait for the states of joint services that are up."""
@@ -46,7 +58,6 @@ EXAMPLES: Final = """
 xrl drive zero knee_left --at 0,-0.5          # by a protractor: phi, theta in rad
 xrl drive zero ankle_right --at -0.02,0.14
 xrl drive zero --all --standing 1.188         # in the jig: soles flat, hips 1.188 m above ankles
-xrl drive zero knee_left --by 0,-0.009        # corrects a zero, as `xrl drive identify body` prints
 xrl drive zero --all --resume                 # after a loss of power, hanging: what has not moved
 xrl drive zero --all --resume --untouched --swing --level     # knees and hips that have moved
 xrl drive zero ankle_left --resume --untouched --at 0.1,0.3   # roughly, to 0.08 rad
@@ -65,8 +76,6 @@ class ZeroFlags(FleetRobotFlags):
     """all six"""
     at: Annotated[Pair | None, parsed(_PAIR, "PHI,THETA", exclusive="where")] = None
     """the joint is at these angles now, rad, as 0,-0.5"""
-    by: Annotated[Pair | None, parsed(_PAIR, "PHI,THETA", exclusive="where")] = None
-    """the joint is this much farther, rad, than its present zero says"""
     standing: Annotated[Number | None, Arg(metavar="HEIGHT", exclusive="where")] = None
     """the robot stands or hangs as if it stood: both soles flat and level, at their distance
     (geometry.w_base), torso upright, COM over the ankles, the hips' axis HEIGHT m above the
@@ -96,17 +105,15 @@ class ZeroFlags(FleetRobotFlags):
     def check(self) -> None:
         """Refuse one module's angles for all, and flags that do not fit each other."""
         super().check()
-        where = [self.at, self.by, self.standing]
+        where = [self.at, self.standing]
         if self.rest and (self.resume or any(one is not None for one in where)):
             raise DriveError("--rest changes no zero; give it alone")
-        if self.resume and self.by is not None:
-            raise DriveError("--by corrects a zero that is there; --resume finds one: first resume")
         if not self.resume and (self.untouched or self.swing or self.level):
             raise DriveError("--untouched, --swing and --level are for --resume")
         if not (self.resume or self.rest or any(one is not None for one in where)):
-            raise DriveError("give --at, --standing or --by; after a loss of power --resume")
-        if self.all and (self.at is not None or self.by is not None):
-            raise DriveError("--at and --by are for one module; for all give --standing HEIGHT")
+            raise DriveError("give --at or --standing; after a loss of power --resume")
+        if self.all and self.at is not None:
+            raise DriveError("--at is for one module; for all give --standing HEIGHT")
 
 
 def run(flags: ZeroFlags) -> int:
@@ -119,17 +126,17 @@ def run(flags: ZeroFlags) -> int:
     holders = {module: drive_access.service_on(robot, module, flags.run_dir) for module in modules}
     with drive_access.drives_to_ourselves(robot, path, flags.run_dir, console.print) as started:
         if flags.rest:
-            kept = resuming.store_rests(robot, path, flags.run_dir, modules, console.print)
+            kept = zero_record.store_rests(robot, path, flags.run_dir, modules, console.print)
             console.print(f"{kept} of {len(modules)} modules rest, and that is stored")
             return 0 if kept == len(modules) else FAULT_EXIT_CODE
         refuse_services(robot, holders)
-        known = resuming.identities(robot, flags.run_dir, modules, console.print)
-        record = zero_record.read(zero_record.path_of(robot, path, flags.run_dir), robot)
+        known = zero_record.identities(robot, flags.run_dir, modules, console.print)
+        record = zero_record.read_zeros(zero_record.path_of(robot, path, flags.run_dir), robot)
         work = _Work(robot, path, flags, holders, known, record, console)
         if flags.resume:
             code = _resume(work, wanted)
         else:
-            with resuming.drives_of(robot, modules, flags.run_dir) as drives:
+            with zero_record.drives_of(robot, modules, flags.run_dir) as drives:
                 code = _zero(work, drives, wanted)
     if started:
         console.print(drive_access.GONE)
@@ -150,7 +157,7 @@ class _Work(NamedTuple):
     def keep(self, record: ZeroRecord) -> None:
         """Write the zeros; that fails with a warning, because the drives have them."""
         try:
-            zero_record.write(
+            zero_record.write_zeros(
                 zero_record.path_of(self.robot, self.path, self.flags.run_dir), record
             )
         except DriveError as error:
@@ -158,28 +165,23 @@ class _Work(NamedTuple):
 
 
 def _zero(work: _Work, drives: Mapping[str, Drive], wanted: Mapping[str, Pair]) -> int:
-    """Zero by measured angles, or correct; return the exit code."""
-    robot, by, console = work.robot, work.flags.by, work.console
+    """Zero by measured angles; return the exit code."""
+    robot, console = work.robot, work.console
     before = _look_all(robot, drives)
-    if by is not None:
-        wanted = corrected(before, by, robot)
     console.print(plan_table(wanted, before))
     _warn(wanted, work.holders, console)
-    question = "Are the joints at these angles now?" if by is None else "Correct the zero?"
-    if not drive_access.confirm(question, yes=work.flags.yes):
+    if not drive_access.confirm("Are the joints at these angles now?", yes=work.flags.yes):
         console.print("nothing was changed")
         return DECLINED_EXIT_CODE
     refuse_services(robot, work.holders)  # a person may take minutes to answer
-    now = _look_all(robot, drives)
-    if by is not None:  # from where it hangs now: it may have been touched meanwhile
-        wanted = corrected(now, by, robot)
+    _look_all(robot, drives)
     done = _set_all(robot, drives, wanted, console)
     modules = dict(work.record.modules)
     for module in done:
         seen = look(drives[module], robot)
         identity, angles = work.known.get(module), seen.angles
         modules.pop(module, None)
-        why = resuming.why_not_kept(robot, seen, identity)
+        why = zero_record.why_not_kept(robot, seen, identity)
         if why or angles is None:
             console.print(marked("[yellow]{}: not kept over a loss of power: {}[/]", module, why))
             continue
@@ -199,19 +201,19 @@ def _resume(work: _Work, about: Mapping[str, Pair]) -> int:
             f"{', '.join(unknown)}: no zero is stored; zero by a protractor (--at, --standing), "
             "as on the first day: from then on it can be resumed"
         )
-    up = resuming.upright(robot, flags.run_dir, level=flags.level)
-    with resuming.drives_of(robot, leg_of(*flags.modules), flags.run_dir) as drives:
+    up = zero_record.upright(robot, flags.run_dir, level=flags.level)
+    with zero_record.drives_of(robot, leg_of(*flags.modules), flags.run_dir) as drives:
         swings: dict[str, Swing] = {}
         if flags.swing:
-            console.print(swing.HOW)
+            console.print(HOW)
             legs = {name: one for name, one in drives.items() if kind_of(name) != "ankle"}
-            swings = swing.watch(legs, gear_ratio, console.print)
-        looks, _ = resuming.looks_at_rest(drives, robot)
+            swings = watch(legs, gear_ratio, console.print)
+        looks, _ = zero_record.looks_at_rest(drives, robot)
         faults = {module: refusal(seen) for module, seen in looks.items()}
         fit = {module: seen for module, seen in looks.items() if not faults[module]}
         found = decide(
             robot,
-            resuming.evidence_of(
+            zero_record.evidence_of(
                 robot, work.record, fit, work.known,
                 untouched=flags.untouched, about=about, swings=swings,
             ),
@@ -240,7 +242,7 @@ def _resume(work: _Work, about: Mapping[str, Pair]) -> int:
         refuse_services(robot, work.holders)
         now = {module: look(drives[module], robot) for module in taken}
         for module, seen in now.items():
-            if refusal(seen) or not resuming.same_angles(seen, looks[module], UNMOVED):
+            if refusal(seen) or not zero_record.same_angles(seen, looks[module], UNMOVED):
                 raise DriveError(f"{module}: it has moved meanwhile; nothing was changed; again")
         done = [
             module
@@ -258,7 +260,7 @@ def _is_its_zero(work: _Work, module: str, drive: Drive) -> bool:
     A joint that creeps while it is written has another.
     """
     seen, offsets = look(drive, work.robot), work.record.modules[module].offsets
-    why = resuming.not_its_zero(seen, offsets, work.robot.joint.gear_ratio)
+    why = zero_record.not_its_zero(seen, offsets, work.robot.joint.gear_ratio)
     if why:
         work.console.print(marked("[bold red]{}: it moved as it was written; again[/]", module))
         if seen.status is not DriveStatus.ARMED:
@@ -277,7 +279,7 @@ def resumed_table(found: Mapping[str, Decision]) -> Table:
 
 
 def angles_of(flags: ZeroFlags, robot: RobotConfig, console: Console) -> dict[str, Pair]:
-    """Return the position (phi, theta), rad, of each selected module; none yet for `--by`.
+    """Return the position (phi, theta), rad, of each selected module.
 
     Raises:
         DriveError: an angle is outside the limits.
@@ -287,8 +289,6 @@ def angles_of(flags: ZeroFlags, robot: RobotConfig, console: Console) -> dict[st
     if flags.at is not None:
         wanted = dict.fromkeys(flags.modules, flags.at)
     elif flags.standing is not None:
-        from tools.bringup.stand_angles import stand_angles  # noqa: PLC0415 - takes a second
-
         stand = stand_angles(robot, flags.standing)
         console.print(
             f"a stand with the hips {flags.standing:g} m above the ankles and "
@@ -299,31 +299,6 @@ def angles_of(flags: ZeroFlags, robot: RobotConfig, console: Console) -> dict[st
     for module, q in wanted.items():
         if fault := why_outside(robot, module, q):
             raise DriveError(f"{module}: {fault}{_if_degrees(q)}")
-    return wanted
-
-
-def corrected(before: Mapping[str, DriveLook], by: Pair, robot: RobotConfig) -> dict[str, Pair]:
-    """Return where modules are if they are farther than their present zeros say.
-
-    Args:
-        before: the drives as they are.
-        by: how much farther, (phi, theta), rad.
-        robot: its limits.
-
-    Raises:
-        DriveError: a drive has no zero that could be corrected, or it would be beyond its limits.
-    """
-    if not all(abs(part) <= CORRECTION_MAX for part in by):  # so that a NaN is refused
-        raise DriveError(
-            f"--by: at most {CORRECTION_MAX:g} rad either way is a correction; else use --at"
-        )
-    wanted = {}
-    for module, seen in before.items():
-        if not seen.zeroed:
-            raise DriveError(f"{module}: it has no zero to correct; give --at PHI,THETA")
-        wanted[module] = (seen.q[0] + by[0], seen.q[1] + by[1])
-        if fault := why_outside(within_stops(robot), module, wanted[module]):
-            raise DriveError(f"{module}: {fault}")  # a knee may hang on its stop
     return wanted
 
 
@@ -462,3 +437,48 @@ def _angles(q: Pair) -> str:
 def _table(*columns: str) -> Table:
     headings = [Column(heading, no_wrap=True) for heading in ("module", *columns)]
     return Table(*headings, box=box.SIMPLE_HEAD, caption="phi, theta", caption_justify="left")
+
+
+class StandAngles(NamedTuple):
+    """An upright stand, soles flat, COM over the ankles."""
+
+    q: dict[str, Pair]
+    """(phi, theta) of each module, rad."""
+    hips_forward: float
+    """Position of the hips ahead of the ankles with the COM over the ankles, m."""
+
+
+def stand_angles(robot: RobotConfig, height: float) -> StandAngles:
+    """Return the stand with the torso level and its origin (between the hips) at a height, m."""
+    from services.planner.law.inverse_kinematics import (  # noqa: PLC0415 - takes a second
+        InverseKinematics,
+        describe,
+    )
+    from services.planner.law.kinematics import Kinematics  # noqa: PLC0415
+
+    longest = robot.geometry.l1 + robot.geometry.l2
+    if not 0.0 < height < longest:
+        text = f"--standing {height:g}: the hips are between 0 and {longest:g} m above the ankles"
+        in_mm = f"; if these are mm: --standing {height / 1e3:g}" if height > 100.0 else ""
+        raise RunError(text + in_mm)
+    limits = np.array(robot.joint_limits())
+    kinematics = Kinematics(robot)
+    ik = InverseKinematics(kinematics, limits)
+    ik.q[:] = stand_pose(robot, height)
+    kinematics.update(ik.q)
+    p_ref = np.array([0.0, 0.0, kinematics.p[2], 0.0, 0.0, 0.0])
+    slope, before = 1.0, None  # d COM height / d torso height, by the last two rounds
+    for _ in range(ROUNDS):
+        reach = ik.solve_from_anywhere(p_ref)
+        if not reach.converged:
+            raise RunError(f"--standing {height:g}: {describe(reach, p_ref, limits)}")
+        z, z_com = float(kinematics.r_torso[2]), float(p_ref[2])
+        if abs(height - z) <= HEIGHT_TOLERANCE:
+            angles = ik.q.reshape(len(MODULES), 2).tolist()
+            q = {module: (angles[i][0], angles[i][1]) for module, i in MODULE_INDEX.items()}
+            return StandAngles(q, float(kinematics.r_torso[0]))
+        if before is not None and z != before[0]:
+            slope = (z_com - before[1]) / (z - before[0])
+        before = (z, z_com)
+        p_ref[2] += slope * (height - z)
+    raise RunError(f"--standing {height:g}: no stand found at this height")
