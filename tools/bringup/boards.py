@@ -53,7 +53,6 @@ STATUS: Final = (
 """A board's state, besides its settings."""
 
 
-BACKUP_VERSION: Final = 1
 _NOT_JSON: Final = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
 """Numbers that JSON does not have, as they stand in the file."""
 
@@ -169,7 +168,6 @@ class BoardBackup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Backup(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The file."""
 
-    version: int = BACKUP_VERSION
     time: str
     """When it was made, ISO 8601, local time with its offset."""
     robot_file: str
@@ -178,7 +176,10 @@ class Backup(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 def backup_of(module: str, board: Board) -> BoardBackup:
     """Return a board's backup, with its numbers as JSON can have them."""
-    plain = {name: _to_json(value) for name, value in board.read(board.settings).items()}
+    plain = {
+        name: str(value) if isinstance(value, float) and not math.isfinite(value) else value
+        for name, value in board.read(board.settings).items()
+    }
     return BoardBackup(module, board.serial_number, describe_firmware(board.firmware), plain)
 
 
@@ -191,11 +192,7 @@ def settings_of(backup: BoardBackup) -> dict[str, Value]:
 
 
 def write_backup(path: Path, boards: Sequence[BoardBackup], *, time: str, robot_file: str) -> None:
-    """Write a backup; the file is whole or not there, and none is ever overwritten.
-
-    Raises:
-        DriveError: it cannot be written.
-    """
+    """Write a backup; the file is whole or not there, and none is ever overwritten."""
     backup = Backup(time=time, robot_file=robot_file, boards=tuple(boards))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -210,20 +207,11 @@ def write_backup(path: Path, boards: Sequence[BoardBackup], *, time: str, robot_
 def read_backup(path: Path) -> Backup:
     """Read a backup."""
     try:
-        backup = msgspec.json.decode(read_text(path), type=Backup)
+        return msgspec.json.decode(read_text(path), type=Backup)
     except OSError as error:
         raise DriveError(f"{path}: cannot be read: {error.strerror}") from None
     except (msgspec.DecodeError, UnicodeError) as error:
         raise DriveError(f"{path}: not a backup of `xrl drive configure`: {error}") from None
-    if backup.version != BACKUP_VERSION:
-        raise DriveError(f"{path}: a backup of version {backup.version}, not {BACKUP_VERSION}")
-    return backup
-
-
-def _to_json(value: Value) -> Value:
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)
-    return value
 
 
 class SettingChange(NamedTuple):
@@ -235,10 +223,10 @@ class SettingChange(NamedTuple):
     after: Value
     """As it should be written."""
     why: str
-    inhibit: str = ""
+    inhibit: str
     """Why it cannot be written; "" if it can."""
-    fits: Callable[[Value], bool] = bool
-    """Whether a value that is read back is as it should be."""
+    fits: Callable[[Value], bool]
+    """Returns True for a value that is as it should be."""
 
 
 class ChangeResult(NamedTuple):
@@ -258,15 +246,14 @@ def changes_to_wanted(
     calibrated = board.read([f"{axis}.{name}" for axis in AXES for name in _CALIBRATED.values()])
     changes = []
     for row in wanted:
-        before = settings.get(row.name)
-        if row.name not in settings:
-            inhibit = "not there in this firmware; 0.5.6 has it"
-        elif _fits(row, before):
-            continue
-        else:
+        before, fits = settings.get(row.name), partial(_fits, row)
+        inhibit = "not there in this firmware; 0.5.6 has it"
+        if row.name in settings:
             inhibit = _uncalibrated(row.name, calibrated)
-        fits = partial(_fits, row)
-        changes.append(SettingChange(module, row.name, before, row.value, row.why, inhibit, fits))
+        if row.name not in settings or not fits(before):
+            changes.append(
+                SettingChange(module, row.name, before, row.value, row.why, inhibit, fits)
+            )
     return changes
 
 
@@ -275,16 +262,13 @@ def against_backup(module: str, saved: Mapping[str, Value], board: Board) -> lis
     settings = board.read(board.settings)
     changes = []
     for name, value in saved.items():
+        before, fits, inhibit = settings.get(name), partial(equal, value), ""
         if name not in settings:
             inhibit = "not there in this board's firmware"
-        elif equal(settings[name], value):
-            continue
         elif name.partition(".")[2] in _FOUND:
             inhibit = "calibration finds it from the wiring of the phases; the board keeps its own"
-        else:
-            inhibit = ""
-        fits, before = partial(equal, value), settings.get(name)
-        changes.append(SettingChange(module, name, before, value, "", inhibit=inhibit, fits=fits))
+        if name not in settings or not fits(before):
+            changes.append(SettingChange(module, name, before, value, "", inhibit, fits))
     return changes
 
 
@@ -308,10 +292,7 @@ def write_changes(board: Board, changes: Sequence[SettingChange]) -> list[Change
         board.save()
     now = board.read([change.name for change in changes])
     return [
-        ChangeResult(
-            change, now.get(change.name), change.name in now and change.fits(now[change.name])
-        )
-        for change in changes
+        ChangeResult(c, now.get(c.name), c.name in now and c.fits(now[c.name])) for c in changes
     ]
 
 
@@ -329,24 +310,18 @@ def describe_setting(value: Value) -> str:
 
 def difference_table(difference: Sequence[SettingChange]) -> Group:
     """Return a difference for the terminal: a table, and below it why each is wanted."""
-    one_line = [Column(heading, no_wrap=True) for heading in ("module", "setting")]
-    rows = Table(
-        *one_line, "now", "new", title="difference", title_justify="left", box=box.SIMPLE_HEAD
-    )
+    columns = (Column("module", no_wrap=True), Column("setting", no_wrap=True), "now", "new")
+    rows = Table(*columns, title="difference", title_justify="left", box=box.SIMPLE_HEAD)
     reasons: dict[str, None] = {}
     for change in difference:
         head, _, tail = change.name.rpartition(".")
-        rows.add_row(
-            change.module,
-            f"{head}.\n{tail}" if head else tail,
-            describe_setting(change.before),
-            describe_setting(change.after),
-        )
+        name = f"{head}.\n{tail}" if head else tail
+        values = map(describe_setting, (change.before, change.after))
+        rows.add_row(change.module, name, *values)
         if change.why:
-            reasons.setdefault(f"{tail}: {change.why}")
+            reasons[f"{tail}: {change.why}"] = None
         if change.inhibit:
-            inhibit = f"{change.module} {change.name} cannot be written: {change.inhibit}"
-            reasons.setdefault(inhibit)
+            reasons[f"{change.module} {change.name} cannot be written: {change.inhibit}"] = None
     return Group(rows, *(Padding(Text(reason), (0, 0, 0, 2), expand=False) for reason in reasons))
 
 

@@ -12,8 +12,11 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from enum import IntFlag
+from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
+
+from rich.status import Status
 
 from services.joint.differential import joint_from_motor
 from shared.bus.messages import Pair
@@ -50,6 +53,7 @@ POLES_WITHIN: Final = 0.04
 
 _ABSOLUTE: Final = 0x100
 """Bit of `encoder.config.mode`."""
+_DIRECTION: Final = "encoder.config.direction"
 _WATCHDOG: Final = "config.enable_watchdog"
 MARKS: Final = ("motor.config.pre_calibrated", "encoder.config.pre_calibrated")
 _READY: Final = ("motor.is_calibrated", "encoder.is_ready")
@@ -149,11 +153,7 @@ def scan_turns(values: Mapping[str, Value], axis: str) -> float:
 def refuse_unfit(
     module: str, board: Board, axes: Sequence[str], pause: Callable[[float], None] = time.sleep
 ) -> None:
-    """Refuse a board that cannot be calibrated as it is set up, or whose joint moves.
-
-    Raises:
-        DriveError: naming what, and what would be right.
-    """
+    """Refuse a board that cannot be calibrated as it is set up, or whose joint moves."""
     names = [f"{axis}.{name}" for axis in axes for name in _LOOK]
     levels = [f"config.dc_bus_{name}voltage_trip_level" for name in ("under", "over")]
     values = board.read([*names, *levels, "vbus_voltage"])
@@ -201,9 +201,9 @@ def calibrate_board(
         board: idle; it restarts before and after.
         axes: "axis0", "axis1" or both.
         interrupts: read all the time; one ends it, idles the axis and saves nothing.
-        progress: is told of the course.
+        progress: receives the axis, what it is at, and for how many seconds.
         clock: monotonic, s.
-        pause: waits so many seconds.
+        pause: waits a number of seconds.
     """
     board.restart()
     # a watchdog is fed over CAN only, and would end it
@@ -312,14 +312,8 @@ def _mismatch(board: Board, axis: str) -> str:
 
 
 def _found(board: Board, axis: str) -> Found:
-    names = [
-        f"{axis}.{name}"
-        for name in (
-            "motor.config.phase_resistance",
-            "motor.config.phase_inductance",
-            "encoder.config.direction",
-        )
-    ]
+    below = ("motor.config.phase_resistance", "motor.config.phase_inductance", _DIRECTION)
+    names = [f"{axis}.{name}" for name in below]
     values = board.read(names)
     ohm, henry, direction = (number(values, name) for name in names)
     return Found(ohm, henry, int(direction))
@@ -365,9 +359,6 @@ def refuse_standing(
     """Refuse a robot that may bear weight: a drive is armed, or a limp leg rests on something.
 
     Drives that are not on USB are listened to on CAN. A leg is judged where it has its zeros.
-
-    Raises:
-        DriveError: naming the first.
     """
     q: dict[str, Pair] = {}
     for module in MODULES:
@@ -420,7 +411,7 @@ def calibrate(
         boards: by module, with the axes to calibrate.
         interrupts: kept while an axis calibrates.
         yes: do not ask.
-        check: raises where somebody else has the drives by now.
+        check: raises an error if another program has the drives by now.
     """
     code, done = 0, list[str]()
     for module, (board, those) in boards.items():
@@ -438,8 +429,7 @@ def calibrate(
                 return DECLINED_EXIT_CODE
             check()  # a person may take minutes to answer
             with interrupts.kept(), console.status(module) as status:
-                told = _Course(console, module, status.update)
-                result = calibrate_board(board, those, interrupts, told)
+                result = calibrate_board(board, those, interrupts, partial(_show, status, module))
         except DriveError as error:
             console.print(marked("[bold red]{}[/]: {}", module, error))
             console.print("what it was at ends by itself; switch its supply off and on after that")
@@ -478,29 +468,15 @@ def tell(console: Console, robot: RobotConfig, module: str, result: BoardResult)
             )
         return False
     values = {f"{axis}.encoder.is_ready": True for axis in result.found} | {
-        f"{axis}.encoder.config.direction": each.direction for axis, each in result.found.items()
+        f"{axis}.{_DIRECTION}": each.direction for axis, each in result.found.items()
     }
-    wrong = [
-        row for row in direction_rows(module, values, robot) if row.verdict is FindingKind.WRONG
-    ]
+    rows = direction_rows(module, values, robot)
+    wrong = [row for row in rows if row.verdict is FindingKind.WRONG]
     for row in wrong:
-        console.print(
-            marked("[bold red]{}[/]: direction is {}: {}", row.subject, row.found, row.fix)
-        )
+        words = "[bold red]{}[/]: direction is {}: {}"
+        console.print(marked(words, row.subject, row.found, row.fix))
     return not wrong
 
 
-class _Course:
-    """Says what an axis is at: a line for each calibration, and the seconds in place."""
-
-    def __init__(self, console: Console, module: str, show: Callable[[str], None]) -> None:
-        self._console, self._module, self._show = console, module, show
-        self._begun: tuple[str, str] | None = None
-
-    def __call__(self, axis: str, procedure: Procedure, passed_s: float) -> None:
-        """Print what an axis is at."""
-        what = f"{self._module}.{axis}: {procedure.what}"
-        if self._begun != (axis, procedure.what):
-            self._begun = (axis, procedure.what)
-            self._console.print(f"{what}, {procedure.seconds:.3g} s")
-        self._show(f"{what}, {passed_s:.1f} of {procedure.seconds:.1f} s")
+def _show(status: Status, module: str, axis: str, procedure: Procedure, passed_s: float) -> None:
+    status.update(f"{module}.{axis}: {procedure.what}, {passed_s:.1f} of {procedure.seconds:.1f} s")

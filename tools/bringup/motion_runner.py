@@ -108,7 +108,7 @@ class Interrupts:
 
     @property
     def words(self) -> str:
-        """Why they stop a motion; "" if none came."""
+        """Why they stop a motion; "" without one."""
         return f"stopped by {signal.Signals(self.number).name}" if self.number else ""
 
     @contextlib.contextmanager
@@ -138,7 +138,7 @@ def await_reading(drive: Drive, clock: Clock = now_ns) -> DriveReading | None:
 
 
 def idle_reading(drive: Drive, clock: Clock = now_ns) -> DriveReading:
-    """Return the first reading of a drive that is nobody's and has its zero."""
+    """Return the first reading of an idle drive that is zeroed."""
     reading = await_reading(drive, clock)
     if reading is None:
         raise DriveError(NO_ANSWER)
@@ -205,15 +205,19 @@ def run_motion(
         progress: receives a sample now and then.
         clock: monotonic, ns.
     """
-    moved = _GuardedModule(module, drives[module], robot, plan, clock)
     hold = MotionPlan(0, Stay(), plan.torque_limit)
-    held = [
-        _GuardedModule(name, drive, robot, hold, clock)
+    modules = {
+        name: _GuardedModule(name, drive, robot, plan if name == module else hold, clock)
         for name, drive in drives.items()
-        if name != module
-    ]
+    }
+    moved = modules.pop(module)
+    held = list(modules.values())
     try:
-        trouble = _hold(held, interrupts) or moved.arm(interrupts, q_seen)
+        trouble = ""
+        for one in held:
+            if not trouble and (why := one.arm(interrupts)):
+                trouble = f"{one.name}: {why}"
+        trouble = trouble or moved.arm(interrupts, q_seen)
         if not trouble:
             trouble = _follow(moved, held, interrupts, progress)
     except BaseException as error:
@@ -261,13 +265,6 @@ class _GuardedModule:
         if target is not None:
             self.drive.write(target)
         return self.law.trouble
-
-
-def _hold(held: Sequence[_GuardedModule], interrupts: Interrupts) -> str:
-    for one in held:
-        if trouble := one.arm(interrupts):
-            return f"{one.name}: {trouble}"
-    return ""
 
 
 def _follow(
@@ -318,16 +315,17 @@ def arm(drive: Drive, interrupts: Interrupts, clock: Clock) -> DriveReading | st
 
 
 def _idle_all(modules: Sequence[_GuardedModule]) -> tuple[str, ...]:
-    """Idle all drives, even if one of them raises; return who does not say that it is idle."""
-    if not modules:
-        return ()
-    one, *others = modules
-    left: tuple[str, ...] = ()
-    try:
-        left = () if idle(one.drive, one.clock) else (one.name,)
-    finally:
-        left += _idle_all(others)
-    return left
+    """Idle all drives, even if one of them raises; return which do not say that they are idle."""
+    left: list[str] = []
+
+    def release(one: _GuardedModule) -> None:
+        if not idle(one.drive, one.clock):
+            left.append(one.name)
+
+    with contextlib.ExitStack() as stack:
+        for one in reversed(modules):
+            stack.callback(release, one)
+    return tuple(left)
 
 
 def idle(drive: Drive, clock: Clock) -> bool:
@@ -437,11 +435,14 @@ def ask_and_move(
     for name in modules:  # a person may take minutes to answer
         refuse_service(robot, name, flags.run_dir)
     name = f"{module}_{AXES[axis]}"
-    shown = contextlib.nullcontext(console.print) if alone else _in_place(console)
-    with open_drives(limited, modules, flags.run_dir) as drives, interrupts.kept(), shown as show:
+    with (
+        open_drives(limited, modules, flags.run_dir) as drives,
+        interrupts.kept(),
+        Live(console=console, refresh_per_second=4, transient=True) as shown,
+    ):
         result = run_motion(
             drives, limited, module, plan, q_seen=q[module], interrupts=interrupts,
-            progress=lambda sample: show(_line(sample, plan, name)),
+            progress=lambda sample: shown.update(_line(sample, plan, name)),
         )  # fmt: skip
     for one in modules:
         # only to drives that say that they are idle: full limits are nothing for an armed one
@@ -450,14 +451,11 @@ def ask_and_move(
         try:
             give_back(robot, one, flags.run_dir)
         except XrlError as error:
-            console.print(
-                marked(
-                    "[yellow]{}: the drive still has the limits of this motion ({}): until it is "
-                    "armed by its service or restarted, `xrl doctor` finds them wrong[/]",
-                    one,
-                    error,
-                )
+            words = (
+                "[yellow]{}: the drive still has the limits of this motion ({}): until it is "
+                "armed by its service or restarted, `xrl doctor` finds them wrong[/]"
             )
+            console.print(marked(words, one, error))
     if result.trouble or result.not_idle:
         return Stopped(f"{name}: {result.trouble or 'the motion ended'}", result.not_idle)
     return Moved(result.samples, plan, q)
@@ -477,11 +475,9 @@ def open_drives(
 
 
 def give_back(robot: RobotConfig, module: str, run_dir: Path) -> None:
-    """Set the limits of a module's drive, which must be idle and nobody's, to the robot file's."""
-    if robot.joint_service.driver == "odrive_usb":
-        _over_usb(robot, module, run_dir)
-    else:
-        _over_can(robot, module, run_dir)
+    """Set the limits of an idle module's drive to the robot file's."""
+    over_usb = robot.joint_service.driver == "odrive_usb"
+    (_over_usb if over_usb else _over_can)(robot, module, run_dir)
 
 
 def _over_can(robot: RobotConfig, module: str, run_dir: Path) -> None:
@@ -513,12 +509,6 @@ def _over_usb(robot: RobotConfig, module: str, run_dir: Path) -> None:
         kept = board.read(wanted)
     if not all(equal(kept.get(name), value) for name, value in wanted.items()):
         raise DriveError(f"ODrive {serial}: it did not keep them")
-
-
-@contextlib.contextmanager
-def _in_place(console: Console) -> Iterator[Callable[[Text], None]]:
-    with Live(console=console, refresh_per_second=4, transient=True) as shown:
-        yield shown.update
 
 
 def _line(sample: Sample, plan: AnyPlan, joint: str) -> Text:

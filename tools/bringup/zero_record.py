@@ -39,18 +39,11 @@ from tools.bringup.zeroing import DriveLook, Swing, look, refusal
 from tools.fleet.process_table import is_simulated
 from tools.fleet.run_dir import RunDir
 
-VERSION: Final = 1
+_CALIBRATION = ("mode", "cpr", "direction", "phase_offset", "phase_offset_float")
 IDENTITY: Final = tuple(
     f"axis{axis}.{name}"
     for axis in (0, 1)
-    for name in (
-        "encoder.config.mode",
-        "encoder.config.cpr",
-        "encoder.config.direction",
-        "encoder.config.phase_offset",
-        "encoder.config.phase_offset_float",
-        "motor.config.pole_pairs",
-    )
+    for name in (*(f"encoder.config.{each}" for each in _CALIBRATION), "motor.config.pole_pairs")
 )
 """Settings that an encoder's calibration finds anew, or that tell which encoder it is."""
 
@@ -98,7 +91,6 @@ class ModuleZero(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 class ZeroRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The file."""
 
-    version: int = VERSION
     gear_ratio: float
     encoder_counts_per_turn: int
     modules: dict[str, ModuleZero] = {}
@@ -112,11 +104,7 @@ def path_of(robot: RobotConfig, config: Path, run_dir: Path) -> Path:
 
 
 def read_zeros(path: Path, robot: RobotConfig) -> ZeroRecord:
-    """Read the zeros; none if there is no file.
-
-    Raises:
-        DriveError: it cannot be read, or is of another gear or encoder.
-    """
+    """Read the zeros; none if there is no file."""
     joint = robot.joint
     empty = ZeroRecord(
         gear_ratio=joint.gear_ratio, encoder_counts_per_turn=joint.encoder_counts_per_turn
@@ -131,7 +119,7 @@ def read_zeros(path: Path, robot: RobotConfig) -> ZeroRecord:
         raise DriveError(
             f"{path}: no zeros of `xrl drive zero`: {error}; remove it, and zero by a protractor"
         ) from None
-    for key in ("version", "gear_ratio", "encoder_counts_per_turn"):
+    for key in ("gear_ratio", "encoder_counts_per_turn"):
         if getattr(record, key) != getattr(empty, key):
             raise DriveError(
                 f"{path}: {key} {getattr(record, key):g}, and the robot file has "
@@ -142,11 +130,7 @@ def read_zeros(path: Path, robot: RobotConfig) -> ZeroRecord:
 
 
 def write_zeros(path: Path, record: ZeroRecord) -> None:
-    """Write the zeros, whole and on the disk.
-
-    Raises:
-        DriveError: it cannot be written.
-    """
+    """Write the zeros, whole and on the disk."""
     try:
         with atomic_file(path, lasting=True) as file:
             file.write(msgspec.json.format(msgspec.json.encode(record)) + b"\n")
@@ -175,13 +159,9 @@ def zeroed(
 
 def with_rests(record: ZeroRecord, rests: Mapping[str, Pair | None]) -> ZeroRecord:
     """Return the zeros with other rests, motor turns; None: unknown."""
-    now = timestamp()
-    modules = {
-        name: msgspec.structs.replace(zero, rest=rests[name], rest_time=now)
-        if name in rests
-        else zero
-        for name, zero in record.modules.items()
-    }
+    now, modules = timestamp(), dict(record.modules)
+    for name, rest in rests.items():
+        modules[name] = msgspec.structs.replace(modules[name], rest=rest, rest_time=now)
     return msgspec.structs.replace(record, modules=modules)
 
 
@@ -333,21 +313,14 @@ def evidence_of(
     swings: Mapping[str, Swing],
 ) -> dict[str, ModuleEvidence]:
     """Return the evidence of every module that has a stored zero and tells its angles."""
-    evidence = {}
-    for module, seen in looks.items():
-        zero = record.modules.get(module)
-        if zero is None or seen.angles is None:
-            continue
-        evidence[module] = ModuleEvidence(
-            offsets=zero.offsets,
-            angles=seen.angles,
-            rest=zero.rest,
-            about=about.get(module),
-            swing=swings.get(module),
-            untouched=untouched,
-            stranger=why_stranger(zero, robot, module, found.get(module)),
+    return {
+        module: ModuleEvidence(
+            zero.offsets, seen.angles, zero.rest, about.get(module), swings.get(module),
+            untouched=untouched, stranger=why_stranger(zero, robot, module, found.get(module)),
         )
-    return evidence
+        for module, seen in looks.items()
+        if (zero := record.modules.get(module)) is not None and seen.angles is not None
+    }  # fmt: skip
 
 
 def store_rests(
@@ -405,10 +378,7 @@ def not_its_zero(seen: DriveLook, offsets: Pair, gear_ratio: float) -> str:
     if seen.angles is None:
         return "its drive tells no angle within the turn"
     turns = motor_from_joint(seen.q_there, gear_ratio)
-    off = [
-        turn - angle - offset
-        for turn, angle, offset in zip(turns, seen.angles, offsets, strict=True)
-    ]
+    off = [t - a - o for t, a, o in zip(turns, seen.angles, offsets, strict=True)]
     if max(abs(each - round(each)) for each in off) > UNMOVED:
         return "its zero is not the stored one: `xrl drive zero` it again"
     return ""

@@ -34,6 +34,7 @@ def trap(subject: str, what: str = "controller.config.vel_limit", wanted: str = 
 
 
 TRAP = trap("knee_left.axis0")
+MANY = [trap(f"bus{i}", "speed") for i in range(8)]
 
 
 def printed(groups: dict[str, list[Finding]], width: int, *, verbose: bool = False) -> str:
@@ -88,7 +89,7 @@ def test_a_message_of_several_services_is_shown_once() -> None:
         ([*FINE, NOTED], "nothing wrong; 1 warning: robot file assumed"),
         ([TRAP], "1 wrong: knee_left.axis0 vel_limit"),
         ([TRAP, NOTED], "1 wrong: knee_left.axis0 vel_limit; 1 warning: robot file assumed"),
-        ([TRAP] * 8, "8 wrong: " + ", ".join(["knee_left.axis0 vel_limit"] * 6) + " and 2 more"),
+        (MANY, "8 wrong: " + ", ".join(f"bus{i} speed" for i in range(6)) + " and 2 more"),
         ([trap(axis) for axis in ALL_AXES], "12 wrong: all 12 vel_limit"),
     ],
 )

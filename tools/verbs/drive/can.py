@@ -88,11 +88,7 @@ def test(flags: TestFlags) -> int:
 
 
 def _buses(robot: RobotConfig, only: str | None) -> Mapping[str, tuple[int, ...]]:
-    """Return the nodes of each bus that is asked for.
-
-    Raises:
-        FleetError: there is none of that name.
-    """
+    """Return the nodes of each bus that is asked for."""
     known = bus_nodes(robot)
     if only is None:
         return known
