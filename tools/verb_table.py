@@ -112,7 +112,6 @@ VERBS: Final = (
     Verb("drive tare", "set the harness's zero from its unloaded reading"),
     Verb("drive can setup", "bring the kernel's CAN interfaces up", "drive.can:set_up"),
     Verb("drive can test", "listen and count what each drive and sensor sends", "drive.can:test"),
-    Verb("drive can latency", "measure how long each axis takes to answer", "drive.can:latency"),
     Verb("drive identify", "measure a hanging joint's friction and reflected inertia"),
     Verb("log info", "show what is in a log: topics, rates, gaps, losses"),
     Verb("log recover", "make a complete log from one that was cut off"),

@@ -12,7 +12,7 @@ from shared.config.files import load_without_schedule
 from shared.extras import EXTRAS
 from shared.places import CHECKOUT, DEFAULT_CONFIG
 from tools import cli
-from tools.bringup import survey
+from tools.verbs import doctor
 
 
 @pytest.mark.parametrize(
@@ -102,6 +102,6 @@ def test_doctor_tells_in_a_row_that_no_settings_are_read_without_the_package_for
     file.write_text(text.replace('interface = "xrl_unix"', 'interface = "socketcan"'), "utf-8")
     robot = load_without_schedule(file)
     monkeypatch.setitem(sys.modules, "odrive", None)
-    (row,) = survey._Usb(robot, {}, services_up=False).rows(tmp_path)
+    (row,) = doctor._Usb(robot, {}, services_up=False).rows(tmp_path)
     assert row.found == "odrive is not installed"
     assert row.fix.startswith("the extra `usb` brings it: ")
