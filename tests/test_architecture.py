@@ -101,7 +101,7 @@ VENDORS = {
     ],
     "odrive": ["services/joint/drivers/odrive_usb.py", "tools/bringup/usb_board.py"],
     "mcap": ["shared/mcap_log/*.py", "tools/logs/reexecution/rewritten.py"],
-    "foxglove": ["tools/judge/reports/foxglove.py", "tools/view/foxglove_server.py"],
+    "foxglove": ["tools/view/foxglove_server.py"],
     "supervisor": ["tools/fleet/*.py"],
     "can": [
         "shared/can/unix_can.py",

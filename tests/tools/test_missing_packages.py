@@ -26,6 +26,8 @@ from tools.bringup import survey
         ("log whatif OUT --kill planner", "sim"),
         ("bench", "sim"),
         ("bench fleet", "sim"),
+        ("drive tune x --sim", "sim"),
+        ("drive tune x", "plot"),
         ("drive identify body OUT", "plot"),
         ("drive identify joint --all", "plot"),
         ("gains", "design"),
