@@ -43,14 +43,16 @@ class FoxgloveServer:
         )
         self._poses, self._links, self._state = (
             foxglove.Channel(
-                row.topic,
-                schema=foxglove.Schema(
-                    name=row.schema_name, encoding=row.schema_encoding, data=row.schema
-                ),
-                message_encoding=row.encoding,
+                f"xrl/{robot}/scene/{name}",
+                schema=schema,
+                message_encoding=encoding.ENCODING,
                 context=self._context,
             )
-            for row in scene.channels(robot)[: scene.MODEL]
+            for name, schema in (
+                ("frames", encoding.transforms_schema()),
+                ("links", encoding.scene_schema()),
+                ("state", encoding.scene_schema()),
+            )
         )
 
     @property

@@ -42,15 +42,11 @@ def make(log: RunLog, out: Path) -> dict[str, Path]:
     cut = out / "cut.mcap"
     cut.write_bytes(run.path.read_bytes()[: run.path.stat().st_size * 2 // 3])
     recover.recover(cut, out / "recovered.mcap")
-    with contextlib.redirect_stdout(io.StringIO()):
-        words = ["log", "export", str(run.path), "--scene", "-o", str(out / "exported.mcap")]
-        assert cli.main(words) == 0
     return {
         "recorded": log.path,
         "whole": run.path,
         "cut": cut,
         "recovered": out / "recovered.mcap",
-        "exported": out / "exported.mcap",
         "every": _every_topic(out / "every"),
     }
 

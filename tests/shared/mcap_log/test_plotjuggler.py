@@ -1,8 +1,8 @@
 """Our files held against the rules by which PlotJuggler reads them (`plotjuggler.py`).
 
-A run in virtual time is opened as it was recorded, as recovered after a cut, and as exported with
-its scene (the last second of it, for speed); and a file with a message of every topic. Foxglove's
-own library takes every schema in tests/tools/judge/reports/test_scene.py.
+A run in virtual time is opened as it was recorded and as recovered after a cut (the last second of
+it, for speed); and a file with a message of every topic. Foxglove's own library takes every schema
+in tests/tools/judge/reports/test_scene.py.
 """
 
 from __future__ import annotations
@@ -20,12 +20,7 @@ from tests.shared.mcap_log.runs import OFFSET_NS, item
 from tests.shared.mcap_log.sample_logs import write_one
 from tools.logs.run_log import read_run
 
-SCENE = {
-    **dict.fromkeys(("scene/frames", "scene/links", "scene/state"), ("protobuf", "protobuf")),
-    "robot_description": ("ros2msg", "cdr"),
-}
-"""What an exported copy has more, and who reads it: for Rerun a text of ROS 2."""
-MADE = ("whole", "recovered", "exported", "every")
+MADE = ("whole", "recovered", "every")
 
 
 @pytest.fixture(scope="module")
@@ -38,12 +33,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def test_every_message_of_every_file_is_read_and_nothing_but_text_is_lost(
     files: dict[str, Path], name: str
 ) -> None:
-    """The scene's channels are no JSON: PlotJuggler's own parsers of these read them."""
     found, log = opened(files[name]), read_run(files[name])
-    scene = SCENE if name == "exported" else {}
-    assert found.left == {f"xrl/{log.robot}/{key}": parsers for key, parsers in scene.items()}
-    keys = set(log.keys()) - set(found.left)
-    assert found.messages == {key: log.count(key) for key in keys}
+    assert found.left == {}
+    assert found.messages == {key: log.count(key) for key in log.keys()}  # noqa: SIM118
     assert found.lost == {}
 
 
@@ -62,7 +54,7 @@ def test_what_is_cut_off_by_a_kill_needs_its_recovery(files: dict[str, Path]) ->
 
 @pytest.mark.parametrize("name", ["recorded", *MADE])
 def test_the_formats_own_doctor_finds_no_error(files: dict[str, Path], name: str) -> None:
-    """What it warns of is meant: see the docstrings of `mcap_log` and `scene`."""
+    """What it warns of is meant: see the docstrings of `mcap_log`."""
     found = Examined(files[name])
     assert found.errors == []
     log = read_run(files[name])
@@ -72,8 +64,6 @@ def test_the_formats_own_doctor_finds_no_error(files: dict[str, Path], name: str
         "Schema described twice",
         "Channel described twice",
     }
-    if name == "exported":
-        meant.add("a message's log time is before an earlier one's")
     assert set(found.warnings) <= meant
 
 

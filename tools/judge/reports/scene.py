@@ -1,17 +1,14 @@
 """3-D scene of the robot: a frame for each module, a body for each link, COM and forces.
 
 The frames are those of `shared.robot.frames`, and `com` with the axes of the world. The links are
-those of `shared.robot.robot_model`. Rerun draws bodies from URDF alone, in a ROS 2 message; all its
-joints are floating: the transforms give the poses of the frames.
+those of `shared.robot.robot_model`.
 """
 
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Final, NamedTuple
-from xml.etree import ElementTree as ET
 
 import numpy as np
 
@@ -23,34 +20,22 @@ from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.joints import MODULES, SIDES
-from shared.mcap_log.log_copy import NewChannel, NewMessage
 from shared.robot.frames import ORIGIN, UPRIGHT, FramePose, Quaternion, body_frames, torso_rotation
 from shared.robot.robot_model import MODULE_RADIUS
-from tools.judge.reports import foxglove
 from tools.judge.reports.foxglove import Arrow, Colour, Entity, Solid
 from tools.logs.run_log import RunLog
 
 RATE_HZ: Final = 30.0
-LINKS_PERIOD_S: Final = 1.0
-"""Links do not change; they are repeated for a viewer that starts in the middle."""
 METRES_PER_NEWTON: Final = 0.005
 FORCE_MIN_N: Final = 2.0
 """Smaller forces have no arrow, since it would show the sensor's noise."""
 
-FRAMES, LINKS, STATE, MODEL = range(4)
 LINK: Final[Colour] = (0.62, 0.66, 0.70, 1.0)
 BODY: Final[Colour] = (0.45, 0.52, 0.60, 0.55)
 COM: Final[Colour] = (0.05, 0.37, 0.65, 1.0)
 HAND: Final[Colour] = (0.77, 0.31, 0.11, 1.0)
 PUSH: Final[Colour] = (0.55, 0.20, 0.60, 1.0)
 UNKNOWN: Final[Colour] = (0.4, 0.4, 0.4, 1.0)
-URDF_SCHEMA_NAME: Final = "std_msgs/msg/String"
-URDF_SCHEMA: Final = b"string data\n"
-URDF_SCHEMA_ENCODING: Final = "ros2msg"
-URDF_ENCODING: Final = "cdr"
-"""Encoding of the message."""
-_LITTLE_ENDIAN: Final = b"\x00\x01\x00\x00"
-NO_MODE: Final = -1
 MODES: Final[dict[int, Colour]] = {
     Mode.DISARMED: (0.70, 0.74, 0.77, 1.0),
     Mode.HOLD: (0.85, 0.56, 0.12, 1.0),
@@ -78,62 +63,6 @@ class RobotPose(NamedTuple):
     """Force of the operator on the torso, N, torso axes."""
     push: Vector3
     """N, world axes."""
-
-
-def channels(robot: str) -> list[NewChannel]:
-    """Return the channels of a scene: `FRAMES`, `LINKS`, `STATE` and, for Rerun, `MODEL`."""
-    rows = (
-        ("frames", foxglove.transforms_schema(), f"{RATE_HZ:g}", "pose of each module"),
-        ("links", foxglove.scene_schema(), f"{1.0 / LINKS_PERIOD_S:g}", "bodies of the robot"),
-        ("state", foxglove.scene_schema(), f"{RATE_HZ:g}", "modes by colour, COM, forces"),
-    )
-    found = [
-        NewChannel(
-            f"xrl/{robot}/scene/{name}",
-            schema.name,
-            schema.encoding,
-            schema.data,
-            foxglove.ENCODING,
-            {"rate_hz": rate, "why": why},
-        )
-        for name, schema, rate, why in rows
-    ]
-    model = NewChannel(
-        f"xrl/{robot}/robot_description",  # the name that Rerun expects
-        URDF_SCHEMA_NAME,
-        URDF_SCHEMA_ENCODING,
-        URDF_SCHEMA,
-        URDF_ENCODING,
-        {"why": "bodies of the robot as URDF, once"},
-    )
-    return [*found, model]
-
-
-def messages(logs: Iterable[RunLog], robot: RobotConfig) -> Iterator[NewMessage]:
-    """Yield the messages of a run's scene in the order of time."""
-    links_ns: int | None = None
-    missing: RunError | None = None
-    for log in logs:
-        try:
-            for pose in poses(log, robot):
-                ns = pose.t_ns + log.offset_ns
-                if links_ns is None:
-                    yield NewMessage(MODEL, ns, urdf_message(model(log.robot, robot, pose)))
-                yield NewMessage(FRAMES, ns, foxglove.transforms(ns, frames(robot, pose)))
-                if links_ns is None or ns - links_ns >= LINKS_PERIOD_S * NS_PER_S:
-                    links_ns = ns
-                    yield NewMessage(LINKS, ns, foxglove.scene(ns, links(robot)))
-                yield NewMessage(STATE, ns, foxglove.scene(ns, state(pose)))
-        except RunError as error:  # a module was silent in this part
-            missing = missing or error
-    if links_ns is None and missing is not None:
-        raise missing
-
-
-def model(name: str, robot: RobotConfig, pose: RobotPose) -> str:
-    """Return all bodies of a robot as URDF; the modules have the colour of no mode."""
-    still = pose._replace(modes=(NO_MODE,) * len(MODULES))
-    return urdf(name, frames(robot, pose), [*links(robot), *state(still)])
 
 
 def poses(log: RunLog, robot: RobotConfig) -> Iterator[RobotPose]:
@@ -251,44 +180,3 @@ def _arrows(force: Vector3, colour: Colour, position: Vector3 = ORIGIN) -> tuple
     if size < FORCE_MIN_N:
         return ()
     return (Arrow(position, rotation_to(force), METRES_PER_NEWTON * size, 0.02, colour),)
-
-
-def urdf_message(text: str) -> bytes:
-    """Return a `std_msgs/msg/String` in CDR."""
-    data = text.encode() + b"\0"
-    return _LITTLE_ENDIAN + struct.pack("<I", len(data)) + data
-
-
-def urdf(robot: str, frames: Sequence[FramePose], entities: Iterable[Entity]) -> str:
-    """Return the model: a link for each frame and its parents, a visual for each solid."""
-    root = ET.Element("robot", name=robot)
-    names = dict.fromkeys(name for row in frames for name in (row.parent, row.child))
-    links = {name: ET.SubElement(root, "link", name=name) for name in names}
-    for entity in entities:
-        for solid in entity.solids:
-            _add_visual(links[entity.frame], entity.name, solid)
-    for row in frames:
-        joint = ET.SubElement(root, "joint", name=f"to_{row.child}", type="floating")
-        ET.SubElement(joint, "parent", link=row.parent)
-        ET.SubElement(joint, "child", link=row.child)
-    ET.indent(root)
-    return ET.tostring(root, encoding="unicode")
-
-
-def _add_visual(link: ET.Element, name: str, solid: Solid) -> None:
-    visual = ET.SubElement(link, "visual", name=name)
-    ET.SubElement(visual, "origin", xyz=_listed(solid.position))
-    geometry = ET.SubElement(visual, "geometry")
-    x, _, z = solid.size
-    if solid.shape == "cube":
-        ET.SubElement(geometry, "box", size=_listed(solid.size))
-    elif solid.shape == "cylinder":
-        ET.SubElement(geometry, "cylinder", radius=str(x / 2), length=str(z))
-    else:
-        ET.SubElement(geometry, "sphere", radius=str(x / 2))
-    material = ET.SubElement(visual, "material", name=name)
-    ET.SubElement(material, "color", rgba=_listed(solid.colour))
-
-
-def _listed(values: Iterable[float]) -> str:
-    return " ".join(map(str, values))

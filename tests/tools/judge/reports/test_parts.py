@@ -109,13 +109,12 @@ def test_a_part_before_the_scenario_is_no_reason_not_to_judge_the_run(log: RunLo
 
 def test_the_scene_of_the_parts_is_that_of_the_whole(log: RunLog) -> None:
     robot = robot_of(log)
-    whole = [m for m in scene.messages([log], robot) if m.channel == scene.STATE]
+    whole = list(scene.poses(log, robot))
     parts = [
-        m for m in scene.messages(parts_of(log.index, part_s=PART_S), robot)
-        if m.channel == scene.STATE
-    ]  # fmt: skip
+        pose for part in parts_of(log.index, part_s=PART_S) for pose in scene.poses(part, robot)
+    ]
     assert abs(len(parts) - len(whole)) <= 1 + log.index.length_s / PART_S
-    times = [m.log_ns for m in parts]
+    times = [pose.t_ns for pose in parts]
     assert times == sorted(set(times))
 
 
