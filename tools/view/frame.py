@@ -286,8 +286,7 @@ class Newest:
         self, truth: SimTruth | None, states: list[JointState]
     ) -> tuple[tuple[SoleLoad, ...], bool]:
         """Return the soles' loads, and whether they are estimated."""
-        # a world of before the soles were measured has zeros
-        if truth is not None and any((*truth.foot_right_force, *truth.foot_left_force)):
+        if truth is not None:
             loads: Sequence[SoleLoad] = (
                 SoleLoad(truth.foot_right_force, truth.foot_right_cop),
                 SoleLoad(truth.foot_left_force, truth.foot_left_cop),

@@ -1,8 +1,8 @@
 """Foxglove's well-known 3-D messages, encoded by its own library. Pure.
 
 `foxglove.FrameTransforms` and `foxglove.SceneUpdate` in protobuf: viewers know them by name.
-Lengths and positions are in m, rotations are quaternions (x, y, z, w), colours are (r, g, b, a) from
-0 to 1.
+Lengths and positions are in m, rotations are quaternions (x, y, z, w), colours are (r, g, b, a)
+from 0 to 1.
 """
 
 from __future__ import annotations
