@@ -29,7 +29,6 @@ EXTRAS: Final = {
     "foxglove": ("foxglove",),
     "ros2": ("rosbags",),
     "usb": ("odrive",),
-    "parquet": ("pyarrow",),
     "pad": ("evdev",),
     "learn": ("gymnasium",),
     "cluster": ("distributed",),
@@ -63,7 +62,7 @@ def is_installed(extra: str) -> bool:
 
 
 def _is_there(package: str) -> bool:
-    """Return True for a package; deploy is on the path too, and its folder `foxglove` is none."""
+    """Return True for a package; deploy is on the path too, and its folder `plants` is none."""
     found = importlib.util.find_spec(package)
     if found is None or found.origin is not None:
         return found is not None

@@ -73,7 +73,6 @@ VENDORS = {
     "rosbags": ["services/ros2_gateway/ros_types.py", "tools/export/ros2_bag.py"],
     "gymnasium": ["tools/lab/learning/environment.py"],
     "shtab": ["tools/verbs/completion.py"],
-    "pyarrow": ["tools/export/tables.py"],
     "mujoco": [
         "services/simulator/physics/world.py",
         "services/simulator/physics/body.py",

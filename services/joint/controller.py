@@ -268,10 +268,7 @@ class JointController:
     def restore(self, snapshot: ControllerSnapshot) -> None:
         """Continue from a copy of a state."""
         self._state = copied(snapshot.state)
-        if self._state.heat.stepped_ns:
-            self.heat.state = self._state.heat
-        else:  # a log from before there was an estimate
-            self._state.heat = self.heat.state
+        self.heat.state = self._state.heat
         self._law.restore(copied(snapshot.law))
 
     def inside_limits(self) -> bool:

@@ -39,7 +39,6 @@ CASES: list[list[str]] = [
     *(["sim", flag, "/dev/zero"] for flag in ("--config", "--scenario")),
     ["log", "report", RUN, "-o", LONG, "--open", "no"],
     ["log", "export", RUN, "--gif", LONG],
-    ["log", "export", RUN, "--scene", "-o", LONG],
     ["gains", "--stiffness", "--config", "/dev/zero"],
     ["status", "--run-dir", LONG],
     ["down", "--run-dir", LONG],

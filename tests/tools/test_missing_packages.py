@@ -37,9 +37,7 @@ from tools.bringup import survey
         ("view --foxglove", "foxglove"),
         ("up --view", "view"),
         ("log export OUT --gif a.gif", "plot"),
-        ("log export OUT --scene", "foxglove"),
         ("log export OUT --ros2bag bag", "ros2"),
-        ("log export OUT --parquet t", "parquet"),
         ("ros2 check", "ros2"),
     ],
 )
