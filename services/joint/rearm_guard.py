@@ -182,7 +182,6 @@ class Pendant:
         self._beats = 0
         for module in modules:
             with suppress(FileNotFoundError), path_of(run_dir, module).open("r+b") as file:
-                file.truncate(len(_NEW))  # from before there were pendants: it is shorter
                 self._memories[module] = mmap.mmap(file.fileno(), len(_NEW))
 
     @property

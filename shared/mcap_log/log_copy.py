@@ -1,4 +1,4 @@
-"""Copies of a log: recovered with the end that it lacks, or with further messages in it.
+"""A copy of a log with the end that it lacks.
 
 Chunks are copied as they are, byte for byte, and get the index that they lack. The mcap package's
 writer cannot copy a chunk that exists already, and adding each message again cost 36 us a message.
@@ -7,10 +7,8 @@ writer cannot copy a chunk that exists already, and adding each message again co
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
-from typing import BinaryIO, Final, NamedTuple
+from collections.abc import Callable
+from typing import BinaryIO
 
 from mcap.opcode import Opcode
 from mcap.records import (
@@ -20,20 +18,16 @@ from mcap.records import (
     Chunk,
     ChunkIndex,
     Header,
-    McapRecord,
     Metadata,
     MetadataIndex,
     Schema,
     Statistics,
 )
 
-from shared.atomic_file import atomic_file
-from shared.exceptions import RunError
-from shared.mcap_log.reader import LOOSE_MAX, LogReader, LogRecord, open_log
+from shared.mcap_log.reader import LOOSE_MAX, LogRecord
 from shared.mcap_log.records import (
     MAGIC,
     MESSAGE_RECORD,
-    PREFIX,
     ChunkMessage,
     compressed_chunk,
     encode,
@@ -47,12 +41,10 @@ from shared.mcap_log.records import (
 class LogCopy:
     """Takes the records of a file in their order and writes what a finished file needs.
 
-    `raw` gives the original's bytes from one offset to another; `library` names the writer.
+    `raw` gives the original's bytes from one offset to another.
     """
 
-    def __init__(
-        self, file: BinaryIO, raw: Callable[[int, int], bytes], library: str = "xrl log recover"
-    ) -> None:
+    def __init__(self, file: BinaryIO, raw: Callable[[int, int], bytes]) -> None:
         self.channels: dict[int, Channel] = {}
         self.orphans = 0
         """Messages of undefined channels; left out."""
@@ -61,7 +53,7 @@ class LogCopy:
             message_count=0, message_end_time=0, message_start_time=0, metadata_count=0,
             schema_count=0,
         )  # fmt: skip
-        self._file, self._raw, self._library = file, raw, library
+        self._file, self._raw = file, raw
         self._position = 0
         self._definitions: dict[tuple[int, int], bytes] = {}
         """By opcode and id: a schema's or a channel's record."""
@@ -226,7 +218,7 @@ class LogCopy:
 
     def _begin(self, profile: str) -> None:
         if not self._position:
-            head = MAGIC + encode(Header(profile=profile, library=self._library))
+            head = MAGIC + encode(Header(profile=profile, library="xrl log recover"))
             self._position += self._file.write(head)
 
     def _write(self, data: bytes) -> tuple[int, int]:
@@ -242,115 +234,3 @@ def _cut_out(record: LogRecord, rows: list[ChunkMessage]) -> list[bytes]:
     """Return the records of some of the messages."""
     begin = MESSAGE_RECORD.size
     return [record.body[row.start - begin : row.end] for row in rows]
-
-
-# ---- further messages
-
-NOTE: Final = "export"
-"""Metadata of an extended copy: where it comes from."""
-
-_FIRST_ID: Final = 60_000  # of new schemas and channels: far beyond those of a recorder
-
-
-class NewChannel(NamedTuple):
-    """A channel to add; its encodings are named as in MCAP's registry."""
-
-    topic: str
-    schema_name: str
-    schema_encoding: str
-    schema: bytes
-    encoding: str
-    """Encoding of the messages."""
-    about: dict[str, str]
-
-
-class NewMessage(NamedTuple):
-    """A message to add."""
-
-    channel: int
-    """Index in the list of channels."""
-    log_ns: int
-    """Log time: ns since 1970, as in the recorded messages."""
-    payload: bytes
-
-
-def write_extended(
-    path: Path, out: Path, channels: list[NewChannel], messages: Iterable[NewMessage]
-) -> int:
-    """Write a finished copy of a log with messages added; return the number of all in the copy.
-
-    The log stays as it is; a file named `out` is replaced when the copy is complete. The topics of
-    the channels are new, the messages come in the order of time. Raises RunError if the log cannot
-    be read or has such a topic, or the copy cannot be written.
-    """
-    try:
-        with open_log(path) as reader, atomic_file(out, lasting=True) as file:
-            copy = LogCopy(file, reader.raw, "xrl log export")
-            for record in _extended(path, reader, channels, messages):
-                copy.take(record)
-            copy.finish(Metadata(name=NOTE, metadata={"from": path.name}))
-    except OSError as error:
-        raise RunError(
-            f"{out}: cannot be written: {error.strerror or error}; give another -o"
-        ) from None
-    return copy.counts.message_count
-
-
-def _extended(
-    path: Path, reader: LogReader, channels: list[NewChannel], messages: Iterable[NewMessage]
-) -> Iterator[LogRecord]:
-    """Yield a log's records and the new ones.
-
-    New messages stand in chunks of their own between the recorded ones, so that a viewer finds what
-    belongs together close by.
-    """
-    topics, sent = {channel.topic for channel in channels}, [0] * len(channels)
-    waiting = iter(messages)
-    following = next(waiting, None)
-
-    def new_until(last_ns: float) -> Iterator[LogRecord]:
-        nonlocal following
-        while following is not None and following.log_ns <= last_ns:
-            yield _message_as_read(following, sent[following.channel])
-            sent[following.channel] += 1
-            following = next(waiting, None)
-
-    defined = False
-    for record in reader:
-        if record.rows and not defined:
-            defined = True
-            yield from _definitions_as_read(channels)
-        for value in record.values():
-            if isinstance(value, Channel) and value.topic in topics:
-                raise RunError(f"{path}: has {value.topic} already; export the original")
-        yield record
-        if record.rows:
-            yield from new_until(max(row.log_ns for row in record.rows))
-    if not defined:
-        yield from _definitions_as_read(channels)
-    yield from new_until(math.inf)
-
-
-def _definitions_as_read(channels: list[NewChannel]) -> Iterator[LogRecord]:
-    for number, row in enumerate(channels, _FIRST_ID):
-        schema = Schema(
-            id=number, data=row.schema, encoding=row.schema_encoding, name=row.schema_name
-        )
-        channel = Channel(
-            id=number, topic=row.topic, message_encoding=row.encoding, metadata=row.about,
-            schema_id=number,
-        )  # fmt: skip
-        definitions: tuple[tuple[int, McapRecord], ...] = (
-            (Opcode.SCHEMA, schema), (Opcode.CHANNEL, channel),
-        )  # fmt: skip
-        for opcode, value in definitions:
-            yield LogRecord(opcode, 0, 0, encode(value)[PREFIX.size :], value)
-
-
-def _message_as_read(message: NewMessage, seq: int) -> LogRecord:
-    start = MESSAGE_RECORD.size
-    head = (_FIRST_ID + message.channel, seq, message.log_ns, message.log_ns)
-    length = start - PREFIX.size + len(message.payload)
-    body = MESSAGE_RECORD.pack(Opcode.MESSAGE, length, *head) + message.payload
-    row = ChunkMessage(*head, start, len(body))
-    return LogRecord(Opcode.MESSAGE, 0, 0, body, rows=(row,))

@@ -33,9 +33,7 @@ from tools.verbs import doctor
         ("view --foxglove", "foxglove"),
         ("up --view", "view"),
         ("log export OUT --gif a.gif", "plot"),
-        ("log export OUT --scene", "foxglove"),
         ("log export OUT --ros2bag bag", "ros2"),
-        ("log export OUT --parquet t", "parquet"),
         ("ros2 check", "ros2"),
     ],
 )

@@ -189,19 +189,12 @@ def _walk(name: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
     if isinstance(a, dict) and isinstance(b, dict):
         for field, value in a.items():
             yield from _walk(f"{name}.{field}" if name else field, value, b.get(field))
-    elif (
-        isinstance(a, list | tuple)
-        and isinstance(b, list | tuple)
-        and (len(a) == len(b) or (name in _RECORDS and len(a) < len(b)))
-    ):
-        for index, (one, other) in enumerate(zip(a, b, strict=False)):
+    elif isinstance(a, list | tuple) and isinstance(b, list | tuple) and len(a) == len(b):
+        for index, (one, other) in enumerate(zip(a, b, strict=True)):
             yield from _walk(f"{name}[{index}]", one, other)
     else:
         yield name, a, b
 
-
-_RECORDS: Final = ("snapshot.request",)
-"""Fields written as a list: an older log has fewer of them, as a struct has that grew."""
 
 Origin: TypeAlias = Mapping[str, Mapping[str, str]]
 """Metadata of a log (`shared.mcap_log.provenance`): `run` and `packages`."""

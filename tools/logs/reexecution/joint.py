@@ -217,7 +217,7 @@ def _reading(c: CycleTrace) -> DriveReading | None:
     if status is None:
         raise RunError(
             f"trace of the cycle at {c.now_ns} ns: drive status {c.status}; there are 0 to "
-            f"{max(_STATUS)}: the record is damaged, or of a later version"
+            f"{max(_STATUS)}: the record is damaged"
         )
     return DriveReading(
         c.sampled_ns,
