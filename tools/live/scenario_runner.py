@@ -35,7 +35,6 @@ from tools.fleet.pace import IDLE_LEAST, PACE_MIN, CoresFullError, idle_and_tota
 from tools.fleet.proxy_client import ProxyClient
 from tools.fleet.stalls import STALL_SHOWN_NS, Stall, StallWatch
 from tools.fleet.supervise import SupervisedFleet
-from tools.live.planner_return import PlannerReturn
 
 READY_TIMEOUT_S: Final = 45.0
 """Longer than all that a planner waits after the first five drop-outs: a machine may stall."""
@@ -187,7 +186,7 @@ class ScenarioRunner:
         self._states = {
             module: session.latest(topics.JOINT_STATE, JointState, module) for module in MODULES
         }
-        self._planner = PlannerReturn(session.latest(topics.PLANNER_STATUS, PlannerStatus))
+        self._planner: Latest[PlannerStatus] = session.latest(topics.PLANNER_STATUS, PlannerStatus)
         self._control = session.publisher(topics.SIM_CONTROL, SimControl)
         self._truth: SimTruth | None = None
         self._truth_at_s = time.monotonic()
@@ -295,7 +294,7 @@ class ScenarioRunner:
                         self._check_cores(idle_share(before))
                     before, look_s = idle_and_total(), time.monotonic() + PATIENCE_S
             if time.monotonic() > deadline:
-                lead = self._planner.latest.take()
+                lead = self._planner.take()
                 raise RunError(
                     f"not all six modules track after {READY_TIMEOUT_S:.0f} s: "
                     f"{(lead.why if lead else '') or self._describe_modes()}; "
@@ -353,12 +352,7 @@ class ScenarioRunner:
                 name_of(Mode, self._modes[module])[0] if module in self._modes else "-"
                 for module in MODULES
             )
-            words = (
-                self._note,
-                self._planner.waits(truth, self._modes.values()),
-                self._stall_words(),
-            )
-            note = "; ".join(word for word in words if word)
+            note = "; ".join(word for word in (self._note, self._stall_words()) if word)
             self._show(LiveSnapshot(truth, modes, note))
         elif time.monotonic() - self._truth_at_s > SILENT_S and self._events.start_ns:
             raise RunError(f"the simulator has said nothing for {SILENT_S:.0f} s; see its log")
@@ -394,8 +388,6 @@ class ScenarioRunner:
             self._fleet.start_service(row.service)
             self._next_pids_s = 0.0
             self._note = f"{row.service} back"
-            if row.service == "planner":
-                self._planner.start(self._truth)
         elif isinstance(row, Inject):
             ProxyClient(self._fleet.run.path).begin(row)
         elif isinstance(row, Fault):
