@@ -163,7 +163,6 @@ TOOL_LAWS = [
     "tools/lab/design/*.py",
     "tools/lab/learning/policy.py",
     "tools/logs/reexecution/compare.py",
-    "tools/logs/reexecution/inputs.py",
     "tools/logs/reexecution/params.py",
 ]
 
