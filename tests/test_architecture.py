@@ -151,7 +151,6 @@ TOOL_LAWS = [
     "tools/bringup/whole_turns.py",
     "tools/lab/design/*.py",
     "tools/logs/reexecution/compare.py",
-    "tools/logs/reexecution/inputs.py",
     "tools/logs/reexecution/params.py",
 ]
 

@@ -8,12 +8,15 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, Final, TypeAlias
+from typing import Any, Final, TypeAlias, TypeVar
 
 import msgspec
 
 from shared.bus.messages import Message
+from shared.exceptions import RunError
 from shared.revision import UNKNOWN
+
+State = TypeVar("State")
 
 _F64: Final = struct.Struct("<d")
 _I64: Final = struct.Struct("<q")
@@ -144,6 +147,17 @@ class ReexecutionResult:
     def equal(self) -> bool:
         """True if something was executed, and nothing came out otherwise."""
         return self.ticks > 0 and not self.differs
+
+
+def memory_of(text: str, kind: type[State]) -> State:
+    """Return a recorded memory."""
+    try:
+        return msgspec.json.decode(text, type=kind)
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise RunError(
+            f"a service's memory in the log is no {kind.__name__}: {error}; execute it again with "
+            "the checkout that wrote it (`xrl log info` tells its commit)"
+        ) from None
 
 
 def size(row: Difference) -> float:

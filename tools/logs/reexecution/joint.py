@@ -24,8 +24,7 @@ from shared.bus.traces import CycleTrace, JointTrace
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.state import copied
-from tools.logs.reexecution.compare import ReexecutionResult
-from tools.logs.reexecution.inputs import memory_of
+from tools.logs.reexecution.compare import ReexecutionResult, memory_of
 from tools.logs.run_log import RunLog
 
 _encode: Final = msgspec.json.Encoder().encode

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-from tools.judge.reports.page_model import PageModel, Panel
 
 from shared.arrays import Array
 from shared.bus import topics

@@ -8,8 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tools.judge.reports.page_model import Line, PageModel, PageWindow, Plot
-from tools.judge.reports.signals import Span
 
 from shared.bus import topics
 from shared.exceptions import RunError
