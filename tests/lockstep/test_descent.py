@@ -19,8 +19,8 @@ from shared.exceptions import FleetError
 from shared.joints import MODULE_INDEX, MODULES
 from tests.lockstep.runs import Run, kill, led_to, modes_of, push, run, still
 from tests.planner.states import with_law
-from tools.live.descent import LIGHT_FRACTION, Ask, Descent, Phase
 from tools.lab.studies.sweeps import plants
+from tools.live.descent import LIGHT_FRACTION, Ask, Descent, Phase
 from tools.sim.lockstep import Lockstep
 from tools.sim.standing_start import begin_standing
 

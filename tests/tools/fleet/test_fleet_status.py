@@ -38,8 +38,6 @@ from tools.fleet.fleet_status import (
     ModuleStatus,
     RateMonitor,
     RefusedCommands,
-    ServiceStatus,
-    lead_status,
     module_status,
     tools_of,
 )
@@ -109,18 +107,19 @@ def test_a_module_without_states_is_not_guessed_at() -> None:
     assert (status.mode, status.tier, status.q, status.way_out) == (None, None, None, "")
 
 
-def test_a_silent_planner_is_reported() -> None:
-    assert lead_status(None) is None
-    assert "each module holds" in describe_lead(None)
-
-
-def test_the_reason_why_the_planner_does_not_lead_yet_is_reported() -> None:
-    good = LeadStatus("LEADING", wait_s=0.0, margin=1.2)
-    assert describe_lead(good) == "planner LEADING, margin 1.20"
-    waits = describe_lead(LeadStatus("ALIGNING", wait_s=12.3, margin=1.2))
-    assert "leads again in 12 s" in waits
-    line = describe_lead(LeadStatus("MISPLACED", wait_s=0.0, margin=1.2, why="a foot is ahead"))
-    assert line == "planner MISPLACED, margin 1.20; a foot is ahead"
+@pytest.mark.parametrize(
+    ("lead", "words"),
+    [
+        (None, "planner silent: each module holds by itself"),
+        (LeadStatus("LEADING", 0.0, 1.2), "planner LEADING, margin 1.20"),
+        (LeadStatus("ALIGNING", 12.3, 1.2), "leads again in 12 s"),
+        (LeadStatus("MISPLACED", 0.0, 1.2, "a foot is ahead"), "margin 1.20; a foot is ahead"),
+    ],
+)
+def test_whether_the_planner_leads_and_why_not_is_reported(
+    lead: LeadStatus | None, words: str
+) -> None:
+    assert words in describe_lead(lead)
 
 
 def fleet_with(lead_session: int, *modules: ModuleStatus) -> FleetStatus:
@@ -137,12 +136,9 @@ def test_refused_commands_are_told_with_their_cause_sender_and_what_to_do(refusa
     (line,) = describe_refusals(fleet_with(7, *rows, module_status(tracking())))
     assert f"refused, {refusal.name} of session 99: ankle_right 250/s, knee_right 120/s; " in line
     assert len(line.rpartition("; ")[2]) > 10, "and what to do"
-
-
-def test_what_is_no_command_is_told_without_a_session() -> None:
-    malformed = RefusedCommands(Refusal.MALFORMED.name, 0, 40.0)
-    (line,) = describe_refusals(fleet_with(7, module_status(tracking(), (malformed,))))
-    assert line.startswith("refused, MALFORMED: ankle_right 40/s; ")
+    nobodys = module_status(tracking(), (RefusedCommands(refusal.name, 0, 40.0),))
+    (line,) = describe_refusals(fleet_with(7, nobodys))
+    assert line.startswith(f"refused, {refusal.name}: ankle_right 40/s; "), "no command: no session"
 
 
 def test_each_way_out_is_told_once_with_its_modules_at_any_width() -> None:
@@ -266,25 +262,14 @@ def test_codes_that_this_version_does_not_know_are_told() -> None:
         ("hip_left", "running", False),
         ("planner", "running", False),
         ("planner", "suspended", None),
-        ("recorder", "running", False),
         ("ros2_gateway", "running", None),
     ],
 )
-def test_real_time_is_expected_of_running_services_that_the_table_gives_it(
+def test_running_services_that_the_table_gives_real_time_and_lack_it_are_told(
     monkeypatch: pytest.MonkeyPatch, name: str, state: str, real_time: bool | None
 ) -> None:
     monkeypatch.setattr(scheduling, "has_real_time", lambda _pid: False)
-    info = ServiceInfo(name, 7, state, 1.0)
-    assert fleet_status._service_status(info).real_time is real_time
-
-
-def test_services_without_real_time_are_told() -> None:
-    def row(real_time: bool | None) -> ServiceStatus:
-        return ServiceStatus("x", 1, "running", 1.0, real_time=real_time)
-
-    status = msgspec.structs.replace(
-        fleet_with(7), services={"planner": row(False), "hip_left": row(True), "view": row(None)}
-    )
-    assert describe_real_time(status).endswith(": planner")
-    served = msgspec.structs.replace(status, services={"hip_left": row(True)})
-    assert describe_real_time(served) == ""
+    row = fleet_status._service_status(ServiceInfo(name, 7, state, 1.0))
+    assert row.real_time is real_time
+    words = describe_real_time(msgspec.structs.replace(fleet_with(7), services={name: row}))
+    assert words.endswith(f": {name}") if real_time is False else words == ""
