@@ -75,7 +75,7 @@ def judged(alive: int, listed: tuple[Mutation, ...], **asked: object) -> tuple[i
         group=(Group(name="a", modules=(), tests=()),),
         reason=(Reason(why=WHY, lives=listed),) if listed else (),
     )
-    flags = {"only": None, "sample": False, "survivors": False, "group": None}
+    flags = {"sample": False, "group": None}
     console = Console(record=True, width=200)
     code = mutants._judge([found], told, argparse.Namespace(**(flags | asked)), console)
     return code, console.export_text()

@@ -39,8 +39,6 @@ LINKED: Final = ("services", "shared", "tests", "tools", "deploy", "docs", "READ
 EXAMPLES: Final = """examples:
   ./deploy/mutants                      all groups; an hour on two cores
   ./deploy/mutants --group joint        one of them
-  ./deploy/mutants --only '*Failsafe*'  mutants by name
-  ./deploy/mutants --survivors          those that lived the last time
   ./deploy/mutants --resume             go on with what was stopped
 """
 
@@ -118,9 +116,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--group", action="append", help="only this group; may be repeated")
     which = parser.add_mutually_exclusive_group()
-    which.add_argument("--only", metavar="PATTERN", help="only mutants whose name matches")
     which.add_argument("--sample", action="store_true", help="a fixed sample of the first group")
-    which.add_argument("--survivors", action="store_true", help="those that lived the last time")
     which.add_argument("--resume", action="store_true", help="go on with a run that was stopped")
     parser.add_argument("--children", type=int, default=os.cpu_count(), help="processes")
     parser.add_argument(
@@ -131,18 +127,13 @@ def _parser() -> argparse.ArgumentParser:
 
 def _run(group: Group, args: argparse.Namespace, console: Console) -> GroupResult:
     folder = args.out.resolve() / group.name
-    patterns = [args.only] if args.only else [SAMPLE] if args.sample else []
-    if args.survivors:
-        patterns = [name for name, status in _statuses(folder) if status not in {*DEAD, UNTRIED}]
-        if not patterns:
-            raise RunError(f"group {group.name}: none lived the last time, or it never ran")
-    elif not args.resume and folder.exists():
+    if not args.resume and folder.exists():
         shutil.rmtree(folder)
     _prepare(group, folder)
     console.print(
         marked("[bold]{}[/]: {} modules; log: {}/run.log", group.name, len(group.modules), folder)
     )
-    _mutmut_run(folder, ["--max-children", str(args.children), *patterns], console)
+    _mutmut_run(folder, ["--max-children", str(args.children), *[SAMPLE] * args.sample], console)
     ran = [row for row in _statuses(folder) if row[1] != UNTRIED]
     alive = [
         (name, change_of(name, _mutmut(folder, "show", name)))
@@ -240,14 +231,14 @@ def _judge(
     counts = sum((found.counts for found in groups), Counter[str]())
     total, dead = counts.total(), sum(counts[word] for word in DEAD)
     if not total:
-        raise RunError("no mutant has such a name")
+        raise RunError("no mutant was made")
     listed = {change for reason in allowed.reason for change in reason.lives}
     alive = [row for found in groups for row in found.alive]
     unlisted = [(name, change) for name, change in alive if change not in listed]
     for name, change in unlisted:
         console.print(f"lives: {name}", style="red")
         console.print(f"  - {change.was}\n  + {change.becomes}", markup=False, soft_wrap=True)
-    whole = not (args.only or args.sample or args.survivors or args.group)
+    whole = not (args.sample or args.group)
     stale = listed - {change for _, change in alive} if whole else set()
     for change in sorted(stale):
         text = f"listed, and does not live: {change.function}: {change.becomes}"
@@ -256,7 +247,7 @@ def _judge(
         f"{dead} of {total} mutants fail a test ({dead / total:.1%}); {len(alive)} live, "
         f"{len(alive) - len(unlisted)} of them for a reason in {FILE.relative_to(ROOT)}"
     )
-    low = dead < LEAST_SHARE * total and not (args.only or args.survivors)
+    low = dead < LEAST_SHARE * total
     if low:
         console.print(f"at least {LEAST_SHARE:.0%} are to fail one", style="red")
     return FAULT_EXIT_CODE if unlisted or stale or low else 0
