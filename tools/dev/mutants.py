@@ -133,7 +133,7 @@ def _run(group: Group, args: argparse.Namespace, console: Console) -> GroupResul
     console.print(
         marked("[bold]{}[/]: {} modules; log: {}/run.log", group.name, len(group.modules), folder)
     )
-    _mutmut_run(folder, ["--max-children", str(args.children), *[SAMPLE] * args.sample], console)
+    _mutmut_run(folder, ["--max-children", str(args.children), *[SAMPLE] * args.sample])
     ran = [row for row in _statuses(folder) if row[1] != UNTRIED]
     alive = [
         (name, change_of(name, _mutmut(folder, "show", name)))
@@ -170,33 +170,24 @@ def _prepare(group: Group, folder: Path) -> None:
     (folder / "pyproject.toml").write_text(text, encoding="utf-8")
 
 
-def _mutmut_run(folder: Path, words: Sequence[str], console: Console) -> None:
-    """Run mutmut; its own words go into run.log, its count is shown."""
-    command = [sys.executable, "-m", "mutmut", "run", *words]
-    with (
-        (folder / "run.log").open("w", encoding="utf-8") as log,
-        subprocess.Popen(
-            command,
+def _mutmut_run(folder: Path, words: Sequence[str]) -> None:
+    """Run mutmut; its words go into run.log."""
+    with (folder / "run.log").open("w", encoding="utf-8") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "mutmut", "run", *words],
             cwd=folder,
-            stdout=subprocess.PIPE,
+            stdout=log,
             stderr=subprocess.STDOUT,
-            text=True,
             start_new_session=True,  # with the processes of its own that it leaves behind
-        ) as process,
-        console.status("mutating, and running the tests as they are") as status,
-    ):
-        assert process.stdout is not None  # noqa: S101 - it is a pipe
+        )
         try:
-            for line in process.stdout:
-                log.write(line)
-                if "/" in line and "🎉" in line:
-                    status.update(line.strip())
+            status = process.wait()
         except BaseException:
             os.killpg(process.pid, signal.SIGKILL)
             raise
-    if process.returncode != 0:
+    if status != 0:
         last = (folder / "run.log").read_text(encoding="utf-8").strip().splitlines()[-3:]
-        raise RunError(f"mutmut ended with {process.returncode}: {' / '.join(last)}")
+        raise RunError(f"mutmut ended with {status}: {' / '.join(last)}")
 
 
 def _mutmut(folder: Path, *words: str) -> str:
