@@ -21,16 +21,15 @@ from shared.places import CHECKOUT
 _PLOT: Final = ("matplotlib", "PIL")
 
 EXTRAS: Final = {
-    "sim": ("mujoco", *_PLOT),
+    "sim": ("mujoco", "scipy", *_PLOT),
     "plot": _PLOT,
-    "design": ("cvxpy",),
+    "design": ("cvxpy", "scipy"),
     "view": ("aiohttp",),
     "foxglove": ("foxglove",),
     "ros2": ("rosbags",),
     "usb": ("odrive",),
     "parquet": ("pyarrow",),
     "pad": ("sdl2", "sdl2dll"),
-    "learn": ("gymnasium",),
     "cluster": ("distributed",),
     "bench": ("cyclonedds", "iceoryx2", "lcm", "zmq"),
 }

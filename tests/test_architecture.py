@@ -71,7 +71,6 @@ VENDORS = {
     "getpass": ["shared/user.py"],
     "zenoh": ["shared/bus/session.py", "services/ros2_gateway/ros_session.py"],
     "rosbags": ["services/ros2_gateway/ros_types.py", "tools/export/ros2_bag.py"],
-    "gymnasium": ["tools/lab/learning/environment.py"],
     "shtab": ["tools/verbs/completion.py"],
     "pyarrow": ["tools/export/tables.py"],
     "mujoco": [
@@ -86,7 +85,6 @@ VENDORS = {
     "matplotlib": [
         "tools/output.py",
         "tools/judge/figure.py",
-        "tools/lab/design/damping_picture.py",
         "tools/lab/studies/sweeps/kill.py",
         "tools/lab/studies/sweeps/latency_report.py",
     ],
@@ -122,7 +120,6 @@ NEEDS_EXTRA = {
     "tools/view/foxglove_server.py": "foxglove",
     "tools/export/ros2_bag.py": "ros2",
     "tools/judge/reports/moving_picture.py": "plot",
-    "tools/lab/learning/environment.py": "learn",
 }
 """Modules that cannot be imported without an extra. Whoever imports one, by a function, has called
 `require` there. All others can be imported with the packages of `dependencies` alone."""
@@ -151,21 +148,15 @@ TOOL_LAWS = [
     "shared/mcap_log/sequence_stats.py",
     "tools/bringup/free_leg.py",
     "tools/bringup/hanging_leg.py",
-    "tools/bringup/identify/body_fit.py",
-    "tools/bringup/identify/body_statics.py",
-    "tools/bringup/identify/estimates.py",
-    "tools/bringup/identify/quasi_static.py",
-    "tools/bringup/identify/sines.py",
+    "tools/bringup/identify.py",
     "tools/bringup/jog.py",
     "tools/bringup/motion.py",
     "tools/bringup/whole_turns.py",
     "tools/lab/design/*.py",
-    "tools/lab/learning/policy.py",
     "tools/logs/reexecution/compare.py",
     "tools/logs/reexecution/inputs.py",
     "tools/logs/reexecution/params.py",
 ]
-
 
 LAWS = [
     file
@@ -302,7 +293,7 @@ def test_no_files_import_each_other_in_a_circle_not_even_for_a_type() -> None:
 
 
 def test_the_design_of_the_gains_knows_the_planners_law_and_no_other_service() -> None:
-    allowed = ("services.planner.", "shared.", "tools.lab.design.", "tools.output.")
+    allowed = ("services.planner.", "shared.", "tools.lab.design.")
 
     def is_foreign(_: str, i: Import) -> bool:
         return i.top in PACKAGES and not f"{i.full}.".startswith(allowed)
@@ -544,7 +535,6 @@ def test_only_simulations_know_the_centralised_baseline_and_no_robot_file_names_
         "tools/sim/recorded_lockstep.py",
         "tools/verbs/sim.py",
         "tools/lab/studies/sweeps/latency_trial.py",
-        "tools/sim/centralised/fleet.py",
     }
     for file in (ROOT / "deploy").rglob("*.toml"):
         assert "centralised" not in file.read_text(encoding="utf-8"), file

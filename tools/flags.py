@@ -85,8 +85,6 @@ class Arg(NamedTuple):
     is_positional: bool = False
     is_one: bool = False
     """One word gives the whole tuple."""
-    takes_many: bool = False
-    """One flag takes several words, in place of a flag for each."""
     exclusive: str = ""
     """Flags of the same word here exclude each other."""
     one_of: str = ""
@@ -287,10 +285,8 @@ def _argument(field: _Field) -> dict[str, Any]:
     metavar = arg.metavar or (_unit(field) if "choices" not in found else "")
     if metavar:
         found["metavar"] = metavar
-    if field.is_repeated and (arg.is_positional or arg.takes_many):
-        found["nargs"] = "+" if field.is_required or arg.takes_many else "*"
-        if not arg.is_positional:
-            found["action"] = "extend"
+    if field.is_repeated and arg.is_positional:
+        found["nargs"] = "+" if field.is_required else "*"
     elif field.is_repeated:
         found["action"] = "append"
     elif arg.is_positional and not field.is_required:

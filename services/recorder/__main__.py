@@ -7,7 +7,7 @@ and SIGINT finish the file; after SIGKILL the next recorder, or `xrl log recover
 flushed.
 
 With --of it is one host's own recorder: it dials these services only, and records what they say
-though the network to the fleet's recorder is cut. `xrl log join` joins the records.
+though the network to the fleet's recorder is cut.
 """
 
 from __future__ import annotations

@@ -256,8 +256,7 @@ class RunEventKind(IntEnum):
     FAULTED = 5
     """A drive's fault began; the subject is the module, the detail the kind."""
     STALLED = 6
-    """The machine, a core of it, all joint services or the simulator stood still until then; the
-    subject says which, the detail for how long."""
+    """The machine stalled until then; the detail says for how long."""
 
 
 def name_of(kind: type[IntEnum], code: int) -> str:

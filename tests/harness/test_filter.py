@@ -28,7 +28,7 @@ from tests.harness.helpers import (
     harness_with,
     legs,
     six,
-)  # fmt: skip
+)
 
 Array = npt.NDArray[np.float64]
 LAW = WrenchFilter(HARNESS)
@@ -67,15 +67,11 @@ def settled(
     return state, reading, t_ns
 
 
-def test_nothing_is_valid_before_the_first_sample() -> None:
+def test_valid_comes_exactly_when_the_tare_time_is_full() -> None:
     state, reading = LAW.step(FilterState(), T0, None)
-    assert (reading.valid, reading.age_ns) == (False, -1)
+    assert (reading.valid, reading.age_ns) == (False, -1), "nor before the first sample"
     assert not reading.wrench.any()
     assert state.tare is not Tare.DONE
-
-
-def test_valid_comes_exactly_when_the_tare_time_is_full() -> None:
-    state = FilterState()
     for t_ns in range(T0, T0 + TARE_NS, PERIOD_NS):
         state, reading = feed(LAW, state, t_ns, ZERO)
         assert not reading.valid
@@ -97,14 +93,15 @@ def test_tare_removes_any_constant_bias(
     np.testing.assert_allclose(reading.wrench, wrench, atol=1e-6)
 
 
-def test_tare_averages_noise() -> None:
+def test_tare_averages_noise_and_a_gap_of_just_the_stale_time_does_not_disturb_it() -> None:
     noise = np.random.default_rng(1).standard_normal((200, 6))
-    state, t_ns, used = FilterState(), T0, 0
-    while state.tare is not Tare.DONE:
-        state, _ = feed(LAW, state, t_ns, tuple(50.0 + noise[used]))
-        used += 1
-        t_ns += PERIOD_NS
-    np.testing.assert_allclose(state.offset, 50.0 + noise[:used].mean(axis=0))
+    for gap_ns in (PERIOD_NS, STALE_NS):
+        state, t_ns, used = FilterState(), T0, 0
+        while state.tare is not Tare.DONE:
+            state, _ = feed(LAW, state, t_ns, tuple(50.0 + noise[used]))
+            used, t_ns = used + 1, t_ns + gap_ns
+        np.testing.assert_allclose(state.offset, 50.0 + noise[:used].mean(axis=0))
+        assert t_ns - gap_ns == T0 + TARE_NS
 
 
 @pytest.mark.parametrize("disturbance", ["gap", "saturation"])
@@ -140,14 +137,6 @@ def test_a_tare_is_taken_up_to_the_limit_of_the_forces_deviation(leg: int, share
         t_ns += PERIOD_NS
     assert reading.valid is (share < 1.0)
     assert state.tare is (Tare.DONE if share < 1.0 else Tare.UNSTEADY)
-
-
-def test_a_gap_of_just_the_stale_time_does_not_disturb_the_tare() -> None:
-    state, t_ns = FilterState(), T0
-    while state.tare is not Tare.DONE:
-        state, _ = feed(LAW, state, t_ns, ZERO)
-        t_ns += STALE_NS
-    assert t_ns - STALE_NS == T0 + TARE_NS
 
 
 def test_tare_can_be_started_again_and_keeps_the_last_wrench_meanwhile() -> None:
@@ -196,14 +185,6 @@ def test_step_response_does_not_depend_on_when_samples_come(cuts: list[int]) -> 
     assert reading.wrench[0] == pytest.approx(expected, abs=1e-9)
 
 
-def test_a_sample_seen_twice_or_out_of_order_does_not_move_the_wrench() -> None:
-    state, t_ns = tared()
-    state, before = feed(LAW, state, t_ns + PERIOD_NS, legs((20.0, 0, 0, 0, 0, 0)))
-    for again_ns in (t_ns + PERIOD_NS, t_ns):
-        _, reading = feed(LAW, state, again_ns, legs((999.0, 0, 0, 0, 0, 0)))
-        np.testing.assert_array_equal(reading.wrench, before.wrench)
-
-
 LAST_BELOW = float(np.nextafter(np.float32(LIMIT), np.float32(0)))
 LEVELS = (
     *((level, False) for level in (0.0, 0.5 * LIMIT, LIMIT - 1.0, LAST_BELOW)),
@@ -239,38 +220,31 @@ def test_a_cell_at_the_end_of_its_range_is_saturated_whatever_float32_makes_of_i
     assert reading.saturated
 
 
-def test_saturation_is_judged_before_the_tare_is_taken_off() -> None:
-    bias = (LIMIT - 10.0,) * 6
-    state, t_ns = tared(bias=bias)
-    _, reading = feed(LAW, state, t_ns + PERIOD_NS, (LIMIT, *bias[1:]))
-    assert reading.saturated
+def test_saturation_is_judged_before_the_tare_and_ends_with_the_first_sample_below_it() -> None:
+    for level in (0.0, LIMIT - 10.0):
+        state, t_ns = tared(bias=(level,) * 6)
+        state, reading = feed(LAW, state, t_ns + PERIOD_NS, (LIMIT, *[level] * 5))
+        assert reading.saturated
+        state, reading = LAW.step(state, t_ns + PERIOD_NS + 1, None)
+        assert (reading.saturated, reading.valid) == (True, False)
+        _, reading = feed(LAW, state, t_ns + 2 * PERIOD_NS, (level,) * 6)
+        assert (reading.saturated, reading.valid) == (False, True)
 
 
-def test_validity_returns_with_the_first_sample_below_the_limit() -> None:
+def test_a_sample_is_usable_up_to_the_stale_age_and_not_beyond() -> None:
     state, t_ns = tared()
-    state, _ = feed(LAW, state, t_ns + PERIOD_NS, (LIMIT,) * 6)
-    state, reading = LAW.step(state, t_ns + PERIOD_NS + 1, None)
-    assert reading.saturated
-    assert not reading.valid
-    _, reading = feed(LAW, state, t_ns + 2 * PERIOD_NS, ZERO)
-    assert reading.valid
-    assert not reading.saturated
-
-
-@pytest.mark.parametrize(
-    ("age_ns", "valid"),
-    [(0, True), (1, True), (STALE_NS // 2, True), (STALE_NS - 1, True), (STALE_NS, True),
-     (STALE_NS + 1, False), (STALE_NS + NS_PER_MS, False), (100 * STALE_NS, False), (-1, False)],
-)  # fmt: skip
-def test_a_sample_is_usable_up_to_the_stale_age_and_not_beyond(age_ns: int, valid: bool) -> None:
-    state, t_ns = tared()
-    _, reading = LAW.step(state, t_ns + age_ns, None)
-    assert (reading.valid, reading.age_ns) == (valid, age_ns)
+    for age_ns in (-1, 0, 1, STALE_NS // 2, STALE_NS - 1, STALE_NS, STALE_NS + 1, 100 * STALE_NS):
+        _, reading = LAW.step(state, t_ns + age_ns, None)
+        assert (reading.valid, reading.age_ns) == (0 <= age_ns <= STALE_NS, age_ns)
 
 
 def test_the_last_good_wrench_is_kept_while_stale_and_replaced_by_the_next_sample() -> None:
+    """A sample seen twice or out of order does not move it."""
     state, t_ns = tared()
     state, before, t_ns = settled(LAW, state, t_ns, legs((20.0, 0, 0, 0, 0, 0)))
+    for again_ns in (t_ns, t_ns - PERIOD_NS):
+        _, reading = feed(LAW, state, again_ns, legs((999.0, 0, 0, 0, 0, 0)))
+        np.testing.assert_array_equal(reading.wrench, before.wrench)
     state, reading = LAW.step(state, t_ns + NS_PER_S, None)
     assert not reading.valid
     np.testing.assert_array_equal(reading.wrench, before.wrench)

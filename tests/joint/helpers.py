@@ -12,6 +12,7 @@ from services.joint.controller import CycleResult, JointController
 from services.joint.differential import joint_torque, motor_from_joint
 from services.joint.drive_manager import DriveAction, DriveCommand, DriveManager
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.failsafe import timing_of
 from services.joint.neighbours import UNKNOWN, NeighbourView
 from services.joint.pd_law import Setpoint
 from services.joint.rearm_guard import LastState
@@ -20,7 +21,17 @@ from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_S
 from shared.config.gain_schedule import believing
 from shared.config.robot_config import RobotConfig
+from tests.robots import ROBOT as SHIPPED
 
+_KNEE = msgspec.structs.replace(SHIPPED.stand.knee, k_p=(900.0, 1500.0), k_d=(45.0, 25.0))
+ROBOT = msgspec.structs.replace(
+    believing(SHIPPED),
+    stand=msgspec.structs.replace(SHIPPED.stand, knee=_KNEE),
+    joint_service=msgspec.structs.replace(SHIPPED.joint_service, hold_stiffens_theta=("ankle",)),
+)
+"""A robot with a soft knee, whose theta HOLD does not stiffen: no test here is about tuning. Its
+joint services believe any command within their limits; `envelope` is tested by itself."""
+TIMING = timing_of(ROBOT)
 T0 = 1_000 * NS_PER_S
 SESSION = 7
 LoopName = Literal["onboard", "service"]
@@ -219,10 +230,7 @@ class ModuleBench(BenchJoint):
     def reading(self) -> DriveReading:
         """Return what the drive measures and tells."""
         return msgspec.structs.replace(
-            super().reading(),
-            error=int(self.error),
-            torque=self.carries,
-            encoder_zero=self.zero,
+            super().reading(), error=int(self.error), torque=self.carries, encoder_zero=self.zero
         )
 
     def cycle(

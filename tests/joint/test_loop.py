@@ -23,12 +23,12 @@ from shared.bus.messages import (
     Mode,
     Pair,
     Refusal,
-)
+)  # fmt: skip
 from shared.bus.ports import M
 from shared.bus.traces import JointTrace
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
-from tests.joint.helpers import SESSION, T0, command, with_service
+from tests.joint.helpers import ROBOT, SESSION, T0, command, with_service
 
 
 class Inbox(Generic[M]):
@@ -102,6 +102,8 @@ class FakeDrive:
 class Rig:
     """A service's loop over one drive, and the file that outlives it, if there is one."""
 
+    ended_session = seq = 0
+
     def __init__(self, robot: RobotConfig, file: RearmGuard | None = None) -> None:
         self.now_ns = T0
         self.onboard = robot.joint_service.loop == "onboard"
@@ -115,16 +117,13 @@ class Rig:
         self.states, self.events = Outbox[JointState](), Outbox[JointEvent]()
         self.traces = Outbox[JointTrace]()
         ports = JointPorts(
-            commands=self.commands,
-            estops=self.estops,
-            states=self.states,
-            events=self.events,
-            traces=self.traces,
-            planner=self,
+            self.commands, self.estops, self.states, self.events, self.traces, planner=self
         )
         self.loop = JointLoop(robot, module, self.drive, ports, file, clock=lambda: self.now_ns)
 
-    ended_session = 0
+    @property
+    def mode(self) -> Mode:
+        return self.controller.failsafe.mode
 
     def ended(self) -> int:
         """Return the session whose planner's process has ended, once."""
@@ -151,21 +150,15 @@ class Rig:
             self.commands.waiting.append(command(seq=self.seq, echo_t_ns=stamp))
             self.run(2)
 
-    seq = 0
-
-    @property
-    def mode(self) -> Mode:
-        return self.controller.failsafe.mode
-
 
 @pytest.fixture(params=["onboard", "service"])
-def rig(robot: RobotConfig, request: pytest.FixtureRequest) -> Rig:
-    return Rig(with_service(robot, loop=request.param))
+def rig(request: pytest.FixtureRequest) -> Rig:
+    return Rig(with_service(ROBOT, loop=request.param))
 
 
 @pytest.fixture
-def onboard(robot: RobotConfig) -> Rig:
-    return Rig(with_service(robot, loop="onboard"))
+def onboard() -> Rig:
+    return Rig(with_service(ROBOT, loop="onboard"))
 
 
 class Stop:
@@ -180,81 +173,64 @@ class Stop:
         return self.left < 0
 
 
-def test_a_drive_without_errors_is_armed_at_once(rig: Rig) -> None:
-    rig.run(2)
-    assert (rig.drive.cleared, rig.drive.armed, rig.mode) == (0, 1, Mode.HOLD)
+@pytest.mark.parametrize(
+    "why", ["nothing", "lost", "outside its limits", "its errors come back", "no state is sent"]
+)
+def test_a_drive_is_armed_once_and_only_when_nothing_speaks_against_it(rig: Rig, why: str) -> None:
+    """A knee that has not been zeroed reads 0: its soft stop would kick it with 80 N m.
+
+    A failed encoder shows again 51 ms after it was cleared; armed meanwhile, it is blind.
+    """
+    drive, q, put = rig.drive, rig.drive.q, rig.states.put
+    drive.comes_back = why == "its errors come back"
+    if why == "lost":
+        drive.status = DriveStatus.LOST
+    elif drive.comes_back:
+        drive.status = DriveStatus.ERROR
+    elif why == "outside its limits":
+        drive.q = (0.0, 0.0)
+    elif why == "no state is sent":
+        rig.states.put = lambda _message: False  # type: ignore[method-assign]
+    if why != "nothing":
+        rig.run_ns(4 * ARM_EVERY_NS)
+        assert (drive.armed, drive.targets) == (0, [])
+        assert set(drive.torques) <= {(0.0, 0.0)}
+    assert (drive.cleared > 2) is drive.comes_back
+    drive.comes_back, drive.q, rig.states.put = False, q, put  # type: ignore[method-assign]
+    drive.status = DriveStatus.IDLE if drive.status is DriveStatus.LOST else drive.status
+    rig.run(2) if why == "nothing" else rig.run_ns(2 * ARM_EVERY_NS)
+    assert (drive.armed, rig.mode) == (1, Mode.HOLD)
 
 
-def test_errors_are_cleared_and_have_stayed_away_before_the_drive_is_armed(rig: Rig) -> None:
-    """A failed encoder shows again 51 ms after it was cleared; armed meanwhile, it is blind."""
-    rig.drive.status = DriveStatus.ERROR
-    rig.drive.comes_back = True
-    rig.run_ns(3 * ARM_EVERY_NS)
-    assert (rig.drive.cleared > 2, rig.drive.armed) == (True, 0)
-    rig.drive.comes_back = False
-    rig.run_ns(2 * ARM_EVERY_NS)
-    assert (rig.drive.armed, rig.mode) == (1, Mode.HOLD)
-
-
-def test_a_torque_drive_armed_by_another_is_armed_by_us_before_it_is_held(
-    robot: RobotConfig,
-) -> None:
-    rig = Rig(with_service(robot, loop="service"))
+def test_a_torque_drive_armed_by_another_is_armed_by_us_before_it_is_held() -> None:
+    rig = Rig(with_service(ROBOT, loop="service"))
     rig.drive.status = DriveStatus.ARMED
     for mode in (Mode.DISARMED, Mode.HOLD):
         rig.run(1)
         assert (rig.mode, rig.drive.armed) == (mode, 1)
 
 
-def test_a_joint_outside_its_limits_is_not_armed_until_it_is_inside(rig: Rig) -> None:
-    """A knee that has not been zeroed reads 0: its soft stop would kick it with 80 N m."""
-    rig.drive.q = (0.0, 0.0)
-    rig.run(1000)
-    assert rig.drive.armed == 0
-    assert not rig.drive.targets
-    assert set(rig.drive.torques) <= {(0.0, 0.0)}
-    rig.drive.q = (0.0, -1.0)
-    rig.run_ns(ARM_EVERY_NS)
-    assert rig.mode is Mode.HOLD
-
-
-def test_a_lost_drive_is_not_asked_to_arm(rig: Rig) -> None:
-    rig.drive.status = DriveStatus.LOST
-    rig.run(100)
-    assert rig.drive.armed == 0
-
-
 @pytest.mark.parametrize("loop", ["onboard", "service"])
 @pytest.mark.parametrize("interrupted", [True, False])
 @pytest.mark.parametrize(
-    ("mode", "left"),
-    [
-        (Mode.DISARMED, LastState.NOTHING),
-        (Mode.HOLD, LastState.HELD),
-        (Mode.DAMP, LastState.DAMP),
-    ],
+    ("mode", "left"), [(Mode.DISARMED, "NOTHING"), (Mode.HOLD, "HELD"), (Mode.DAMP, "DAMP")]
 )
 def test_a_fleet_that_goes_down_leaves_idle_drives_and_a_service_ended_alone_one_that_holds(
-    robot: RobotConfig,
-    tmp_path: Path,
-    mode: Mode,
-    left: LastState,
-    interrupted: bool,
-    loop: str,
+    tmp_path: Path, mode: Mode, left: str, interrupted: bool, loop: str
 ) -> None:
     """A fleet that goes down leaves nothing, a service that ends alone that it held or sank."""
     guard = RearmGuard(tmp_path, "knee_right")
-    rig = Rig(with_service(robot, loop=loop), guard)
+    rig = Rig(with_service(ROBOT, loop=loop), guard)
     rig.drive.obeys = mode is not Mode.DISARMED
     rig.run(20)
     if mode is Mode.DAMP:
         rig.estops.waiting.append(Estop(t_ns=0, seq=1, source="test"))
         rig.run(5)
-    assert (rig.mode, guard.read()) == (mode, left)
+    assert (rig.mode, guard.read()) == (mode, LastState[left])
     rig.end(interrupted=interrupted)
     goes_on = loop == "onboard" and mode is not Mode.DISARMED and not interrupted
     assert rig.drive.idled == int(not goes_on)
-    assert guard.read() is (LastState.NOTHING if interrupted else left)
+    assert guard.read() is (LastState.NOTHING if interrupted else LastState[left])
 
 
 def test_states_carry_the_stamp_of_the_drives_sample(rig: Rig) -> None:
@@ -331,13 +307,3 @@ def test_the_end_of_the_planners_process_is_hold_in_that_cycle_and_traced(onboar
     cycles = [each for trace in onboard.traces.sent for each in trace.cycles]
     ended = {at: each.ended for at, each in enumerate(cycles, 1) if each.ended}
     assert ended == {cycle - 39: SESSION + 1, cycle + 1: SESSION}
-
-
-def test_a_module_whose_state_cannot_be_sent_does_not_arm(robot: RobotConfig) -> None:
-    rig = Rig(robot)
-    put, rig.states.put = rig.states.put, lambda _message: False  # type: ignore[method-assign]
-    rig.run_ns(NS_PER_S)
-    assert rig.drive.armed == 0
-    rig.states.put = put  # type: ignore[method-assign]
-    rig.run_ns(NS_PER_S)
-    assert rig.drive.armed > 0

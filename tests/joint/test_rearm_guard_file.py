@@ -34,7 +34,6 @@ from tools.verbs import services
 
 MODULE = "knee_left"
 
-
 PID = 4711
 
 

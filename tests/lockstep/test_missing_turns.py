@@ -18,10 +18,10 @@ from services.joint.drivers.base import DriveReading, DriveStatus
 from services.joint.drivers.wired_drive import MotorFrame, WiredDrive
 from services.joint.rearm_guard import LastState
 from services.simulator.drives.axis_bank import AxisBank
-from services.simulator.drives.odd_encoder import Words
+from services.simulator.drives.axis_encoders import Words
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
+from tests.robots import ROBOT
 from tools.sim.virtual_drive import VirtualDrive
 
 PERIOD_NS = 2 * NS_PER_MS
@@ -86,24 +86,24 @@ def words(dice: np.random.Generator) -> list[Words]:
     return found
 
 
-def draw(robot: RobotConfig, seed: int) -> list[Outcome]:
+def draw(seed: int) -> list[Outcome]:
     """Run six modules through motions with wrong words."""
     dice = np.random.default_rng(seed)
-    counts, mark = robot.joint.encoder_counts_per_turn, robot.drive.zero_mark_turns
-    bank = AxisBank(robot.drive, encoder_counts_per_turn=counts, watchdog=False)
+    counts, mark = ROBOT.joint.encoder_counts_per_turn, ROBOT.drive.zero_mark_turns
+    bank = AxisBank(ROBOT.drive, encoder_counts_per_turn=counts, watchdog=False)
     now_ns = NS_PER_S
     held = [bool(dice.random() < 0.6) for _ in MODULES]
     frame = MotorFrame(mark)
     drives, modules, true, wrong = [], [], np.zeros((CYCLES, 12)), []
     for i, name in enumerate(MODULES):
-        drive = PhasedDrive(bank, i, robot.drive, lambda: now_ns, counts_per_turn=counts)
+        drive = PhasedDrive(bank, i, ROBOT.drive, lambda: now_ns, counts_per_turn=counts)
         drive.phase_ns = int(dice.integers(0, BEAT_NS))
         drives.append(WiredDrive(drive, frame))
         last = LastState.NOTHING if held[i] else LastState.HELD
-        modules.append(DriveManager(robot, name, last))
-        limit = getattr(robot.limits, name.split("_")[0])
+        modules.append(DriveManager(ROBOT, name, last))
+        limit = getattr(ROBOT.limits, name.split("_")[0])
         q = (sum(limit.phi) / 2, sum(limit.theta) / 2)
-        start = motor_from_joint(q, robot.joint.gear_ratio)
+        start = motor_from_joint(q, ROBOT.joint.gear_ratio)
         both = [motion(dice, held=held[i]) for _ in range(2)]
         true[:, 2 * i] = start[0] + both[0]
         true[:, 2 * i + 1] = start[1] + both[1]
@@ -144,8 +144,8 @@ def draw(robot: RobotConfig, seed: int) -> list[Outcome]:
 @pytest.mark.parametrize(
     "seeds", [range(10), pytest.param(range(10, 170), marks=pytest.mark.wide)], ids=["60", "960"]
 )
-def test_no_module_keeps_a_zero_with_turns_missing(robot: RobotConfig, seeds: range) -> None:
-    found = [one for seed in seeds for one in draw(robot, seed)]
+def test_no_module_keeps_a_zero_with_turns_missing(seeds: range) -> None:
+    found = [one for seed in seeds for one in draw(seed)]
     assert not [one for one in found if one.zeroed and one.missing]
     assert sum(not one.zeroed for one in found) > len(found) / 20
     assert sum(one.armed for one in found) > len(found) / 20

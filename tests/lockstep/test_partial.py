@@ -24,11 +24,11 @@ from services.planner.watch.engagement_fsm import GRACE_NS, WAITS_NS
 from shared.bus.messages import Mode, Pair, PlannerStatus
 from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Kill, Scenario
 from shared.joints import MODULE_INDEX, MODULES, SIDES
 from shared.links import Pair as Link
 from tests.lockstep.runs import Heard, led_to, modes_of, moment_of, push, restart, run
+from tests.robots import ROBOT
 from tests.shared.mcap_log.runs import sample as sample_of
 from tools.lab.studies.sweeps.figures import Ending, com_max_mm, ending_of, operator_peak_n, step_nm
 from tools.sim.lockstep import FleetMoment, Lockstep
@@ -133,7 +133,7 @@ class Outcome(NamedTuple):
     """
 
 
-def run_case(case: PartialCase, robot: RobotConfig, start: FleetMoment) -> Outcome:
+def run_case(case: PartialCase, start: FleetMoment) -> Outcome:
     """Go on from the common moment, with the case's failure, to its end or to the fall."""
     statuses = Heard(PlannerStatus)
     led_s: list[float] = []
@@ -146,7 +146,7 @@ def run_case(case: PartialCase, robot: RobotConfig, start: FleetMoment) -> Outco
             led_s.append(row.scenario_s - HEAL_S)
 
     scenario, how = scenario_of(case), {"fleet_type": PartialFleet, "record": statuses}
-    fleet, rows = run(robot, scenario, start=start, each=look, **how)
+    fleet, rows = run(ROBOT, scenario, start=start, each=look, **how)
     begin_ns = rows[0].t_ns - round(rows[0].scenario_s * NS_PER_S)
     cut_ns, heal_ns = (begin_ns + round(at * NS_PER_S) for at in (CUT_S, HEAL_S))
     held = [status.t_ns for status in statuses if status.hold and status.t_ns >= cut_ns]
@@ -160,7 +160,7 @@ def run_case(case: PartialCase, robot: RobotConfig, start: FleetMoment) -> Outco
     all_left = bool(left) and awake <= set(left)
     last = [row for row in rows if row.scenario_s > rows[-1].scenario_s - LAST_S]
     return Outcome(
-        stood=ending_of(rows[-1], END_S, robot) is Ending.STOOD,
+        stood=ending_of(rows[-1], END_S, ROBOT) is Ending.STOOD,
         hold_shown_ms=(held[0] - cut_ns) / NS_PER_MS if held else None,
         track_left_ms=(max(left.values()) - cut_ns) / NS_PER_MS if all_left else None,
         led_again_s=led_s[0] if led_s else None,
@@ -171,17 +171,17 @@ def run_case(case: PartialCase, robot: RobotConfig, start: FleetMoment) -> Outco
 
 
 @pytest.fixture(scope="module")
-def start(robot: RobotConfig) -> FleetMoment:
-    return moment_of(robot, scenario_of(PartialCase("links", ())), BEGIN_S)
+def start() -> FleetMoment:
+    return moment_of(ROBOT, scenario_of(PartialCase("links", ())), BEGIN_S)
 
 
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("case", [case for kind in KINDS for case in sample(kind)], ids=words)
 def test_with_any_subset_failed_all_hold_at_once_nothing_falls_and_all_six_lead_again(
-    case: PartialCase, robot: RobotConfig, start: FleetMoment
+    case: PartialCase, start: FleetMoment
 ) -> None:
-    outcome = run_case(case, robot, start)
-    age_ms = robot.joint_service.max_command_age_ms
+    outcome = run_case(case, start)
+    age_ms = ROBOT.joint_service.max_command_age_ms
     assert outcome.stood
     assert outcome.hold_shown_ms is not None
     assert outcome.hold_shown_ms <= age_ms + 10.0, "hold_all is in the planner's status"
@@ -196,8 +196,8 @@ def test_with_any_subset_failed_all_hold_at_once_nothing_falls_and_all_six_lead_
     assert outcome.operator_end_n < 75.0, "44 to 50 measured: it leads, and is not at its limit"
 
 
-def test_with_nothing_failed_no_module_holds(robot: RobotConfig, start: FleetMoment) -> None:
-    outcome = run_case(PartialCase("links", ()), robot, start)
+def test_with_nothing_failed_no_module_holds(start: FleetMoment) -> None:
+    outcome = run_case(PartialCase("links", ()), start)
     assert outcome.stood
     assert outcome.hold_shown_ms is None
     assert outcome.track_left_ms is None
@@ -216,9 +216,9 @@ def test_with_nothing_failed_no_module_holds(robot: RobotConfig, start: FleetMom
     ],
 )
 def test_who_tips_at_the_end_or_does_not_come_so_far_has_not_stood(
-    changes: dict[str, object], ending: Ending, robot: RobotConfig
+    changes: dict[str, object], ending: Ending
 ) -> None:
     good = {"scenario_s": END_S, "com": (0.0, 0.0, 1.0), "fallen": False}
     flat = {"foot_left_tilt": 0.0, "foot_right_tilt": 0.0, "lean": (0.0, 0.0)}
     row = sample_of(SimTruth, **(good | flat | changes))
-    assert ending_of(row, END_S, robot) is ending
+    assert ending_of(row, END_S, ROBOT) is ending

@@ -104,7 +104,7 @@ def test_a_certificate_that_this_host_does_not_believe_is_told(
         assert ("no link over TLS" in caplog.text) is bool(words)
 
 
-def test_a_service_logs_a_refused_link_once_and_that_it_came(
+def test_a_service_logs_a_refused_link_once_and_a_session_knows_its_links(
     pair: Pair, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO")
@@ -117,9 +117,6 @@ def test_a_service_logs_a_refused_link_once_and_that_it_came(
     linked.add(pair.knee)
     assert comes_true(lambda: "link with knee_left is there" in caplog.text)
     watch.end()
-
-
-def test_a_session_knows_which_of_its_tls_links_are_there(pair: Pair) -> None:
     with open_session(pair.host("planner"), "planner", pair.folder) as planner:
         with open_session(pair.host("knee_left"), "knee_left", pair.folder):
             assert comes_true(lambda: planner.is_linked(pair.knee))

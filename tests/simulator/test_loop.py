@@ -12,11 +12,10 @@ from hypothesis import strategies as st
 
 from services.simulator.drives.axis_bank import AxisBank
 from services.simulator.fronts.cansimple_front import CanSimpleFront
-from services.simulator.fronts.sensor_fronts import HarnessFront
 from services.simulator.loop import SimulatorLoop, SimulatorPorts, granted
-from services.simulator.physics.body import body_of
 from services.simulator.physics.plant import IDEAL
 from services.simulator.physics.world import World
+from services.simulator.robot import SimulatedRobot
 from shared.bus.messages import OperatorIntent, Vector4
 from shared.can.cansimple import AxisState, ControlMode
 from shared.config.robot_config import RobotConfig
@@ -25,11 +24,13 @@ from tests.simulator.banks import close_loop
 
 
 class Silent:
-    """Every end of the bus, and the harness: takes anything, has nothing."""
+    """Every end of the bus, and the load cells' own: takes anything, has nothing."""
 
     def put(self, *_: object) -> None: ...
 
-    def send(self, *_: object) -> None: ...
+    def poll(self) -> None: ...
+
+    def broadcast(self, *_: object) -> None: ...
 
     def take(self) -> None:
         return None
@@ -43,21 +44,15 @@ def make_loop(robot: RobotConfig, *faults: Fault) -> tuple[SimulatorLoop, World,
         keyframe=(Keyframe(at=0.0, height=robot.simulation.stand_height),),
         fault=faults,
     )
-    world = World(body_of(robot, IDEAL), stand)
-    bank = AxisBank(
-        robot.drive,
-        encoder_counts_per_turn=robot.joint.encoder_counts_per_turn,
-        watchdog=False,
+    silent: Any = Silent()
+    made = SimulatedRobot(robot, IDEAL, stand, cells=silent, imu=None, seed=0)
+    made.bank.settings.fill("config.enable_watchdog", value=False)
+    ports = msgspec.defstruct("Fake", list(SimulatorPorts.__struct_fields__))(
+        *[silent] * len(SimulatorPorts.__struct_fields__)
     )
-    front = CanSimpleFront(bank, [], [])
-    ports = cast(
-        "SimulatorPorts",
-        msgspec.defstruct("Fake", list(SimulatorPorts.__struct_fields__))(
-            *[Silent()] * len(SimulatorPorts.__struct_fields__)
-        ),
-    )
-    harness = cast("HarnessFront", cast("Any", Silent()))
-    return SimulatorLoop(robot, world, bank, front, [], (harness, None), ports), world, bank
+    front = CanSimpleFront(made.bank, [], [])
+    loop = SimulatorLoop(robot, made, front, [], cast("SimulatorPorts", ports))
+    return loop, made.world, made.bank
 
 
 def count_steps(loop: SimulatorLoop, bank: AxisBank, monkeypatch: pytest.MonkeyPatch) -> int:

@@ -2,7 +2,7 @@
 
 The robot stands, but after each the planner waits for longer: a scenario that begins once all six
 have tracked for a second may then never begin. A test is let off only where the stall was measured,
-by a real-time thread that does nothing else (`tools.fleet.stall_watch`).
+by a thread of a process that does nothing else (`tools.fleet.stalls`).
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import atexit
 import json
 import os
 import subprocess
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -21,8 +22,7 @@ from shared.bus.messages import Mode
 from shared.clock import NS_PER_S
 from shared.exceptions import FAULT_EXIT_CODE
 from shared.joints import MODULES
-from tools.fleet import stall_watch
-from tools.fleet.stall_watch import Gap
+from tools.fleet.stalls import StallWatch
 from tools.logs.run_log import read_run
 
 NEVER_READY: Final = "not all six modules track after"
@@ -38,14 +38,17 @@ def start_watch() -> None:
     os.close(handle)
     atexit.register(Path(path).unlink)
     os.environ[FILE_VARIABLE] = path
-    subprocess.Popen(stall_watch.command(Path(path)))
+    subprocess.Popen([sys.executable, "-m", __name__, path, str(os.getpid())])
 
 
-def gaps_in(path: Path, from_ns: int = 0) -> list[Gap]:
-    """Return what was written, from a time on; a last line that is not whole is left out."""
-    lines = path.read_bytes().splitlines(keepends=True)
-    found = [Gap(*map(int, line.split())) for line in lines if line.endswith(b"\n")]
-    return [gap for gap in found if gap.end_ns >= from_ns]
+def watch(path: Path, parent: int) -> None:
+    """Append the end of each stall, ns, until the parent exits."""
+    with StallWatch() as own, path.open("a") as file:
+        while os.getppid() == parent:
+            time.sleep(0.1)
+            for stall in own.take():
+                file.write(f"{stall.end_ns}\n")
+            file.flush()
 
 
 def has_stalled(since_ns: int) -> bool:
@@ -54,7 +57,7 @@ def has_stalled(since_ns: int) -> bool:
     Where no watch runs nothing was measured.
     """
     path = os.environ.get(FILE_VARIABLE)
-    return path is not None and bool(gaps_in(Path(path), since_ns))
+    return path is not None and any(int(at) >= since_ns for at in Path(path).read_text().split())
 
 
 def stalled_before_it_began(code: int, said: str, out: Path) -> bool:
@@ -97,3 +100,7 @@ def _has_tracked(record: Path) -> bool:
         any(event.mode_after == Mode.TRACK for event in log.messages(topics.JOINT_EVENT, module))
         for module in MODULES
     )
+
+
+if __name__ == "__main__":
+    watch(Path(sys.argv[1]), int(sys.argv[2]))

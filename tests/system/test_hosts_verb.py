@@ -156,7 +156,8 @@ def lead_through(place: Place, ear: FleetEar, capsys: Any) -> None:
     assert place.xrl("records", "-o", str(place.base / "so far")) == 2
     assert "--while-up" in capsys.readouterr().err
     assert place.xrl("records", "--while-up", "-o", str(place.base / "so far")) == 0
-    assert read_run(place.base / "so far" / "joined").count(topics.PLANNER_STATUS.key("xrl"))
+    (so_far,) = (place.base / "so far" / "body").iterdir()
+    assert read_run(so_far).count(topics.PLANNER_STATUS.key("xrl"))
 
     before = procfs.fleet_pids(place.run_dir("right"))
     place.cut_power("left", ear)
@@ -182,8 +183,9 @@ def lead_through(place: Place, ear: FleetEar, capsys: Any) -> None:
     out = place.base / "records"
     assert place.xrl("records", "-o", str(out)) == 0
     assert [len(list((out / host).glob("*/run.mcap"))) for host in NAMES] == [1, 1, 3]
-    joined = read_run(out / "joined")
+    (fleets,) = (out / "body").iterdir()
+    log = read_run(fleets)
     for module in MODULES:
-        modes = [event.mode_after for event in joined.messages(topics.JOINT_EVENT, module)]
+        modes = [event.mode_after for event in log.messages(topics.JOINT_EVENT, module)]
         assert modes[-1] == Mode.DAMP, "to the end"
         assert Mode.TRACK in modes

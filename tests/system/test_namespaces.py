@@ -38,8 +38,6 @@ from tests.system.multihost import BODY, LEGS, RECORDED, REPORT, Cut, Report
 from tests.system.namespaces import isolation, processes_in
 from tests.system.stalls import stalled_before_it_began
 from tools.fleet import procfs
-from tools.logs.joined_records import host_record, join
-from tools.logs.run_index import RunIndex
 from tools.logs.run_log import RunLog, read_run
 
 pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(240)]
@@ -61,8 +59,8 @@ class Led(NamedTuple):
 
     report: Report
     log: RunLog
-    joined: RunLog
-    """With the record that the left leg's host made of its own services."""
+    own: RunLog
+    """The record that the left leg's host made of its own services."""
     run_dir: Path
     interfaces_before: list[str]
 
@@ -95,9 +93,7 @@ def led(tmp_path_factory: pytest.TempPathFactory) -> Led:
         fell = [row.scenario_s for row in truth if row.fallen]
         assert not fell, f"the robot fell at {fell[0]:.2f} s of {report.cuts}; record in {out}"
         if report.finished_ns:
-            fleets = RunIndex(out)
-            join(fleets, [host_record(fleets, RunIndex(out / RECORDED))], out / "joined")
-            return Led(report, log, read_run(out / "joined"), run_dir, before)
+            return Led(report, log, read_run(out / RECORDED), run_dir, before)
         why = f"not all six track again after the cuts: {report.cuts}; logs in {out}"
     pytest.fail(why)
 
@@ -219,8 +215,7 @@ def test_nothing_passes_a_cut_until_it_is_mended(led: Led) -> None:
 def test_the_cut_off_legs_own_record_has_every_state_that_reached_nobody(led: Led) -> None:
     for module in LEGS[RECORDED]:
         states = [
-            [s.seq for s in log.messages(topics.JOINT_STATE, module)]
-            for log in (led.log, led.joined)
+            [s.seq for s in log.messages(topics.JOINT_STATE, module)] for log in (led.log, led.own)
         ]
         assert len(states[0]) < len(states[1]), "the cut kept some from the fleet's recorder"
         assert states[1] == list(range(states[1][0], states[1][0] + len(states[1])))

@@ -4,46 +4,174 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import json
 import os
-import pty
-import select
 import signal
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
-from tests.tools.logs.playback.bench import (
-    NAME,
-    ROOT,
-    STATE,
-    WRENCH,
-    LiveJoint,
-    command_items,
-    ended,
-    items,
-    listening,
-    play,
-    playing,
-    write,
-)
+from shared.bus import codec, topics
+from shared.bus.messages import Estop, JointCommand, JointState, Message, Wrench
+from shared.bus.session import Session, open_session
+from shared.bus.traces import SimTruth
+from shared.config import files as config_file
+from shared.places import DEFAULT_CONFIG
+from tests.messages import sample
+from tests.shared.mcap_log import runs
+from tools.verbs.log.play import LISTEN
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
+
+ROOT = DEFAULT_CONFIG.parents[1]
+ROBOT = config_file.load(DEFAULT_CONFIG)
+NAME = ROBOT.name
+PATIENCE_S = 30.0
+BEGAN = 5_000_000_000
+STATE = topics.JOINT_STATE.key(NAME, "knee_left")
+WRENCH = topics.WRENCH.key(NAME)
+TRUTH = topics.SIM_TRUTH.key(NAME)
+COMMAND = topics.JOINT_COMMAND.key(NAME, "knee_left")
+STOP = topics.ESTOP.key(NAME)
+KINDS: dict[str, type[Message]] = {
+    STATE: JointState, WRENCH: Wrench, TRUTH: SimTruth, COMMAND: JointCommand, STOP: Estop,
+}  # fmt: skip
+
+Item = tuple[str, bytes, int]
+
+
+class Ended(NamedTuple):
+    code: int
+    out: str
+
+
+def items(seconds: float, *keys: str) -> list[Item]:
+    """Return messages of some keys, 100 of each for each second."""
+    found: list[Item] = []
+    for n in range(round(100 * seconds)):
+        for k, key in enumerate(keys or (STATE, WRENCH, TRUTH)):
+            t_ns = BEGAN + 10_000_000 * n + 1_000_000 * k
+            found.append((key, codec.encode(sample(KINDS[key], seq=n, t_ns=t_ns)), t_ns + 77))
+    return found
+
+
+def write(
+    directory: Path, rows: list[Item], monkeypatch: pytest.MonkeyPatch, parts: int = 1
+) -> str:
+    """Write a run of the shipped robot, in one file or several, and return its directory."""
+    monkeypatch.setitem(runs.METADATA, "run", {**runs.METADATA["run"], "robot": NAME})
+    monkeypatch.setitem(runs.ATTACHMENTS, "robot.toml", config_file.to_toml(ROBOT).encode())
+    runs.write_in_parts(runs.writer(directory, keys=topics.all_keys(NAME)), rows, parts)
+    return str(directory)
+
+
+@contextlib.contextmanager
+def playing(run_dir: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
+    command = [sys.executable, "-m", "tools.cli", "log", "play", *words, "--run-dir", str(run_dir)]
+    process = subprocess.Popen(
+        command,
+        cwd=ROOT,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def ended(process: subprocess.Popen[str]) -> Ended:
+    out, _ = process.communicate(timeout=PATIENCE_S)
+    return Ended(process.returncode, out)
+
+
+class Ear:
+    """Takes everything that comes on some keys."""
+
+    def __init__(self, session: Session, expression: str) -> None:
+        self._stream = session.stream([expression], capacity=1_000_000)
+        self.received: list[tuple[str, bytes]] = []
+
+    def until(self, enough: Callable[[], bool]) -> bool:
+        deadline = time.monotonic() + PATIENCE_S
+        while not enough():
+            item = self._stream.take()
+            if item is not None:
+                self.received.append(item[:2])
+            elif time.monotonic() > deadline:
+                return False
+            else:
+                time.sleep(0.001)
+        return True
+
+    def all(self, process: subprocess.Popen[str]) -> list[tuple[str, bytes]]:
+        """Return what has come when the player has ended and nothing more comes."""
+        assert self.until(lambda: process.poll() is not None)
+        quiet = time.monotonic() + 0.5
+        while time.monotonic() < quiet:
+            item = self._stream.take()
+            if item is not None:
+                self.received.append(item[:2])
+                quiet = time.monotonic() + 0.5
+        return self.received
+
+
+@contextlib.contextmanager
+def listening(run_dir: Path, expression: str = "replay/**") -> Iterator[Ear]:
+    with open_session(ROBOT, "ear", run_dir, connect=[LISTEN]) as session:
+        yield Ear(session, expression)
+
+
+class LiveJoint:
+    """A joint service as far as the bus knows: states out, commands and estop in."""
+
+    def __init__(self, run_dir: Path, module: str = "knee_left") -> None:
+        self._run_dir, self._module = run_dir, module
+        self._over = threading.Event()
+        self._up = threading.Event()
+        self.taken = 0
+        self._thread = threading.Thread(target=self._serve)
+
+    def __enter__(self) -> LiveJoint:
+        self._thread.start()
+        assert self._up.wait(PATIENCE_S)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def _serve(self) -> None:
+        with open_session(ROBOT, self._module, self._run_dir) as session:
+            states = session.publisher(topics.JOINT_STATE, JointState, self._module)
+            commands = session.latest(topics.JOINT_COMMAND, JointCommand, self._module)
+            estops = session.latest(topics.ESTOP, Estop)
+            self._up.set()
+            for n in itertools.count():
+                if self._over.is_set():
+                    return
+                states.put(sample(JointState, seq=n, t_ns=time.monotonic_ns()))
+                self.taken += (commands.take() is not None) + (estops.take() is not None)
+                time.sleep(0.004)
 
 
 def test_a_subscriber_gets_every_message_in_the_recorded_order_byte_for_byte(
     run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rows = items(3.0)
+    """Also as fast as it can, and under no other key than one below `replay/`."""
+    rows = items(60.0)
     log = write(tmp_path / "log", rows, monkeypatch, parts=3)
-    with (
-        listening(run_dir) as ear,
-        playing(run_dir, str(log), "--rate", "5", "--wait", "60") as process,
-    ):
+    words = (log, "--rate", "1000", "--wait", "60")
+    with listening(run_dir, "**") as ear, playing(run_dir, *words) as process:
         assert ear.all(process) == [(f"replay/{key}", payload) for key, payload, _ in rows]
         done = ended(process)
     assert done.code == 0, done.out
@@ -52,21 +180,11 @@ def test_a_subscriber_gets_every_message_in_the_recorded_order_byte_for_byte(
     assert not list(run_dir.glob("*")), "the player's socket is gone"
 
 
-def test_nothing_is_lost_to_a_subscriber_when_it_plays_as_fast_as_it_can(
-    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rows = items(60.0)
-    log = write(tmp_path, rows, monkeypatch)
-    words = (str(log / "run.mcap"), "--rate", "1000", "--wait", "60")
-    with listening(run_dir) as ear, playing(run_dir, *words) as process:
-        assert [payload for _, payload in ear.all(process)] == [row[1] for row in rows]
-
-
 STANDS_STILL = """
 import os, signal, sys, time
 from pathlib import Path
 from shared.bus.session import open_session
-from tests.tools.logs.playback.bench import LISTEN, ROBOT
+from tests.system.test_play import LISTEN, ROBOT
 with open_session(ROBOT, "ear", Path(sys.argv[1]), connect=[LISTEN]) as session:
     stream = session.stream(["replay/**"], capacity=1_000_000)
     while stream.take() is None:
@@ -84,8 +202,7 @@ def test_the_end_is_not_lost_to_a_subscriber_that_stands_still_for_half_a_second
 ) -> None:
     rows = items(3.0)  # more than a socket takes, less than the player's queue besides
     log = write(tmp_path, rows, monkeypatch)
-    words = (str(log / "run.mcap"), "--rate", "1000", "--wait", "60")
-    with playing(run_dir, *words) as process:
+    with playing(run_dir, log, "--rate", "1000", "--wait", "60") as process:
         command = [sys.executable, "-c", STANDS_STILL, str(run_dir), str(len(rows))]
         ear = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
         try:
@@ -99,43 +216,21 @@ def test_the_end_is_not_lost_to_a_subscriber_that_stands_still_for_half_a_second
             ear.communicate()
 
 
-def test_chosen_topics_of_a_part_go_under_other_names_with_the_recorded_time_beside(
-    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rows = items(2.0)
-    log = write(tmp_path, rows, monkeypatch)
-    words = (
-        *(str(log), "--prefix", "lab/7", "--topics", "joint/*/state", "harness/*"),
-        *("--exclude", "harness/tare", "--remap", "joint/*/state=was/*", "--clock"),
-        *("--start-offset", "0.5", "--duration", "1", "--wait", "60"),
-    )
-    with listening(run_dir, "lab/**") as ear, playing(run_dir, *words) as process:
-        received = ear.all(process)
-    first, last = rows[0][2] + 500_000_000, rows[0][2] + 1_500_000_000
-    wanted = {STATE: f"lab/7/xrl/{NAME}/was/knee_left", WRENCH: f"lab/7/{WRENCH}"}
-    assert [row for row in received if row[0] != "lab/7/clock"] == [
-        (wanted[key], payload) for key, payload, at in rows if key in wanted and first <= at < last
-    ]
-    ticks = [json.loads(payload) for key, payload in received if key == "lab/7/clock"]
-    assert [tick["seq"] for tick in ticks] == list(range(ticks[0]["seq"], ticks[-1]["seq"] + 1))
-    stamps = [tick["t_ns"] for tick in ticks]
-    assert stamps == sorted(stamps)
-    assert first <= stamps[0] < stamps[-1] <= last
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_loop_runs_until_a_signal_and_then_reports_its_counts_and_leaves_nothing(
     number: signal.Signals, run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows = items(0.5)
     log = write(tmp_path, rows, monkeypatch)
-    with listening(run_dir) as ear, playing(run_dir, str(log), "--loop", "--wait", "60") as process:
-        assert ear.has(2 * len(rows) + 5)
+    with listening(run_dir) as ear, playing(run_dir, log, "--loop", "--wait", "60") as process:
+        assert ear.until(lambda: len(ear.received) >= 2 * len(rows) + 5)
+        second = subprocess.run(process.args, cwd=ROOT, capture_output=True, text=True, check=False)
+        assert second.returncode == 2
+        assert "in use" in second.stdout + second.stderr
         process.send_signal(number)
         done = ended(process)
     assert done.code == 128 + number, done.out
     assert "messages on 3 keys" in done.out
-    assert "passes" in done.out
     assert "Traceback" not in done.out
     assert not list(run_dir.glob("*"))
     assert [payload for _, payload in ear.received] == [
@@ -143,101 +238,15 @@ def test_a_loop_runs_until_a_signal_and_then_reports_its_counts_and_leaves_nothi
     ]
 
 
-def test_on_a_terminal_space_begins_right_steps_and_q_ends(
+def test_recorded_commands_and_stops_reach_no_live_joint_service(
     run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rows = items(60.0)
-    log = write(tmp_path, rows, monkeypatch)
-    words = (str(log), "--start-paused", "--run-dir", str(run_dir))
-    pid, terminal = pty.fork()
-    if pid == 0:
-        os.chdir(ROOT)
-        os.execv(sys.executable, [sys.executable, "-m", "tools.cli", "log", "play", *words])  # noqa: S606
-    screen = bytearray()
-    over = threading.Event()
-
-    def read() -> None:
-        with contextlib.suppress(OSError):
-            while not over.is_set():
-                if select.select([terminal], [], [], 0.1)[0]:
-                    screen.extend(os.read(terminal, 4096))
-
-    reader = threading.Thread(target=read)
-    reader.start()
-    try:
-        with listening(run_dir) as ear:
-            assert ear.until(lambda: b"paused" in screen and b"nobody" not in screen[-60:])
-            for count in (1, 2):
-                os.write(terminal, b"\x1b[C")
-                assert ear.has(count)
-            assert ear.quiet() == 2
-            os.write(terminal, b" ")
-            assert ear.has(30)
-            os.write(terminal, b"q")
-            _, status = os.waitpid(pid, 0)
-        pid = 0
-    finally:
-        if pid:
-            os.kill(pid, signal.SIGKILL)
-            os.waitpid(pid, 0)
-        over.set()
-        reader.join()
-        os.close(terminal)
-    assert os.waitstatus_to_exitcode(status) == 0, screen.decode()
-    assert b"all sent" in screen
-    assert [payload for _, payload in ear.received] == [row[1] for row in rows[: len(ear.received)]]
-
-
-def test_on_live_keys_commands_are_refused_beside_a_live_drive_and_never_forced(
-    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Under its prefix a player does not reach a live joint service at all."""
-    log = str(write(tmp_path, command_items(), monkeypatch))
-    with LiveJoint(run_dir) as joint:
-        with listening(run_dir) as ear, playing(run_dir, log, "--wait", "60") as process:
-            assert len(ear.all(process)) == 400
-            assert process.returncode == 0
-        assert (joint.commands, joint.estops) == (0, 0)
-        refused = play(run_dir, log, "--prefix", "")
-        assert refused.code == 2
-        assert "knee_left" in refused.out
-        assert "estop, joint/*/command" in refused.out
-        assert (joint.commands, joint.estops) == (0, 0)
-        only = play(run_dir, log, "--prefix", "", "--force", "--topics", "joint/*/command")
-        assert only.code == 2
-        assert "even with --force" in only.out
-        forced = play(run_dir, log, "--prefix", "", "--force", "--wait", "60")
-        assert forced.code == 0, forced.out
-        assert "left out even with --force: joint/*/command" in forced.out
-        assert joint.commands == 0
-        assert joint.estops > 0
-
-
-def test_with_no_live_drive_the_live_keys_are_played_until_one_comes_up(
-    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    log = str(write(tmp_path, command_items(), monkeypatch))
-    words = (log, "--prefix", "", "--wait", "60", "--loop")
-    with listening(run_dir, f"xrl/{NAME}/**") as ear, playing(run_dir, *words) as process:
-        assert ear.has(101)
-        assert {key for key, _ in ear.received} == {row[0] for row in command_items()}
-        with LiveJoint(run_dir):
-            done = ended(process)
-    assert done.code == 2
-    assert "stopped: the joint service knee_left is heard" in done.out
-    assert "messages on 2 keys" in done.out
-
-
-def test_a_second_player_on_one_endpoint_is_one_line(
-    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    log = str(write(tmp_path, items(0.5), monkeypatch))
-    with listening(run_dir) as ear, playing(run_dir, log, "--loop", "--wait", "60"):
-        assert ear.has(1)
-        second = play(run_dir, log)
-        assert second.code == 2
-        assert "in use" in second.out
-        assert "Traceback" not in second.out
-        elsewhere = play(run_dir, log, "--listen", "none", "--wait", "0")
-        assert elsewhere.code == 0, elsewhere.out
-        assert "nobody listened" in elsewhere.out
+    log = write(tmp_path, items(2.0, COMMAND, STOP), monkeypatch)
+    with (
+        LiveJoint(run_dir) as joint,
+        listening(run_dir) as ear,
+        playing(run_dir, log, "--rate", "5", "--wait", "60") as process,
+    ):
+        assert len(ear.all(process)) == 400
+        assert process.returncode == 0
+        assert joint.taken == 0

@@ -1,4 +1,4 @@
-"""A fleet of stand-ins under the real supervisor: nothing may be left behind, ever."""
+"""A fleet of stand-ins under the real supervisor: nothing is left behind, nor open to others."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import os
 import shutil
 import signal
 import socket
+import stat
 import subprocess
 import sys
 import tempfile
@@ -23,7 +24,8 @@ from supervisor.states import ProcessStates
 
 from shared.exceptions import FleetError
 from shared.places import DEFAULT_CONFIG
-from tests.system.fleets import wait_for
+from shared.run_directory import live_dir
+from tests.system.fleets import command, wait_for
 from tests.tools.fleet.plans import robot_file
 from tests.waiting import comes_true
 from tools import cli
@@ -485,3 +487,31 @@ def test_a_second_fleet_here_is_refused_and_the_first_is_killed_and_ended_by_ver
     assert wait_for(lambda: service(fleet, "planner").state == "suspended")
     assert order("down")[0] == 0
     assert_nothing_left(run_dir, pids)
+
+
+SHARED_MEMORY = Path("/dev/shm")
+
+
+def test_a_fleet_that_was_started_with_umask_0_leaves_nothing_to_others(
+    run_dir: Path, tmp_path: Path
+) -> None:
+    before = set(SHARED_MEMORY.iterdir())
+    out = tmp_path / "record"
+    only = ("--only", "ankle_right,simulator,recorder", "--scenario", "stand")
+    words = command("up", "--run-dir", run_dir, "--out", out, *only)
+    script = 'umask 0; exec "$@"'
+    try:
+        subprocess.run(["bash", "-c", script, "-", *words], check=True, timeout=90)
+        # "up" is a service that listens; what else it opens follows, on a busy machine later
+        opened = (live_dir(run_dir) / "ankle_right.rearm", live_dir(run_dir) / "joints.near")
+        assert wait_for(lambda: all(path.exists() for path in opened) and any(out.glob("*.mcap")))
+        folders = (run_dir, live_dir(run_dir))
+        found = [*folders, *(path for folder in folders for path in folder.rglob("*"))]
+        found += set(SHARED_MEMORY.iterdir()) - before
+        modes = {str(path): stat.S_IMODE(path.lstat().st_mode) for path in found}
+        assert {path.suffix for path in found} >= {".rearm", ".near", ".log"}
+        assert {path: oct(mode) for path, mode in modes.items() if mode & 0o077} == {}
+        (record,) = out.glob("*.mcap")
+        assert stat.S_IMODE(record.stat().st_mode) == 0o640
+    finally:
+        assert cli.main(["down", "--run-dir", str(run_dir)]) == 0

@@ -42,17 +42,6 @@ def page(log: RunLog) -> str:
     return render(log)
 
 
-@pytest.fixture(scope="session")
-def shown(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The run with its scene."""
-
-    def show(folder: Path) -> None:
-        words = ["--scene", "-o", str(folder / "shown.mcap")]
-        assert cli.main(["log", "export", str(made.path), *words]) == 0
-
-    return once(tmp_path_factory, "shown", show) / "shown.mcap"
-
-
 IMPAIRED = (
     "planner->joints delay=25 at=0.4 for=0.6",
     "planner->left delay=40 jitter=5 at=0.7 for=0.6",

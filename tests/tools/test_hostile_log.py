@@ -29,7 +29,6 @@ RECORDS: Final = {
     "recorder": ("flush_ms",),
     "recovered": ("from",),
     "packages": ("xrl", HOSTILE),
-    "joined": (HOSTILE,),
     HOSTILE: (HOSTILE,),
 }  # fmt: skip
 """Metadata that a verb prints."""

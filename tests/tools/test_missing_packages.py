@@ -26,8 +26,6 @@ from tools.bringup import survey
         ("log whatif OUT --kill planner", "sim"),
         ("bench", "sim"),
         ("bench fleet", "sim"),
-        ("drive identify body OUT", "plot"),
-        ("drive identify joint --all", "plot"),
         ("gains", "design"),
         ("view", "view"),
         ("view OUT", "view"),

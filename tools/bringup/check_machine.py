@@ -38,8 +38,14 @@ UDEV_FIX: Final = (
 LIMIT_FIX: Final = (
     "`YOU - {} {}` in /etc/security/limits.d/xrl.conf and log in again, or systemd's Limit{}={}"
 )
+CLOCK_FIX: Final = "`sudo apt-get install chrony`, or `sudo timedatectl set-ntp true`"
 RTPRIO_FIX: Final = LIMIT_FIX.format("rtprio", 40, "RTPRIO", 40)
 MEMLOCK_FIX: Final = LIMIT_FIX.format("memlock", "unlimited", "MEMLOCK", "infinity")
+
+_TIMEX_BYTES: Final = 256
+"""At least the size of `struct timex` of <sys/timex.h>; all zeros ask and change nothing."""
+_TIME_ERROR: Final = 5
+"""State of a clock that is not synchronised."""
 
 
 def machine_rows(robot: RobotConfig, root: Path = Path("/")) -> list[Finding]:
@@ -94,6 +100,7 @@ def _delays(root: Path, *, emulated: bool) -> list[Finding]:
     governors = (root / "sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor")
     governor = " and ".join(sorted({_text(file) for file in governors} - {""}))
     clock = _text(root / "sys/devices/system/clocksource/clocksource0/current_clocksource")
+    synchronised = clock_is_synchronised()
     may_lock, areas = scheduling.may_lock(), len(_text(root / "proc/swaps").splitlines()) - 1
     locked = f"refused: {resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] // 1024} KiB"
     pause_ms = scheduling.real_time_pause_ms(root)
@@ -104,6 +111,9 @@ def _delays(root: Path, *, emulated: bool) -> list[Finding]:
         (clock in ("", *CLOCKS), "clock source", clock or "unknown here", f"{CLOCKS[0]} or alike",
          "see in the kernel's log why it was dropped",
          "every read of the clock costs a system call"),
+        (synchronised, "wall clock", "synchronised" if synchronised else "not synchronised",
+         "synchronised", CLOCK_FIX,
+         "certificates go by it, and records of several hosts are merged by it"),
         (may_lock, "locked memory", "allowed" if may_lock else locked, "allowed", MEMLOCK_FIX,
          "a page that must be read from disk stops a loop"),
         (areas <= 0, "swap", "none" if areas <= 0 else f"{areas} in use", "none",
@@ -114,6 +124,12 @@ def _delays(root: Path, *, emulated: bool) -> list[Finding]:
          "for that time of each second the kernel stops what fills a processor: modules hold"),
     )  # fmt: skip
     return [advised(good or emulated, SUBJECT, *row) for good, *row in rows]
+
+
+def clock_is_synchronised() -> bool:
+    """Return True if chrony, systemd-timesyncd or another program keeps the wall clock right."""
+    state = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES))
+    return int(state) != _TIME_ERROR
 
 
 def _real_time(*, emulated: bool) -> Finding:

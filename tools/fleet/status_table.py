@@ -39,7 +39,7 @@ def describe_lead(lead: LeadStatus | None) -> str:
 
 
 REMEDIES: Final = {
-    Refusal.TOO_OLD.name: "a slow link, a slow planner, or a record played onto the live keys",
+    Refusal.TOO_OLD.name: "a slow link or a slow planner",
     Refusal.FOREIGN_SESSION.name: "a second planner, or one that the module has left: end one",
     Refusal.NOT_NEWER.name: "a network that repeats, or a command forged in the planner's name",
     Refusal.OUT_OF_ENVELOPE.name: "a wrong planner, or a forged command: xrl kill planner",

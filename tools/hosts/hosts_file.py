@@ -15,8 +15,6 @@ from shared.toml_file import Range, Section, read_toml
 
 _TOOLS: Final = (OPERATOR, VIEWER)
 _IPV4_BITS: Final = 32
-JOINED: Final = "joined"
-"""Folder of the joined run, beside one for each host (`xrl hosts records`)."""
 
 
 class Host(Section, frozen=True):
@@ -95,8 +93,6 @@ def _check(file: str, hosts: Hosts, robot: RobotConfig) -> None:
         if not re.fullmatch(r"[A-Za-z0-9_-]+", host.name):
             right = "letters, digits, _ and - only"
             raise ConfigError(file, f"{where}.name", f"{host.name!r}", right)
-        if host.name == JOINED:
-            raise ConfigError(file, f"{where}.name", repr(JOINED), "that is the joined record's")
         _check_address(file, f"{where}.address", host.address)
         if host.ssh.startswith("-") or not host.ssh.strip():
             raise ConfigError(file, f"{where}.ssh", f"{host.ssh!r}", "as ssh takes it: user@host")

@@ -29,11 +29,9 @@ from tools.hosts.layout import (
     unit,
 )
 from tools.hosts.probe import Probe, digest
-from tools.hosts.remote import ClockOffset, Remote
+from tools.hosts.remote import Remote
 from tools.keys.authority import Authority, bundle
 
-CLOCK_MAX_S: Final = 1.0
-"""Certificates and the names of records go by the clock; ages do not."""
 _AT_REST: Final = ("inactive", "failed", "unknown")
 """States of a unit whose services are down."""
 _UNIT_FOLDER: Final = "/etc/systemd/system"
@@ -52,9 +50,8 @@ class HostRow(NamedTuple):
     """One host in the table of `xrl hosts check`."""
 
     name: str
+    reached: bool = False
     revision: str = ""
-    clock: ClockOffset | None = None
-    """None: it was not reached."""
     unit: str = "-"
     """State of its unit by systemd."""
     made_from: tuple[str, str] = ("", "")
@@ -130,7 +127,7 @@ def check(hosts: Hosts, remote: Remote, files: list[HostFile]) -> HostRow:
     python, config = f"{hosts.checkout}/.venv/bin/python", f"{hosts.folder}/{ROBOT_FILE}"
     # the module is found in the installed package, wherever the command starts
     words = ("-P", "-m", "tools.hosts.probe", "--config", config, "--run-dir", RUN_DIR)
-    line, clock = remote.echoed(python, *words)
+    line = remote.must(python, *words, as_user=True)
     try:
         probe = msgspec.json.decode(line.encode(), type=Probe)
     except msgspec.DecodeError:
@@ -158,12 +155,10 @@ def check(hosts: Hosts, remote: Remote, files: list[HostFile]) -> HostRow:
         wrong.append(f"of no known version: {hosts.checkout} is no git checkout that can be read")
     if probe.revision.endswith("+"):
         warnings.append(f"{hosts.checkout} has changes of its own")
-    if abs(clock.offset_s) > CLOCK_MAX_S + clock.round_trip_s:
-        warnings.append(f"its clock is {clock.offset_s:+.1f} s off: certificates go by it")
     return HostRow(
         name=remote.host.name,
+        reached=True,
         revision=probe.revision,
-        clock=clock,
         unit=state,
         made_from=(probe.lock, probe.python),
         wrong=tuple(wrong),
@@ -195,7 +190,7 @@ def disagreements(rows: list[HostRow]) -> list[str]:
     """Return what is not the same on all hosts that were reached."""
     wrong = []
     for word, value_of in _SAME_ON_ALL.items():
-        found = {row.name: value_of(row) for row in rows if row.clock is not None}
+        found = {row.name: value_of(row) for row in rows if row.reached}
         if len(set(found.values())) > 1:
             rest = ", ".join(f"{name} {value or 'none'}" for name, value in found.items())
             wrong.append(f"several {word}: {rest}")

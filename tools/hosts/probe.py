@@ -1,4 +1,4 @@
-"""What `xrl hosts check` asks a host: one line of JSON, then its clock for each line it is sent.
+"""What `xrl hosts check` asks a host: one line of JSON.
 
 python -m tools.hosts.probe --config /etc/xrl/robot.toml --run-dir /var/lib/xrl/run
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import platform
 import sys
-import time
 from pathlib import Path
 from typing import Final
 
@@ -24,6 +23,7 @@ from shared.config import gain_schedule
 from shared.exceptions import XrlError
 from shared.places import CHECKOUT, IS_CHECKOUT
 from shared.revision import UNKNOWN, code
+from tools.bringup.check_machine import CLOCK_FIX, clock_is_synchronised
 from tools.fleet.run_dir import SUPERVISOR_PID
 from tools.keys.authority import held_files
 from tools.keys.inspection import inspect_keys
@@ -75,6 +75,8 @@ def probe(config: Path, run_dir: Path) -> Probe:
     free_mib = free_bytes_at(run_dir) // MIB
     if free_mib < FREE_MIB:
         warnings.append(f"{free_mib} MiB free for records: take old ones away")
+    if not clock_is_synchronised():
+        warnings.append(f"its clock is not synchronised: {CLOCK_FIX}")
     pause_ms = scheduling.real_time_pause_ms()
     if pause_ms:
         warnings.append(
@@ -134,17 +136,12 @@ def _revision() -> str:
 
 
 def main() -> None:
-    """Print what there is to say, then answer until the input ends."""
+    """Print what this host says of itself."""
     parser = FlagParser(description=__doc__)
     parser.add_argument("--config", type=Path, required=True)
     parser.add_argument("--run-dir", type=Path, required=True)
     args = parser.parse_args()
-    found = probe(args.config, args.run_dir)
-    sys.stdout.write(msgspec.json.encode(found).decode() + "\n")
-    sys.stdout.flush()
-    for _ in sys.stdin:
-        sys.stdout.write(f"{time.time_ns()}\n")
-        sys.stdout.flush()
+    print(msgspec.json.encode(probe(args.config, args.run_dir)).decode())
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Fetches the records of a robot's hosts, and joins them into one run."""
+"""Fetches the records of a robot's hosts."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from shared.bus.topics import RECORDER
 from shared.exceptions import FleetError, RunError
 from tools.hosts.layout import RECORDS
 from tools.hosts.remote import Remote
-from tools.logs.joined_records import HostRecord, host_record, join
 from tools.logs.run_index import RunIndex, runs_in
 
 _DATED: Final = re.compile(r"([0-9]{1,12}(?:\.[0-9]{1,12})?) (/.*)")
@@ -58,25 +57,6 @@ def is_fleets(remote: Remote) -> bool:
 def fleets_run(folder: Path) -> RunIndex:
     """Return the fleet's newest run in a folder: a recorder that was killed begins another."""
     return RunIndex(folder, runs_in(folder)[-1])
-
-
-def join_fetched(fleets: RunIndex, hosts: list[Path], out: Path) -> tuple[int, list[str]]:
-    """Join what was fetched."""
-    records: list[HostRecord] = []
-    left_out: list[str] = []
-    for folder in hosts:
-        try:
-            runs = runs_in(folder)
-        except RunError as error:
-            left_out.append(str(error))
-            continue
-        for files in runs:
-            try:
-                records.append(host_record(fleets, RunIndex(files[0], files)))
-            except RunError as error:
-                left_out.append(str(error))
-    out.mkdir(parents=True, exist_ok=True)
-    return sum(join(fleets, records, out).values()), left_out
 
 
 def _name_in(remote: Remote, folder: str) -> str:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import shlex
 import subprocess
-import threading
-import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from typing import BinaryIO, Final, NamedTuple, TypedDict, TypeVar, Unpack
@@ -18,7 +16,6 @@ from tools.hosts.layout import IP, NAMESPACE
 R = TypeVar("R")
 
 TIMEOUT_S: Final = 90.0
-ECHOES: Final = 20
 MARK: Final = "xrl-output-follows"
 """Line before a command's own output: a host's .bashrc may print lines before it."""
 _NOISE_MAX: Final = 1 << 20
@@ -30,15 +27,6 @@ class Said(NamedTuple):
     code: int
     out: str
     error: str
-
-
-class ClockOffset(NamedTuple):
-    """A host's clock against this computer's."""
-
-    offset_s: float
-    """Positive: the host's clock is ahead."""
-    round_trip_s: float
-    """Shortest of `ECHOES`; half of it bounds the offset's error."""
 
 
 class Manner(TypedDict, total=False):
@@ -158,42 +146,6 @@ class Remote:
             f"mv {part} {shlex.quote(path)}"
         )
         self.must("sh", "-c", script, content=content, as_user=private)
-
-    def echoed(self, *words: str) -> tuple[str, ClockOffset]:
-        """Return the first line of a command that then answers each line with its clock."""
-        command = self._command(words, {"as_user": True})
-        pipe = subprocess.PIPE
-        with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
-            limit = threading.Timer(TIMEOUT_S, process.kill)
-            limit.start()
-            try:
-                first, found = _talk(process)
-            except (OSError, ValueError):
-                process.kill()
-                _, errors = process.communicate()
-                text = f"{self.host.ssh} does not answer: {_last(errors)}"
-                raise FleetError(f"{self.host.name}: {text}") from None
-            finally:
-                limit.cancel()
-        return first, min(found, key=lambda row: row.round_trip_s)
-
-
-def _talk(process: subprocess.Popen[str]) -> tuple[str, list[ClockOffset]]:
-    there, back = process.stdin, process.stdout
-    if there is None or back is None:
-        raise ValueError
-    _skip_noise(back)
-    first = back.readline()
-    found = []
-    for _ in range(ECHOES):
-        before = time.time()
-        there.write("\n")
-        there.flush()
-        answer = int(back.readline())
-        after = time.time()
-        found.append(ClockOffset(answer / 1e9 - (before + after) / 2, after - before))
-    there.close()
-    return first, found
 
 
 def _skip_noise(lines: Iterable[str]) -> None:

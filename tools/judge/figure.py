@@ -1,24 +1,26 @@
-"""The picture of a run, like the paper's Fig. 7: COM and torso angles against time."""
+"""Files that a judged run leaves beside its log: `summary.json` and the picture `run.png`.
+
+The picture is like the paper's Fig. 7: COM and torso angles against time.
+"""
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import msgspec
 import numpy as np
 
-from shared.bus import topics
-from shared.bus.messages import JointState, Mode, PlannerMode, RunEvent, RunEventKind
-from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import files as config_file
-from shared.exceptions import ConfigError, RunError
+from shared.atomic_file import replace_file
 from shared.extras import late
-from shared.joints import MODULES
-from tools.judge.verdict import Summary, course, fell
-from tools.logs.impairment_intervals import Impaired, impairments
-from tools.logs.run_log import RunLog, text_of
+from tools.judge import verdict
+from tools.judge.reports.events import Event, Events
+from tools.judge.reports.panels import COLOURS, GAP_S, Line, Panel, panels_of
+from tools.judge.reports.run_data import RunData
+from tools.judge.verdict import ShownStall, Summary, fell
+from tools.logs.run_index import RunIndex
+from tools.logs.run_log import PICTURE_MAX_S, RunLog, RunPart
 from tools.output import new_figure, save_figure
 
 if TYPE_CHECKING:
@@ -26,253 +28,160 @@ if TYPE_CHECKING:
 else:
     patches = late("matplotlib.patches")
 
-MODE_COLOURS: Final[dict[int, str]] = {
-    Mode.DISARMED: "#d9d9d9",
-    Mode.HOLD: "#f2a65a",
-    Mode.TRACK: "#4c9f70",
-    Mode.DAMP: "#8f5fbf",
-    Mode.FAULT: "#c0392b",
-}
-LINES: Final = ("#1f4e79", "#c8553d", "#5b8c5a")
-MODULE_LINES: Final = ("#1f4e79", "#4a90c4", "#7fc4d8", "#8c2d19", "#c8553d", "#e09f5b")
-IMPAIRED_COLOUR: Final = "#8f7fc8"
+PANELS: Final = {
+    "COM": 2.0, "Height": 1.4, "Torso angles": 1.7, "Operator's force": 1.5, "Command age": 1.6,
+    "Modes": 1.8,
+}  # fmt: skip
+"""Panels of the picture and their heights."""
+INKS: Final = {
+    "idle": "#d9d9d9", "warn": "#f2a65a", "good": "#4c9f70", "odd": "#8f5fbf", "bad": "#c0392b",
+    "net": "#8f7fc8",
+}  # fmt: skip
+"""By the names of `COLOURS`."""
+LINES: Final = (
+    "#1f4e79", "#c8553d", "#5b8c5a", "#8c2d19", "#4a90c4", "#e09f5b", "#7fc4d8", "#6b6b6b",
+)  # fmt: skip
 STALLED_COLOUR: Final = "#6b6b6b"
-IMPAIRED_TEXT: Final = "#3f2f6f"
-LEADS_COLOUR: Final = MODE_COLOURS[Mode.TRACK]
-WAITS_COLOUR: Final = "#b9c4cf"
 EVENT_COLOURS: Final = {
-    RunEventKind.KILLED: "#c0392b",
-    RunEventKind.RESTARTED: "#2e7d32",
-    RunEventKind.PUSHED: "#7f7f7f",
-    RunEventKind.FAULTED: "#b8590b",
-}
-AGE_MOST_MS: Final = 50.0
-"""If the log does not tell its robot's greatest usable age."""
-AGE_REACH: Final = 1.2
-"""Top of the panel of ages, ms: older commands are not used."""
-SILENT_S: Final = 0.1
-"""A service that says nothing for so long has a gap in the picture."""
-LANES_MAX: Final = 8
-"""Impairments with a lane each; the rest share the last, without words."""
+    "kill": "#c0392b", "fall": "#c0392b", "estop": "#c0392b", "restart": "#2e7d32",
+    "fault": "#b8590b", "network": "#3f2f6f",
+}  # fmt: skip
+"""By kind of event; grey for the others."""
+LABEL_ROWS: Final = 3
+"""Rows of event names above the first panel."""
+
+
+def judge_run(out: Path, title: str, duration_s: float, **figures: float | None) -> Summary:
+    """Judge a run of a scenario of `duration_s`; write `summary.json` and `run.png` beside it.
+
+    The picture of a long run is that of its end. `figures` are fields of the summary that no log
+    tells.
+    """
+    index = RunIndex(out / "run.mcap")
+    last_s = max(0.0, index.length_s - PICTURE_MAX_S)
+    log = RunLog(index, RunPart(last_s))
+    if last_s > 0.0:
+        summary = verdict.summarise_parts(index, duration_s)
+        title = f"{title}: the last {PICTURE_MAX_S:g} s"
+    else:
+        summary = verdict.summarise(log, duration_s)
+    summary = msgspec.structs.replace(summary, **figures)
+    text = msgspec.json.format(msgspec.json.encode(summary), indent=2)
+    replace_file(out / "summary.json", text + b"\n")
+    draw(log, title, summary, out / "run.png")
+    return summary
 
 
 def draw(log: RunLog, name: str, summary: Summary, path: Path) -> None:
     """Draw a run into a PNG file."""
-    t, rows, began, zero_ns = course(log)
-    end_s = float(t[-1])
-    network = impairments(log.messages(topics.LINK_EVENT))
-    heights = [2.0, 1.4, 1.7, 1.5, 1.6, 1.6]
-    if network:
-        heights.insert(4, 0.2 + 0.22 * min(len(network), LANES_MAX))
-    figure = new_figure(11.5, 1.15 * sum(heights))
+    run = RunData(log)
+    panels = panels_of(run)
+    events = Events()
+    events.add(run, panels)
+    drawn = {panel.title: panel for panel in panels if panel.title in PANELS}
+    figure = new_figure(11.5, 1.15 * sum(PANELS.values()))
     axes = figure.subplots(
-        len(heights), 1, sharex=True, gridspec_kw={"height_ratios": heights}, squeeze=False
-    )[:, 0]
-    com = np.array([row.over for row in rows]) * 1e3
-    _lines(axes[0], t, com, ("x", "y"), "COM in mm")
-    height = np.array([row.torso[2] for row in rows])
-    _lines(axes[1], t, height[:, None], ("torso height",), "height in m")
-    angles = np.array([row.angles for row in rows])
-    _lines(axes[2], t, angles, ("roll", "pitch", "yaw"), "torso in rad")
-    force = np.array([row.operator_force[:0:-1] for row in rows])  # z, y
-    force = force if force[:, 1].any() else force[:, :1]
-    _lines(axes[3], t, force, ("operator's\nhand, z", "hand, y"), "force in N")
-    if any(row.load_n for row in rows):
-        load = [row.load_n for row in rows]
-        axes[3].plot(t, load, color=LINES[2], lw=1.1, label="weight on\nthe harness")
-        _legend(axes[3])
-    _ages(axes[-2], log, zero_ns)
-    _modes(axes[-1], log, zero_ns, end_s)
-    plots = [*axes[:4], *axes[-2:]]
-    _events(plots, log.messages(topics.RUN_EVENT))
-    _stalls(plots, summary["stalls"])
-    if network:
-        _network(axes[4], network, zero_ns, end_s)
-        _shade(plots, network, zero_ns, end_s)
-    axes[-1].set_xlabel("scenario time in s" if began else "time since the hoist let go in s")
-    axes[-1].set_xlim(0.0, end_s)
-    verdict = "stood" if summary["stood"] else "FELL" if fell(summary) else "not finished"
-    if summary["unsound"]:
-        verdict = "stood, but not soundly"
-    figure.suptitle(f"{name}: {verdict}", fontsize=12, x=0.01, ha="left")
+        len(PANELS), 1, sharex=True, gridspec_kw={"height_ratios": [*PANELS.values()]}
+    )
+    for axis, title in zip(axes, PANELS, strict=True):
+        panel = drawn[title]
+        axis.set_ylabel(f"{title}\nin {panel.unit}" if panel.unit else title, fontsize=9)
+        axis.grid(visible=True, lw=0.3, color="#bbbbbb")
+        axis.tick_params(labelsize=8)
+        if panel.rows:
+            _bars(axis, panel)
+        else:
+            _lines(axis, panel)
+    begin_s, end_s = 0.0 if run.course else run.span.begin, run.span.end
+    for begin, end, _ in drawn["Modes"].rows.get("network", ()):
+        for axis in axes[:-1]:
+            axis.axvspan(begin, end, color=INKS["net"], alpha=0.2, lw=0.0, zorder=0)
+    _events(axes, [row for row in events.all(run.span) if row.mark], end_s - begin_s)
+    _stalls(axes, summary.stalls)
+    axes[-1].set_xlabel(f"{run.axis.removesuffix(', s')} in s")
+    axes[-1].set_xlim(begin_s, end_s)
+    word = "stood" if summary.stood else "FELL" if fell(summary) else "not finished"
+    if summary.unsound:
+        word = "stood, but not soundly"
+    figure.suptitle(f"{name}: {word}", fontsize=12, x=0.01, ha="left")
     save_figure(figure, path)
 
 
-def _lines(axis: Any, t: Any, columns: Any, names: Sequence[str], label: str) -> None:
-    for column, name, colour in zip(columns.T, names, LINES, strict=False):
-        axis.plot(t, column, color=colour, lw=1.1, label=name)
-    _dress(axis, label)
-    _legend(axis)
+def _lines(axis: Any, panel: Panel) -> None:
+    for line in panel.lines:
+        if not line.hidden:
+            style = "--" if line.dashed else "-"
+            ink = LINES[line.colour % len(LINES)]
+            axis.plot(*_with_gaps(line), color=ink, lw=1.0, ls=style, label=line.label)
+    for value, label, shown in panel.levels:
+        if shown:
+            axis.axhline(value, color=INKS["bad"], lw=1.0)
+            axis.annotate(
+                f"{value:g} {panel.unit}: {label}", (1.005, value), va="center", fontsize=8,
+                xycoords=("axes fraction", "data"), color=INKS["bad"], annotation_clip=False,
+            )  # fmt: skip
+    if panel.reach is not None:
+        axis.set_ylim(0.0, panel.reach)
+    low = {"loc": "lower left", "bbox_to_anchor": (1.0, 0.0)} if panel.reach is not None else {}
+    _legend(axis, axis.get_legend_handles_labels()[0], **low)
 
 
-def _dress(axis: Any, label: str) -> None:
-    axis.set_ylabel(label, fontsize=9)
-    axis.grid(visible=True, lw=0.3, color="#bbbbbb")
-    axis.tick_params(labelsize=8)
+def _with_gaps(line: Line) -> tuple[Any, Any]:
+    """Return times and values; a line has a gap where its sender was silent."""
+    is_late = np.diff(line.t, prepend=line.t[:1]) > GAP_S
+    return line.t, np.where(is_late, np.nan, line.values)
 
 
-def _legend(axis: Any, handles: Sequence[Any] | None = None, **more: Any) -> None:
+def _legend(axis: Any, handles: Sequence[Any], **more: Any) -> None:
     """Put the legend beside the panel, where no curve is."""
-    found = axis.get_legend_handles_labels()[0] if handles is None else handles
     usual = {
         "loc": "upper left", "bbox_to_anchor": (1.0, 1.0), "fontsize": 8, "frameon": False,
-        "borderaxespad": 0.2, "handlelength": 1.4,
+        "borderaxespad": 0.2, "handlelength": 1.4, "labelspacing": 0.2,
     }  # fmt: skip
-    axis.legend(handles=found, **(usual | more))
+    axis.legend(handles=handles, **(usual | more))
 
 
-def _ages(axis: Any, log: RunLog, zero_ns: int) -> None:
-    """Draw how old the newest command of each module was, and from where on it is not used."""
-    most_ms = _greatest_age_ms(log)
-    for module, colour in zip(MODULES, MODULE_LINES, strict=True):
-        states: list[JointState] = log.messages(topics.JOINT_STATE, module)
-        t = np.array([(state.t_ns - zero_ns) / NS_PER_S for state in states])
-        age = np.array([state.age_ns / NS_PER_MS for state in states])
-        age[age < 0.0] = np.nan
-        age[np.diff(t, prepend=t[:1]) > SILENT_S] = np.nan
-        style = "-" if module.endswith("right") else "--"
-        axis.plot(t, age, color=colour, lw=0.7, ls=style, label=module)
-    axis.axhline(most_ms, color="#c0392b", lw=1.0)
-    axis.annotate(
-        f"{most_ms:g} ms: HOLD", (1.005, most_ms), xycoords=("axes fraction", "data"),
-        fontsize=8, color="#c0392b", va="center", annotation_clip=False,
-    )  # fmt: skip
-    axis.set_ylim(0.0, AGE_REACH * most_ms)
-    _dress(axis, "command age\nin ms")
-    _legend(axis, loc="lower left", bbox_to_anchor=(1.0, 0.0), borderaxespad=0.1, labelspacing=0.2)
-
-
-def _greatest_age_ms(log: RunLog) -> float:
-    """Return the age from which on a command is not used, by the robot file in the log, ms."""
-    with contextlib.suppress(ConfigError, RunError):
-        robot = config_file.parse(text_of(log, "robot.toml"), "robot.toml")
-        return robot.joint_service.max_command_age_ms
-    return AGE_MOST_MS
-
-
-def _modes(axis: Any, log: RunLog, start_ns: int, end_s: float) -> None:
-    """Draw the planner's state and each service's mode as bars; white where one said nothing."""
-    statuses = log.messages(topics.PLANNER_STATUS)
-    leads = [
-        LEADS_COLOUR if row.mode == PlannerMode.LEADING else WAITS_COLOUR if row.wait_s > 0 else ""
-        for row in statuses
-    ]
-    _bars(axis, 0, [(row.t_ns - start_ns) / NS_PER_S for row in statuses], leads)
-    for place, module in enumerate(MODULES, 1):
-        states: list[JointState] = log.messages(topics.JOINT_STATE, module)
-        times = [(state.t_ns - start_ns) / NS_PER_S for state in states]
-        _bars(axis, place, times, [MODE_COLOURS.get(state.mode, "black") for state in states])
-    axis.set_yticks(range(len(MODULES) + 1), ["planner", *MODULES], fontsize=8)
+def _bars(axis: Any, panel: Panel) -> None:
+    """Draw a row of coloured bars for the planner, each module and the network."""
+    names = {name: COLOURS.get(name, "idle") for row in panel.rows.values() for *_, name in row}
+    for place, row in enumerate(panel.rows.values()):
+        for name, colour in names.items():
+            spans = [(begin, end - begin) for begin, end, bar in row if bar == name]
+            axis.broken_barh(spans, (place - 0.4, 0.8), color=INKS[colour], lw=0.0)
+    axis.set_yticks(range(len(panel.rows)), list(panel.rows), fontsize=8)
     axis.invert_yaxis()
-    axis.set_xlim(0.0, end_s)
-    axis.tick_params(labelsize=8)
     handles = [
-        patches.Patch(color=colour, label=Mode(mode).name) for mode, colour in MODE_COLOURS.items()
+        patches.Patch(
+            color=INKS[colour], label="\n".join(one for one in names if names[one] == colour)
+        )
+        for colour in dict.fromkeys(names.values())
     ]
-    handles[2].set_label("TRACK; planner leads")
-    if WAITS_COLOUR in leads:
-        handles.append(patches.Patch(color=WAITS_COLOUR, label="planner waits\nafter drop-outs"))
     _legend(axis, handles)
 
 
-def _bars(axis: Any, place: int, times: Sequence[float], colours: Sequence[str]) -> None:
-    """Draw one row of coloured bars; no bar where the colour is empty or unknown."""
-    begin, colour, last = 0.0, "", 0.0
-    spans: dict[str, list[tuple[float, float]]] = {}
-    for t, now in zip(times, colours, strict=True):
-        if now != colour or t - last > SILENT_S:
-            spans.setdefault(colour, []).append((begin, last - begin))
-            begin, colour = t, now
-        last = t
-    spans.setdefault(colour, []).append((begin, last - begin))
-    for name, bars in spans.items():
-        if name:
-            axis.broken_barh(bars, (place - 0.4, 0.8), color=name)
-
-
-def _events(axes: Any, events: list[RunEvent]) -> None:
-    """Mark kills, faults, restarts and pushes in every panel, with their names above the first."""
+def _events(axes: Any, events: Sequence[Event], length_s: float) -> None:
+    """Mark events in every panel, with their names above the first."""
+    ends = [-np.inf] * LABEL_ROWS
     for event in events:
-        kind = RunEventKind(event.kind)
-        colour = EVENT_COLOURS.get(kind)
-        if colour is None:
-            continue
+        colour = EVENT_COLOURS.get(event.kind, "#7f7f7f")
         for axis in axes:
-            axis.axvline(event.scenario_s, color=colour, lw=1.0, ls="--")
+            axis.axvline(event.t, color=colour, lw=1.0, ls="--")
+        half_s = 0.004 * len(event.mark) * length_s
+        row = next((row for row, end in enumerate(ends) if event.t - half_s > end), None)
+        if row is None:
+            continue
+        ends[row] = event.t + half_s
         axes[0].annotate(
-            _label(kind, event),
-            (event.scenario_s, 1.0),
-            xycoords=("data", "axes fraction"),
-            xytext=(0, 3),
-            textcoords="offset points",
-            ha="center",
-            fontsize=8,
-            color=colour,
-        )
+            event.mark, (event.t, 1.0), xycoords=("data", "axes fraction"), ha="center",
+            xytext=(0, 3 + 11 * row), textcoords="offset points", fontsize=8, color=colour,
+        )  # fmt: skip
 
 
-def _stalls(axes: Any, stalls: Sequence[dict[str, Any]]) -> None:
+def _stalls(axes: Any, stalls: Sequence[ShownStall]) -> None:
     """Shade stalls, and the time that is judged apart because of them."""
     for row in stalls:
-        begin, end = row["at_s"], row["at_s"] + row["lasted_ms"] / 1e3
+        end = row.at_s + row.lasted_ms / 1e3
+        apart = row.apart_until_s if row.modules_held else end
         for axis in axes:
-            axis.axvspan(begin, end, color=STALLED_COLOUR, alpha=0.8, lw=0.0, zorder=0)
-            if row["modules_held"]:
-                axis.axvspan(begin, row["apart_until_s"], alpha=0.15,
-                             color=STALLED_COLOUR, lw=0.0, zorder=0)  # fmt: skip
-        if row["modules_held"]:
-            axes[0].annotate(
-                f"{row['who']} stood still, {row['lasted_ms']:.0f} ms", (begin, 1.0),
-                xycoords=("data", "axes fraction"), xytext=(0, 13), textcoords="offset points",
-                ha="left", fontsize=8, color=STALLED_COLOUR,
-            )  # fmt: skip
-
-
-def _shade(axes: Any, network: Sequence[Impaired], zero_ns: int, end_s: float) -> None:
-    """Shade impairments of the network: darker where two overlap, a line at the start of each."""
-    for row in network:
-        begin, end = _extent(row, zero_ns, end_s)
-        for axis in axes:
-            axis.axvspan(begin, end, color=IMPAIRED_COLOUR, alpha=0.2, lw=0.0, zorder=0)
-            for edge, style in ((begin, "-"), (end, ":")):
-                axis.axvline(edge, color=IMPAIRED_COLOUR, lw=0.7, ls=style, zorder=0.5)
-
-
-def _network(axis: Any, network: Sequence[Impaired], zero_ns: int, end_s: float) -> None:
-    """Draw a lane for each impairment, with its words in a place where nothing else is."""
-    for number, row in enumerate(network):
-        lane = min(number, LANES_MAX - 1)
-        begin, end = _extent(row, zero_ns, end_s)
-        axis.broken_barh([(begin, end - begin)], (lane - 0.42, 0.84), color=IMPAIRED_COLOUR,
-                         alpha=0.45, lw=0.0)  # fmt: skip
-        words = f"{row.title}, {row.when(zero_ns)}"
-        if len(network) > LANES_MAX and number >= LANES_MAX - 1:
-            if number > LANES_MAX - 1:
-                continue
-            words = f"{len(network) - number} more"
-        late = begin > end_s / 2.0
-        axis.annotate(
-            words, (end if late else begin, lane), xytext=(-3 if late else 3, 0),
-            textcoords="offset points", ha="right" if late else "left", va="center_baseline",
-            fontsize=8, color=IMPAIRED_TEXT, zorder=5,
-        )  # fmt: skip
-    axis.set_ylim(min(len(network), LANES_MAX) - 0.4, -0.6)
-    axis.set_yticks([])
-    axis.set_ylabel("network", fontsize=9)
-    axis.grid(visible=True, axis="x", lw=0.3, color="#bbbbbb")
-    axis.tick_params(labelsize=8)
-
-
-def _extent(row: Impaired, zero_ns: int, end_s: float) -> tuple[float, float]:
-    """Return where an impairment begins and ends within the picture, s."""
-    end = row.end_s(zero_ns)
-    begin = min(max(0.0, row.begin_s(zero_ns)), end_s)
-    return begin, end_s if end is None else min(max(begin, end), end_s)
-
-
-def _label(kind: RunEventKind, event: RunEvent) -> str:
-    if kind is RunEventKind.PUSHED:
-        return f"push {event.detail.partition(' for ')[0]}"
-    if kind is RunEventKind.RESTARTED:
-        return f"{event.subject} back"
-    return f"{event.subject} {event.detail}"
+            axis.axvspan(row.at_s, end, color=STALLED_COLOUR, alpha=0.8, lw=0.0, zorder=0)
+            axis.axvspan(end, apart, color=STALLED_COLOUR, alpha=0.15, lw=0.0, zorder=0)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from collections.abc import Sequence
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,8 +102,17 @@ SINK_OVER_S: Final = 0.1
 _HELD: Final = (Mode.HOLD, Mode.TRACK, Mode.DAMP)
 
 
-def soundness(log: RunLog, truth: Sequence[SimTruth], robot: RobotConfig) -> dict[str, Any]:
-    """Return the figures of a run from its first row on; None where the log has no data."""
+class Soundness(NamedTuple):
+    """The figures of `SOUND`; None where the log has no data."""
+
+    torque_at_limit_ms: float | None = None
+    shaking_nm: float | None = None
+    sinking_m_s: float | None = None
+    overforce_s: float | None = None
+
+
+def soundness(log: RunLog, truth: Sequence[SimTruth], robot: RobotConfig) -> Soundness:
+    """Return the figures of a run from its first row on."""
     start_ns = truth[0].t_ns
     longest, shaking = [], []
     for module in MODULES:
@@ -118,12 +127,12 @@ def soundness(log: RunLog, truth: Sequence[SimTruth], robot: RobotConfig) -> dic
         at_limit = np.abs(tau).sum(axis=1) >= AT_LIMIT * robot.joint.tau_module_max
         longest.append(_longest_s(t, at_limit))
         shaking.append(float(shaking_of(t, tau).max()))
-    return {
-        "torque_at_limit_ms": 1e3 * max(longest) if longest else None,
-        "shaking_nm": max(shaking) if shaking else None,
-        "sinking_m_s": _sinking(truth),
-        "overforce_s": _overforce_s(log, truth),
-    }
+    return Soundness(
+        torque_at_limit_ms=1e3 * max(longest) if longest else None,
+        shaking_nm=max(shaking) if shaking else None,
+        sinking_m_s=_sinking(truth),
+        overforce_s=_overforce_s(log, truth),
+    )
 
 
 def tracking(log: RunLog, times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -143,12 +152,12 @@ def _overforce_s(log: RunLog, truth: Sequence[SimTruth]) -> float:
     return _longest_s(t, (force > OVERFORCE_N) & tracking(log, t))
 
 
-def why_not_sound(figures: Mapping[str, Any]) -> str:
-    """Return the exceeded limits as text; "" if none is."""
-    rows = (BY_KEY[key] for key in SOUND)
-    over = [row for row in rows if (figures.get(row.key) or 0.0) > row.limit]
+def why_not_sound(figures: object) -> str:
+    """Return the exceeded limits as text, or an empty string; `figures` has the fields `SOUND`."""
     return "; ".join(
-        f"{row.what}: {figures[row.key]:.3g} {row.unit} (limit {row.limit:g})" for row in over
+        f"{row.what}: {value:.3g} {row.unit} (limit {row.limit:g})"
+        for row in map(BY_KEY.__getitem__, SOUND)
+        if (value := getattr(figures, row.key)) is not None and value > row.limit
     )
 
 

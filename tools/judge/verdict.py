@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from itertools import compress, pairwise
-from typing import Any, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple, TypeAlias, get_type_hints
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,28 +24,11 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE, ConfigError, RunError
 from shared.joints import MODULES
 from shared.mcap_log.sequence_stats import KeyCount
-from tools.judge.stalls import (
-    WORLD_STOPS,
-    Disturbance,
-    Stall,
-    as_dicts,
-    disturbances,
-    drop_outs,
-    goes_to_hold,
-    inside,
-    stalls_of,
-)
-from tools.judge.standing import (
-    BY_KEY,
-    soundness,
-    tracking,
-    why_not_sound,
-    why_not_standing,
-)
+from tools.fleet.stalls import Disturbance, disturbances, goes_to_hold, inside, stalls_of
+from tools.judge.standing import soundness, tracking, why_not_sound, why_not_standing
 from tools.logs.impairment_intervals import Impaired, impairments, touches
-from tools.logs.run_log import RunLog, robot_of
-
-Summary = dict[str, Any]
+from tools.logs.run_index import RunIndex
+from tools.logs.run_log import RunLog, parts_of, robot_of
 
 KILLED, RESTARTED, FAULTED = (
     RunEventKind.KILLED, RunEventKind.RESTARTED, RunEventKind.FAULTED,
@@ -56,6 +40,133 @@ NEXT_CYCLE_MS: Final = 2.0
 this time, ms: nothing is measured."""
 LATE_MAX_S: Final = 0.05
 """More world time given up than this: the run was not in real time."""
+
+
+class Percentiles(msgspec.Struct, frozen=True):
+    """Distribution of a figure."""
+
+    median: float
+    p99: float
+
+
+class ShownImpairment(msgspec.Struct, frozen=True):
+    """One impairment of the network; times in scenario time."""
+
+    link: str
+    words: str
+    """The impairment, as `--inject` takes it."""
+    begin_s: float
+    end_s: float | None
+    passed: int | None
+    lost: int | None
+    said: str
+    """All of it as a line for people."""
+
+
+class ShownStall(msgspec.Struct, frozen=True):
+    """One stall of the machine; times in scenario time."""
+
+    at_s: float
+    lasted_ms: float
+    apart_until_s: float
+    """The run is judged apart until then."""
+    modules_held: int
+    said: str
+    """All of it as a line for people."""
+
+
+def _worst(found: Sequence[Percentiles]) -> Percentiles:
+    """Return the median of the medians and the worst 99th percentile."""
+    return Percentiles(
+        median=float(np.median([one.median for one in found])), p99=max(one.p99 for one in found)
+    )
+
+
+def _each_stall(found: Sequence[list[ShownStall]]) -> list[ShownStall]:
+    """Return the stalls of all parts; the later part knows more of one that is in two."""
+    return list({row.at_s: row for part in found for row in part}.values())
+
+
+Largest: TypeAlias = Annotated[float | None, max]
+Smallest: TypeAlias = Annotated[float | None, min]
+Spread: TypeAlias = Annotated[Percentiles | None, _worst]
+
+
+class Summary(msgspec.Struct, kw_only=True):
+    """Figures of a run, as `summary.json` has them.
+
+    The annotation of a field says how the figures of the parts of a long run are merged; a field
+    without one has the value of the last part. A figure is None where the log does not tell it.
+    """
+
+    stood: bool = False
+    """It stands at the planned end of its scenario."""
+    sound: bool = False
+    why_not: str = ""
+    """Why it does not stand at the end."""
+    unsound: str = ""
+    """Limits of soundness that it exceeded."""
+    began: bool = False
+    fallen_at_s: Smallest = None
+    duration_s: float = 0.0
+    pace: float = 1.0
+    """Pace of the fleet's clock; below 1 the run was in slow motion."""
+    real_time_factor: float | None = None
+    world_time_lost_s: float | None = None
+    in_real_time: Annotated[bool, all] = True
+    com_x_max_mm: Largest = None
+    com_y_max_mm: Largest = None
+    roll_max_rad: Largest = None
+    pitch_max_rad: Largest = None
+    yaw_max_rad: Largest = None
+    hold_com_x_max_mm: Largest = None
+    """`hold_`: while no planner leads; `alive_`: while it leads, against what the hand asks."""
+    hold_com_y_max_mm: Largest = None
+    hold_roll_max_rad: Largest = None
+    hold_pitch_max_rad: Largest = None
+    hold_yaw_max_rad: Largest = None
+    alive_com_x_max_mm: Largest = None
+    alive_com_y_max_mm: Largest = None
+    alive_roll_max_rad: Largest = None
+    alive_pitch_max_rad: Largest = None
+    alive_yaw_max_rad: Largest = None
+    torso_height_min_m: Smallest = None
+    torso_height_max_m: Largest = None
+    sole_tilt_max_rad: Largest = None
+    torque_at_limit_ms: Largest = None
+    shaking_nm: Largest = None
+    sinking_m_s: Largest = None
+    overforce_s: Largest = None
+    alive_sole_tilt_max_rad: Largest = None
+    operator_peak_n: Largest = None
+    hold_operator_peak_n: Largest = None
+    operator_side_peak_n: Largest = None
+    assist_error_n: Largest = None
+    handover_ms: dict[str, float | None] | None = None
+    """From the first kill to HOLD, by module."""
+    handover_max_ms: Largest = None
+    handover_torque_step_nm: Largest = None
+    reengage_s: Largest = None
+    """From the first restart to TRACK of the last module."""
+    hold_entries: Annotated[int, max] = 0
+    """Of the module that dropped out most often."""
+    command_age_ms: Spread = None
+    command_age_impaired_ms: Spread = None
+    command_age_otherwise_ms: Spread = None
+    links_impaired: int = 0
+    impairments: list[ShownImpairment] = []
+    pd_cycles_late_pct: Largest = None
+    planner_tick_us: Spread = None
+    stopped: list[str] = []
+    """Processes that were frozen."""
+    messages_recorded: int = 0
+    """Up to the end of the last part; so are the gaps."""
+    sequence_gaps: int = 0
+    stalls: Annotated[list[ShownStall], _each_stall] = []
+    fleet_cpu_pct: float | None = None
+    """Of a live run."""
+    speed: float | None = None
+    """Of a run in virtual time, as a multiple of real time."""
 
 
 class Course(NamedTuple):
@@ -91,180 +202,188 @@ def course(log: RunLog) -> Course:
     return Course(t, let_go, began=False, zero_ns=zero_ns)
 
 
-def summarise(log: RunLog, duration_s: float) -> Summary:
-    """Return the figures of a run; what follows a fall does not count."""
+def summarise(log: RunLog, duration_s: float, counts: dict[str, KeyCount] | None = None) -> Summary:
+    """Return the figures of a run, or of a part of one; what follows a fall does not count.
+
+    Args:
+        log: the run, or the part.
+        duration_s: planned length of its scenario.
+        counts: of the messages up to the end of the part; None: the log is the whole run.
+    """
     t, truth, began, zero_ns = course(log)
-    whole = log
+    counted = (log.gaps() if counts is None else counts).values()
+    summary = Summary(
+        began=began,
+        messages_recorded=sum(one.count for one in counted),
+        sequence_gaps=sum(one.missing for one in counted),
+    )
     fall = next((index for index, row in enumerate(truth) if row.fallen), None)
     if fall is not None:
         t, truth = t[: fall + 1], truth[: fall + 1]
         log = log.until(truth[-1].t_ns)
     events: list[RunEvent] = log.messages(topics.RUN_EVENT)
     kills = [row for row in events if row.kind == KILLED]
-    kill_s = kills[0].scenario_s if kills else np.inf
-    last = truth[-1]
-    fallen = last.fallen
-    reached = began and bool(t[-1] >= duration_s - 0.1)
-    robot = None
-    with contextlib.suppress(RunError, ConfigError):  # none in it, or one of another version
-        robot = robot_of(log)
-    sound = soundness(log, truth, robot) if robot is not None else {}
-    why_not = why_not_standing(last, robot) if robot is not None and reached else ""
-    stands = reached and not fallen and not why_not
-    unsound = why_not_sound(sound) if stands else ""
-    summary: Summary = {
-        "stood": stands,
-        "sound": stands and not unsound,
-        "why_not": why_not,
-        "unsound": unsound,
-        "began": began,
-        "fallen_at_s": float(t[-1]) if fallen else None,
-        "duration_s": float(t[-1]),
-        "pace": _pace(log),
-        "real_time_factor": last.real_time_factor,
-        "world_time_lost_s": last.late_s,
-        "in_real_time": _in_real_time(
-            last, [row for row in stalls_of(events) if zero_ns < row.end_ns <= last.t_ns]
-        ),
-    }
-    times_ns = np.array([row.t_ns for row in truth])
-    disturbed = disturbances(log, truth[0].t_ns, last.t_ns)
-    apart = inside(disturbed, times_ns)
-    led = leading(log, times_ns)
-    led, held = led & ~apart, ~led & ~apart
-    poses = np.array([(*row.over, row.com[2], *row.angles) for row in truth])
-    for prefix, mask in (("", t >= 0.0), ("hold_", held)):
-        summary |= _extent(prefix, poses[mask])
-    summary |= _extent("alive_", (poses - _asked(log, truth))[led])
-    heights = [row.torso[2] for row in truth]
-    summary["torso_height_min_m"] = min(heights)
-    summary["torso_height_max_m"] = max(heights)
-    tilt = np.array([max(row.foot_right_tilt, row.foot_left_tilt) for row in truth])
-    summary["sole_tilt_max_rad"] = _max(tilt)
-    summary |= sound
-    summary["alive_sole_tilt_max_rad"] = _max(tilt[led])
-    _, side, force = np.abs([row.operator_force for row in truth]).T
-    summary["operator_peak_n"] = _max(force[led])
-    summary["hold_operator_peak_n"] = _max(force[held])
-    summary["operator_side_peak_n"] = _max(side[led]) if side.any() else None
-    judged = (t < kill_s) & ~apart
-    summary["assist_error_n"] = _assist_error(list(compress(truth, judged)))
-    summary |= _handover(log, kills)
-    summary["reengage_s"] = _reengage(log, events)
-    entries = [len(_drop_outs(log, module, truth[0].t_ns)) for module in MODULES]
-    summary["hold_entries"] = max(entries)
     network = impairments(log.messages(topics.LINK_EVENT))
-    summary |= _command_age(log, truth[0].t_ns, network)
-    summary["links_impaired"] = len(network)
-    summary["impairments"] = [row.as_dict(zero_ns) for row in network]
-    summary["pd_cycles_late_pct"] = _late_share(log, truth[0].t_ns, disturbed)
-    statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
-    ticks_us = [row.tick_us for row in statuses if row.t_ns >= truth[0].t_ns]
-    summary["planner_tick_us"] = _middle_and_most(np.array(ticks_us))
-    summary["stopped"] = sorted({row.subject for row in kills if row.detail == "STOP"})
-    summary["messages_recorded"] = sum(whole.count(key) for key in whole.keys())  # noqa: SIM118 - not a dict
-    summary["sequence_gaps"] = sum(count.missing for count in whole.gaps().values())
-    summary["stalls"] = as_dicts(log, disturbed, truth, zero_ns)
-    summary["across_stalls"] = _across(summary, events, disturbed)
-    done_ns = [row.t_ns for row in events if row.kind in (KILLED, FAULTED)]
-    until_ns = min([*done_ns, last.t_ns])
-    summary["drop_outs"] = []
-    if not network and not log.metadata.get("run", {}).get("lockstep"):
-        begin_ns = max(zero_ns, truth[0].t_ns)
-        summary["drop_outs"] = drop_outs(log, disturbed, zero_ns, begin_ns, until_ns)
+    changes = [row for name in MODULES for row in log.messages(topics.JOINT_EVENT, name)]
+    disturbed = disturbances(events, changes, truth[-1].t_ns)
+    _add_end(summary, log, t, truth, duration_s)
+    if not _is_virtual(log):
+        _add_real_time(summary, log, truth, zero_ns, disturbed)
+    _add_motion(summary, log, t, truth, kills, disturbed)
+    _add_handover(summary, log, kills)
+    summary.reengage_s = _reengage(log, events)
+    summary.hold_entries = max(len(_holds(log, name, truth[0].t_ns)) for name in MODULES)
+    _add_command_ages(summary, log, truth[0].t_ns, network)
+    summary.links_impaired = len(network)
+    summary.impairments = [shown(row, zero_ns) for row in network]
+    summary.stopped = sorted({row.subject for row in kills if row.detail == "STOP"})
+    summary.stalls = [
+        _shown_stall(row, zero_ns) for row in disturbed if row.stall.begin_ns >= truth[0].t_ns
+    ]
     return summary
 
 
-def _in_real_time(last: SimTruth, stalls: Sequence[Stall]) -> bool:
-    """Return True if the world kept up with the clock, but for the stalls in which it stopped."""
-    stood_still_s = sum(row.lasted_ms for row in stalls if row.who in WORLD_STOPS) / 1e3
-    factor = last.real_time_factor
-    if stood_still_s and last.scenario_s > 0.0:
-        wall_s = last.scenario_s / max(factor, 1e-9)
-        factor = last.scenario_s / max(wall_s - stood_still_s, 1e-9)
-    return factor >= REAL_TIME_FACTOR_MIN and last.late_s - stood_still_s <= LATE_MAX_S
+def _shown_stall(row: Disturbance, zero_ns: int) -> ShownStall:
+    at_s, held = (row.stall.begin_ns - zero_ns) / NS_PER_S, row.held
+    who = f": {'all six' if held == len(MODULES) else held} held" if held else ""
+    return ShownStall(
+        at_s=at_s,
+        lasted_ms=row.stall.lasted_ms,
+        apart_until_s=(row.end_ns - zero_ns) / NS_PER_S,
+        modules_held=held,
+        said=f"{at_s:.2f} s: {row.stall.words}{who}",
+    )
 
 
-def _across(
-    summary: Summary, events: Sequence[RunEvent], disturbed: Sequence[Disturbance]
-) -> list[str]:
-    """Return the keys of figures over their limits that would be within them but for a stall."""
-    found = []
-    for kind, key, unit_s in ((KILLED, "handover_max_ms", 1e-3), (RESTARTED, "reengage_s", 1.0)):
-        begins_ns = [event.t_ns for event in events if event.kind == kind]
-        if not begins_ns or summary[key] is None:
-            continue
-        begin_ns, end_ns = begins_ns[0], begins_ns[0] + summary[key] * unit_s * NS_PER_S
-        overlaps_ns = [
-            max(0.0, min(end_ns, row.stall.end_ns) - max(begin_ns, row.begin_ns))
-            for row in disturbed
-        ]
-        without = summary[key] - sum(overlaps_ns) / NS_PER_S / unit_s
-        if without <= BY_KEY[key].limit < summary[key]:
-            found.append(key)
-    return found + _lost_in_stalls(summary)
+def summarise_parts(index: RunIndex, duration_s: float) -> Summary:
+    """Return the figures of a run that is read in parts; RunError says why none can be judged."""
+    found: list[Summary] = []
+    counts: dict[str, KeyCount] = {}
+    why: RunError | None = None
+    for part in parts_of(index):
+        part.count_into(counts)
+        try:
+            found.append(summarise(part, duration_s, counts))
+        except RunError as error:  # the scenario has not begun in it
+            why = why or error
+    if not found:
+        raise why or RunError(f"{index.path}: holds nothing to judge")
+    return merged(found)
 
 
-def _lost_in_stalls(summary: Mapping[str, Any]) -> list[str]:
-    lost = sum(row["messages_lost"] for row in summary["stalls"])
-    return ["sequence_gaps"] if lost and lost >= summary["sequence_gaps"] else []
+def merged(parts: Sequence[Summary]) -> Summary:
+    """Return the figures of a run from those of its parts, in their order."""
+    last = parts[-1]
+    if len(parts) == 1:
+        return last
+    summary = msgspec.structs.replace(last)
+    for name, hint in get_type_hints(Summary, include_extras=True).items():
+        merge: Sequence[Callable[[list[Any]], Any]] = getattr(hint, "__metadata__", ())
+        found = [value for part in parts if (value := getattr(part, name)) is not None]
+        if merge and found:
+            setattr(summary, name, merge[0](found))
+    summary.stood = last.stood and summary.fallen_at_s is None
+    summary.unsound = why_not_sound(summary) if summary.stood else ""
+    summary.sound = summary.stood and not summary.unsound
+    return summary
 
 
-def fell(summary: Mapping[str, Any]) -> bool:
+def fell(summary: Summary) -> bool:
     """Return True if the robot of a run is down, or cannot recover."""
-    return summary["fallen_at_s"] is not None or bool(summary["why_not"])
+    return summary.fallen_at_s is not None or bool(summary.why_not)
 
 
-def exit_code(summary: Mapping[str, Any]) -> int:
+def exit_code(summary: Summary) -> int:
     """Return the exit code of a run that was judged: standing, but not soundly, is a fault."""
-    if summary["sound"]:
+    if summary.sound:
         return 0
     return FELL_EXIT_CODE if fell(summary) else FAULT_EXIT_CODE
 
 
-LAST_COUNTS: Final = ("world_time_lost_s", "real_time_factor", "duration_s", "pace", "began")
-"""Figures that a later part has of the whole run."""
-COUNTED: Final = ("messages_recorded", "sequence_gaps")
-"""Figures that parts with margins cannot tell: `joined` is given them."""
-LEAST: Final = ("torso_height_min_m",)
+def _is_virtual(log: RunLog) -> bool:
+    return bool(log.metadata.get("run", {}).get("lockstep"))
 
 
-def joined(parts: Sequence[Summary], counts: Iterable[KeyCount]) -> Summary:
-    """Return the figures of a run from those of its parts, in their order.
+def _add_end(
+    summary: Summary, log: RunLog, t: Array, truth: Sequence[SimTruth], duration_s: float
+) -> None:
+    """Add how the robot stands at the end, and how soundly it stood until then."""
+    last, end_s = truth[-1], float(t[-1])
+    reached = summary.began and end_s >= duration_s - 0.1
+    robot = None
+    with contextlib.suppress(RunError, ConfigError):  # none in the log, or of another version
+        robot = robot_of(log)
+    if robot is not None:
+        for name, value in soundness(log, truth, robot)._asdict().items():
+            setattr(summary, name, value)
+        summary.why_not = why_not_standing(last, robot) if reached else ""
+    summary.stood = reached and not last.fallen and not summary.why_not
+    summary.unsound = why_not_sound(summary) if summary.stood else ""
+    summary.sound = summary.stood and not summary.unsound
+    summary.fallen_at_s = end_s if last.fallen else None
+    summary.duration_s = end_s
+    summary.pace = _pace(log)
 
-    Extremes are those of the run. A percentile or a mean is that of the worst part, a median
-    the median of the parts.
-    """
-    if len(parts) == 1:
-        return parts[0]
-    counted = list(counts)
-    last, summary = parts[-1], dict(parts[-1])
-    for key in last:
-        found = [part[key] for part in parts if part[key] is not None]
-        if not found or key in LAST_COUNTS or not isinstance(found[0], int | float | dict):
-            continue
-        if isinstance(found[0], dict):
-            if "p99" in found[0]:
-                summary[key] = {
-                    "median": float(np.median([one["median"] for one in found])),
-                    "p99": max(one["p99"] for one in found),
-                }
-        elif not isinstance(found[0], bool):
-            summary[key] = min(found) if key in LEAST else max(found)
-    told = {(row["at_s"], row["who"]): row for part in parts for row in part["stalls"]}
-    summary["stalls"] = list(told.values())
-    summary["drop_outs"] = list(dict.fromkeys(line for p in parts for line in p["drop_outs"]))
-    totals = sum(one.count for one in counted), sum(one.missing for one in counted)
-    summary |= dict(zip(COUNTED, totals, strict=True))
-    across = {key for part in parts for key in part["across_stalls"]} - {"sequence_gaps"}
-    summary["across_stalls"] = sorted(across) + _lost_in_stalls(summary)
-    fallen = [part["fallen_at_s"] for part in parts if part["fallen_at_s"] is not None]
-    summary["fallen_at_s"] = min(fallen, default=None)
-    summary["stood"] = last["stood"] and not fallen
-    summary["unsound"] = why_not_sound(summary) if summary["stood"] else ""
-    summary["sound"] = summary["stood"] and not summary["unsound"]
-    summary["in_real_time"] = all(part["in_real_time"] for part in parts)
-    return summary
+
+def _add_real_time(
+    summary: Summary,
+    log: RunLog,
+    truth: Sequence[SimTruth],
+    zero_ns: int,
+    disturbed: Sequence[Disturbance],
+) -> None:
+    """Add what only a live run has."""
+    start_ns, last = truth[0].t_ns, truth[-1]
+    stalls = stalls_of(log.messages(topics.RUN_EVENT))
+    stalled_ms = sum(row.lasted_ms for row in stalls if zero_ns < row.end_ns <= last.t_ns)
+    summary.in_real_time = _in_real_time(last, stalled_ms / 1e3)
+    summary.real_time_factor, summary.world_time_lost_s = last.real_time_factor, last.late_s
+    summary.pd_cycles_late_pct = _late_share(log, start_ns, disturbed)
+    statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
+    ticks_us = [row.tick_us for row in statuses if row.t_ns >= start_ns]
+    summary.planner_tick_us = _percentiles(np.array(ticks_us))
+
+
+def _in_real_time(last: SimTruth, stalled_s: float) -> bool:
+    """Return True if the world kept up with the clock, but for the stalls of the machine."""
+    factor = last.real_time_factor
+    if stalled_s and last.scenario_s > 0.0:
+        wall_s = last.scenario_s / max(factor, 1e-9)
+        factor = last.scenario_s / max(wall_s - stalled_s, 1e-9)
+    return factor >= REAL_TIME_FACTOR_MIN and last.late_s - stalled_s <= LATE_MAX_S
+
+
+def _add_motion(
+    summary: Summary,
+    log: RunLog,
+    t: Array,
+    truth: Sequence[SimTruth],
+    kills: Sequence[RunEvent],
+    disturbed: Sequence[Disturbance],
+) -> None:
+    """Add extremes of the robot's motion and of the hand's force, all in all, led and held."""
+    times_ns = np.array([row.t_ns for row in truth])
+    apart = inside(disturbed, times_ns)
+    led = leading(log, times_ns)
+    led, held = led & ~apart, ~led & ~apart
+    poses = np.array([(*row.over, row.com[2], *row.angles) for row in truth])
+    deviations = poses - _requested(log, truth)
+    for prefix, rows in (
+        ("", poses[t >= 0.0]),
+        ("hold_", poses[held]),
+        ("alive_", deviations[led]),
+    ):
+        for name, scale, column in POSES:
+            setattr(summary, prefix + name, _max(np.abs(rows[:, column]) * scale))
+    heights = [row.torso[2] for row in truth]
+    summary.torso_height_min_m, summary.torso_height_max_m = min(heights), max(heights)
+    tilt = np.array([max(row.foot_right_tilt, row.foot_left_tilt) for row in truth])
+    summary.sole_tilt_max_rad, summary.alive_sole_tilt_max_rad = _max(tilt), _max(tilt[led])
+    _, side, force = np.abs([row.operator_force for row in truth]).T
+    summary.operator_peak_n, summary.hold_operator_peak_n = _max(force[led]), _max(force[held])
+    summary.operator_side_peak_n = _max(side[led]) if side.any() else None
+    kill_s = kills[0].scenario_s if kills else np.inf
+    summary.assist_error_n = _assist_error(list(compress(truth, (t < kill_s) & ~apart)))
 
 
 POSES: Final = (
@@ -274,27 +393,23 @@ POSES: Final = (
 """Figure, scale and column of a pose: COM over the soles and its height, m, roll, pitch, yaw."""
 
 
-def _extent(prefix: str, poses: Array) -> Summary:
-    return {prefix + name: _max(np.abs(poses[:, n]) * scale) for name, scale, n in POSES}
-
-
-def _asked(log: RunLog, truth: Sequence[SimTruth]) -> Array:
+def _requested(log: RunLog, truth: Sequence[SimTruth]) -> Array:
     """Return the closed directions that the operator requested, at the planner's rate of reference.
 
     (n, 6): COM x, y over the floor along gravity, z, roll, pitch, yaw; zeros where none was
     requested.
     """
-    asked = np.zeros((len(truth), 6))
+    found = np.zeros((len(truth), 6))
     rows: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
     if not any(any(row.shift_requested) for row in rows):
-        return asked
+        return found
     t, p_ref = [row.t_ns for row in rows], np.array([row.p_ref for row in rows])
     times_ns = [row.t_ns for row in truth]
     for row in ROWS:
-        asked[:, row] = np.interp(times_ns, t, p_ref[:, row])
+        found[:, row] = np.interp(times_ns, t, p_ref[:, row])
     # on a slope the reference goes with gravity, as `SimTruth.over` does
-    asked[:, :2] -= [(row.lean[0] * row.com[2], row.lean[1] * row.com[2]) for row in truth]
-    return asked
+    found[:, :2] -= [(row.lean[0] * row.com[2], row.lean[1] * row.com[2]) for row in truth]
+    return found
 
 
 def _max(values: Array) -> float | None:
@@ -325,8 +440,23 @@ def leading(log: RunLog, times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
     return led & tracking(log, times_ns)
 
 
-def _command_age(log: RunLog, start_ns: int, network: Sequence[Impaired]) -> Summary:
-    """Return how old the newest command of each module that tracks was, from the start on, ms.
+def shown(row: Impaired, zero_ns: int) -> ShownImpairment:
+    """Return an impairment as the summary has it; times in s after a stamp."""
+    return ShownImpairment(
+        link=row.link,
+        words=row.words,
+        begin_s=row.begin_s(zero_ns),
+        end_s=row.end_s(zero_ns),
+        passed=row.passed,
+        lost=row.lost,
+        said=f"{row.title}: {row.when(zero_ns)}; {row.counts()}",
+    )
+
+
+def _add_command_ages(
+    summary: Summary, log: RunLog, start_ns: int, network: Sequence[Impaired]
+) -> None:
+    """Add how old the newest command of each module that tracks was, from the start on, ms.
 
     All in all, while a link of that module was impaired, and otherwise.
     """
@@ -340,29 +470,23 @@ def _command_age(log: RunLog, start_ns: int, network: Sequence[Impaired]) -> Sum
         ages.append(np.array([row.age_ns / NS_PER_MS for row in rows]))
         impaired.append(touches(network, module, np.array([row.t_ns for row in rows], np.int64)))
     age, mask = np.concatenate(ages), np.concatenate(impaired)
-    return {
-        "command_age_ms": _middle_and_most(age),
-        "command_age_impaired_ms": _middle_and_most(age[mask]),
-        "command_age_otherwise_ms": _middle_and_most(age[~mask]),
-    }
+    summary.command_age_ms = _percentiles(age)
+    summary.command_age_impaired_ms = _percentiles(age[mask])
+    summary.command_age_otherwise_ms = _percentiles(age[~mask])
 
 
-def _middle_and_most(values: Array) -> dict[str, float] | None:
-    """Return the median and the 99th percentile; None of nothing."""
-    if not len(values):
-        return None
-    median, p99 = np.percentile(values, [50, 99])
-    return {"median": float(median), "p99": float(p99)}
+def _percentiles(values: Array) -> Percentiles | None:
+    return Percentiles(*np.percentile(values, [50, 99]).tolist()) if len(values) else None
 
 
-def _drop_outs(log: RunLog, module: str, from_ns: int) -> list[JointEvent]:
+def _holds(log: RunLog, module: str, from_ns: int) -> list[JointEvent]:
     """Return each time that a module went from TRACK to HOLD."""
     events: list[JointEvent] = log.messages(topics.JOINT_EVENT, module)
     return [row for row in events if row.t_ns >= from_ns and goes_to_hold(row)]
 
 
-def _handover(log: RunLog, kills: Sequence[RunEvent]) -> Summary:
-    """Return the time from the first kill to HOLD, and the largest torque step into HOLD.
+def _add_handover(summary: Summary, log: RunLog, kills: Sequence[RunEvent]) -> None:
+    """Add the time from the first kill to HOLD, and the largest torque step into HOLD.
 
     Steps count from the first kill on, or from when the network was first impaired.
     """
@@ -371,7 +495,7 @@ def _handover(log: RunLog, kills: Sequence[RunEvent]) -> Summary:
     times: dict[str, float | None] = dict.fromkeys(MODULES)
     steps = []
     for module in MODULES if begins else ():
-        entries = _drop_outs(log, module, min(begins))
+        entries = _holds(log, module, min(begins))
         steps += [abs(b - a) for row in entries
                   for a, b in zip(row.tau_before, row.tau_after, strict=True)]  # fmt: skip
         after = [row.t_ns for row in entries if kills and row.t_ns >= kills[0].t_ns]
@@ -379,14 +503,11 @@ def _handover(log: RunLog, kills: Sequence[RunEvent]) -> Summary:
             times[module] = (after[0] - kills[0].t_ns) / NS_PER_MS
     known = [value for value in times.values() if value is not None]
     slowest = max(known) if len(known) == len(MODULES) else None
-    is_virtual = bool(log.metadata.get("run", {}).get("lockstep"))
-    if is_virtual and slowest is not None and slowest <= NEXT_CYCLE_MS:
+    if _is_virtual(log) and slowest is not None and slowest <= NEXT_CYCLE_MS:
         slowest = None
-    return {
-        "handover_ms": times if kills else None,
-        "handover_max_ms": slowest,
-        "handover_torque_step_nm": max(steps, default=None),
-    }
+    summary.handover_ms = times if kills else None
+    summary.handover_max_ms = slowest
+    summary.handover_torque_step_nm = max(steps, default=None)
 
 
 def _reengage(log: RunLog, events: Sequence[RunEvent]) -> float | None:

@@ -33,7 +33,7 @@ def show(summary: Summary, console: Console) -> None:
         colour = "green" if word == OK else "yellow" if word.startswith(OVER) else "default"
         table.add_row(*cells, Text(word, colour))
     console.print(table)
-    if summary["sound"] and any(word.startswith(OVER) for *_, word in figures):
+    if summary.sound and any(word.startswith(OVER) for *_, word in figures):
         decide = ", ".join(BY_KEY[key].what for key in SOUND)
         console.print(
             "A figure over its limit is reported and does not decide: standing to the end does, "
@@ -42,20 +42,20 @@ def show(summary: Summary, console: Console) -> None:
         )
     for line in (*stalls(summary), *network(summary)):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
-    if summary.get("pace", 1.0) != 1.0:
+    if summary.pace != 1.0:
         console.print(
-            f"In slow motion: the fleet's clock went at {summary['pace']:g} of real time.",
+            f"In slow motion: the fleet's clock went at {summary.pace:g} of real time.",
             style="dim",
             highlight=False,
         )
-    if not summary["in_real_time"]:
+    if not summary.in_real_time:
         console.print(
             marked(
                 "[yellow]The machine was too slow for real time: real-time factor "
                 "{:.3f}, {:.2f} s of world "
                 "time given up. The times above are not those of a robot.[/]",
-                summary["real_time_factor"],
-                summary["world_time_lost_s"],
+                summary.real_time_factor,
+                summary.world_time_lost_s,
             )
         )
     console.print(_sentence(summary))
@@ -70,45 +70,37 @@ def rows(summary: Summary) -> list[tuple[str, str, str, str]]:
     for row in LIMITS:
         unit = f" {row.unit}" if row.unit else ""
         limit = f"{row.limit:g}{unit}"
-        if summary.get(row.key) is not None:
-            measured = f"{digits(summary[row.key])}{unit}"
-            found.append((row.what, measured, limit, mark(row, summary)))
-        elif row.key == "handover_max_ms" and summary.get("handover_ms"):
+        value: float | None = getattr(summary, row.key)
+        if value is not None:
+            found.append((row.what, f"{digits(value)}{unit}", limit, mark(row, summary)))
+        elif row.key == "handover_max_ms" and summary.handover_ms:
             found.append((row.what, "-", limit, ""))
     return found
 
 
 def mark(row: VerdictLimit, summary: Summary) -> str:
     """Return the verdict on a figure: `ok`, or `over` and perhaps why."""
-    if summary[row.key] <= row.limit:
+    if getattr(summary, row.key) <= row.limit:
         return OK
-    if row.key == "sequence_gaps" and summary["stopped"]:
+    if row.key == "sequence_gaps" and summary.stopped:
         return "of a service that was stopped"
-    if row.key in summary["across_stalls"]:
-        return "in a stall"
     if row.key in OF_THE_MACHINE:
         return f"{OVER}, a busy machine" if row.key != "sequence_gaps" else OVER
-    return f"{OVER}, links impaired" if summary.get("links_impaired") else OVER
+    return f"{OVER}, links impaired" if summary.links_impaired else OVER
 
 
 def stalls(summary: Summary) -> list[str]:
-    """Return a line for each stall that made something of the run, and one for the others.
-
-    After them each drop-out that no stall explains.
-    """
-    rows = summary["stalls"]
-    told = [row for row in rows if row["modules_held"] or row["messages_lost"]]
-    rest = [row["lasted_ms"] for row in rows if row not in told]
-    lines = [row["said"] for row in told[:STALLS_MAX]]
+    """Return a line for each stall that made modules hold, and one for the others."""
+    told = [row.said for row in summary.stalls if row.modules_held]
+    rest = [row.lasted_ms for row in summary.stalls if not row.modules_held]
+    lines = told[:STALLS_MAX]
     if len(told) > STALLS_MAX:
         lines.append(f"{len(told) - STALLS_MAX} more stalls with consequences")
     if rest:
-        stalls_are = "stall was" if len(rest) == 1 else "stalls were"
-        lines.append(f"{len(rest)} {'more ' if told else ''}{stalls_are} without consequence: "
-                     f"{max(rest):.0f} ms{' at most' if len(rest) > 1 else ''}")  # fmt: skip
+        lines.append(f"Stalls of the machine without consequence: {len(rest)}, at most "
+                     f"{max(rest):.0f} ms")  # fmt: skip
     if told:
         lines.append("Figures marked led or held leave out what a stall made of the run.")
-    lines += summary["drop_outs"]
     return lines
 
 
@@ -117,13 +109,15 @@ def network(summary: Summary) -> list[str]:
 
     If there is any, one more line compares the commands' ages during impairments and outside.
     """
-    lines = [str(row["said"]) for row in summary.get("impairments", ())]
+    lines = [row.said for row in summary.impairments]
     ages = [
-        f"{digits(found['median'])} ms, 99 % within {digits(found['p99'])} ms {word}"
-        for word, key in (("while impaired", "command_age_impaired_ms"),
-                          ("otherwise", "command_age_otherwise_ms"))
-        if (found := summary.get(key)) is not None
-    ]  # fmt: skip
+        f"{digits(age.median)} ms, 99 % within {digits(age.p99)} ms {when}"
+        for when, age in (
+            ("while impaired", summary.command_age_impaired_ms),
+            ("otherwise", summary.command_age_otherwise_ms),
+        )
+        if age is not None
+    ]
     if lines and ages:
         lines.append(f"median age of commands in TRACK: {'; '.join(ages)}")
     return lines
@@ -140,17 +134,17 @@ def digits(value: float) -> str:
 
 
 def _sentence(summary: Summary) -> Text:
-    if summary["sound"]:
-        return marked("[bold green]STOOD[/] for {:.1f} s", summary["duration_s"])
-    if not summary["began"]:
+    if summary.sound:
+        return marked("[bold green]STOOD[/] for {:.1f} s", summary.duration_s)
+    if not summary.began:
         return marked(
             "[bold red]FELL[/] {:.1f} s after the hoist let go, before the scenario began",
-            summary["fallen_at_s"],
+            summary.fallen_at_s,
         )
-    if summary["fallen_at_s"] is not None:
-        return marked("[bold red]FELL[/] at {:.1f} s", summary["fallen_at_s"])
-    if summary["why_not"]:
-        return marked("[bold red]DOES NOT STAND[/] at the end: {}", summary["why_not"])
-    if summary["unsound"]:
-        return marked("[bold red]STOOD, BUT NOT SOUNDLY[/]: {}", summary["unsound"])
-    return marked("[bold red]NOT FINISHED[/]: the log ends at {:.1f} s", summary["duration_s"])
+    if summary.fallen_at_s is not None:
+        return marked("[bold red]FELL[/] at {:.1f} s", summary.fallen_at_s)
+    if summary.why_not:
+        return marked("[bold red]DOES NOT STAND[/] at the end: {}", summary.why_not)
+    if summary.unsound:
+        return marked("[bold red]STOOD, BUT NOT SOUNDLY[/]: {}", summary.unsound)
+    return marked("[bold red]NOT FINISHED[/]: the log ends at {:.1f} s", summary.duration_s)

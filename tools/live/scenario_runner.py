@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Final, NamedTuple
 
+from shared import scheduling
 from shared.bus import topics
 from shared.bus.messages import (
     JointState,
@@ -32,9 +33,8 @@ from shared.joints import MODULES
 from tools.fleet import procfs
 from tools.fleet.pace import IDLE_LEAST, PACE_MIN, CoresFullError, idle_and_total, idle_share
 from tools.fleet.proxy_client import ProxyClient
+from tools.fleet.stalls import STALL_SHOWN_NS, Stall, StallWatch
 from tools.fleet.supervise import SupervisedFleet
-from tools.judge.stalls import Stall
-from tools.live.live_stalls import LiveStalls
 from tools.live.planner_return import PlannerReturn
 
 READY_TIMEOUT_S: Final = 45.0
@@ -54,8 +54,8 @@ POLL_S: Final = 0.004
 UNHEARD_S: Final = 0.5
 """A module that says nothing for so long is shown as silent."""
 PIDS_EVERY_S: Final = 1.0
-STALLS_FILE: Final = "stalls"
-"""In the run directory: what `StallWatch` finds."""
+FULL_CORE: Final = 0.2
+"""With less idle time beside the fleet one of two cores may be full; of four it fills none."""
 ENDING_S: Final = 3.0
 """s; a service that was asked to end has done so by then, or was killed by its supervisor."""
 
@@ -196,8 +196,9 @@ class ScenarioRunner:
         self._note = ""
         self._pids: dict[str, int] = {}
         self._next_pids_s = 0.0
-        self._stalls = LiveStalls()
-        self._killed = False
+        self._watch = StallWatch()
+        self._stalls: list[Stall] = []
+        self._killed = self._is_standing = False
 
     def run(self, is_over: Callable[[], bool] = lambda: False) -> EndOfRun:
         """Wait until the robot stands, run the scenario to its end, or until `is_over`.
@@ -207,7 +208,7 @@ class ScenarioRunner:
             RunError: the robot did not come to stand, or the simulated world went silent.
             FleetError: a service that was to be restarted could not be.
         """
-        with self._stalls.watched(self._fleet.run.path / STALLS_FILE):
+        with self._watch:
             return self._run(is_over)
 
     @property
@@ -249,7 +250,6 @@ class ScenarioRunner:
             self._follow(scenario_s)
             time.sleep(POLL_S)
         meter.sample(self._pids.values())
-        self._events.tell(self._stalls.rest())
         self._finish("")
         return EndOfRun(meter.share_pct, ended_at_s)
 
@@ -284,7 +284,7 @@ class ScenarioRunner:
             if self._truth is not None and self._truth.fallen:
                 return False
             if all(tracking) and standing:
-                self._stalls.begin()
+                self._is_standing = True
                 if since is None:
                     since, before = time.monotonic(), idle_and_total()
                 self._note = "standing, settling"
@@ -305,7 +305,7 @@ class ScenarioRunner:
         assert before is not None  # noqa: S101 - set with `since`
         idle = idle_share(before)
         self._check_cores(idle)
-        self._tell(self._stalls.describe_machine(idle))
+        self._tell(describe_machine(idle))
         self._note = ""
         return True
 
@@ -342,30 +342,39 @@ class ScenarioRunner:
         for module, latest in self._states.items():
             state = latest.take()
             if state is not None:
-                self._stalls.hear(module, state)
                 self._modes[module] = state.mode
                 self._heard_s[module] = time.monotonic()
             elif time.monotonic() - self._heard_s.get(module, 0.0) > UNHEARD_S:
                 self._modes.pop(module, None)
         truth = self._truths.take()
         if truth is not None:
-            self._stalls.see(truth)
             self._truth, self._truth_at_s = truth, time.monotonic()
             modes = tuple(
                 name_of(Mode, self._modes[module])[0] if module in self._modes else "-"
                 for module in MODULES
             )
-            held_by_it = [] if self._killed else list(self._modes.values())
             words = (
                 self._note,
                 self._planner.waits(truth, self._modes.values()),
-                self._stalls.words(held_by_it),
+                self._stall_words(),
             )
             note = "; ".join(word for word in words if word)
             self._show(LiveSnapshot(truth, modes, note))
         elif time.monotonic() - self._truth_at_s > SILENT_S and self._events.start_ns:
             raise RunError(f"the simulator has said nothing for {SILENT_S:.0f} s; see its log")
-        self._events.tell(self._stalls.take())
+        stalls = self._watch.take()
+        if self._is_standing:  # services that start take the machine's time
+            self._events.tell(stalls)
+            self._stalls += stalls
+
+    def _stall_words(self) -> str:
+        """Return what to show of the newest stall; empty if it was a while ago."""
+        if not self._stalls or now_ns() - self._stalls[-1].end_ns > STALL_SHOWN_NS:
+            return ""
+        held = list(self._modes.values()).count(Mode.HOLD)
+        who = "all six" if held == len(MODULES) else held
+        by_it = f": {who} hold" if held and not self._killed else ""
+        return f"{self._stalls[-1].words}{by_it}"
 
     def _act(self, row: Kill | Restart | Push | Fault | Inject) -> None:
         """Do what is due; the simulator does pushes and faults, and they are only recorded here."""
@@ -411,6 +420,18 @@ class ScenarioRunner:
             if procfs.is_gone(pid) or procfs.is_suspended(pid):
                 return
             time.sleep(POLL_S)
+
+
+def describe_machine(idle: float) -> str:
+    """Return how the machine carries the fleet, from the idle fraction of its cores."""
+    words = f"{len(os.sched_getaffinity(0))} cores, {100 * idle:.0f} % idle beside the fleet"
+    pause_ms = scheduling.real_time_pause_ms() if idle < FULL_CORE else 0.0
+    if pause_ms:
+        words += (
+            f"; a core that real time fills the kernel stops for {pause_ms:g} ms in each second: "
+            f"`sudo sysctl {scheduling.NO_PAUSE}`"
+        )
+    return words
 
 
 def _zero_ns(truth: SimTruth) -> int:

@@ -1,1 +1,1 @@
-"""Records of runs: found, read, joined, played, executed again."""
+"""Records of runs: found, read, executed again."""

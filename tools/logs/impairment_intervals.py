@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,18 +59,6 @@ class Impaired(NamedTuple):
         if self.passed is None:
             return "its end is not in the log"
         return f"{self.passed} messages passed, {self.lost} lost"
-
-    def as_dict(self, zero_ns: int) -> dict[str, Any]:
-        """Return it as plain values, times in s after a stamp."""
-        return {
-            "link": self.link,
-            "words": self.words,
-            "begin_s": self.begin_s(zero_ns),
-            "end_s": self.end_s(zero_ns),
-            "passed": self.passed,
-            "lost": self.lost,
-            "said": f"{self.title}: {self.when(zero_ns)}; {self.counts()}",
-        }
 
 
 def impairments(events: Iterable[LinkEvent]) -> list[Impaired]:

@@ -15,6 +15,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Final
 
+from shared.bus.topics import RECORDER
 from shared.config.robot_config import SERVICES
 from shared.exceptions import RunError
 from shared.mcap_log.files import SUFFIX
@@ -64,12 +65,6 @@ def files_of_run(path: Path, metadata: MetadataByName) -> list[Path]:
             if head.get("split", {}).get("run") == run and number not in numbers.values():
                 numbers[other] = number
     return sorted(numbers, key=lambda file: numbers[file])
-
-
-def further_files(path: Path) -> list[Path]:
-    """Return the other files of the run that a file belongs to."""
-    own = path.resolve()
-    return [file for file in files_of_run(path, head_of(path)) if file.resolve() != own]
 
 
 def files_in(directory: Path) -> list[Path]:
@@ -161,12 +156,12 @@ class RecordedFile:
             return None
         return min(c.first_ns for c in self.chunks), max(c.last_ns for c in self.chunks)
 
-    def keys_with_messages(self) -> list[str]:
-        """Return the keys that have a message, in the order of their channels."""
+    def keys_with_messages(self) -> set[str]:
+        """Return the keys that have a message."""
         known = {n for chunk in self.chunks if chunk.channels is not None for n in chunk.channels}
         if any(chunk.channels is None for chunk in self.chunks):
             known |= {row.channel_id for record in self.records(0, _EVER) for row in record.rows}
-        return [self.keys[number] for number in sorted(known) if number in self.keys]
+        return {self.keys[number] for number in known if number in self.keys}
 
     def records(
         self, begin_ns: int, end_ns: int, keys: frozenset[str] | None = None
@@ -255,6 +250,10 @@ class RunIndex:
         """Attached files by name."""
         return dict(chain.from_iterable(file.attachments.items() for file in self._files))
 
+    def keys_with_messages(self) -> set[str]:
+        """Return the keys that have a message."""
+        return {key for file in self._files for key in file.keys_with_messages()}
+
     @property
     def hosts(self) -> dict[str, str]:
         """Host of each service, by the attached robot file; nothing if that says none."""
@@ -268,6 +267,11 @@ class RunIndex:
             for service, endpoint in endpoints
             if service in SERVICES and isinstance(endpoint, str)
         }
+
+    @property
+    def recorded_beside(self) -> str:
+        """A service on the host of this record's recorder: a host may record its own services."""
+        return self.metadata["run"].get("of", "").partition(",")[0] or RECORDER
 
     @property
     def complete(self) -> bool:

@@ -14,7 +14,6 @@ import bisect
 import copy
 import math
 from collections.abc import Callable, Iterator, Sequence
-from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -24,15 +23,15 @@ import msgspec
 from services.planner.controller_file import ATTACHED
 from shared.bus import topics
 from shared.bus.topics import Topic
-from shared.clock import NS_PER_S
+from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import files as config_file
 from shared.config.gain_table import GainSchedule
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.mcap_log.sequence_stats import KeyCount
 from shared.text_file import decoded
-from tools.logs.host_clocks import HostClocks, find_clocks
 from tools.logs.run_index import RunIndex
+from tools.topic_keys import sender_of
 
 PART_S: Final = 30.0
 """Length of a part: its messages, decoded, fit into some 0.4 GB."""
@@ -42,7 +41,10 @@ WHOLE_MAX_S: Final = 600.0
 """Longest time that is read at once."""
 PICTURE_MAX_S: Final = 120.0
 """Longest time in one picture of a run."""
-
+RESTART_NS: Final = 60 * NS_PER_S
+"""A clock that jumps by more has restarted with its host. No link holds messages up for so long."""
+ONE_CLOCK_NS: Final = 100 * NS_PER_MS
+"""Clocks that are nearer to each other are one clock: no two hosts start at the same time."""
 
 SEE_INFO: Final = "`xrl log info` shows what the file holds"
 """What to do about a part without messages."""
@@ -98,9 +100,10 @@ class RunLog:
     Messages are decoded on request, once for each key. Topics of events, which have no rate, are
     always of the whole run: a mode or a cut link that began before a part holds in it.
 
-    Where the services ran on several hosts, `t_ns` of a message is brought to the clock of the
-    recorder's (`tools/logs/host_clocks.py`), so that times can be compared; with `as_sent` it is
-    what the message says, as re-execution needs it. Other times in a message stay its sender's.
+    Where the services ran on several hosts, `t_ns` of a message from another host than the
+    recorder's is brought to the recorder's clock (`on_recorders_clock`), so that times can be
+    compared. With `as_sent` it is what the message says, as re-execution needs it. Other times in a
+    message stay its sender's.
     """
 
     def __init__(
@@ -122,7 +125,7 @@ class RunLog:
         self.is_first = part.begin_s <= 0.0
         self.is_last = self.end_ns > ended_ns
         self.is_whole = self.is_first and self.is_last
-        self._clocks = None if as_sent else clocks_of(index)
+        self._hosts = {} if as_sent else index.hosts
         self._series: dict[str, Series] = {}
         self._read(_ns(margin_s))
         self.complete, self.damage, self.cut = index.complete, index.damage, index.cut
@@ -219,14 +222,15 @@ class RunLog:
         self, messages: list[Any], topic: Topic, module: str, received_ns: list[int]
     ) -> list[Any]:
         """Return the messages with `t_ns` on the recorder's clock."""
-        if self._clocks is None:
+        here = self._hosts.get(self.index.recorded_beside)
+        if len(set(self._hosts.values())) < 2 or here is None:
             return messages
-        offset_ns = self._clocks.offset_ns
+        if self._hosts.get(sender_of(topic, module)) == here:
+            return messages
+        times_ns = on_recorders_clock([message.t_ns for message in messages], received_ns)
         return [
-            msgspec.structs.replace(
-                message, t_ns=message.t_ns + offset_ns(topic, module, message.t_ns, at_ns)
-            )
-            for message, at_ns in zip(messages, received_ns, strict=True)
+            msgspec.structs.replace(message, t_ns=t_ns)
+            for message, t_ns in zip(messages, times_ns, strict=True)
         ]
 
     def _key(self, topic: Topic, module: str) -> str:
@@ -275,10 +279,23 @@ class RunLog:
                     series.seq.append(seq)
 
 
-@lru_cache(maxsize=8)
-def clocks_of(index: RunIndex) -> HostClocks | None:
-    """Compare the clocks of a run's hosts; None if all its services ran on one."""
-    return find_clocks(index, lambda *part: RunLog(index, RunPart(*part), as_sent=True))
+def on_recorders_clock(sent_ns: Sequence[int], received_ns: Sequence[int]) -> list[int]:
+    """Return the times of one sender's messages on the clock of the recorder that received them.
+
+    A monotonic clock counts from its host's start, so two of them are hours apart. The fastest
+    message is taken to have no delay: times are late by its delay, up to some milliseconds, and by
+    what the clocks drift apart in the part that is read (50 ppm are 1.5 ms in 30 s). A host that
+    restarts has another clock from then on. Messages that a cut link held up keep their times.
+    """
+    late_ns = [got - sent for sent, got in zip(sent_ns, received_ns, strict=True)]
+    restarts = [n for n, (a, b) in enumerate(pairwise(late_ns), 1) if abs(b - a) > RESTART_NS]
+    found: list[int] = []
+    for first, last in pairwise([0, *restarts, len(late_ns)]):
+        offset_ns = min(late_ns[first:last], default=0)
+        if abs(offset_ns) < ONE_CLOCK_NS:
+            offset_ns = 0
+        found += [sent + offset_ns for sent in sent_ns[first:last]]
+    return found
 
 
 def read_run(path: Path, *, as_sent: bool = False) -> RunLog:

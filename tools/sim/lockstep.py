@@ -8,9 +8,8 @@ process, clock or bus: two runs with one seed are equal to the last bit.
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import msgspec
 
@@ -19,16 +18,14 @@ from services.joint.drive_manager import DriveManager, DriveManagerState
 from services.planner.controller import Controller
 from services.planner.intents import OperatorRequest
 from services.planner.planner import Planner, PlannerState
-from services.simulator.drives.axis_bank import AxisBank
-from services.simulator.fault_injector import FaultInjector
-from services.simulator.physics.body import body_of
 from services.simulator.physics.plant import PlantConfig
-from services.simulator.physics.world import World
-from services.simulator.state import read_state, write_state
+from services.simulator.robot import SimulatedRobot, axes_by_bus
 from shared.bus import topics
 from shared.bus.messages import HandLead, JointEvent, Message, Mode, RunEvent, RunEventKind
 from shared.bus.topics import Topic
 from shared.bus.traces import SimState, SimTruth
+from shared.can.imu_can import ImuAssembler
+from shared.can.loadcell_can import SampleAssembler
 from shared.clock import NS_PER_S
 from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
@@ -40,6 +37,7 @@ from tools.sim.network import BASE, VirtualNetwork
 from tools.sim.virtual_drive import VirtualBus
 from tools.sim.virtual_services import (
     SharedMemory,
+    VirtualCan,
     VirtualHarness,
     VirtualImu,
     VirtualJoint,
@@ -71,26 +69,6 @@ class FleetMoment(msgspec.Struct, frozen=True):
     """State of each joint service; one that is not named is dead."""
     planner: tuple[int, PlannerState] | None
     """Session and state of the planner; None: it is dead."""
-
-
-class _Periods(NamedTuple):
-    """Periods of what comes at a rate, ns."""
-
-    cycle: int
-    step: int
-    truth: int
-    sim_state: int
-    """0: it is not recorded."""
-
-    @classmethod
-    def of(cls, config: RobotConfig, *, traced: bool) -> _Periods:
-        rates_hz = (
-            config.joint_service.rate_hz,
-            1.0 / config.simulation.timestep,
-            config.simulation.truth_rate_hz,
-            topics.SIM_STATE.rate_hz if traced else math.inf,
-        )
-        return cls(*(round(NS_PER_S / rate_hz) for rate_hz in rates_hz))
 
 
 class _Progress(msgspec.Struct):
@@ -155,11 +133,9 @@ class Lockstep:
         self._check_kills(config, scenario)
         self.config, self.scenario = config, scenario
         self.plant = plant or PlantConfig()
-        self.world = World(body_of(config, self.plant), scenario)
         self.events: list[tuple[str, JointEvent]] = []
         self.time = time = VirtualTime(NS_PER_S)
-        self._record = record
-        self._controller = controller
+        self._record, self._traced, self._controller = record, traced, controller
         self.network = network_ = VirtualNetwork(
             network or BASE,
             scenario.inject,
@@ -168,11 +144,17 @@ class Lockstep:
         )
         clock_of = {name: HostClock() for name in ("planner", "harness", "imu", *MODULES)}
         clock_of |= clocks or {}
+        cells, frames = VirtualCan(SampleAssembler()), VirtualCan(ImuAssembler())
+        self._robot = robot = SimulatedRobot(
+            config, self.plant, scenario, cells=cells,
+            imu=frames if config.imu.fitted else None, seed=seed,
+        )  # fmt: skip
+        self.world, self.bank = robot.world, robot.bank
         self.harness = VirtualHarness(
-            config, network_, record, seed, time=time, clock=clock_of["harness"]
+            config, robot, cells, network_, record, time=time, clock=clock_of["harness"]
         )
         self._imu = VirtualImu(
-            config, self.plant.imu, network_, record, seed, time=time, clock=clock_of["imu"]
+            config, robot, frames, network_, record, time=time, clock=clock_of["imu"]
         )
         self._memory = SharedMemory()
         self._planner = VirtualPlanner(
@@ -180,25 +162,9 @@ class Lockstep:
             time=time, clock=clock_of["planner"], traced=traced,
             beside=self._memory if planner_beside else None,
         )  # fmt: skip
-        self.bank = AxisBank(
-            config.drive,
-            encoder_counts_per_turn=config.joint.encoder_counts_per_turn,
-            motor_signs=config.motor_signs(),
-            heat=self.plant.heat,
-        )
-        self._torque = self.bank.torque
-        self._faults = FaultInjector(scenario.fault, self.bank)
         self.buses = {
-            name: VirtualBus(
-                self.bank,
-                [
-                    2 * at + side
-                    for at, each in enumerate(MODULES)
-                    if config.module_named(each).bus == name
-                    for side in (0, 1)
-                ],
-            )
-            for name in dict.fromkeys(row.bus for row in config.module)
+            name: VirtualBus(self.bank, tuple(nodes.values()))
+            for name, nodes in axes_by_bus(config).items()
         }
         self.joints = [
             VirtualJoint(
@@ -208,7 +174,6 @@ class Lockstep:
             )
             for index, name in enumerate(MODULES)
         ]  # fmt: skip
-        self._periods = _Periods.of(config, traced=traced)
         happens: list[Happening] = [*scenario.kill, *scenario.restart, *scenario.push, *hand]
         self._progress = _Progress(sorted(happens, key=lambda row: row.at))
 
@@ -244,7 +209,7 @@ class Lockstep:
         """Return what world and services are now, for `resume`; it shares what still changes."""
         planner = self.planner
         return FleetMoment(
-            read_state(self.world, self.bank, self.now_ns, 0),
+            self._robot.read_state(self.now_ns, 0),
             {joint.name: joint.manager.snapshot() for joint in self.joints},
             None if planner is None else (planner.session, planner.snapshot()),
         )
@@ -252,9 +217,9 @@ class Lockstep:
     def resume(self, moment: FleetMoment) -> None:
         """Continue from a moment of another run, before the first step; links are empty then."""
         state, modules = moment.state, moment.modules
-        step_ns = self._periods.step
+        step_ns = self._robot.every.step
         self.time.now_ns = -(-state.t_ns // step_ns) * step_ns
-        write_state(self.world, self.bank, state)
+        self._robot.write_state(state)
         for joint in self.joints:
             joint.resume(modules.get(joint.name))
         self._planner.resume(moment.planner)
@@ -269,15 +234,16 @@ class Lockstep:
         Before the scenario starts its time is negative. Ends early if by then the robot has fallen,
         or if the scenario has not started when virtual time is past `READY_NS`.
         """
+        every = self._robot.every
         while self.world.scenario_s < self.scenario.duration:
             while self._progress.todo and self.world.scenario_s >= self._progress.todo[0].at:
                 self.act(self._progress.todo.pop(0))
             self.advance()
-            if self._periods.sim_state and self.now_ns % self._periods.sim_state == 0:
+            if self._traced and self.now_ns % every.state == 0:
                 self._progress.sim_states += 1
-                state = read_state(self.world, self.bank, self.now_ns, self._progress.sim_states)
+                state = self._robot.read_state(self.now_ns, self._progress.sim_states)
                 self._record(topics.SIM_STATE, "", state)
-            if self.now_ns % self._periods.truth == 0:
+            if self.now_ns % every.truth == 0:
                 truth = self.world.truth(self.now_ns, 1.0, 0.0)
                 self._record(topics.SIM_TRUTH, "", truth)
                 yield truth
@@ -286,23 +252,23 @@ class Lockstep:
 
     def advance(self) -> None:
         """Advance virtual time by one step of the world."""
-        now = self.now_ns
+        robot, now = self._robot, self.now_ns
         self.network.advance(self.world.scenario_s, now)
-        if now % self._periods.cycle == 0:
-            for fault in self._faults.advance(self.world.scenario_s):
+        if now % robot.every.encoders == 0:
+            for fault in robot.begin_faults():
                 self._put_event(RunEventKind.FAULTED, fault.module, fault.kind)
             for bus in self.buses.values():
                 bus.advance(now)
-            self._torque = self.bank.step(self.world.time, *self.world.motor_turns())
+            robot.step_drives()
             self._cycle_joints()
         elif self.bank.regulates:
-            self._torque = self.bank.step(self.world.time, *self.world.motor_turns())
-        self.harness.advance(self.world)
-        self._imu.advance(self.world)
+            robot.step_drives()
+        self.harness.advance()
+        self._imu.advance()
         self._planner.advance()
         self._start_when_tracking(now)
-        self.world.step(self._torque)
-        self.time.now_ns += self._periods.step
+        robot.step_world()
+        self.time.now_ns += robot.every.step
 
     def _new_planner(self, session: int) -> Planner:
         if self._controller is None:

@@ -24,11 +24,11 @@ from shared.config.scenarios import Scenario
 from shared.mcap_log import provenance
 from shared.mcap_log.writer import SCHEMA_VERSION, RunWriter
 from shared.robot.robot_model import mjcf
-from tools.judge.judgement import judge_run
+from tools.judge.figure import judge_run
 from tools.judge.verdict import Summary
 from tools.live import experiment
 from tools.logs.hand_path import HandRow
-from tools.sim.centralised.fleet import CONTROLS, SHIPPED
+from tools.sim.centralised import CONTROLS, SHIPPED
 from tools.sim.lockstep import Watch
 from tools.sim.virtual_time import Record
 
@@ -37,13 +37,6 @@ AFTER_FALL_S: Final = 1.0
 """A recorded run goes on this long after a fall, s, so that the log shows it."""
 DRAIN_EVERY: Final = 512
 """Messages that wait before they are written."""
-REAL_TIME_ONLY: Final = (
-    "pd_cycles_late_pct",
-    "planner_tick_us",
-    "real_time_factor",
-    "world_time_lost_s",
-)
-"""Keys of the summary that only a live run has."""
 
 
 class RecordedMessages:
@@ -199,16 +192,15 @@ def simulate(
     return record_run(scenario, robot, out, metadata, run, watch, true_plant, attached)
 
 
-def judge_in_lockstep(scenario: Scenario, out: Path, **figures: Any) -> Summary:
-    """Judge a run in virtual time, which has no real time to keep.
+def judge_in_lockstep(scenario: Scenario, out: Path, speed: float | None = None) -> Summary:
+    """Judge a run in virtual time.
 
     Args:
         scenario: what happened.
         out: folder of `run.mcap`.
-        **figures: added to the summary.
+        speed: of the simulation, as a multiple of real time.
 
     Raises:
         RunError: the log holds nothing to judge, or a file cannot be written.
     """
-    figures |= dict.fromkeys(REAL_TIME_ONLY) | {"in_real_time": True}
-    return judge_run(out, f"{scenario.name} in lockstep", scenario.duration, figures)
+    return judge_run(out, f"{scenario.name} in lockstep", scenario.duration, speed=speed)

@@ -21,16 +21,12 @@ from services.planner.intents import OperatorRequest
 from services.planner.loop import PlannerLoop, PlannerPorts
 from services.planner.planner import Planner, PlannerState
 from services.simulator.drives.axis_bank import AxisBank
-from services.simulator.fronts.sensor_fronts import HarnessFront, ImuFront
-from services.simulator.physics.plant import ImuErrors
-from services.simulator.physics.world import World
+from services.simulator.robot import SimulatedRobot
 from shared.bus import topics
-from shared.bus.messages import Estop, TareRequest
+from shared.bus.messages import Estop, TareRequest, Vector6
 from shared.bus.traces import PlannerCheckpoint
 from shared.can.frame_group import FrameGroup
-from shared.can.imu_can import ImuAssembler
-from shared.can.loadcell_can import SampleAssembler
-from shared.clock import NS_PER_S
+from shared.can.imu_can import ImuSample
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
 from tools.sim.network import VirtualNetwork
@@ -307,43 +303,34 @@ class VirtualCan(Generic[S]):
         return sample
 
 
-def whole_steps_ns(config: RobotConfig, rate_hz: float) -> int:
-    """Return a sensor's period in whole steps of the world, ns, as the live simulator has it."""
-    step_ns = round(config.simulation.timestep * NS_PER_S)
-    return step_ns * max(1, round(NS_PER_S / (rate_hz * step_ns)))
-
-
 class VirtualHarness:
-    """Sensor and service in one; both begin with a tare, while the hoist holds."""
+    """Service of the load cells; it begins with a tare, while the hoist holds."""
 
     def __init__(
         self,
         config: RobotConfig,
+        robot: SimulatedRobot,
+        cells: VirtualCan[Vector6],
         network: VirtualNetwork,
         record: Record,
-        seed: int,
         *,
         time: VirtualTime,
         clock: HostClock,
     ) -> None:
-        """Draw the cells' zero offsets from `seed`, and their noise."""
-        cells = VirtualCan(SampleAssembler())
-        self._front = HarnessFront(config, cells, seed)
         wrenches = RecordOutbox(record, topics.WRENCH, "", network.wrenches(), time)
         self._loop = HarnessLoop(cells, WrenchFilter(config.harness), wrenches, self)
-        self._period_ns = whole_steps_ns(config, config.harness.rate_hz)
-        self._time, self._clock = time, time.on(clock)
+        self._robot, self._time, self._clock = robot, time, time.on(clock)
         self._request: TareRequest | None = None
 
-    def advance(self, world: World) -> None:
+    def advance(self) -> None:
         """If it is time, sample what acts on the torso, and run one cycle of the service."""
-        if not self._time.now_ns % self._period_ns:
-            self._front.send(world.outside.harness_force, world.outside.harness_moment)
+        if not self._time.now_ns % self._robot.every.harness:
+            self._robot.feel()
             self._loop.cycle(self._clock())
 
     def assume_tared(self) -> None:
         """Set the tare as done: in the middle of a run the operator's load is on the cells."""
-        self._loop.state = tared_state(self._front.bias)
+        self._loop.state = tared_state(self._robot.harness.bias)
 
     def tare(self, request: TareRequest) -> None:
         """Ask for a new zero, from the next cycle on."""
@@ -356,30 +343,26 @@ class VirtualHarness:
 
 
 class VirtualImu:
-    """Sensor and service in one."""
+    """Service of the IMU, if one is fitted."""
 
     def __init__(
         self,
         config: RobotConfig,
-        errors: ImuErrors,
+        robot: SimulatedRobot,
+        frames: VirtualCan[ImuSample],
         network: VirtualNetwork,
         record: Record,
-        seed: int,
         *,
         time: VirtualTime,
         clock: HostClock,
     ) -> None:
-        """Mount the sensor with the plant's errors, if one is fitted; `seed` is its noise's."""
-        frames = VirtualCan(ImuAssembler())
-        self._fitted = config.imu.fitted
-        self._period_ns = whole_steps_ns(config, config.imu.rate_hz)
-        self._time, self._clock = time, time.on(clock)
-        self._front = ImuFront(config.imu, errors, frames, seed)
+        self._robot, self._time, self._clock = robot, time, time.on(clock)
         attitudes = RecordOutbox(record, topics.ATTITUDE, "", network.attitudes(), time)
         self._loop = ImuLoop(frames, AttitudeLaw(config.imu), attitudes)
 
-    def advance(self, world: World) -> None:
+    def advance(self) -> None:
         """If it is time, sample how the torso stands, and run one cycle of the service."""
-        if self._fitted and not self._time.now_ns % self._period_ns:
-            self._front.send(world)
+        robot = self._robot
+        if robot.imu is not None and not self._time.now_ns % robot.every.imu:
+            robot.imu.send(robot.world)
             self._loop.cycle(self._clock())

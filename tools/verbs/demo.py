@@ -24,7 +24,7 @@ from tools.fleet.pace import PaceFlags
 from tools.fleet.status_table import warn_of_others
 from tools.fleet.supervise import SupervisedFleet
 from tools.judge import verdict, verdict_table
-from tools.judge.judgement import judge_run
+from tools.judge.figure import judge_run
 from tools.live import experiment
 from tools.live.live import run_live
 from tools.live.live_view import LiveView
@@ -152,8 +152,7 @@ def _interrupts_set(event: threading.Event) -> Iterator[None]:
 
 def judge(out: Path, scenario: Scenario, ended: EndOfRun, console: Console) -> int:
     """Write summary and picture from the log, print the verdict, return the exit code."""
-    figures = {"fleet_cpu_pct": ended.cpu_pct}
-    summary = judge_run(out, scenario.name, ended.scenario_s, figures)
+    summary = judge_run(out, scenario.name, ended.scenario_s, fleet_cpu_pct=ended.cpu_pct)
     verdict_table.show(summary, console)
     console.print(f"{out}/run.mcap, run.png, summary.json, logs/", style="dim", highlight=False)
     return verdict.exit_code(summary)

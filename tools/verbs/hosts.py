@@ -34,7 +34,7 @@ xrl hosts update                           # sends the files over ssh
 xrl hosts check                            # versions, keys, clocks, units
 xrl hosts up
 xrl hosts status
-xrl hosts records -o out/lab               # copies the newest records here, joins them into a run
+xrl hosts records -o out/lab               # copies the newest records here
 xrl hosts estop
 xrl hosts down                             # goes down first, and waits until a hoist bears it
 xrl hosts down --limp                      # idles the drives at once: a standing robot falls
@@ -227,22 +227,14 @@ def bring(flags: RecordsFlags) -> int:
     base = records.fetch(body, records.newest(body), out / body.host.name)
     _tell(body.host.name, str(base))
     fleets_run = records.fleets_run(base)
-    fetched: list[Path] = []
 
     def one(remote: Remote) -> str:
         names = records.since(remote, fleets_run.began_ns * 1e-9)
         mine = [records.fetch(remote, name, out / remote.host.name) for name in names]
-        fetched.extend(mine)
         return ", ".join(map(str, mine)) or "no record since then"
 
     others = [r for r in given.remotes if not records.is_fleets(r) and r.host.record]
-    failed = _each(given._replace(remotes=others), one) if others else 0
-    joined = out / hosts_file.JOINED
-    gained, left_out = records.join_fetched(fleets_run, sorted(fetched), joined)
-    for why in left_out:
-        _tell("", FleetError(why))
-    print(f"{joined}: one run, {gained} messages more than the recorder had")
-    return FAULT_EXIT_CODE if failed or left_out else 0
+    return _each(given._replace(remotes=others), one) if others else 0
 
 
 def check(flags: HostsFlags) -> int:
@@ -281,18 +273,15 @@ def _tell(name: str, result: str | FleetError) -> None:
 
 def _table(rows: list[HostRow]) -> Table:
     table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("host", "version", "unit", "clock", "round trip", ""):
+    for heading in ("host", "version", "unit", ""):
         table.add_column(heading, no_wrap=heading != "")
     for row in rows:
-        clock = row.clock
         words = [Text(text, "bold red") for text in row.wrong]
         words += [Text(text, "yellow") for text in row.warnings]
         table.add_row(
             row.name,
             row.revision or "-",
             row.unit,
-            "-" if clock is None else f"{1e3 * clock.offset_s:+.1f} ms",
-            "-" if clock is None else f"{1e3 * clock.round_trip_s:.1f} ms",
             Text("\n").join(words) or "ok",
         )
     return table

@@ -9,10 +9,9 @@ from typing import Any, Final
 import msgspec
 import numpy as np
 
-from services.planner.law.kinematics import DETERMINANT_MIN, Kinematics
-from services.planner.law.model import LegGeometry, leg_geometry
+from services.planner.law.kinematics import Kinematics, Measured
+from services.planner.watch.soles import ANKLES, Soles
 from services.simulator.physics.posture import SoleLoad
-from shared.arrays import Array
 from shared.bus import topics
 from shared.bus.messages import (
     JointCommand,
@@ -30,78 +29,16 @@ from shared.bus.topics import Topic
 from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
-from shared.joints import MODULES, N_LEG
+from shared.joints import MODULES
 from shared.robot.frames import ORIGIN, capture_point
+from shared.robot.robot_model import ankle_positions
 from tools.fleet.fleet_status import module_status
-from tools.judge.reports import scene
-from tools.judge.stalls import STALL_SHOWN_NS, stalls_of
+from tools.fleet.stalls import STALL_SHOWN_NS, stalls_of
+from tools.judge.reports.robot_pose import pose_of_legs
 from tools.topic_keys import every_key
 
 LEAST_N: Final = 20.0
 """A sole that bears less has no centre of pressure worth showing."""
-
-
-class SoleEstimate:
-    """Both soles, with the feet where the robot file has them."""
-
-    def __init__(self, config: RobotConfig) -> None:
-        self._legs = leg_geometry(config)
-        self._foot_height = config.geometry.foot_height
-        self._leg_weight = config.leg_weight
-
-    def of(self, q: Sequence[float], tau: Sequence[float]) -> tuple[SoleLoad, SoleLoad] | None:
-        """Return the loads of the right and the left sole; None where a leg is too straight."""
-        found = []
-        for index, leg in enumerate(self._legs):
-            part = slice(index * N_LEG, (index + 1) * N_LEG)
-            load = self._of_leg(leg, np.array(q[part]), np.array(tau[part]))
-            if load is None:
-                return None
-            found.append(load)
-        return found[0], found[1]
-
-    def _of_leg(self, leg: LegGeometry, q: Array, tau: Array) -> SoleLoad | None:
-        J, r_torso = jacobian(leg, q)
-        if abs(np.linalg.det(J)) < DETERMINANT_MIN:
-            return None
-        wrench = np.linalg.solve(J.T, tau)
-        force, moment = wrench[:3], wrench[3:]
-        moment = moment + np.cross(r_torso - leg.r_foot, force)  # about the ankle
-        f_x, f_y, f_z = force.tolist()
-        f_z += self._leg_weight
-        if f_z < LEAST_N:
-            return SoleLoad((f_x, f_y, f_z), (0.0, 0.0))
-        x = leg.r_foot[0] + (-moment[1] - self._foot_height * f_x) / f_z
-        y = leg.r_foot[1] + (moment[0] - self._foot_height * f_y) / f_z
-        return SoleLoad((f_x, f_y, f_z), (float(x), float(y)))
-
-
-def jacobian(leg: LegGeometry, q: Array) -> tuple[Array, Array]:
-    """Return the torso's velocity per joint rate (6, 6), linear above angular, and its origin (3,).
-
-    By the product of exponentials, from the foot up; m, rad, world.
-    """
-    R, t = np.eye(3), np.zeros(3)
-    axes, points = [], []
-    for axis, point, angle in zip(leg.axes, leg.points, q.tolist(), strict=True):
-        axes.append(R @ axis)
-        points.append(R @ point + t)
-        turn = _turn(axis, angle)
-        t = R @ (point - turn @ point) + t
-        R = R @ turn
-    r_torso = R @ leg.r_torso + t
-    columns = [
-        np.concatenate((np.cross(axis, r_torso - point), axis))
-        for axis, point in zip(axes, points, strict=True)
-    ]
-    return np.array(columns).T, r_torso
-
-
-def _turn(axis: Array, angle: float) -> Array:
-    """Return the rotation matrix about a unit axis (Rodrigues)."""
-    x, y, z = axis.tolist()
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + math.sin(angle) * K + (1.0 - math.cos(angle)) * (K @ K))
 
 
 _TOPICS: Final = (
@@ -195,7 +132,8 @@ class Newest:
     """The newest message of each key that a frame is made of."""
 
     def __init__(self, robot: RobotConfig) -> None:
-        self._kinematics, self._soles = Kinematics(robot), SoleEstimate(robot)
+        self._kinematics, self._measured = Kinematics(robot), Measured(robot)
+        self._soles, self._feet = Soles(robot), ankle_positions(robot)
         self.clear()
 
     def clear(self) -> None:
@@ -232,7 +170,7 @@ class Newest:
             torso, angles, com = truth.torso, truth.angles, truth.com
         else:
             newest = self._rows.get((topics.PLANNER_STATUS.name, ""))
-            torso, angles, com = scene.pose_of_legs(self._kinematics, q, newest)
+            torso, angles, com = pose_of_legs(self._kinematics, q, newest)
         commands: list[JointCommand] = self._of_modules(topics.JOINT_COMMAND)
         led = status is not None and len(commands) == len(MODULES)
         soles, estimated = self._soles_of(truth, states)
@@ -286,16 +224,28 @@ class Newest:
         self, truth: SimTruth | None, states: list[JointState]
     ) -> tuple[tuple[SoleLoad, ...], bool]:
         """Return the soles' loads, and whether they are estimated."""
-        # a world of before the soles were measured has zeros
-        if truth is not None and any((*truth.foot_right_force, *truth.foot_left_force)):
-            loads: Sequence[SoleLoad] = (
-                SoleLoad(truth.foot_right_force, truth.foot_right_cop),
-                SoleLoad(truth.foot_left_force, truth.foot_left_cop),
-            )
-            return _shown_soles(loads), False
+        if truth is not None:
+            right = SoleLoad(truth.foot_right_force, truth.foot_right_cop)
+            left = SoleLoad(truth.foot_left_force, truth.foot_left_cop)
+            return _shown_soles((right, left)), False
         q = [angle for state in states for angle in state.q]
         tau = [torque for state in states for torque in state.tau]
-        return _shown_soles(self._soles.of(q, tau) or ()), True
+        return _shown_soles(self.estimated_soles(q, tau)), True
+
+    def estimated_soles(self, q: Sequence[float], tau: Sequence[float]) -> tuple[SoleLoad, ...]:
+        """Return the loads of both soles by the joints' torques; nothing if a leg is too straight.
+
+        An ankle's torque over the load is how far the pressure is from below that ankle.
+        """
+        self._measured.update(np.array(q), np.zeros(len(q)))
+        loads = self._soles.loads(self._measured.leg_loads(np.array(tau)))
+        if any(map(math.isnan, loads)):
+            return ()
+        found = []
+        for load, ankle, (x, y, _) in zip(loads, ANKLES, self._feet, strict=True):
+            cop = (x - tau[ankle + 1] / load, y + tau[ankle] / load) if load > LEAST_N else (x, y)
+            found.append(SoleLoad((0.0, 0.0, load), cop))
+        return tuple(found)
 
 
 def _shown(status: PlannerStatus) -> PlannerShown:

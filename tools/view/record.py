@@ -17,8 +17,8 @@ from shared.bus.messages import RunEventKind
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
+from tools.judge.reports.events import events_of
 from tools.judge.reports.run_data import RunData
-from tools.judge.reports.timeline import timeline_events
 from tools.logs.run_log import NewestAt, RunLog
 from tools.view.frame import SHOWN, Frame, Newest
 from tools.view.source import (
@@ -48,7 +48,7 @@ class RecordSource(Source):
         stalls.sort(key=lambda row: row.t_ns)  # each tells when it ended, and is told later
         self._keys.append((topics.RUN_EVENT, "", NewestAt(stalls)))
         self._marks = tuple(
-            Mark(event.t, event.kind, event.text) for event in timeline_events(self._data)
+            Mark(event.t, event.kind, event.text) for event in events_of(self._data)
         )
 
     def model(self) -> Model:

@@ -11,12 +11,10 @@ from typing import Final
 import msgspec
 
 from services.simulator.physics.led_hand import PUSH_EXPIRES_S
-from shared.bus.messages import HandLead, Mode
+from shared.bus.messages import HandLead, Mode, Vector3
 from shared.config.robot_config import RobotConfig
-from shared.joints import MODULES
-from shared.robot.frames import ORIGIN
-from tools.judge.reports import scene
-from tools.judge.reports.scene import RobotPose
+from shared.joints import JOINTS, MODULES, SIDES
+from shared.robot.frames import ORIGIN, body_frames
 from tools.view.frame import Frame
 
 COURSE_FRAMES: Final = 300
@@ -28,11 +26,6 @@ FOXGLOVE_PORT: Final = 8765
 FRAMES_S: Final = 30.0
 PAGE: Final = Path(__file__).parent / "page"
 UPLOT: Final = Path(__file__).parents[1] / "judge" / "reports" / "vendor" / "uplot"
-
-_STILL: Final = RobotPose(
-    t_ns=0, torso=ORIGIN, angles=ORIGIN, com=ORIGIN, q=(0.0,) * 12, modes=(-1,) * len(MODULES),
-    force=ORIGIN, push=ORIGIN,
-)  # fmt: skip
 
 CUTS: Final[Mapping[str, tuple[str, ...]]] = {
     "left leg": ("planner->left", "left->planner"),
@@ -57,8 +50,24 @@ class ShownBody(msgspec.Struct, frozen=True):
     frame: str
     kind: str
     """`cube`, `cylinder` along z, or `sphere`."""
-    size: tuple[float, float, float]
-    position: tuple[float, float, float]
+    size: Vector3
+    """Along x, y and z; the diameter where the body is round."""
+    position: Vector3 = ORIGIN
+    """Of its centre."""
+
+
+def bodies_of(robot: RobotConfig) -> tuple[ShownBody, ...]:
+    """Return the torso, and on each leg thigh, shin and sole."""
+    geometry = robot.geometry
+    found = [ShownBody("torso", "cube", geometry.torso_size)]
+    sole = (geometry.l_foot, geometry.w_foot, geometry.foot_height / 2)
+    for side in SIDES:
+        for kind, length in (("hip", geometry.l1), ("knee", geometry.l2)):
+            size, middle = (0.06, 0.06, length), (0.0, 0.0, -length / 2)
+            found.append(ShownBody(f"{kind}_{side}", "cylinder", size, middle))
+        below = (0.0, 0.0, -0.75 * geometry.foot_height)
+        found.append(ShownBody(f"ankle_{side}", "cube", sole, below))
+    return tuple(found)
 
 
 class Order(msgspec.Struct, frozen=True):
@@ -72,7 +81,7 @@ class Order(msgspec.Struct, frozen=True):
     """For `hand`: where to lead the torso, m above the ankles."""
     pitch: float = 0.0
     """For `hand`, rad."""
-    force: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    force: Vector3 = (0.0, 0.0, 0.0)
     """For `push`, N, world."""
 
 
@@ -85,12 +94,12 @@ class Model(msgspec.Struct, frozen=True):
     title: str
     modules: tuple[str, ...]
     modes: dict[int, str]
-    joints: dict[str, tuple[str, tuple[float, float, float]]]
+    joints: dict[str, tuple[str, Vector3]]
     """By module: the frame that it hangs in, and where, m."""
     bodies: tuple[ShownBody, ...]
-    harness: tuple[float, float, float]
+    harness: Vector3
     """On the torso, m."""
-    foot: tuple[float, float, float]
+    foot: Vector3
     """Length, width, and height of the ankle's axis above the floor, m."""
     orders: tuple[str, ...] = ()
     processes: tuple[str, ...] = ()
@@ -117,7 +126,7 @@ class Source(ABC):
     def model(self) -> Model:
         """Return what does not change."""
         geometry = self.robot.geometry
-        still = {row.child: row for row in scene.frames(self.robot, _STILL)}
+        still = {row.child: row for row in body_frames(geometry, (0.0,) * len(JOINTS))}
         return Model(
             robot=self.robot.name,
             source=self.kind,
@@ -125,11 +134,7 @@ class Source(ABC):
             modules=MODULES,
             modes={int(mode): mode.name for mode in Mode},
             joints={name: (still[name].parent, still[name].position) for name in MODULES},
-            bodies=tuple(
-                ShownBody(entity.frame, solid.shape, solid.size, solid.position)
-                for entity in scene.links(self.robot)
-                for solid in entity.solids
-            ),
+            bodies=bodies_of(self.robot),
             harness=geometry.harness_point,
             foot=(geometry.l_foot, geometry.w_foot, geometry.foot_height),
             orders=self.orders,

@@ -34,9 +34,8 @@ from services.simulator.drives.axis_faults import (
 )
 from services.simulator.drives.axis_heat import AxisHeat, Heat
 from services.simulator.drives.axis_settings import configured
-from services.simulator.drives.axis_watchdogs import Watchdogs
+from services.simulator.drives.axis_watches import Spinout, Watchdogs
 from services.simulator.drives.dc_bus import DEAD_VOLTAGE, DcBus
-from services.simulator.drives.spinout import Spinout
 from shared.can.cansimple import (
     AxisError,
     AxisState,

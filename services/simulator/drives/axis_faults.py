@@ -14,10 +14,9 @@ import math
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 
-from services.simulator.drives.axis_encoders import AxisEncoders
+from services.simulator.drives.axis_encoders import AxisEncoders, Words
 from services.simulator.drives.axis_heat import AxisHeat
 from services.simulator.drives.axis_settings import N_DRIVES
-from services.simulator.drives.odd_encoder import Words
 from shared.can.cansimple import (
     AxisError,
     ControllerError,

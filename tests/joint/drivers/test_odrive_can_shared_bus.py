@@ -14,7 +14,6 @@ from tests.joint.drivers.rig import DRIVE, MS, Rig, Shed, read
 
 MODULES = 3
 
-
 NODES = [(0, 1), (2, 3), (4, 5)]
 
 

@@ -50,6 +50,16 @@ def test_a_slow_loop_is_a_warning_on_a_real_robot_and_a_note_on_an_emulated_one(
         assert row.found != row.wanted
 
 
+@pytest.mark.parametrize(
+    ("synchronised", "verdict"), [(False, FindingKind.WARNING), (True, FindingKind.OK)]
+)
+def test_a_wall_clock_that_nothing_keeps_right_is_warned_of_on_a_real_robot(
+    real: RobotConfig, monkeypatch: pytest.MonkeyPatch, synchronised: bool, verdict: FindingKind
+) -> None:
+    monkeypatch.setattr(check_machine, "clock_is_synchronised", lambda: synchronised)
+    assert row_of(check_machine.machine_rows(real), "wall clock").verdict is verdict
+
+
 def test_one_processor_that_sleeps_is_seen(real: RobotConfig, tmp_path: Path) -> None:
     for cpu, governor in enumerate(("performance", "powersave", "performance")):
         write(tmp_path, f"{CPU}/cpu{cpu}/cpufreq/scaling_governor", governor)

@@ -15,7 +15,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
 from tests.tools.bringup.bench_drive import MODULE, PLAN, START, BenchDrive, jog_by
 from tools.bringup.hanging_leg import HangingJoint
-from tools.bringup.identify.sines import plan_for
+from tools.bringup.identify import plan_for
 from tools.bringup.jog import JogCheck, judge, what_to_see
 from tools.bringup.motion import (
     AnyPlan,

@@ -19,7 +19,6 @@ from tools.fleet import pace
 from tools.fleet.pace import CoresFullError, check_pace
 from tools.fleet.process_table import FleetOptions
 from tools.live import live, scenario_runner
-from tools.live.live_stalls import LiveStalls
 from tools.live.scenario_runner import ScenarioRunner
 
 
@@ -134,7 +133,7 @@ def test_the_cores_are_judged_while_the_robot_stands_before_the_scenario(
     runner = object.__new__(ScenarioRunner)
     runner._modes = dict.fromkeys(MODULES, int(Mode.TRACK))
     runner._truth = filled(SimTruth, {bool: False, int: 0, float: 0.0})
-    runner._stalls, runner._tell = LiveStalls(), print
+    runner._tell = print
     monkeypatch.setattr(runner, "_listen", lambda: None)
     monkeypatch.setattr(scenario_runner, "SETTLE_S", 0.05)
     monkeypatch.setattr(scenario_runner, "idle_share", lambda _before: idle)

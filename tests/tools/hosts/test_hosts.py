@@ -92,7 +92,6 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "a folder with a quote": ({"folder": "/etc/x'"}, "an absolute path"),
     "a name that is allowed": ({"allow": ["laptop"]}, "an IP address"),
     "a user": ({"user": "a b"}, "a user's name"),
-    "the joined record's name": ({"name1": "joined"}, "the joined record's"),
     "a private interface without a network": ({"private1": ["can0"]}, "the robot's network"),
     "a network without a private interface": ({"nic1": "eth0"}, "missing beside `nic`"),
     "the network among the private": ({"private1": ["eth0"], "nic1": "eth0"}, "not among them"),

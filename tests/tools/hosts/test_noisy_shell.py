@@ -54,14 +54,6 @@ def test_a_record_comes_whole(base: Path, remote: Remote, tmp_path: Path) -> Non
     assert copy.read_bytes() == path.read_bytes()
 
 
-def test_a_hosts_first_line_and_clock_are_read_behind_it(remote: Remote) -> None:
-    """That is how `xrl hosts check` asks."""
-    answers = "echo first; while read -r _; do date +%s%N; done"
-    first, clock = remote.echoed("sh", "-c", answers)
-    assert first == "first\n"
-    assert abs(clock.offset_s) < 1.0
-
-
 def test_a_shell_that_does_not_run_the_command_is_an_error(base: Path, robot: RobotConfig) -> None:
     have_shells_print(base, "echo this account is not available; exit 0")
     hosts = hosts_file.load(base / "hosts.toml", robot)

@@ -92,9 +92,11 @@ def test_a_panel_for_the_network_is_there_only_if_something_was_done_to_it(
 
 def test_ages_while_impaired_and_otherwise_are_separate(impaired: RunLog) -> None:
     summary = verdict.summarise(impaired, 2.0)
-    late, otherwise = (summary[f"command_age_{when}_ms"] for when in ("impaired", "otherwise"))
-    assert otherwise["median"] <= otherwise["p99"] < 20.0
-    assert 25.0 <= late["median"] <= late["p99"]
-    links = [row["link"] for row in summary["impairments"]]
+    late, otherwise = summary.command_age_impaired_ms, summary.command_age_otherwise_ms
+    assert late is not None
+    assert otherwise is not None
+    assert otherwise.median <= otherwise.p99 < 20.0
+    assert 25.0 <= late.median <= late.p99
+    links = [row.link for row in summary.impairments]
     assert links == ["planner->joints", "planner->left", "all"]
-    assert summary["links_impaired"] == 3
+    assert summary.links_impaired == 3

@@ -23,12 +23,14 @@ from tools.judge import verdict, verdict_table
 from tools.judge.standing import (
     LIMITS,
     SOUND,
+    Soundness,
     _longest_s,
     _overforce_s,
     shaking_of,
     why_not_sound,
     why_not_standing,
 )
+from tools.judge.verdict import Percentiles, Summary, merged
 from tools.logs.run_log import RunLog, RunPart, read_run
 from tools.terminal import Console
 
@@ -78,9 +80,9 @@ def test_a_run_is_judged_by_how_it_stands_at_its_end(
     assert cli.main(["sim", *words, "--out", str(tmp_path / "out")]) == 1
     log = read_run(tmp_path / "out" / "run.mcap")
     summary = verdict.summarise(log, 1.5)
-    assert summary["fallen_at_s"] is None
-    assert summary["stood"] is False
-    assert summary["why_not"]
+    assert summary.fallen_at_s is None
+    assert summary.stood is False
+    assert summary.why_not
     assert "DOES NOT STAND" in capsys.readouterr().out
 
 
@@ -88,11 +90,11 @@ def test_a_run_in_virtual_time_has_no_stalls_and_says_nothing_of_them(
     impaired: RunLog, log: RunLog
 ) -> None:
     led_again = verdict.summarise(log, 2.0)
-    assert led_again["reengage_s"] is not None
+    assert led_again.reengage_s is not None
     sound = verdict.summarise(impaired, 2.0)
     for run in (led_again, sound):
-        assert (run["stalls"], run["across_stalls"], run["drop_outs"]) == ([], [], [])
-    assert sound["operator_side_peak_n"] is None, "nobody holds it sideways"
+        assert run.stalls == []
+    assert sound.operator_side_peak_n is None, "nobody holds it sideways"
     assert verdict_table.stalls(sound) == []
 
 
@@ -100,10 +102,10 @@ def test_a_sound_run_has_figures_within_their_limits(log: RunLog) -> None:
     """Until its planner is killed."""
     before_s = (verdict.course(log).zero_ns - log.began_ns()) / 1e9
     sound = verdict.summarise(RunLog(log.index, RunPart(0.0, before_s + 0.95)), 0.95)
-    assert (sound["stood"], sound["sound"]) == (True, True)
-    assert sound["torque_at_limit_ms"] == 0.0
-    assert 0.05 < sound["shaking_nm"] < 5.0
-    assert 0.05 < sound["sinking_m_s"] < 0.3, "it is led down"
+    assert (sound.stood, sound.sound) == (True, True)
+    assert sound.torque_at_limit_ms == 0.0
+    assert 0.05 < (sound.shaking_nm or 0.0) < 5.0
+    assert 0.05 < (sound.sinking_m_s or 0.0) < 0.3, "it is led down"
     console = Console(width=120, record=True)
     verdict_table.show(sound, console)
     text = console.export_text()
@@ -117,9 +119,9 @@ def test_motors_at_their_limit_are_no_sound_standing(
     flags = ("--fault", "knee_left:disarmed@1.5", "--duration", "4")
     assert cli.main(["sim", *flags, "--out", str(tmp_path)]) == 3
     summary = verdict.summarise(read_run(tmp_path / "run.mcap"), 4.0)
-    assert (summary["stood"], summary["sound"]) == (True, False)
-    assert (summary["fallen_at_s"], summary["why_not"]) == (None, "")
-    assert "torque at its limit" in summary["unsound"]
+    assert (summary.stood, summary.sound) == (True, False)
+    assert (summary.fallen_at_s, summary.why_not) == (None, "")
+    assert "torque at its limit" in summary.unsound
     output = capsys.readouterr().out
     assert "STOOD, BUT NOT SOUNDLY" in output
     assert "(limit 50)" in output
@@ -135,16 +137,16 @@ def test_what_follows_a_fall_does_not_count(log: RunLog, monkeypatch: pytest.Mon
     ]
     monkeypatch.setattr(verdict, "course", lambda _log: whole._replace(rows=rows))
     summary = verdict.summarise(log, 2.0)
-    assert summary["fallen_at_s"] == summary["duration_s"] == whole.t[fall]
-    assert (summary["handover_ms"], summary["hold_entries"]) == (None, 0)
-    assert summary["torso_height_min_m"] == min(row.torso[2] for row in rows[: fall + 1])
-    assert summary["messages_recorded"] == sum(log.count(key) for key in log.keys())  # noqa: SIM118
+    assert summary.fallen_at_s == summary.duration_s == whole.t[fall]
+    assert (summary.handover_ms, summary.hold_entries) == (None, 0)
+    assert summary.torso_height_min_m == min(row.torso[2] for row in rows[: fall + 1])
+    assert summary.messages_recorded == sum(log.count(key) for key in log.keys())  # noqa: SIM118
 
 
 def test_a_time_to_hold_that_was_not_measured_is_a_dash(log: RunLog) -> None:
     """In virtual time the joint services see the end of the planner in the same instant."""
     summary = verdict.summarise(log, 2.0)
-    assert summary["handover_max_ms"] is None
+    assert summary.handover_max_ms is None
     shown = {what: measured for what, measured, *_ in verdict_table.rows(summary)}
     assert shown["kill to HOLD, slowest module"] == "-"
 
@@ -161,17 +163,16 @@ def test_a_time_to_hold_that_was_not_measured_is_a_dash(log: RunLog) -> None:
     ids=["stood", "fell", "tips at the end", "not soundly", "not finished"],
 )
 def test_only_a_fall_is_exit_code_1(changes: dict[str, object], code: int) -> None:
-    summary = {"stood": False, "sound": False, "fallen_at_s": None, "why_not": "", "unsound": ""}
-    assert verdict.exit_code(summary | changes) == code
+    assert verdict.exit_code(msgspec.convert(changes, Summary)) == code
 
 
 @pytest.mark.parametrize("key", SOUND)
 def test_each_figure_of_soundness_is_judged_by_its_limit(key: str) -> None:
     (limit,) = (row for row in LIMITS if row.key == key)
-    calm = dict.fromkeys(SOUND, 0.0)
-    assert why_not_sound(calm | {key: limit.limit}) == ""
-    assert limit.what in why_not_sound(calm | {key: 1.01 * limit.limit})
-    assert why_not_sound(dict.fromkeys(SOUND)) == "", "of which nothing is known"
+    calm = Soundness(*[0.0] * len(SOUND))
+    assert why_not_sound(calm._replace(**{key: limit.limit})) == ""
+    assert limit.what in why_not_sound(calm._replace(**{key: 1.01 * limit.limit}))
+    assert why_not_sound(Soundness()) == "", "nothing is known"
 
 
 def test_nothing_is_reported_of_a_gap_in_the_log() -> None:
@@ -180,6 +181,35 @@ def test_nothing_is_reported_of_a_gap_in_the_log() -> None:
     assert _longest_s(t_ns, np.ones(5, bool)) == pytest.approx(0.008)
     tau = np.array([[10.0, 0.0]] * 3 + [[90.0, 0.0]] * 2)
     assert shaking_of(t_ns, tau).max() == 0.0
+
+
+def test_every_limit_is_one_of_a_figure() -> None:
+    assert {row.key for row in LIMITS} <= set(Summary.__struct_fields__)
+
+
+def test_figures_of_parts_merge_as_their_fields_declare() -> None:
+    first = Summary(
+        shaking_nm=3.0, torso_height_min_m=0.9, duration_s=10.0, in_real_time=False,
+        command_age_ms=Percentiles(3.0, 9.0), messages_recorded=5,
+        links_impaired=1,
+    )  # fmt: skip
+    last = Summary(
+        stood=True, sound=True, shaking_nm=2.0, torso_height_min_m=1.0, duration_s=20.0,
+        command_age_ms=Percentiles(5.0, 8.0), messages_recorded=9,
+    )  # fmt: skip
+    assert merged([first, last]) == Summary(
+        stood=True, sound=True, shaking_nm=3.0, torso_height_min_m=0.9, duration_s=20.0,
+        in_real_time=False, command_age_ms=Percentiles(4.0, 9.0), messages_recorded=9,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("changes", "stood"), [({"fallen_at_s": 3.0}, False), ({"shaking_nm": 16.0}, True), ({}, True)]
+)
+def test_a_run_is_as_sound_as_its_worst_part(changes: dict[str, float], stood: bool) -> None:
+    found = merged([msgspec.convert(changes, Summary), Summary(stood=True, sound=True)])
+    assert (found.stood, found.sound) == (stood, not changes)
+    assert found.fallen_at_s == changes.get("fallen_at_s")
 
 
 class Events:

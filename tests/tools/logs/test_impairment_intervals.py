@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -15,7 +16,7 @@ from shared.config.scenarios import Inject
 from shared.links import DIRECTIONS, directions_of
 from shared.network.impairment_schedule import ImpairmentSchedule
 from tests.shared.mcap_log.runs import sample
-from tools.judge import verdict_table
+from tools.judge import verdict, verdict_table
 from tools.judge.standing import LIMITS
 from tools.judge.verdict import Summary
 from tools.live.live_view import LiveView, active, said_by
@@ -45,7 +46,7 @@ def test_an_impairment_of_many_directions_is_one_with_the_sum_of_their_counts() 
     (row,) = impairments(told(("planner->left", CUT, 3.0, 7.0)))
     assert row.directions == set(directions_of("planner->left"))
     assert (row.passed, row.lost) == (0, 3 * 4)
-    assert row.as_dict(NS_PER_S)["said"] == (
+    assert verdict.shown(row, NS_PER_S).said == (
         "planner->left partition: 2.00 to 6.00 s; 0 messages passed, 12 lost"
     )
 
@@ -60,7 +61,7 @@ def test_impairments_that_overlap_keep_each_its_own_begin_and_end() -> None:
 def test_an_impairment_without_an_end_in_the_log_is_reported_so() -> None:
     (row,) = impairments(told(("all", LATE, 3.0, 99.0)))
     assert row.when(0) == "from 3.00 s on"
-    assert "its end is not in the log" in row.as_dict(0)["said"]
+    assert "its end is not in the log" in verdict.shown(row, 0).said
     assert row.at(1 << 60)
 
 
@@ -81,10 +82,8 @@ def test_a_module_is_touched_by_its_own_links_only() -> None:
 
 
 def judged(**figures: object) -> Summary:
-    return {
-        "stood": True, "sound": True, "duration_s": 8.0, "in_real_time": True, "stopped": [],
-        "stalls": [], "drop_outs": [], "across_stalls": [], **figures,
-    }  # fmt: skip
+    begin: dict[str, object] = {"stood": True, "sound": True, "began": True, "duration_s": 8.0}
+    return msgspec.convert(begin | figures, Summary)
 
 
 def shown(summary: Summary) -> str:
@@ -97,7 +96,10 @@ def test_a_limit_passed_with_links_impaired_is_marked_and_otherwise_not() -> Non
     (row,) = (row for row in LIMITS if row.key == "alive_com_y_max_mm")
     over = judged(alive_com_y_max_mm=row.limit + 1.0)
     assert verdict_table.mark(row, over) == "over"
-    assert verdict_table.mark(row, over | {"links_impaired": 1}) == "over, links impaired"
+    assert (
+        verdict_table.mark(row, msgspec.structs.replace(over, links_impaired=1))
+        == "over, links impaired"
+    )
     cpu = next(row for row in LIMITS if row.key == "fleet_cpu_pct")
     busy = judged(fleet_cpu_pct=cpu.limit + 1.0, links_impaired=1)
     assert verdict_table.mark(cpu, busy) == "over, a busy machine", "no link makes it busy"
@@ -118,7 +120,7 @@ def test_the_verdict_has_a_line_for_each_impairment_and_one_of_ages() -> None:
     rows = impairments(told(("planner->joints", LATE, 3.0, 7.0), ("all", CUT, 8.0, 9.0)))
     summary = judged(
         links_impaired=2,
-        impairments=[row.as_dict(0) for row in rows],
+        impairments=[verdict.shown(row, 0) for row in rows],
         command_age_impaired_ms={"median": 32.0, "p99": 40.0},
         command_age_otherwise_ms={"median": 4.0, "p99": 4.5},
     )

@@ -105,15 +105,10 @@ REFUSALS: Final = {
     "drive can test --bus foot": "--bus foot: the robot has ",
     "drive can latency --bus foot": "--bus foot: the robot has ",
     "drive can latency --count 0": "a whole number from 1",
-    "drive identify body --level 0": "a number from 1e-06 to 0.1 rad",
-    "drive identify body --added 1 --added 2": "2 for 1",
-    "drive identify body --added -1": "from 0 to 100 kg",
-    "drive identify body /nowhere/run.mcap": "/nowhere",
-    "drive identify body": "no fleet",
-    "drive identify joint": "one of the arguments MODULE --all is required",
-    "drive identify joint --all knee_left": "not allowed with",
-    "drive identify joint shin_left": "shin_left: one of ankle_right",
-    "drive identify joint knee_left --torque -1": "'-1': a number of at least 0.001 N m",
+    "drive identify": "one of the arguments MODULE --all is required",
+    "drive identify --all knee_left": "not allowed with",
+    "drive identify shin_left": "shin_left: one of ankle_right",
+    "drive identify knee_left --torque -1": "'-1': a number of at least 0.001 N m",
     "log export LOG": "say what to write: --scene",
     "log export LOG --scene --topic estop": "--topic chooses what is in tables",
     "log export LOG --scene -o LOG --force": "is the record itself",
@@ -150,20 +145,13 @@ REFUSALS: Final = {
     "log explain --p -0.01,0,1.4,0,0,0": "COM z 1.40 m wanted",
     "log explain --p 0,0,0.8,0,0,0 --q 0": "one of them",
     "log explain no_such.mcap": "cannot be read",
-    "log play --topics 'joint/*/state' LOG": "write it first",
-    "log play LOG --start-paused --listen none": "there is no terminal here",
     "log play LOG --rate 0": "a number from 0.001 to 1000",
     "log play LOG --rate -1": "a number from 0.001 to 1000",
     "log play LOG --start-offset -0.1": "'-0.1': a number of at least 0 s",
     "log play LOG --start-offset 9": "the log is 0.04 s long",
+    "log play LOG --topic joint/*/sate": "no topic is so named",
+    "log play LOG --topic estop": "none of these topics has a message",
     "log play LOG --duration 0": "a number of at least 1e-09 s",
-    "log play LOG --clock-hz 0": "a number from 0.001 to 1000 Hz",
-    "log play LOG --topics joint/*/sate": "the nearest is joint/*/state",
-    "log play LOG --topics estop": "nothing is left to play; the log holds joint/*/state",
-    "log play LOG --exclude wrenchh": "the nearest is harness/wrench",
-    "log play LOG --remap joint/knee_right/state": "OLD=NEW is right",
-    "log play LOG --prefix xrl/lab": "--prefix",
-    "log play LOG --config nowhere.toml": "nowhere.toml",
     "topic hz foo": "foo",
     "topic hz estop --for 0": "a number of at least 0.001 s",
     "topic echo": "TOPIC",
@@ -248,6 +236,6 @@ def test_what_cannot_be_meant_is_refused_with_what_is_right(
     lines = err.splitlines()
     assert REFUSALS[typed] in " ".join(" ".join(lines).split())
     assert len(lines) == 1 or lines[0].startswith("usage: xrl ")
-    assert out == "" or typed.startswith("log play"), "which says first what it plays"
+    assert out == ""
     assert list(tmp_path.iterdir()) == [], "nothing was begun"
     assert log.read_bytes() == before, "a record is never touched"

@@ -13,7 +13,7 @@ from shared.bus.traces import SimTruth
 from shared.joints import MODULES
 from tests.shared.mcap_log.runs import recorded_in_parts
 from tests.tools.judge.reports.runs import changed
-from tools.judge.stalls import MACHINE, Stall
+from tools.fleet.stalls import Stall
 from tools.logs.run_log import RunLog, read_run, robot_of
 from tools.view.record import RecordSource
 from tools.view.source import COURSE_FRAMES, Order
@@ -50,12 +50,12 @@ def test_a_frame_holds_the_newest_messages_at_its_time(log: RunLog, source: Reco
 
 def test_a_stall_of_the_machine_is_shown_for_moments_after_it_and_marked(log: RunLog) -> None:
     zero_ns = next(row.t_ns for row in log.messages(topics.SIM_TRUTH) if row.scenario_s >= 0.0)
-    event = Stall(zero_ns + 2_430_000_000, zero_ns + 2_493_000_000, MACHINE).event(99, zero_ns)
+    event = Stall(zero_ns + 2_430_000_000, zero_ns + 2_493_000_000).event(99, zero_ns)
     more = [(event.t_ns, "run/event", msgspec.json.encode(event))]
     found = changed(log, more=more)
     source = RecordSource(found, robot_of(found))
     shown = [source.frame(t_s) for t_s in (2.4, 2.6, 3.1, 2.6)]
-    words = "the machine stood still for 63 ms"
+    words = "the machine stalled for 63 ms"
     assert [frame and frame.stall for frame in shown] == ["", words, words, words]
     assert [mark.text for mark in source.model().marks if mark.kind == "stall"] == [words]
 

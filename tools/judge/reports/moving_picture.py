@@ -22,8 +22,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.joints import MODULES, SIDES
 from shared.robot.frames import UPRIGHT, Quaternion, product, rotated
-from tools.judge.reports import scene
-from tools.judge.reports.scene import RobotPose
+from tools.judge.reports.robot_pose import FORCE_MIN_N, RobotPose, frames, poses
 from tools.logs.run_log import RunLog
 
 Point = tuple[float, float]
@@ -113,8 +112,7 @@ def write_gif(
     The pose is the simulated world's, or as the legs know the torso. `progress` takes 0 .. 1.
     """
     began = _began_ns(log)
-    poses = [pose for pose in scene.poses(log, robot) if pose.t_ns >= began]
-    chosen = list(scene.thinned(poses, poses[0].t_ns if poses else 0, FRAMES_S))
+    chosen = [pose for pose in poses(log, robot, FRAMES_S) if pose.t_ns >= began]
     if not chosen:
         raise RunError(f"{log.path}: the scenario never began; there is nothing to draw")
     captions = _captions(log, began)
@@ -150,7 +148,7 @@ def write_gif(
 def world_frames(robot: RobotConfig, pose: RobotPose) -> dict[str, tuple[Array, Quaternion]]:
     """Return each frame's origin (3,), m, and rotation, in the world."""
     placed = {"world": (np.zeros(3), UPRIGHT)}
-    for frame in scene.frames(robot, pose):
+    for frame in frames(robot, pose.torso, pose.angles, pose.com, pose.q):
         origin, rotation = placed[frame.parent]
         placed[frame.child] = (
             origin + rotated(rotation, frame.position),
@@ -248,7 +246,7 @@ def _draw_robot(
             canvas.disc(joint, 8.5, MODE_INK.get(mode, INK))
     canvas.disc(at(np.array(pose.com)), 5.0, COM_INK)
     harness = at(frames["harness"][0])
-    if abs(pose.force[2]) >= scene.FORCE_MIN_N:
+    if abs(pose.force[2]) >= FORCE_MIN_N:
         canvas.arrow(harness, (0.0, -PX_PER_N * pose.force[2]), HAND_INK)
     if pose.push[axis]:
         canvas.arrow(at(np.array(pose.torso)), (sign * PX_PER_N * pose.push[axis], 0.0), PUSH_INK)

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from html import escape
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
+import numpy as np
+
+from shared.arrays import Array
 from shared.clock import NS_PER_S
 from shared.exceptions import RunError
-from tools.judge import verdict_table
-from tools.judge.reports import panels, summary, times, torques
-from tools.judge.reports.page_model import PageModel, PageWindow, TimelineEvent
-from tools.judge.reports.run_data import RunData, TimeAxis
-from tools.judge.reports.signals import Span
-from tools.judge.reports.summary import RunVerdict, TopicLoss
-from tools.judge.reports.timeline import Timeline
+from tools.judge.reports.events import Event, Events
+from tools.judge.reports.panels import COLOURS, GAP_S, Bar, Line, Panel, panels_of
+from tools.judge.reports.run_data import RunData, Span, TimeAxis
+from tools.judge.reports.summary import Judge, MessageLosses, inputs, verdict_and_facts
 from tools.judge.run_parts import zero_ns
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import PART_S, SEE_INFO, WHOLE, RunLog, RunPart, parts_of
@@ -26,35 +25,90 @@ HERE: Final = Path(__file__).parent
 VENDOR: Final = HERE / "vendor" / "uplot"
 STYLES: Final = (VENDOR / "uPlot.min.css", HERE / "page.css")
 LIBRARY: Final = VENDOR / "uPlot.iife.min.js"
-SCRIPTS: Final = tuple(
-    HERE / f"{name}.js" for name in ("signals", "format", "overlay", "panel", "view", "page")
+SCRIPT: Final = HERE / "page.js"
+POINTS: Final = 4000
+"""Maximum number of points of a line: the least and the greatest value of each interval, so that
+a plot shows every extreme, and a page of an hour has 2 MB."""
+BEFORE_S: Final = {"fall": 3.0}
+"""A click on an event shows this time before it; else half a second."""
+HELP: Final = (
+    "Drag in a plot to zoom all plots; double-click to show the whole run. Ctrl and wheel zoom at "
+    "the cursor. The legends show the values at the cursor; click a name to hide or show its line. "
+    "Dotted red lines are limits."
 )
-
-PANELS: Final = (
-    panels.body, panels.hand, panels.feet, panels.states, panels.network, times.ages,
-    panels.certificate, torques.joints, panels.heat, panels.harness, times.times,
-)  # fmt: skip
-"""What makes the panels, in the order of the page."""
-BEFORE_FALL_S: Final = 3.0
-"""A click on a fall shows this time before it."""
-
-HELP: Final = "".join(
-    f"<li>{line}</li>"
-    for line in (
-        "Drag in a plot to zoom all plots; double-click to show the whole run.",
-        "Ctrl and wheel zoom at the cursor; Shift and wheel move the time shown.",
-        "The legends show the values at the cursor. Dotted red lines are limits.",
-        "Click in a plot to pin the cursor and to see time differences; Escape removes the pin.",
-        "Click a name in a legend to hide or show its line; with Ctrl, to show it alone.",
-        "Keys in a plot: arrows move the cursor, with Shift the time shown; Enter pins.",
-        "Keys in a plot: + and &minus; zoom; 0 shows the whole run.",
-    )
-)
-
 POLICY: Final = (
     "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
 )
 """Makes the browser refuse every request to another place."""
+
+
+class _PanelData:
+    """A panel over all parts of a run."""
+
+    def __init__(self, panel: Panel) -> None:
+        self._panel = panel
+        self._lines: dict[str, tuple[Line, list[tuple[Array, Array]]]] = {}
+        self._rows: dict[str, list[Bar]] = {}
+
+    def add(self, panel: Panel, run: RunData) -> None:
+        """Add what a part of the run has of it."""
+        self._panel = panel
+        for line in panel.lines:
+            inside = run.inside(line.t) & (line.t >= run.span.begin) & (line.t <= run.span.end)
+            parts = self._lines.setdefault(line.label, (line, []))[1]
+            parts.append(thinned(line.t[inside], line.values[inside], run.span))
+        for label, bars in panel.rows.items():
+            row = self._rows.setdefault(label, [])
+            for bar in bars:
+                last = row[-1] if row else (-np.inf, -np.inf, "")
+                if bar[2] == last[2] and bar[0] <= last[1] + GAP_S:
+                    row[-1] = last[0], max(bar[1], last[1]), last[2]
+                elif bar[1] > max(last[1], run.span.begin) and bar[0] < run.span.end:
+                    row.append((max(bar[0], run.span.begin), *bar[1:]))
+
+    def as_data(self) -> dict[str, Any] | None:
+        """Return it as the page stores it; None if it has no data."""
+        panel, lines = self._panel, []
+        for line, parts in self._lines.values():
+            t, values = with_gaps(*map(np.concatenate, zip(*parts, strict=True)))
+            if len(t):
+                lines.append({
+                    "label": line.label, "colour": line.colour, "hidden": line.hidden,
+                    "dashed": line.dashed, "t": [round(at, 4) for at in t.tolist()],
+                    "v": [None if value != value else float(f"{value:.5g}") for value in values],
+                })  # fmt: skip
+        rows = [
+            [label, [(round(a, 4), round(b, 4), name) for a, b, name in bars]]
+            for label, bars in self._rows.items()
+        ]
+        if not lines and not rows:
+            return None
+        return {
+            "title": panel.title, "unit": panel.unit, "note": panel.note, "lines": lines,
+            "levels": panel.levels, "reach": panel.reach, "rows": rows,
+        }  # fmt: skip
+
+
+def thinned(t: Array, values: Array, span: Span) -> tuple[Array, Array]:
+    """Return the finite samples of a line; of many only the extremes of each short interval."""
+    finite = np.isfinite(values)
+    t, values = t[finite], values[finite]
+    width_s = 2.0 * (span.end - span.begin) / POINTS
+    if not len(t) or width_s <= 0.0:
+        return t, values
+    bins = ((t - span.begin) / width_s).astype(np.int64)
+    firsts = np.flatnonzero(np.diff(bins, prepend=-1))
+    by_value = np.lexsort((values, bins))
+    kept = np.unique(np.concatenate((by_value[firsts], by_value[[*(firsts[1:] - 1), -1]])))
+    return t[kept], values[kept]
+
+
+def with_gaps(t: Array, values: Array) -> tuple[Array, Array]:
+    """Return a line with NaN where it has no sample for too long."""
+    steps = np.diff(t)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    gaps = np.flatnonzero(steps > max(GAP_S, 5.0 * usual)) + 1
+    return np.insert(t, gaps, t[gaps - 1] + 1e-3), np.insert(values, gaps, np.nan)
 
 
 class Page:
@@ -62,57 +116,53 @@ class Page:
 
     def __init__(self, axis: TimeAxis | None = None) -> None:
         self._axis = axis
-        self._model: PageModel | None = None
         self._about: RunData | None = None
         self._has_first = self._has_last = False
-        self._armed_s: float | None = None
-        self._timeline = Timeline()
-        self._judge = summary.Judge()
-        self._losses = summary.MessageLosses()
+        self._panels: dict[str, _PanelData] = {}
+        self._events = Events()
+        self._judge = Judge()
+        self._losses = MessageLosses()
 
     def add(self, log: RunLog) -> None:
         """Add a run, or the next part of it."""
-        run = RunData(log, self._axis, self._armed_s)
-        armed_s = run.armed_s()
-        self._armed_s = armed_s if math.isfinite(armed_s) else None
+        run = RunData(log, self._axis)
         self._has_first |= log.is_first
         self._has_last |= log.is_last
         if self._about is None or (self._about.course is None and run.course is not None):
             self._about = run  # a part in which the scenario runs names the time axis
-        self._model = self._model or PageModel(run.span)
-        span = None if log.is_whole else run.span
-        self._model.window = PageWindow(run.begin_s, run.end_s, span)
-        for make in PANELS:
-            for panel in make(run):
-                self._model.add(panel)
-        self._timeline.add(run)
-        self._judge.add(run)
+        panels = panels_of(run)
+        for panel in panels:
+            self._panels.setdefault(panel.title, _PanelData(panel)).add(panel, run)
+        self._events.add(run, panels)
         self._losses.add(run)
+        self._judge.add(run, self._losses.counts)
 
     def html(self) -> str:
         """Return the page."""
-        run, model = self._about, self._model
+        run = self._about
         assert run is not None  # noqa: S101 - a run has a part
-        assert model is not None  # noqa: S101
-        log = run.log
-        events = self._timeline.events(run.span)
-        plots, left_out = model.as_data(events)
-        verdict = self._judge.verdict(
-            log, self._losses.counts.values(), whole=self._has_first and self._has_last
-        )
-        name = log.metadata["run"].get("scenario") or log.path.name
-        fell_s = next((row.t for row in events if row.kind == "fall"), None)
+        name = run.log.metadata["run"].get("scenario") or run.log.path.name
+        verdict = self._judge.verdict(whole=self._has_first and self._has_last)
+        events = self._events.all(run.span)
+        found = {title: panel.as_data() for title, panel in self._panels.items()}
+        data = {
+            "span": run.span,
+            "marks": [[row.t, row.kind, row.mark] for row in events if row.mark],
+            "colours": COLOURS,
+            "panels": [data for data in found.values() if data is not None],
+        }
+        empty = ", ".join(title for title, data in found.items() if data is None)
         parts = (
-            _head(run, verdict, name),
-            _tools(run, fell_s),
-            f'<div class="work">{_timeline(events)}<main id="panels"></main></div>',
-            _left_out(left_out),
-            _message_losses(run, self._losses.rows(log.robot)),
-            _inputs(run),
+            verdict_and_facts(run, verdict, name),
+            _tools(run),
+            f'<div class="work">{_listed(events)}<main id="panels"></main></div>',
+            f'<p class="hint" id="left-out">The log has no data for: {empty}.</p>' if empty else "",
+            self._losses.html(run),
+            inputs(run),
         )
-        data = json.dumps(plots, separators=(",", ":"), allow_nan=False)
+        text = json.dumps(data, separators=(",", ":"), allow_nan=False)
         prefix = "" if verdict.good is None else f"{verdict.sentence}: "
-        return _document(f"{prefix}{name}, {log.robot}", "\n".join(parts), data)
+        return _document(f"{prefix}{name}, {run.log.robot}", "\n".join(parts), text)
 
 
 def render(log: RunLog) -> str:
@@ -145,8 +195,6 @@ def render_parts(
 
 def _document(title: str, body: str, data: str) -> str:
     style = "\n".join(path.read_text(encoding="utf-8") for path in STYLES)
-    library = LIBRARY.read_text(encoding="utf-8")
-    script = "\n".join(path.read_text(encoding="utf-8") for path in SCRIPTS)
     safe = data.replace("<", "\\u003c")  # so the data hold no end tag
     return f"""<!DOCTYPE html>
 <html lang="en">
@@ -162,38 +210,15 @@ def _document(title: str, body: str, data: str) -> str:
 <body>
 {body}
 <script type="application/json" id="data">{safe}</script>
-<script id="uplot">{library}</script>
+<script id="uplot">{LIBRARY.read_text(encoding="utf-8")}</script>
 <script>
-{script}</script>
+{SCRIPT.read_text(encoding="utf-8")}</script>
 </body>
 </html>
 """
 
 
-def _head(run: RunData, verdict: RunVerdict, name: str) -> str:
-    word = {True: "good", False: "bad", None: "none"}[verdict.good]
-    rows = "".join(
-        f"<div><dt>{escape(key)}</dt><dd>{escape(value)}</dd></div>"
-        for key, value in summary.head(run)
-    )
-    caution = f'<p class="caution">{escape(verdict.caution)}</p>' if verdict.caution else ""
-    table = ""
-    if verdict.rows:
-        marks = [mark for *_, mark in verdict.rows if mark]
-        over = sum(mark.startswith(verdict_table.OVER) for mark in marks)
-        count = f"{over} of {len(marks)} over" if over else f"all {len(marks)} ok"
-        names = ("figure", "measured", "limit", "")
-        cells = _table(names, verdict.rows, numbers=(1, 2))
-        table = _details(f"Figures against their limits: {count}", cells, is_open=True)
-    return (
-        f"<header><h1>{escape(run.log.robot)}: {escape(name)}</h1>"
-        f'<p class="verdict {word}" id="verdict">{escape(verdict.sentence)}</p>{caution}'
-        f'<div class="head">{table}<dl>{rows}</dl></div></header>'
-    )
-
-
-def _tools(run: RunData, fell_s: float | None) -> str:
-    begin, end = run.span
+def _tools(run: RunData) -> str:
     buttons = "".join(
         f'<button type="button" data-do="{do}" title="{title}" aria-label="{title}">{text}</button>'
         for do, text, title in (
@@ -201,101 +226,21 @@ def _tools(run: RunData, fell_s: float | None) -> str:
             ("in", "+", "zoom in"), ("out", "&minus;", "zoom out"), ("all", "all", "whole run"),
         )
     )  # fmt: skip
-    if fell_s is not None:
-        title = f"the last {BEFORE_FALL_S:g} s before the fall"
-        buttons += (
-            f'<button type="button" data-t="{fell_s:.4f}" data-before="{BEFORE_FALL_S:g}" '
-            f'title="{title}" aria-label="{title}">fall</button>'
-        )
-    field = '<input type="number" step="any" min="{0:.3f}" max="{1:.3f}" value="{2:.3f}" id="{3}">'
-    fields = (
-        f'<span class="range"><label>from {field.format(begin, end, begin, "from")}</label>'
-        f"<label>to {field.format(begin, end, end, 'to')} s</label></span>"
-        '<select id="goto" aria-label="go to a panel"><option value="">go to ...</option></select>'
-    )
     return (
-        f'<nav class="tools" aria-label="time shown"><span class="buttons">{buttons}</span>{fields}'
-        f'<output id="cursor"></output></nav>'
-        f'<details class="hint"><summary>{escape(run.axis[0].upper() + run.axis[1:])}. '
-        f"How to read and zoom</summary><ul>{HELP}</ul></details>"
-        "<noscript><p>The plots need JavaScript; verdict, timeline and tables do not.</p>"
-        "</noscript>"
+        f'<nav class="tools" aria-label="time shown">{buttons}<output id="cursor"></output></nav>'
+        f'<p class="hint">{escape(run.axis[0].upper() + run.axis[1:])}. {HELP}</p>'
+        "<noscript><p>The plots need JavaScript; verdict, events and tables do not.</p></noscript>"
     )
 
 
-def _left_out(panels_without_data: Sequence[tuple[str, str]]) -> str:
-    if not panels_without_data:
-        return ""
-    rows = "".join(f"<li>{escape(title)}: {escape(why)}</li>" for title, why in panels_without_data)
-    return f'<section id="left-out"><h2>Panels without data</h2><ul>{rows}</ul></section>'
-
-
-def _timeline(events: Sequence[TimelineEvent]) -> str:
+def _listed(events: Sequence[Event]) -> str:
     rows = "".join(
-        f'<li class="{escape(row.kind)}"><button type="button" data-t="{row.t:.4f}"'
-        f"{_before(row)}>"
-        f"<time>{row.t:.3f} s</time> <span>{escape(row.text)}</span></button></li>"
+        f'<li class="{row.kind}"><button type="button" data-t="{row.t:.4f}" '
+        f'data-before="{BEFORE_S.get(row.kind, 0.5):g}"><time>{row.t:.3f} s</time> '
+        f"<span>{escape(row.text)}</span></button></li>"
         for row in events
     )
-    rows = rows or "<li>no events</li>"
     return (
-        '<section id="timeline"><h2>Timeline</h2>'
-        f'<p class="hint">Click a row to show its time in the plots.</p><ol tabindex="0" '
-        f'aria-label="timeline">{rows}</ol></section>'
+        '<section id="timeline"><h2>Events</h2><p class="hint">Click one to show its time in the '
+        f'plots.</p><ol aria-label="events">{rows or "<li>no events</li>"}</ol></section>'
     )
-
-
-def _before(row: TimelineEvent) -> str:
-    """Return the time to show before an event, if it is a fall; other events have the default."""
-    return f' data-before="{BEFORE_FALL_S:g}"' if row.kind == "fall" else ""
-
-
-def _message_losses(run: RunData, rows: Sequence[TopicLoss]) -> str:
-    missing = sum(row.counted.missing for row in rows)
-    cells = []
-    for name, rate_hz, nominal_hz, count in rows:
-        rate = f"{rate_hz:.1f}" if rate_hz is not None else ""
-        nominal = f"{nominal_hz:g}" if nominal_hz else ""
-        counts = map(str, (count.missing, count.gaps, count.restarts))
-        cells.append((name, str(count.count), rate, nominal, *counts))
-    title = f"Messages: {missing} lost on the way to the log" if missing else "Messages: none lost"
-    names = ("topic", "messages", "Hz", "nominal Hz", "lost", "gaps", "restarts")
-    damage = "".join(f"<li>{escape(line)}</li>" for line in summary.damage(run))
-    body = (f"<ul>{damage}</ul>" if damage else "") + _table(names, cells, numbers=range(1, 7))
-    return f'<section id="lost">{_details(title, body, is_open=bool(missing or damage))}</section>'
-
-
-def _inputs(run: RunData) -> str:
-    parts = [_details(name, f"<pre>{escape(text)}</pre>") for name, text in summary.files(run)]
-    installed = summary.packages(run)
-    if installed:
-        table = _table(("package", "version"), installed, numbers=())
-        parts.append(_details(f"{len(installed)} packages", table))
-    return f'<section id="inputs"><h2>Inputs of the run</h2>{"".join(parts)}</section>'
-
-
-def _details(title: str, body: str, *, is_open: bool = False) -> str:
-    flag = " open" if is_open else ""
-    return f"<details{flag}><summary>{escape(title)}</summary>{body}</details>"
-
-
-def _table(names: Sequence[str], rows: Iterable[Sequence[str]], *, numbers: Sequence[int]) -> str:
-    head = "".join(
-        f'<th scope="col"{_class("", number=column in numbers)}>{escape(name)}</th>'
-        for column, name in enumerate(names)
-    )
-    body = ""
-    for row in rows:
-        cells = "".join(
-            f"<td{_class(value, number=column in numbers)}>{escape(value)}</td>"
-            for column, value in enumerate(row)
-        )
-        body += f"<tr>{cells}</tr>"
-    table = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-    return f'<div class="wide">{table}</div>'
-
-
-def _class(value: str, *, number: bool) -> str:
-    word = value.partition(",")[0]
-    kind = "n" if number else word if word in (verdict_table.OK, verdict_table.OVER) else ""
-    return f' class="{kind}"' if kind else ""

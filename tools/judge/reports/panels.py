@@ -1,156 +1,174 @@
-"""Panels of the body, the hand, the feet, the states, the network, the harness, the certificate."""
+"""The eight panels of a run: lines over one time axis, their limits, and bars of states. Pure.
+
+The report's page and `run.png` draw the same panels.
+"""
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
-from enum import IntEnum
+from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import Final, NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from shared.arrays import Array
 from shared.bus import topics
-from shared.bus.messages import DriveStatus, Mode, PlannerMode, SplitSource
-from shared.bus.topics import Topic
-from shared.bus.traces import LinkEvent
-from shared.clock import NS_PER_S
+from shared.bus.messages import Mode, PlannerMode, name_of
+from shared.clock import NS_PER_MS
 from shared.joints import MODULES
-from shared.links import GROUPS
-from tools.judge.reports.page_model import BarRow, Bars, LevelLine, Line, Panel, Plot
+from tools.fleet import stalls
 from tools.judge.reports.run_data import RunData
-from tools.judge.reports.signals import GAP_S
 from tools.judge.standing import BY_KEY
+from tools.judge.verdict import leading
+from tools.logs.impairment_intervals import impairments
 
-NO_WORLD: Final = "no sim/truth in this log"
-NO_PLANNER: Final = "no planner/status in this log"
-NO_HARNESS: Final = "no harness/wrench in this log"
-NO_STATES: Final = "no joint/*/state in this log"
-NO_IMPAIRMENTS: Final = "no impairment in this log"
-XYZ: Final = ("x", "y", "z")
-ANGLES: Final = ("roll", "pitch", "yaw")
-
-
-class ImpairedLink(IntEnum):
-    """State of one direction of a link."""
-
-    CLEAR = 0
-    IMPAIRED = 1
-    """Delayed, or lossy."""
-    CUT = 2
-
-
-class WrenchQuality(IntEnum):
-    """Quality of the harness sensor's wrench."""
-
-    VALID = 0
-    NOT_VALID = 1
-    SATURATED = 2
-
-
-COLOURS: Final[Mapping[type[IntEnum], Mapping[int, str]]] = {
-    Mode: {
-        Mode.DISARMED: "idle", Mode.HOLD: "warn", Mode.TRACK: "good", Mode.DAMP: "odd",
-        Mode.FAULT: "bad",
-    },
-    DriveStatus: {
-        DriveStatus.LOST: "bad", DriveStatus.IDLE: "idle", DriveStatus.ARMED: "good",
-        DriveStatus.ERROR: "odd", DriveStatus.UNZEROED: "warn", DriveStatus.HOLDING: "good",
-        DriveStatus.UNACKNOWLEDGED: "bad",
-    },
-    PlannerMode: {
-        PlannerMode.WAITING: "idle", PlannerMode.ALIGNING: "warn", PlannerMode.LEADING: "good",
-        PlannerMode.OVERLOADED: "odd", PlannerMode.UNCERTIFIED: "bad",
-        PlannerMode.MISPLACED: "bad", PlannerMode.TRIPPED: "bad", PlannerMode.MISLOADED: "bad",
-        PlannerMode.YIELDING: "odd",
-    },
-    SplitSource: {
-        SplitSource.DIAGONAL: "idle", SplitSource.SCHEDULE: "good", SplitSource.STIFFENED: "warn",
-        SplitSource.UNCERTIFIED: "bad", SplitSource.CONTROLLER: "good",
-    },
-    WrenchQuality: {
-        WrenchQuality.VALID: "good", WrenchQuality.NOT_VALID: "warn",
-        WrenchQuality.SATURATED: "bad",
-    },
-    ImpairedLink: {
-        ImpairedLink.CLEAR: "good", ImpairedLink.IMPAIRED: "warn", ImpairedLink.CUT: "bad",
-    },
+GAP_S: Final = 0.1
+"""A plot interrupts its line where a signal has no sample for longer than this."""
+AGE_REACH: Final = 1.2
+"""Top of the panel of ages, as a multiple of the oldest usable age: older commands are not used."""
+AGE_MAX_MS: Final = 50.0
+"""Oldest usable age if the log does not tell its robot's."""
+AT_LIMIT: Final = 0.999
+"""Fraction of a module's torque limit from which the torque counts as limited."""
+TORQUE_DURATION_MIN_S: Final = 0.02
+"""Shorter times at the torque limit, in total, are not reported."""
+COLOURS: Final[Mapping[str, str]] = {
+    "DISARMED": "idle", "HOLD": "warn", "TRACK": "good", "DAMP": "odd", "FAULT": "bad",
+    "WAITING": "idle", "ALIGNING": "warn", "LEADING": "good", "OVERLOADED": "odd",
+    "UNCERTIFIED": "bad", "MISPLACED": "bad", "TRIPPED": "bad", "MISLOADED": "bad",
+    "YIELDING": "odd", "IMPAIRED": "net", "CUT": "bad",
 }  # fmt: skip
+"""Name of the colour of each state in the bars."""
+
+Bar = tuple[float, float, str]
+"""Begin and end, s, and the name of the state."""
 
 
-class StateBars(NamedTuple):
-    """A panel of bars that shows one field of a topic."""
+class Beyond(NamedTuple):
+    """A limit of a line."""
+
+    words: str
+    """Such as `over 20 mm while led`."""
+    shortest_s: float = 0.0
+    """A shorter time beyond it, in total, is not reported."""
+
+
+Beyonds = Mapping[Beyond, NDArray[np.bool_]]
+"""Where a line is beyond its limits."""
+WITHOUT_LIMIT: Final[Beyonds] = MappingProxyType({})
+
+
+class Line(NamedTuple):
+    """One line of a panel."""
+
+    label: str
+    t: Array
+    values: Array
+    """NaN where there is none."""
+    colour: int
+    hidden: bool = False
+    """True: not shown until the user switches it on in the legend."""
+    dashed: bool = False
+    beyond: Beyonds = WITHOUT_LIMIT
+
+
+class Level(NamedTuple):
+    """A limit or another level to compare the lines with."""
+
+    value: float
+    label: str
+    shown: bool = False
+    """True: the value axis extends to it."""
+
+
+class Panel(msgspec.Struct, frozen=True):
+    """What a run, or a part of it, has for a panel: lines or rows of bars."""
 
     title: str
-    label: str
-    """Its row's label; empty: a row for each module."""
-    topic: Topic
-    field: str
-    names: type[IntEnum]
-    if_empty: str
+    unit: str = ""
+    note: str = ""
+    """An explanation for readers who do not know the panel."""
+    lines: Sequence[Line] = ()
+    levels: Sequence[Level] = ()
+    rows: Mapping[str, Sequence[Bar]] = {}
+    reach: float | None = None
+    """Upper end of the value axis; lines may go beyond it."""
 
 
-STATES: Final = (
-    StateBars("Modes of the six services", "", topics.JOINT_STATE, "mode", Mode, NO_STATES),
-    StateBars("Drives", "", topics.JOINT_STATE, "drive", DriveStatus, NO_STATES),
-    StateBars("Planner", "planner", topics.PLANNER_STATUS, "mode", PlannerMode, NO_PLANNER),
-    StateBars(
-        "Source of the local gains", "gains", topics.PLANNER_STATUS, "split", SplitSource,
-        NO_PLANNER,
-    ),
-)  # fmt: skip
-
-History = tuple[tuple[float, ImpairedLink], ...]
+def panels_of(run: RunData) -> list[Panel]:
+    """Return all panels in the order of the page; some may have no data."""
+    return [*_body(run), _hand(run), _states(run), _ages(run), _torques(run), _certificate(run)]
 
 
-def body(run: RunData) -> Iterator[Panel]:
+def _body(run: RunData) -> Iterator[Panel]:
     """Yield COM, height and torso angles (the paper's Fig. 7)."""
     com, torso, angles = (run.wide(topics.SIM_TRUTH, n, 3) for n in ("com", "torso", "angles"))
+    over = np.array([row.over for row in run.log.messages(topics.SIM_TRUTH)]).reshape(-1, 2) * 1e3
     t, t_p = run.times(topics.SIM_TRUTH), run.times(topics.PLANNER_STATUS)
     p, p_ref = (run.wide(topics.PLANNER_STATUS, name, 6) for name in ("p", "p_ref"))
     p[_waits(run)] = p_ref[_waits(run)] = np.nan
     simulated = bool(len(t))
 
-    def both(label: str, truth: Array, estimate: Array, colour: int) -> list[Line]:
+    def both(
+        label: str, truth: Array, estimate: Array, colour: int, beyond: Beyonds = WITHOUT_LIMIT
+    ) -> list[Line]:
         """Return the simulated value and, hidden, the planner's estimate; or only the latter."""
-        lines = [Line(label, t, truth, colour)] if simulated else []
+        lines = [Line(label, t, truth, colour, beyond=beyond)] if simulated else []
         name = f"{label}, planner's estimate" if simulated else label
         return [*lines, Line(name, t_p, estimate, colour, hidden=simulated, dashed=simulated)]
 
-    neither = f"{NO_WORLD}, and {NO_PLANNER}"
-    yield Plot(
-        "COM", "mm", "World axes: x forward, y left; 0 is midway between the ankles.", neither,
-        lines=[*both("x", com[:, 0] * 1e3, p[:, 0] * 1e3, 0),
-               *both("y", com[:, 1] * 1e3, p[:, 1] * 1e3, 1)],
-        limits=[*_leading_limits("alive_com_x_max_mm", "x, planner leading"),
-                *_leading_limits("alive_com_y_max_mm", "y, planner leading")],
+    judged = _Judged(run)
+    yield Panel(
+        "COM", "mm", "Over the soles: x forward, y left; 0 is midway between the ankles.",
+        lines=[
+            line for number, axis in enumerate("xy")
+            for line in both(
+                axis, over[:, number], p[:, number] * 1e3, number,
+                judged.beyond(over[:, number], f"alive_com_{axis}_max_mm",
+                              f"hold_com_{axis}_max_mm"),
+            )
+        ],
+        levels=[*_both_signs("alive_com_x_max_mm", "x, led"),
+                *_both_signs("alive_com_y_max_mm", "y, led")],
     )  # fmt: skip
-    yield Plot(
-        "Height", "m", "Above the ankles.", neither,
+    yield Panel(
+        "Height", "m", "Above the ankles.",
         lines=[Line("torso", t, torso[:, 2], 0), *both("COM", com[:, 2], p[:, 2], 1),
                Line("COM reference", t_p, p_ref[:, 2], 2, hidden=True, dashed=True)],
     )  # fmt: skip
-    yield Plot(
-        "Torso angles", "rad", "", neither,
-        lines=[*(line for number, name in enumerate(ANGLES)
-                 for line in both(name, angles[:, number], p[:, 3 + number], number)),
+    keys = ("alive_roll_max_rad", "", "alive_yaw_max_rad")
+    yield Panel(
+        "Torso angles", "rad",
+        lines=[*(line for number, name in enumerate(("roll", "pitch", "yaw"))
+                 for line in both(name, angles[:, number], p[:, 3 + number], number,
+                                  judged.beyond(angles[:, number], keys[number]))),
                Line("pitch reference", t_p, p_ref[:, 4], 4, hidden=True, dashed=True)],
-        limits=_leading_limits("alive_roll_max_rad", "roll and yaw, planner leading"),
+        levels=_both_signs("alive_roll_max_rad", "roll and yaw, led"),
     )  # fmt: skip
 
 
-def hand(run: RunData) -> Iterator[Panel]:
-    """Yield the operator's force, with what is carried and pushed."""
+def _hand(run: RunData) -> Panel:
+    """Return the operator's force, with what is carried and pushed."""
+    title, unit = "Operator's force", "N"
+    t, t_p = run.times(topics.SIM_TRUTH), run.times(topics.PLANNER_STATUS)
+    if not len(t):
+        t, force = run.times(topics.WRENCH), run.wide(topics.WRENCH, "force", 3)
+        lines = [Line(f"hand, {axis}", t, force[:, n], n) for n, axis in enumerate("xyz")]
+        return Panel(title, unit, "By the harness sensor, torso axes.", lines=lines)
     force, push = (run.wide(topics.SIM_TRUTH, name, 3) for name in ("operator_force", "push"))
     load, carried = run.columns(topics.SIM_TRUTH, "", "load_n", "harness_force_z")
-    t, t_p = run.times(topics.SIM_TRUTH), run.times(topics.PLANNER_STATUS)
     requested, assist = run.columns(topics.PLANNER_STATUS, "", "assist_requested_n", "assist_n")
-    lines = [Line("hand, z", t, force[:, 2], 0)]
-    limits = _leading_limits("operator_peak_n", "hand z, planner leading")
+    judged = _Judged(run)
+    lines = [
+        Line("hand, z", t, force[:, 2], 0, beyond=judged.beyond(force[:, 2], "operator_peak_n"))
+    ]
+    levels = _both_signs("operator_peak_n", "hand z, led")
     if force[:, 1].any():
-        limits += _leading_limits("operator_side_peak_n", "hand y, planner leading")
-        lines.append(Line("hand, y", t, force[:, 1], 7))
+        beyond = judged.beyond(force[:, 1], "operator_side_peak_n")
+        lines.append(Line("hand, y", t, force[:, 1], 7, beyond=beyond))
+        levels += _both_signs("operator_side_peak_n", "hand y, led")
     if load.any():
         lines += [Line("weight on the harness", t, load, 1), Line("carried", t, carried, 2)]
     if requested.any() or assist.any():
@@ -160,188 +178,132 @@ def hand(run: RunData) -> Iterator[Panel]:
         ]
     lines += [
         Line(f"push, {axis}", t, push[:, number], 3 + number, hidden=True)
-        for number, axis in enumerate(XYZ)
+        for number, axis in enumerate("xyz")
         if push[:, number].any()
     ]
-    yield Plot(
-        "Operator's force", "N", "World axes, on the torso.", NO_WORLD,
-        lines=lines if len(t) else [],
-        limits=limits,
-    )  # fmt: skip
+    return Panel(title, unit, "World axes, on the torso.", lines=lines, levels=levels)
 
 
-def feet(run: RunData) -> Iterator[Panel]:
-    """Yield tilt and slip of the feet, and how far the legs' estimates of the torso differ."""
-    right, left, slip = run.columns(
-        topics.SIM_TRUTH, "", "foot_right_tilt", "foot_left_tilt", "feet_slip"
-    )
-    t, t_p = run.times(topics.SIM_TRUTH), run.times(topics.PLANNER_STATUS)
-    yield Plot(
-        "Tilt of the soles", "rad",
-        "Angle between sole and floor: a tilted foot stands on an edge.", NO_WORLD,
-        lines=[Line("right", t, right, 0), Line("left", t, left, 1)],
-        limits=_leading_limits("alive_sole_tilt_max_rad", "planner leading")[:1],
-    )  # fmt: skip
-    yield Plot(
-        "Slip of the feet", "mm", "Distance of the ankle from its position at the start.", NO_WORLD,
-        lines=[Line("larger of both ankles", t, slip * 1e3, 0)],
-    )  # fmt: skip
-    closure = run.wide(topics.PLANNER_STATUS, "closure", 6)
-    closure[_waits(run) | (t_p < run.armed_s())] = np.nan
-    closure[:, :3] *= 1e3
-    note = (
-        "Left leg's estimate of the torso pose minus the right leg's: grows when a foot slips or "
-        "tips."
-    )
-    for what, unit, names, values, words in (
-        ("position", "mm", XYZ, closure[:, :3], note),
-        ("angle", "rad", ANGLES, closure[:, 3:], ""),
-    ):
-        title = f"Difference between the legs, {what}"
-        yield Plot(title, unit, words, NO_PLANNER, lines=_components(names, t_p, values))
+def _states(run: RunData) -> Panel:
+    """Return the modes of planner and services, and what was done to the network."""
+    (modes,) = run.columns(topics.PLANNER_STATUS, "", "mode")
+    rows = {"planner": _bars(run.times(topics.PLANNER_STATUS), modes, PlannerMode)}
+    for module in MODULES:
+        (modes,) = run.columns(topics.JOINT_STATE, module, "mode")
+        rows[module] = _bars(run.times(topics.JOINT_STATE, module), modes, Mode)
+    rows["network"] = []
+    for row in impairments(run.log.messages(topics.LINK_EVENT)):
+        end_s = row.end_s(run.zero_ns)
+        name = "CUT" if "partition" in row.words else "IMPAIRED"
+        end_s = run.span.end if end_s is None else end_s
+        rows["network"].append((row.begin_s(run.zero_ns), end_s, name))
+    return Panel("Modes", rows={label: bars for label, bars in rows.items() if bars})
 
 
-def states(run: RunData) -> Iterator[Panel]:
-    """Yield the state bars: services, drives, planner, gains, harness."""
-    for title, label, topic, field, names, if_empty in STATES:
-        rows = [
-            BarRow(label or module, run.times(topic, module), *run.columns(topic, module, field))
-            for module in (("",) if label else MODULES)
-        ]
-        yield Bars(title, if_empty=if_empty, rows=rows, names=names, colours=COLOURS[names])
-    valid, saturated = run.columns(topics.WRENCH, "", "valid", "saturated")
-    quality = np.where(saturated > 0.0, WrenchQuality.SATURATED, np.where(valid > 0.0, 0.0, 1.0))
-    yield Bars(
-        "Harness sensor",
-        if_empty=NO_HARNESS,
-        rows=[BarRow("harness", run.times(topics.WRENCH), quality)],
-        names=WrenchQuality,
-        colours=COLOURS[WrenchQuality],
-    )
+def _bars(t: Array, codes: Array, names: type[Mode | PlannerMode]) -> list[Bar]:
+    """Return an interval for each time with one state; a gap ends an interval."""
+    if not len(t):
+        return []
+    ends = (np.diff(codes) != 0) | (np.diff(t) > GAP_S)
+    starts = np.flatnonzero(np.concatenate(([True], ends)))
+    found: list[Bar] = []
+    for start, following in zip(starts, np.append(starts[1:], len(t)), strict=True):
+        end = t[following - 1]
+        if following < len(t) and t[following] - end <= GAP_S:
+            end = t[following]
+        found.append((float(t[start]), float(end), name_of(names, int(codes[start]))))
+    return found
 
 
-def network(run: RunData) -> Iterator[Panel]:
-    """Yield the impaired directions; directions with equal histories share a row."""
-    names_by_history: dict[History, list[str]] = defaultdict(list)
-    events: list[LinkEvent] = run.log.messages(topics.LINK_EVENT)
-    for name, history in histories(events, run.zero_ns).items():
-        names_by_history[history].append(name)
-    rows = []
-    for history, names in names_by_history.items():
-        # samples that are close enough to form one bar
-        changes = np.array([t for t, _ in history])
-        codes = np.array([ImpairedLink.CLEAR, *(code for _, code in history)])
-        t = np.union1d(np.arange(*run.span, GAP_S / 2), changes)
-        codes = codes[np.searchsorted(changes, t, side="right")]
-        rows += [BarRow(label, t, codes) for label in _labels(names)]
-    yield Bars(
-        "Injected network impairments",
-        if_empty=NO_IMPAIRMENTS,
-        rows=rows,
-        names=ImpairedLink,
-        colours=COLOURS[ImpairedLink],
-    )
-
-
-def histories(events: Iterable[LinkEvent], zero_ns: int) -> dict[str, History]:
-    """Return (time in s, state from then on) of each direction that was ever impaired.
-
-    A partition outweighs all other impairments (`shared.config.impairment.Direction`).
-    """
-    found: dict[str, list[tuple[float, ImpairedLink]]] = defaultdict(list)
-    active: dict[str, dict[int, bool]] = defaultdict(dict)
-    for event in events:
-        cuts = active[event.link]
-        if event.active:
-            cuts[event.number] = event.partition
-        else:
-            cuts.pop(event.number, None)
-        state = ImpairedLink.IMPAIRED if cuts else ImpairedLink.CLEAR
-        state = ImpairedLink.CUT if any(cuts.values()) else state
-        found[event.link].append(((event.t_ns - zero_ns) / NS_PER_S, state))
-    return {name: tuple(history) for name, history in found.items()}
-
-
-def _labels(names: Iterable[str]) -> list[str]:
-    """Return short labels: the largest groups that the directions cover, then the rest."""
-    left, found = set(names), []
-    for group, members in sorted(GROUPS.items(), key=lambda item: -len(item[1])):
-        if set(members) <= left:
-            found.append(group)
-            left -= set(members)
-    return [_short(name) for name in (*found, *sorted(left))]
-
-
-def _short(name: str) -> str:
-    sender, arrow, receiver = name.partition("->")
-    if not arrow:
-        return name
-    return f"to {receiver}" if sender == "planner" else f"from {sender}"
-
-
-def harness(run: RunData) -> Iterator[Panel]:
-    """Yield the measured wrench of the operator on the torso."""
-    t = run.times(topics.WRENCH)
-    note = "Wrench of the operator on the torso, at the harness point, torso axes."
-    for name, unit in (("force", "N"), ("moment", "N m")):
-        lines = _components(XYZ, t, run.wide(topics.WRENCH, name, 3))
-        yield Plot(f"Harness {name}", unit, note, NO_HARNESS, lines=lines)
-
-
-def heat(run: RunData) -> Iterator[Panel]:
-    """Yield the estimated temperature of each module's warmer winding, and the seconds left."""
+def _ages(run: RunData) -> Panel:
+    """Return the age of each module's newest command."""
     lines = []
     for number, module in enumerate(MODULES):
-        celsius = run.wide(topics.JOINT_STATE, "celsius", 2, module)
-        if celsius.any():
-            t = run.times(topics.JOINT_STATE, module)
-            lines.append(Line(module, t, celsius.max(axis=1), number))
-    limits = []
-    if run.robot is not None and run.robot.heat.estimate:
-        limits = [LevelLine(run.robot.heat.winding_max, "limit", shown=False)]
-    yield Plot(
-        "Warmest winding", "C", "Estimated from torque and time; the warmer of a module's motors.",
-        "no estimate in this log", lines=lines, limits=limits,
-    )  # fmt: skip
-    t = run.times(topics.PLANNER_STATUS)
-    (left,) = run.columns(topics.PLANNER_STATUS, "", "heat_left_s")
-    left[left < 0.0] = np.nan
-    known = bool(np.isfinite(left).any())
-    yield Plot(
-        "Left at this load", "s", "Until a winding or an output stage is too warm; 3600: or more.",
-        "no estimate in this log", lines=[Line("least of all", t, left, 0)] if known else [],
+        (age_ns,) = run.columns(topics.JOINT_STATE, module, "age_ns")
+        age_ms = np.where(age_ns < 0.0, np.nan, age_ns) / NS_PER_MS
+        lines.append(Line(module, run.times(topics.JOINT_STATE, module), age_ms, number))
+    most_ms = run.robot.joint_service.max_command_age_ms if run.robot is not None else AGE_MAX_MS
+    return Panel(
+        "Command age", "ms", "Of the command in use, by each joint service's own clock.",
+        lines=lines,
+        levels=[Level(most_ms, "HOLD", shown=True)],
+        reach=AGE_REACH * most_ms,
     )  # fmt: skip
 
 
-def certificate(run: RunData) -> Iterator[Panel]:
-    """Yield the stability margins of the active gains and the least allowed margins."""
+def _torques(run: RunData) -> Panel:
+    """Return the torque of each module against its limit."""
+    lines = []
+    most = run.robot.joint.tau_module_max if run.robot is not None else np.inf
+    for number, module in enumerate(MODULES):
+        tau = np.abs(run.wide(topics.JOINT_STATE, "tau", 2, module)).sum(axis=1)
+        limit = Beyond(f"at the limit of {most:g} N m", TORQUE_DURATION_MIN_S)
+        beyond = {limit: tau >= AT_LIMIT * most}
+        t = run.times(topics.JOINT_STATE, module)
+        lines.append(Line(module, t, tau, number, beyond=beyond))
+    return Panel(
+        "Torque of each module", "N m",
+        "|tau_phi| + |tau_theta|: both motors of a module act along one axis.",
+        lines=lines,
+        levels=[Level(most, "limit")] if np.isfinite(most) else [],
+    )  # fmt: skip
+
+
+def _certificate(run: RunData) -> Panel:
+    """Return the stability margins of the active gains and the least allowed margins."""
     t = run.times(topics.PLANNER_STATUS)
-    service, onboard = run.columns(topics.PLANNER_STATUS, "", "margin", "margin_onboard")
-    service[_waits(run)] = onboard[_waits(run)] = np.nan
-    limits = [LevelLine(0.0, "unstable")]
-    if run.robot is not None:
-        least = run.robot.certificate
-        limits += [
-            LevelLine(least.margin_min, "least, services"),
-            LevelLine(least.onboard_margin_min, "least, drives"),
-        ]
-    yield Plot(
+    mode, *margins = run.columns(topics.PLANNER_STATUS, "", "mode", "margin", "margin_onboard")
+    levels, lines = [Level(0.0, "unstable", shown=True)], []
+    for number, (label, margin) in enumerate(zip(("services", "drives"), margins, strict=True)):
+        margin[_waits(run)] = np.nan
+        beyond = WITHOUT_LIMIT
+        if run.robot is not None:
+            certificate = run.robot.certificate
+            least = (certificate.margin_min, certificate.onboard_margin_min)[number]
+            levels.append(Level(least, f"least, {label}", shown=True))
+            is_led = mode != PlannerMode.MISPLACED
+            beyond = {Beyond(f"under {least:g}"): (margin < least) & is_led}
+        name = "joint services alone" if number == 0 else "drives alone"
+        lines.append(Line(name, t, margin, number, beyond=beyond))
+    return Panel(
         "Certificate margin",
         note="Stability without the planner: 1 is the required stiffness, at 0 the robot falls.",
-        if_empty=NO_PLANNER,
-        lines=[Line("joint services alone", t, service, 0), Line("drives alone", t, onboard, 1)],
-        limits=limits,
+        lines=lines,
+        levels=levels,
     )
 
 
-def _components(names: Iterable[str], t: Array, values: Array) -> list[Line]:
-    return [Line(name, t, values[:, number], number) for number, name in enumerate(names)]
+class _Judged:
+    """Times of `sim/truth` that the verdict judges, and by which limits."""
+
+    def __init__(self, run: RunData) -> None:
+        rows = run.log.messages(topics.SIM_TRUTH)
+        times_ns = np.array([row.t_ns for row in rows], dtype=np.int64)
+        self._led = self._held = np.zeros(len(rows), dtype=bool)
+        if run.course is not None:
+            begin_ns, end_ns = run.course.rows[0].t_ns, run.course.rows[-1].t_ns
+            judged = (times_ns >= begin_ns) & (times_ns <= end_ns)
+            changes = [row for m in MODULES for row in run.log.messages(topics.JOINT_EVENT, m)]
+            events = run.log.messages(topics.RUN_EVENT)
+            judged &= ~stalls.inside(stalls.disturbances(events, changes, end_ns), times_ns)
+            led = leading(run.log, times_ns)
+            self._led, self._held = led & judged, ~led & judged
+
+    def beyond(self, values: Array, led_key: str, held_key: str = "") -> Beyonds:
+        """Return where values are beyond their limits of the verdict; an empty key: no limit."""
+        found = {}
+        for key, mask, when in ((led_key, self._led, "led"), (held_key, self._held, "held")):
+            if key:
+                row = BY_KEY[key]
+                limit = Beyond(f"over {row.limit:g} {row.unit} while {when}")
+                found[limit] = mask & (np.abs(values) > row.limit)
+        return found
 
 
-def _leading_limits(key: str, label: str) -> list[LevelLine]:
+def _both_signs(key: str, label: str) -> list[Level]:
     """Return a limit of the verdict for both signs; visible once a line comes close."""
     most = BY_KEY[key].limit
-    return [LevelLine(most, label, shown=False), LevelLine(-most, label, shown=False)]
+    return [Level(most, label), Level(-most, label)]
 
 
 def _waits(run: RunData) -> NDArray[np.bool_]:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import io
 import json
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from datetime import datetime
+from html import escape
 from typing import Any, Final, NamedTuple
 
 from shared.bus import topics
@@ -18,17 +19,11 @@ from shared.text_file import decoded
 from tools.judge import verdict, verdict_table
 from tools.judge.reports.run_data import RunData
 from tools.judge.verdict import Summary
-from tools.logs.run_log import RunLog
 from tools.terminal import Console
-
-REAL_TIME_ONLY: Final = ("pd_cycles_late_pct", "planner_tick_us")
-"""Figures without a meaning in virtual time."""
 
 MACHINE: Final = {
     "python": "Python", "platform": "platform", "cpu_model": "CPU", "cpu_count": "CPUs",
 }  # fmt: skip
-
-
 INCOMPLETE: Final = "incomplete: the recorder did not close the file"
 
 
@@ -44,16 +39,6 @@ class RunVerdict(NamedTuple):
     """Reason not to trust the figures."""
 
 
-class TopicLoss(NamedTuple):
-    """Recorded and lost messages of one topic."""
-
-    name: str
-    rate_hz: float | None
-    """Mean rate from the first to the last message."""
-    nominal_hz: float
-    counted: KeyCount
-
-
 class Judge:
     """Judges a run in the words of the command that made it, from its parts in their order."""
 
@@ -61,8 +46,8 @@ class Judge:
         self._summaries: list[Summary] = []
         self._why_not = ""
 
-    def add(self, run: RunData) -> None:
-        """Add a run, or the next part of it."""
+    def add(self, run: RunData, counts: dict[str, KeyCount]) -> None:
+        """Add a run, or the next part of it; `counts` are of all messages up to its end."""
         if run.course is None:
             self._why_not = self._why_not or run.without_course
             return
@@ -70,46 +55,58 @@ class Judge:
             planned = _scenario_of(run).get("duration")
             last_s = float(run.course.t[-1])
             duration_s = float(planned) if isinstance(planned, int | float) else last_s
-            self._summaries.append(verdict.summarise(run.log, duration_s))
+            self._summaries.append(verdict.summarise(run.log, duration_s, counts))
         except XrlError as error:
             self._why_not = str(error)
 
-    def verdict(self, log: RunLog, counts: Iterable[KeyCount], *, whole: bool = True) -> RunVerdict:
+    def verdict(self, *, whole: bool = True) -> RunVerdict:
         """Return the verdict; a part of a run (`whole` is False) has figures alone."""
         if not self._summaries:
             return RunVerdict(f"No verdict: {self._why_not}", None, [])
-        summary = verdict.joined(self._summaries, counts)
-        if log.metadata["run"].get("lockstep"):
-            summary |= dict.fromkeys(REAL_TIME_ONLY) | {"in_real_time": True}
+        summary = verdict.merged(self._summaries)
+        rows = verdict_table.rows(summary)
         if not whole:
-            return RunVerdict(
-                "A part of a run, and its figures: no verdict", None, verdict_table.rows(summary)
-            )
-        lines = _verdict_lines(summary)
+            return RunVerdict("A part of a run, and its figures: no verdict", None, rows)
+        text = io.StringIO()
+        console = Console(file=text, width=200, color_system=None, soft_wrap=True)
+        verdict_table.show(summary, console)
+        lines = [line.strip() for line in text.getvalue().strip().splitlines()]
         cautions = verdict_table.stalls(summary)
-        cautions += [] if summary["in_real_time"] else [lines[-2]]
+        cautions += [] if summary.in_real_time else [lines[-2]]
         caution = " ".join(f"{line.rstrip('.')}." for line in cautions)
-        return RunVerdict(lines[-1], bool(summary["sound"]), verdict_table.rows(summary), caution)
+        return RunVerdict(lines[-1], summary.sound, rows, caution)
 
 
 def _scenario_of(run: RunData) -> dict[str, Any]:
     """Return the scenario of a run; nothing if the log has none that can be read."""
-    raw = run.log.attachments.get("scenario.toml", b"")
     try:
-        return tomllib.loads(decoded(raw))
+        return tomllib.loads(decoded(run.log.attachments.get("scenario.toml", b"")))
     except (ValueError, RecursionError):
         return {}
 
 
-def _verdict_lines(summary: Summary) -> list[str]:
-    """Return the printed lines of the verdict; the last line is the verdict itself."""
-    text = io.StringIO()
-    console = Console(file=text, width=200, color_system=None, soft_wrap=True)
-    verdict_table.show(summary, console)
-    return [line.strip() for line in text.getvalue().strip().splitlines()]
+def verdict_and_facts(run: RunData, found: RunVerdict, name: str) -> str:
+    """Return the head of the page."""
+    word = {True: "good", False: "bad", None: "none"}[found.good]
+    caution = f'<p class="caution">{escape(found.caution)}</p>' if found.caution else ""
+    table = ""
+    if found.rows:
+        marks = [mark for *_, mark in found.rows if mark]
+        over = sum(mark.startswith(verdict_table.OVER) for mark in marks)
+        count = f"{over} of {len(marks)} over" if over else f"all {len(marks)} ok"
+        cells = _table(("figure", "measured", "limit", ""), found.rows, numbers=(1, 2))
+        table = _details(f"Figures against their limits: {count}", cells, is_open=True)
+    facts = "".join(
+        f"<div><dt>{escape(key)}</dt><dd>{escape(value)}</dd></div>" for key, value in _facts(run)
+    )
+    return (
+        f"<header><h1>{escape(run.log.robot)}: {escape(name)}</h1>"
+        f'<p class="verdict {word}" id="verdict">{escape(found.sentence)}</p>{caution}'
+        f'<div class="head">{table}<dl>{facts}</dl></div></header>'
+    )
 
 
-def head(run: RunData) -> list[tuple[str, str]]:
+def _facts(run: RunData) -> list[tuple[str, str]]:
     """Return (name, value) of the facts that a reader needs first."""
     log, about = run.log, run.log.metadata["run"]
     begin, end = run.span
@@ -125,10 +122,9 @@ def head(run: RunData) -> list[tuple[str, str]]:
         ("git commit", about.get("git_commit", "") + changed),
         ("robot", log.robot),
         ("xrl", log.metadata.get("packages", {}).get("xrl", "")),
-        ("log version", about.get("schema_version", "")),
+        *((name, about.get(key, "")) for key, name in MACHINE.items()),
+        ("threads", _threads(about.get("thread_env", ""))),
     ]
-    rows += [(name, about.get(key, "")) for key, name in MACHINE.items()]
-    rows.append(("threads", _threads(about.get("thread_env", ""))))
     return [(name, value) for name, value in rows if value]
 
 
@@ -162,41 +158,78 @@ class MessageLosses:
         log.count_into(self.counts)
         for key in log.keys():  # noqa: SIM118 - a log is no mapping
             times = [t_ns for t_ns, _, _ in log.raw(key) if log.holds(t_ns)]
-            if not times:
-                continue
-            first_ns, last_ns = min(times), max(times)
-            self._times_ns[key] = (self._times_ns.get(key, (first_ns, 0))[0], last_ns)
+            if times:
+                first_ns, last_ns = min(times), max(times)
+                self._times_ns[key] = (self._times_ns.get(key, (first_ns, 0))[0], last_ns)
 
-    def rows(self, robot: str) -> list[TopicLoss]:
-        """Return a row for each topic that has messages."""
-        known, rows = topics.all_keys(robot), []
+    def html(self, run: RunData) -> str:
+        """Return a table with a row for each topic that has messages, and the file's damage."""
+        log = run.log
+        known, cells = topics.all_keys(log.robot), []
         for key, count in sorted((key, one) for key, one in self.counts.items() if one.count):
             first_ns, last_ns = self._times_ns[key]
             span_s = (last_ns - first_ns) / NS_PER_S
             nominal_hz = known[key].rate_hz if key in known else 0.0
-            rate = (count.count - 1) / span_s if nominal_hz > 0.0 and span_s > 0.0 else None
-            name = key.removeprefix(f"xrl/{robot}/")
-            rows.append(TopicLoss(name, rate, nominal_hz, count))
-        return rows
+            rate = f"{(count.count - 1) / span_s:.1f}" if nominal_hz and span_s > 0.0 else ""
+            cells.append((
+                key.removeprefix(f"xrl/{log.robot}/"), str(count.count), rate,
+                f"{nominal_hz:g}" if nominal_hz else "",
+                *map(str, (count.missing, count.gaps, count.restarts)),
+            ))  # fmt: skip
+        damage = []
+        if log.damage or not log.complete:
+            damage = describe_lost(log.cut, log.damage, finished=log.complete)
+        missing = sum(one.missing for one in self.counts.values())
+        title = (
+            f"Messages: {missing} lost on the way to the log" if missing else "Messages: none lost"
+        )
+        names = ("topic", "messages", "Hz", "nominal Hz", "lost", "gaps", "restarts")
+        lines = "".join(f"<li>{escape(line)}</li>" for line in damage)
+        body = (f"<ul>{lines}</ul>" if damage else "") + _table(names, cells, numbers=range(1, 7))
+        is_open = bool(missing or damage)
+        return f'<section id="lost">{_details(title, body, is_open=is_open)}</section>'
 
 
-def damage(run: RunData) -> list[str]:
-    """Return the unreadable parts of the file, one line each."""
-    log = run.log
-    if log.complete and not log.damage:
-        return []
-    return describe_lost(log.cut, log.damage, finished=log.complete)
-
-
-def files(run: RunData) -> list[tuple[str, str]]:
-    """Return (name, text) of the input files of the run, from its log."""
+def inputs(run: RunData) -> str:
+    """Return the input files of the run, those written by people first, and its packages."""
     texts = {name: raw.decode(errors="replace") for name, raw in run.log.attachments.items()}
-    written = sorted(name for name in texts if name.endswith(".toml"))  # by people, so first
+    written = sorted(name for name in texts if name.endswith(".toml"))
     computed = sorted(name for name in texts if name.endswith(".json"))
-    return [(name, texts[name]) for name in (*written, *computed)]
+    parts = [_details(name, f"<pre>{escape(texts[name])}</pre>") for name in (*written, *computed)]
+    found: dict[str, str] = run.log.metadata.get("packages", {})
+    if found:
+        rows = sorted(found.items(), key=lambda row: row[0].lower())
+        parts.append(_details(f"{len(rows)} packages", _table(("package", "version"), rows)))
+    return f'<section id="inputs"><h2>Inputs of the run</h2>{"".join(parts)}</section>'
 
 
-def packages(run: RunData) -> list[tuple[str, str]]:
-    """Return (name, version) of all installed packages."""
-    found: dict[str, Any] = run.log.metadata.get("packages", {})
-    return sorted(found.items(), key=lambda row: row[0].lower())
+def _details(title: str, body: str, *, is_open: bool = False) -> str:
+    flag = " open" if is_open else ""
+    return f"<details{flag}><summary>{escape(title)}</summary>{body}</details>"
+
+
+def _table(
+    names: Sequence[str], rows: Iterable[Sequence[str]], *, numbers: Sequence[int] = ()
+) -> str:
+    """Return a table; the columns `numbers` are set as numbers, `ok` and `over` in colour."""
+    kinds = ["n" if column in numbers else "" for column in range(len(names))]
+    head = "".join(
+        f'<th scope="col" class="{kind}">{escape(name)}</th>'
+        for name, kind in zip(names, kinds, strict=True)
+    )
+    body = "".join(
+        "<tr>"
+        + "".join(
+            f'<td class="{kind or _word(value)}">{escape(value)}</td>'
+            for value, kind in zip(row, kinds, strict=True)
+        )
+        + "</tr>"
+        for row in rows
+    )
+    table = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+    return f'<div class="wide">{table}</div>'
+
+
+def _word(value: str) -> str:
+    word = value.partition(",")[0]
+    return word if word in (verdict_table.OK, verdict_table.OVER) else ""

@@ -210,7 +210,7 @@ FACTS: Final = {
     "architecture": "architecture", "cpu_model": "CPU", "libc": "libc", "python": "Python",
 }  # fmt: skip
 """Facts of `run` by which numbers may differ, with their names in a sentence."""
-NUMERIC_PACKAGES: Final = ("casadi", "msgspec", "numpy", "pin", "scipy")
+NUMERIC_PACKAGES: Final = ("casadi", "msgspec", "numpy", "pin")
 """Packages with which planner and joint services compute."""
 CHANGED: Final = " with changes"
 """After a commit: the checkout has it and more, so two of them may differ."""

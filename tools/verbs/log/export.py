@@ -1,4 +1,4 @@
-"""`xrl log export`: a run for others: a 3-D scene in it, a picture, tables, a bag of ROS 2."""
+"""`xrl log export`: a run for others: a picture, tables, a bag of ROS 2."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from rich.progress import Progress
 
 from shared.exceptions import RunError
 from shared.extras import require
-from shared.mcap_log.files import SUFFIX
-from shared.mcap_log.log_copy import write_extended
 from shared.places import FILES
 from tools.export.folders import whole_folder
 from tools.export.tables import (
@@ -23,16 +21,14 @@ from tools.export.tables import (
     write_grid,
     write_tables,
 )
-from tools.flags import RUN_HELP, Arg, Folder, Rate, option, positional
-from tools.judge.reports import scene
+from tools.flags import RUN_HELP, Arg, Folder, Rate, positional
 from tools.judge.run_parts import PartFlags, part_of
 from tools.logs.run_index import RunIndex
-from tools.logs.run_log import SEE_INFO, RunLog, RunPart, parts_of, read_part, robot_of
+from tools.logs.run_log import SEE_INFO, RunLog, RunPart, read_part, robot_of
 from tools.output import progress_along, refuse_taken, write_atomically
 from tools.terminal import Console, marked
 from tools.topic_keys import keys_named
 
-SCENE_SUFFIX: Final = ".scene" + SUFFIX
 LAYOUT: Final = FILES / "foxglove" / "xrl.json"
 """For a robot of this name; `--layout` writes it for the name in the log."""
 LAYOUT_ROBOT: Final = "xrl"
@@ -41,8 +37,7 @@ BAG_RATE_HZ: Final = 100.0
 
 
 EXAMPLES: Final = """
-xrl log export out/a/run.mcap --scene
-xrl log export out/a/run.mcap --scene -o shown.mcap --layout layout.json
+xrl log export out/a/run.mcap --layout layout.json
 xrl log export out/a/run.mcap --gif squat.gif     # the robot moving, from side and front
 xrl log export out/a/run.mcap --gif shove.gif --from 5 --to 9
 xrl log export out/a/run.mcap --gif fig7.gif --curves     # with curves, as the paper's Fig. 7
@@ -56,11 +51,6 @@ class ExportFlags(PartFlags):
     """Which run, and what is made of it."""
 
     file: Annotated[Path, positional("FILE", help=f"{RUN_HELP}; it is not touched")]
-    scene: bool = False
-    """copy it with frames, bodies and forces at 30 Hz, for the 3-D views of Foxglove (all of it)
-    and Rerun (frames and bodies)"""
-    out: Annotated[Path | None, option("-o", "--out", metavar="OUT")] = None
-    """where the copy goes (default: NAME.scene.mcap beside the record)"""
     layout: Path | None = None
     """also write Foxglove's layout for this robot's name (that for `xrl` is shipped,
     deploy/foxglove/xrl.json)"""
@@ -90,9 +80,9 @@ class ExportFlags(PartFlags):
         """Refuse nothing to write, and what goes with something that is not written."""
         super().check()
         tables = self.csv is not None or self.parquet is not None
-        if not (self.scene or self.layout or self.gif or tables or self.ros2bag):
+        if not (self.layout or self.gif or tables or self.ros2bag):
             raise RunError(
-                "say what to write: --scene, --layout FILE, --gif FILE, --csv DIR, --parquet DIR, "
+                "say what to write: --layout FILE, --gif FILE, --csv DIR, --parquet DIR, "
                 "--ros2bag DIR, or several of them"
             )
         if self.topic and not tables:
@@ -109,7 +99,6 @@ def run(flags: ExportFlags) -> int:
         (flags.csv, CsvFile), (flags.parquet, ParquetFile),
     ]  # fmt: skip
     for extra, wanted, otherwise in (
-        ("foxglove", flags.scene, ""),
         ("plot", flags.gif, ""),
         ("parquet", flags.parquet, "take --csv"),
         ("ros2", flags.ros2bag, ""),
@@ -117,16 +106,9 @@ def run(flags: ExportFlags) -> int:
         if wanted:
             require(extra, otherwise)
     path = flags.file
-    if path.is_dir() and flags.scene:
-        raise RunError(f"{path}: is a directory; give --scene one of its files")
     index = RunIndex(path)
     part = part_of(flags, index)
     console = Console()
-    if flags.scene:
-        out = flags.out or path.with_name(path.name.removesuffix(SUFFIX) + SCENE_SUFFIX)
-        refuse_taken(out, path, force=flags.force)
-        count = export_scene(index, out)
-        console.print(marked("[bold]{}[/]: {} messages", out, count), soft_wrap=True)
     if flags.gif is not None:
         refuse_taken(flags.gif, path, force=flags.force)
         _draw(read_part(index, part), flags.gif, console, with_curves=flags.curves)
@@ -199,14 +181,6 @@ def _draw(log: RunLog, out: Path, console: Console, *, with_curves: bool) -> Non
             with_curves=with_curves,
         )  # fmt: skip
     console.print(marked("[bold]{}[/]: {} frames", out, count), soft_wrap=True)
-
-
-def export_scene(index: RunIndex, out: Path) -> int:
-    """Write a copy of a log with its scene, with progress; return how many messages it has."""
-    robot = robot_of(index)
-    with progress_along("copying", index.length_s) as done:
-        found = scene.messages(parts_of(index, done=done), robot)
-        return write_extended(index.path, out, scene.channels(index.robot), found)
 
 
 def layout_for(robot: str) -> dict[str, Any]:

@@ -25,10 +25,9 @@ from shared.mcap_log.writer import SCHEMA_VERSION
 from tools.flags import Arg, Flags, option, positional
 from tools.guarded_streams import printable
 from tools.judge.run_parts import zero_ns
-from tools.logs.host_clocks import HostClocks
 from tools.logs.impairment_intervals import impairments
 from tools.logs.run_index import RunIndex, files_in, files_of_run
-from tools.logs.run_log import NOTHING, RunLog, clocks_of
+from tools.logs.run_log import NOTHING, RunLog
 from tools.logs.survey import FileFacts, Survey, TopicFacts
 from tools.terminal import Console, marked
 
@@ -101,7 +100,6 @@ def as_json(survey: Survey, run_files: list[Path]) -> dict[str, Any]:
         "start_ns": survey.first_ns if survey.messages else None,
         "duration_s": _seconds(survey.first_ns, survey.last_ns) if survey.messages else None,
         "messages": survey.messages,
-        "clocks": _clocks_as_json(survey.files[0]),
         "topics": {
             name: {
                 "schema": topic.schema,
@@ -201,9 +199,8 @@ def _show_run(survey: Survey, console: Console) -> None:
         grid.add_row(
             "version", f"{printable(version) or 'unknown'}; this code writes {SCHEMA_VERSION}"
         )
-    for label, lines in (("injected", _injected(survey)), ("clocks", _clocks(file))):
-        for number, line in enumerate(lines):
-            grid.add_row("" if number else label, printable(line))
+    for number, line in enumerate(_injected(survey)):
+        grid.add_row("" if number else "injected", printable(line))
     console.print(grid)
 
 
@@ -232,27 +229,6 @@ def _injected(survey: Survey) -> list[str]:
     if more > 0:
         lines[INJECTED_MAX:] = [f"and {more} more"]
     return [line + since for line in lines[:1]] + lines[1:]
-
-
-def _clocks(file: FileFacts) -> list[str]:
-    """Return a line for each host of a run on several: what brings its times to the recorder's."""
-    try:
-        clocks = _clocks_of(file)
-    except XrlError as error:
-        return [str(error)]
-    return [] if clocks is None else clocks.describe()
-
-
-def _clocks_as_json(file: FileFacts) -> dict[str, Any]:
-    try:
-        clocks = _clocks_of(file)
-    except XrlError as error:
-        return {"error": str(error)}
-    return {} if clocks is None else clocks.as_json()
-
-
-def _clocks_of(file: FileFacts) -> HostClocks | None:
-    return clocks_of(RunIndex(file.path)) if file.ours else None
 
 
 def _table(found: dict[str, TopicFacts], prefix: str, *, events: bool) -> Table:

@@ -40,7 +40,7 @@ from tools.lab.studies.sweeps.figures import (
 )
 from tools.lab.studies.sweeps.push_range import SHARE, PushRange, uniform
 from tools.lab.studies.sweeps.table import plain
-from tools.sim.centralised.fleet import CentralisedLockstep
+from tools.sim.centralised import CentralisedLockstep
 from tools.sim.lockstep import Lockstep
 from tools.sim.virtual_time import Record
 

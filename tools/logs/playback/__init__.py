@@ -1,1 +1,0 @@
-"""Parts of `xrl log play`: guard, reading, selection, schedule, player."""
