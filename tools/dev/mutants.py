@@ -77,7 +77,7 @@ class MutantsFile(Section, frozen=True):
     reason: tuple[Reason, ...] = ()
 
 
-class GroupResult(NamedTuple):
+class _GroupResult(NamedTuple):
     """What became of a group."""
 
     counts: Counter[str]
@@ -125,7 +125,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _run(group: Group, args: argparse.Namespace, console: Console) -> GroupResult:
+def _run(group: Group, args: argparse.Namespace, console: Console) -> _GroupResult:
     folder = args.out.resolve() / group.name
     if not args.resume and folder.exists():
         shutil.rmtree(folder)
@@ -136,11 +136,11 @@ def _run(group: Group, args: argparse.Namespace, console: Console) -> GroupResul
     _mutmut_run(folder, ["--max-children", str(args.children), *[SAMPLE] * args.sample])
     ran = [row for row in _statuses(folder) if row[1] != UNTRIED]
     alive = [
-        (name, change_of(name, _mutmut(folder, "show", name)))
+        (name, _change_of(name, _mutmut(folder, "show", name)))
         for name, status in ran
         if status not in DEAD
     ]
-    return GroupResult(Counter(status for _, status in ran), alive)
+    return _GroupResult(Counter(status for _, status in ran), alive)
 
 
 def _prepare(group: Group, folder: Path) -> None:
@@ -207,7 +207,7 @@ def _statuses(folder: Path) -> list[tuple[str, str]]:
     return [(name, status) for name, _, status in pairs]
 
 
-def change_of(name: str, shown: str) -> Mutation:
+def _change_of(name: str, shown: str) -> Mutation:
     """Return what a mutant changes."""
     lines = [line for line in shown.splitlines() if not line.startswith(("---", "+++"))]
     was, becomes = (
@@ -217,7 +217,7 @@ def change_of(name: str, shown: str) -> Mutation:
 
 
 def _judge(
-    groups: Sequence[GroupResult], allowed: MutantsFile, args: argparse.Namespace, console: Console
+    groups: Sequence[_GroupResult], allowed: MutantsFile, args: argparse.Namespace, console: Console
 ) -> int:
     counts = sum((found.counts for found in groups), Counter[str]())
     total, dead = counts.total(), sum(counts[word] for word in DEAD)

@@ -329,11 +329,11 @@ def read_status(
             for module in MODULES
             if module in monitors
         },
-        lead=lead_status(newest.get(PLANNER)),
+        lead=_lead_status(newest.get(PLANNER)),
         network=impairments(fleet),
         pace=pace(),
         security=bus.mode,
-        tools=tools_of(roster),
+        tools=_tools_of(roster),
         trouble=(*_trouble_of(fleet, infos), *recorder),
         bus_faults=bus.describe({row.name: row.pid for row in infos if row.pid is not None}),
     )
@@ -431,7 +431,7 @@ def module_status(
     )
 
 
-def lead_status(message: Message | None) -> LeadStatus | None:
+def _lead_status(message: Message | None) -> LeadStatus | None:
     """Return the planner's state from its newest status."""
     if not isinstance(message, PlannerStatus):
         return None
@@ -439,7 +439,7 @@ def lead_status(message: Message | None) -> LeadStatus | None:
     return LeadStatus(mode, message.wait_s, message.margin, reason_of(message), message.session)
 
 
-def tools_of(message: Message | None) -> tuple[str, ...]:
+def _tools_of(message: Message | None) -> tuple[str, ...]:
     """Return the tools that are linked, but for this process, from the recorder's newest roster."""
     own = f".{place_of_tool()}"
     if not isinstance(message, ToolRoster):
