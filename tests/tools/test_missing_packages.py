@@ -31,6 +31,8 @@ from tools.verbs import doctor
         ("view OUT", "view"),
         ("view --sim", "sim"),
         ("view --foxglove", "foxglove"),
+        ("up --run-dir run --out o", "sim"),
+        ("up --run-dir run --out o --no-sim --ros2", "ros2"),
         ("up --view", "view"),
         ("log export OUT --gif a.gif", "plot"),
         ("log export OUT --ros2bag bag", "ros2"),
@@ -75,21 +77,6 @@ def test_a_verb_whose_package_cannot_be_imported_gives_the_packages_remedy_in_on
     )
     assert done.stderr.count("\n") == 1
     assert [file.name for file in tmp_path.iterdir()] == ["mujoco"]
-
-
-@pytest.mark.parametrize(("flags", "extra"), [([], "sim"), (["--no-sim", "--ros2"], "ros2")])
-def test_up_starts_no_service_without_its_packages(
-    flags: list[str],
-    extra: str,
-    monkeypatch: pytest.MonkeyPatch,
-    run_dir: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.setitem(sys.modules, EXTRAS[extra][0], None)
-    run = ["--run-dir", str(run_dir / "run"), "--out", str(run_dir / "out")]
-    assert cli.main(["up", *flags, *run]) == 2
-    assert f"the extra `{extra}` brings it" in capsys.readouterr().err
-    assert not (run_dir / "run").exists()
 
 
 def test_doctor_tells_in_a_row_that_no_settings_are_read_without_the_package_for_usb(
