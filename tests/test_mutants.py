@@ -16,16 +16,16 @@ from tools.dev.mutants import (
     FILE,
     ROOT,
     Group,
-    GroupResult,
     MutantsFile,
     Mutation,
     Reason,
-    change_of,
+    _change_of,
+    _GroupResult,
 )
 from tools.terminal import Console
 
-DIFF = """--- services/joint/torque_limiter.py
-+++ services/joint/torque_limiter.py
+DIFF = """--- services/joint/differential.py
++++ services/joint/differential.py
 @@ -1,5 +1,5 @@
  def _soft_stop(q: float, stops: Pair) -> float:
 -    if q < stops[0]:
@@ -33,7 +33,7 @@ DIFF = """--- services/joint/torque_limiter.py
          return STIFFNESS * (stops[0] - q)
 """
 LIVES = Mutation(
-    "services.joint.torque_limiter.x__soft_stop", "if q < stops[0]:", "if q <= stops[0]:"
+    "services.joint.differential.x__soft_stop", "if q < stops[0]:", "if q <= stops[0]:"
 )
 WHY = "at the stop itself the spring pulls by nothing"
 
@@ -65,17 +65,17 @@ def test_each_mutant_that_may_live_is_of_a_function_that_is_there(told: MutantsF
 
 
 def test_a_mutant_is_known_by_its_function_and_its_lines() -> None:
-    assert change_of("services.joint.torque_limiter.x__soft_stop__mutmut_1", DIFF) == LIVES
+    assert _change_of("services.joint.differential.x__soft_stop__mutmut_1", DIFF) == LIVES
 
 
 def judged(alive: int, listed: tuple[Mutation, ...], **asked: object) -> tuple[int, str]:
     """Return exit code and words for 100 mutants of which some live, each by the same change."""
-    found = GroupResult(Counter(killed=100 - alive, survived=alive), [("one", LIVES)] * alive)
+    found = _GroupResult(Counter(killed=100 - alive, survived=alive), [("one", LIVES)] * alive)
     told = MutantsFile(
         group=(Group(name="a", modules=(), tests=()),),
         reason=(Reason(why=WHY, lives=listed),) if listed else (),
     )
-    flags = {"only": None, "sample": False, "survivors": False, "group": None}
+    flags = {"sample": False, "group": None}
     console = Console(record=True, width=200)
     code = mutants._judge([found], told, argparse.Namespace(**(flags | asked)), console)
     return code, console.export_text()

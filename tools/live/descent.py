@@ -80,7 +80,7 @@ class Phase(Enum):
     RESTING = "holds at its lowest pose"
 
 
-class LegLoad:
+class _LegLoad:
     """How much of the torso's weight the legs bear, by the joints' torques."""
 
     def __init__(self, robot: RobotConfig) -> None:
@@ -123,7 +123,7 @@ class Descent:
 
     def __init__(self, robot: RobotConfig, wait_s: float) -> None:
         """Begin with a look; at rest wait `wait_s` for the weight to be taken."""
-        self._load, self._wait_s = LegLoad(robot), wait_s
+        self._load, self._wait_s = _LegLoad(robot), wait_s
         self._stop = robot.joint_service.damp_knee_stop
         self._fade_s = robot.joint_service.damp_fade_s
         self.phase = Phase.LOOKING

@@ -110,7 +110,7 @@ def run(flags: LeadFlags) -> int:
         pad = Gamepad(find_pad(flags.pad), hold=flags.hold, stop=flags.stop)
     console = Console()
     with open_session(robot, "lead", fleet.run.path) as session:
-        leader = Leader(robot, session, simulated="simulator" in fleet.manifest.services)
+        leader = _Leader(robot, session, simulated="simulator" in fleet.manifest.services)
         ended = _by_pad(pad, leader, console) if pad is not None else _by_keys(leader, console)
         if ended is not Key.STOP:
             console.print(f"let go: the hand stays, assist fades out in {robot.assist.fade_s:g} s")
@@ -141,7 +141,7 @@ def _ask(robot: RobotConfig, run_dir: Path, assist_n: float, flags: LeadFlags) -
     return 0
 
 
-class Leader:
+class _Leader:
     """Sends where a person leads."""
 
     def __init__(self, robot: RobotConfig, session: Session, *, simulated: bool) -> None:
@@ -203,7 +203,7 @@ class Leader:
         return self._last
 
 
-def _by_pad(pad: Gamepad, leader: Leader, console: Console) -> Key | None:
+def _by_pad(pad: Gamepad, leader: _Leader, console: Console) -> Key | None:
     """Lead by a pad until it is over; STOP if it was the stop."""
     console.print(f"{pad.name}: hold the dead man's button and move the sticks; Ctrl-C ends it")
     settling = time.monotonic() + SETTLE_S
@@ -232,7 +232,7 @@ def _by_pad(pad: Gamepad, leader: Leader, console: Console) -> Key | None:
     return None
 
 
-def _by_keys(leader: Leader, console: Console) -> Key | None:
+def _by_keys(leader: _Leader, console: Console) -> Key | None:
     """Lead by keys until it is over; STOP if it was the stop."""
     stop = StopFlag()
     with Keyboard(KEYS) as keyboard:
@@ -248,7 +248,7 @@ def _by_keys(leader: Leader, console: Console) -> Key | None:
                 if Key.QUIT in presses:
                     return None
                 now = time.monotonic()
-                leader.lead(deflection_of(presses), min(now - last, KEY_HELD_S))
+                leader.lead(_deflection_of(presses), min(now - last, KEY_HELD_S))
                 last = now
                 shown.update(leader.describe("led"))
         if not keyboard.present:
@@ -256,7 +256,7 @@ def _by_keys(leader: Leader, console: Console) -> Key | None:
     return None
 
 
-def deflection_of(presses: Sequence[Key]) -> Deflection:
+def _deflection_of(presses: Sequence[Key]) -> Deflection:
     """Return what several keys ask for together; however often one is repeated, at most full."""
     parts = [sum(float(press.value[axis]) for press in presses) for axis in range(3)]
     height, pitch, assist = (max(-1.0, min(1.0, part)) for part in parts)

@@ -18,7 +18,7 @@ from shared.robot.robot_model import stand_pose
 from tests.messages import joint_state, planner_status
 from tools.fleet import procfs
 from tools.live import descent
-from tools.live.descent import HEARD_S, LIGHT_S, PATIENCE_S, STALLED_S, Ask, Descent, LegLoad
+from tools.live.descent import HEARD_S, LIGHT_S, PATIENCE_S, STALLED_S, Ask, Descent, _LegLoad
 from tools.verbs import down
 from tools.verbs.down import DownFlags
 
@@ -46,7 +46,7 @@ def limp(robot: RobotConfig) -> States:
 
 
 def test_a_stand_bears_the_torsos_weight_and_a_limp_robot_none(robot: RobotConfig) -> None:
-    load = LegLoad(robot)
+    load = _LegLoad(robot)
     assert load.fraction(stand(robot)) == pytest.approx(1.0, abs=0.15)
     assert load.fraction(stand(robot, scale=-0.2)) < 0.0, "its legs hang"
     assert load.fraction(limp(robot)) == 0.0
@@ -67,12 +67,12 @@ def test_a_stand_bears_the_torsos_weight_and_a_limp_robot_none(robot: RobotConfi
 def test_what_is_not_known_is_not_light(
     robot: RobotConfig, states: Callable[[RobotConfig], Sequence[JointState | None]]
 ) -> None:
-    assert not LegLoad(robot).fraction(states(robot)) < descent.LIGHT_FRACTION
+    assert not _LegLoad(robot).fraction(states(robot)) < descent.LIGHT_FRACTION
 
 
 def test_a_straight_leg_that_its_shin_pulls_straight_bears_nothing(robot: RobotConfig) -> None:
     pulled = stand(robot, 1.294, scale=-2.0 * descent.PULLED / KNEE_TORQUE)
-    assert LegLoad(robot).fraction(pulled) == 0.0
+    assert _LegLoad(robot).fraction(pulled) == 0.0
 
 
 def asked(
