@@ -23,8 +23,7 @@ from tests.planner.states import with_law
 from tests.robots import ROBOT
 from tools.lab.studies.sweeps import plants
 from tools.live.descent import LIGHT_FRACTION, Ask, Descent, Phase
-from tools.sim.lockstep import Lockstep
-from tools.sim.standing_start import begin_standing
+from tools.sim.lockstep import Lockstep, begin_standing
 
 AT_S = 0.3
 HEARD_S = 0.1

@@ -10,9 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.joint.drivers.base import DriveStatus
 from services.planner.watch.engagement_fsm import FORGET_NS, GRACE_NS, WAITS_NS, Engagement
-from shared.bus.messages import Mode, PlannerMode
+from shared.bus.messages import DriveStatus, Mode, PlannerMode
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES

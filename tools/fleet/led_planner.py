@@ -6,7 +6,7 @@ import os
 
 from shared.bus.messages import PlannerStatus
 from shared.config.scenarios import SCENARIO
-from shared.user import user_name
+from shared.places import user_name
 
 
 def asker(verb: str) -> str:

@@ -21,11 +21,18 @@ import msgspec
 from services.joint import pd_law
 from services.joint.differential import limit_differential, motor_torque
 from services.joint.drive_manager import ArmingInhibit, DriveAction, DriveCommand, DriveManager
-from services.joint.drivers.base import DriveReading, DriveStatus
+from services.joint.drivers.base import DriveReading
 from services.joint.neighbours import UNKNOWN, NeighbourView
 from services.planner.planner import Planner
 from services.planner.watch.engagement_fsm import Engagement
-from shared.bus.messages import JointCommand, JointState, Mode, PlannerMode, PlannerStatus
+from shared.bus.messages import (
+    DriveStatus,
+    JointCommand,
+    JointState,
+    Mode,
+    PlannerMode,
+    PlannerStatus,
+)
 from shared.clock import NS_PER_MS
 from shared.config.gain_schedule import believing
 from shared.config.robot_config import RobotConfig

@@ -30,7 +30,7 @@ from tools.live import experiment
 from tools.logs.hand_path import HandRow
 from tools.sim.centralised import CONTROLS, SHIPPED
 from tools.sim.lockstep import Watch
-from tools.sim.virtual_time import Record
+from tools.sim.virtual_services import Record
 
 Outcome = TypeVar("Outcome")
 AFTER_FALL_S: Final = 1.0
