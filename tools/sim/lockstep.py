@@ -35,6 +35,7 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import SCENARIO, Kill, Push, Restart, Scenario
 from shared.exceptions import RunError
 from shared.joints import MODULE_INDEX, MODULES
+from shared.state import copied
 from tools.logs.hand_path import HandRow
 from tools.sim.network import BASE, VirtualNetwork
 from tools.sim.virtual_drive import VirtualBus
@@ -246,7 +247,7 @@ class Lockstep:
         return FleetMoment(
             read_state(self.world, self.bank, self.now_ns, 0),
             {joint.name: joint.manager.snapshot() for joint in self.joints},
-            None if planner is None else (planner.session, planner.snapshot()),
+            None if planner is None else (planner.session, copied(planner.state)),
         )
 
     def resume(self, moment: FleetMoment) -> None:

@@ -33,6 +33,7 @@ from shared.can.loadcell_can import SampleAssembler
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
+from shared.state import copied
 from tools.sim.network import VirtualNetwork
 from tools.sim.virtual_drive import VirtualBus, VirtualDrive
 from tools.sim.virtual_time import HostClock, LinkInbox, Record, RecordOutbox, VirtualTime
@@ -282,7 +283,7 @@ class VirtualPlanner:
         self._session, state = start
         if self.planner is None or self.planner.session != self._session:
             self.planner = self._make(self._session)
-        self.planner.restore(state)
+        self.planner.state = copied(state)
 
 
 class VirtualCan(Generic[S]):

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import numpy as np
 
 from services.planner.law.small_matrices import positive_part
@@ -101,63 +102,50 @@ class PushIntegral:
         gain: rate of the force per error, N/(m s); 0: the direction is led, or the split the
             paper's. The dynamic certificate holds for any limit.
         most: the limit, N.
-        force: F_I, N.
     """
 
     def __init__(self, law: LawConfig) -> None:
-        """Start at rest."""
+        """Set rate and limit."""
         closed = law.split == "certified" and not law.S[Y]
         self.gain = law.K_p[Y] / law.push_integral_s if closed else 0.0
         self.most = law.push_integral_max if closed else 0.0
-        self.force = 0.0
 
-    def advance(self, error: float, rate: float, dt: float) -> None:
-        """Integrate for dt seconds, within the limit.
+    def after(self, force: float, error: float, rate: float, dt: float) -> float:
+        """Return F_I after dt seconds, N.
 
         Args:
+            force: F_I before, N.
             error: of y, m.
             rate: of the error, m/s.
             dt: time since the last tick, s.
         """
         slow = max(0.0, 1.0 - abs(rate) / FAST)
-        self.force = clamp(self.force + dt * slow * self.gain * error, -self.most, self.most)
+        return clamp(force + dt * slow * self.gain * error, -self.most, self.most)
 
 
-class CoupledTorque:
-    """tau_coupled: the body's request with its integral, through a low-pass with two equal poles.
+class CouplingState(msgspec.Struct):
+    """State of the coupled torque."""
 
-    Attributes:
-        integral: F_I.
+    first: tuple[float, ...] = (0.0,) * N_JOINTS
+    """Output of the low-pass's first pole, N m."""
+    second: tuple[float, ...] = (0.0,) * N_JOINTS
+    """Output of its second pole, N m."""
+    push: float = 0.0
+    """F_I, N."""
+
+
+def low_passed(s: CouplingState, tau: Array, bandwidth_hz: float, dt: float) -> Array:
+    """Return tau_coupled (12,), N m, after two equal poles: docs/law.md (18).
+
+    Args:
+        s: both poles, which change.
+        tau: unfiltered (12,), N m.
+        bandwidth_hz: of each pole.
+        dt: time since the last tick, s.
     """
-
-    def __init__(self, bandwidth_hz: float, integral: PushIntegral) -> None:
-        """Start at rest."""
-        self.integral = integral
-        self._bandwidth_hz = bandwidth_hz
-        self._first: Array = np.zeros(N_JOINTS)
-        self._second: Array = np.zeros(N_JOINTS)
-
-    def advance(self, tau: Array, dt: float) -> Array:
-        """Return the filtered torque (12,), N m: docs/law.md (18).
-
-        Args:
-            tau: unfiltered (12,), N m.
-            dt: time since the last tick, s.
-        """
-        gain = pole_gain(self._bandwidth_hz, dt)
-        self._first += gain * (tau - self._first)
-        self._second += gain * (self._first - self._second)
-        return self._second.copy()
-
-    def reset(self) -> None:
-        """Reset filter and integral to zero."""
-        self._first[:] = self._second[:] = self.integral.force = 0.0
-
-    def snapshot(self) -> tuple[float, ...]:
-        """Return both poles' states (24,), N m, and F_I, N."""
-        return (*self._first.tolist(), *self._second.tolist(), self.integral.force)
-
-    def restore(self, state: tuple[float, ...]) -> None:
-        """Continue from a state that `snapshot` returned; an old log knows no F_I."""
-        self._first[:], self._second[:] = state[:N_JOINTS], state[N_JOINTS : 2 * N_JOINTS]
-        self.integral.force = sum(state[2 * N_JOINTS :])
+    gain = pole_gain(bandwidth_hz, dt)
+    first, second = np.array(s.first), np.array(s.second)
+    first += gain * (tau - first)
+    second += gain * (first - second)
+    s.first, s.second = tuple(first.tolist()), tuple(second.tolist())
+    return second

@@ -25,7 +25,6 @@ from enum import IntEnum
 from typing import Final
 
 import msgspec
-import numpy as np
 
 from shared.arrays import Array
 from shared.bus.messages import Pair
@@ -104,6 +103,26 @@ class HeightState(msgspec.Struct, array_like=True):
     """F_lift, N, upwards at the COM."""
     moment: float = 0.0
     """M, N m, about the torso's pitch."""
+    T_z: float = 0.0
+    """Largest joint rate per unit of the height at the last reference, rad/m."""
+
+    @property
+    def is_active(self) -> bool:
+        """True while height and pitch are not wholly the person's, or a force or moment is left."""
+        return any(self.hold) or self.force > 0.0 or self.moment != 0.0
+
+    def apply(self, p_ref: Array, pdot_ref: Array) -> None:
+        """Close height and pitch in a reference p_ref (6,) and its rate pdot_ref (6,)."""
+        for row, hold, at, rate in zip(
+            _ROWS, self.hold, (self.height, self.pitch), (self.rate, 0.0), strict=True
+        ):
+            if hold > 0.0:
+                p_ref[row] += hold * (at - p_ref[row])
+                pdot_ref[row] += hold * (rate - pdot_ref[row])
+
+    def reset(self) -> None:
+        """End at once: the planner does not lead."""
+        self.hold, self.rate, self.force, self.moment = (0.0, 0.0), 0.0, 0.0, 0.0
 
 
 class HeightReference:
@@ -112,39 +131,32 @@ class HeightReference:
     def __init__(self, knees: Pair) -> None:
         """Take the ends of the knees' way, theta in rad: the lowest pose, the highest."""
         self._knees = knees
-        self.state = HeightState()
-
-    @property
-    def is_active(self) -> bool:
-        """True while height and pitch are not wholly the person's, or a force or moment is left."""
-        s = self.state
-        return any(s.hold) or s.force > 0.0 or s.moment != 0.0
 
     def advance(
         self,
+        s: HeightState,
         toward: Toward,
         released: Released,
         drive: float,
         p: Array,
         pdot: Array,
-        T_z: Array,
         knees: Pair,
         dt: float,
     ) -> Pair:
         """Advance by one tick; return the force, N, and the moment about pitch, N m.
 
         Args:
+            s: state of the closed directions, which changes.
             toward: where to.
             released: nobody leads the height, the pitch: closed where they are, if the robot goes
                 nowhere by itself.
             drive: moment that turns a torso which nobody leads, N m.
             p: measured pose (6,), m and rad.
             pdot: its rate (6,).
-            T_z: joint rates per unit of the height (12,), rad/m.
             knees: theta of both, rad.
             dt: time since the last tick, s.
         """
-        s, z, pitch = self.state, float(p[2]), float(p[4])
+        z, pitch = float(p[2]), float(p[4])
         wanted = 0.0
         closed = released
         if toward is not _PERSON:
@@ -166,7 +178,7 @@ class HeightReference:
             clamp(held_z + (step if closed[0] else -step), 0.0, 1.0),
             clamp(held_pitch + (step if closed[1] else -step), 0.0, 1.0),
         )
-        lead = min(LEAD_MAX, LEAD_ANGLE / max(float(np.abs(T_z).max()), 1.0))
+        lead = min(LEAD_MAX, LEAD_ANGLE / max(s.T_z, 1.0))
         if s.hold[0] > 0.0:
             step = dt * (STOPPING if toward is _PERSON else ACCELERATION)
             s.rate += clamp(wanted - s.rate, -step, step)
@@ -184,18 +196,3 @@ class HeightReference:
             fade = MOMENT_FADE_RATE * dt
             s.moment -= clamp(s.moment, -fade, fade)
         return s.force, s.moment
-
-    def apply(self, p_ref: Array, pdot_ref: Array) -> None:
-        """Close height and pitch in a reference p_ref (6,) and its rate pdot_ref (6,)."""
-        s = self.state
-        for row, hold, at, rate in zip(
-            _ROWS, s.hold, (s.height, s.pitch), (s.rate, 0.0), strict=True
-        ):
-            if hold > 0.0:
-                p_ref[row] += hold * (at - p_ref[row])
-                pdot_ref[row] += hold * (rate - pdot_ref[row])
-
-    def reset(self) -> None:
-        """End at once: the planner does not lead."""
-        s = self.state
-        s.hold, s.rate, s.force, s.moment = (0.0, 0.0), 0.0, 0.0, 0.0

@@ -24,7 +24,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-import numpy as np
+import msgspec
 
 from shared.arrays import Array
 from shared.bus.messages import Pair, Vector3
@@ -35,31 +35,34 @@ SLOPE_MAX: Final = 0.12
 that has come loose, and is ignored."""
 
 
-class Levelling:
-    """Low-passed slope of the floor.
+class LevellingState(msgspec.Struct):
+    """State of `Levelling`."""
 
-    Attributes:
-        slope: rise of the floor along x and along y, rad, as in the plant's `floor.slope`.
-        up: unit vector against gravity (3,), floor axes.
-    """
+    slope: Pair = (0.0, 0.0)
+    """Rise of the floor along x and along y, rad, as in the plant's `floor.slope`."""
+    known: bool = False
+
+
+class Levelling:
+    """Low-passed slope of the floor."""
 
     def __init__(self, levelling_s: float) -> None:
-        """Start with a level floor.
-
-        Args:
-            levelling_s: time constant, s.
-        """
-        self.slope: Pair = (0.0, 0.0)
+        """Set the time constant, s."""
         self._levelling_s = levelling_s
-        self._known = False
-        self.up: Array = np.array((0.0, 0.0, 1.0))
 
     def advance(
-        self, up_torso: Vector3 | None, angles: Array, dt: float, *, jump: bool = False
+        self,
+        s: LevellingState,
+        up_torso: Vector3 | None,
+        angles: Array,
+        dt: float,
+        *,
+        jump: bool = False,
     ) -> None:
         """Update the slope with the IMU's newest attitude.
 
         Args:
+            s: the slope, which changes.
             up_torso: unit vector against gravity, torso axes; None if it is not known now.
             angles: the torso's roll, pitch and yaw on the floor from the joints, rad.
             dt: time since the last call, s.
@@ -70,24 +73,11 @@ class Levelling:
         x, y = slope_of(up_torso, *angles.tolist())
         if max(abs(x), abs(y)) > SLOPE_MAX:
             return
-        at_once = jump and not self._known
-        self._known = True
+        at_once = jump and not s.known
+        s.known = True
         gain = 1.0 if at_once else 1.0 - math.exp(-dt / self._levelling_s)
-        before = self.slope
-        self._set_slope((before[0] + gain * (x - before[0]), before[1] + gain * (y - before[1])))
-
-    def snapshot(self) -> tuple[bool, float, float]:
-        """Return whether a slope is known, and the slope, rad."""
-        return (self._known, *self.slope)
-
-    def restore(self, state: tuple[bool, float, float]) -> None:
-        """Continue from a state that `snapshot` returned."""
-        self._known = state[0]
-        self._set_slope(state[1:])
-
-    def _set_slope(self, slope: Pair) -> None:
-        self.slope = slope
-        self.up[:] = up_of(slope)
+        before = s.slope
+        s.slope = before[0] + gain * (x - before[0]), before[1] + gain * (y - before[1])
 
 
 def up_of(slope: Pair) -> Vector3:

@@ -33,6 +33,16 @@ class ShiftState(msgspec.Struct):
     at: list[float] = msgspec.field(default_factory=lambda: [0.0] * len(ROWS))
     rate: list[float] = msgspec.field(default_factory=lambda: [0.0] * len(ROWS))
 
+    def rest(self) -> None:
+        """Stop at the current shift while the planner is not engaged."""
+        self.rate = [0.0] * len(ROWS)
+
+    def add_to(self, p: Array, pdot: Array) -> None:
+        """Add the shift to a pose p (6,), m and rad, and its rate to pdot (6,), per s."""
+        for row, at, rate in zip(ROWS, self.at, self.rate, strict=True):
+            p[row] += at
+            pdot[row] += rate
+
 
 class ShiftReference:
     """Reference (x, y, roll, yaw) that follows the requested shift.
@@ -43,28 +53,18 @@ class ShiftReference:
     def __init__(self, shift_max: Sequence[float]) -> None:
         """Set the largest shift each way: m, m, rad, rad."""
         self._shift_max = tuple(shift_max)
-        self.state = ShiftState()
 
-    def advance(self, wanted: Vector4, dt: float) -> None:
+    def advance(self, s: ShiftState, wanted: Vector4, dt: float) -> None:
         """Follow for dt seconds.
 
         Args:
+            s: the shift, which changes.
             wanted: x, y in m, roll, yaw in rad; clipped to the limits.
             dt: time since the last tick, s.
         """
-        at, rate = self.state.at, self.state.rate
+        at, rate = s.at, s.rate
         for i, limit in enumerate(self._shift_max):
             target, rate_max = clamp(wanted[i], -limit, limit), limit / SHIFT_S
             rate_next = rate[i] + dt * OMEGA * (OMEGA * (target - at[i]) - 2.0 * rate[i])
             rate[i] = clamp(rate_next, -rate_max, rate_max)
             at[i] += dt * rate[i]
-
-    def rest(self) -> None:
-        """Stop at the current shift while the planner is not engaged."""
-        self.state.rate = [0.0] * len(ROWS)
-
-    def add_to(self, p: Array, pdot: Array) -> None:
-        """Add the shift to a pose p (6,), m and rad, and its rate to pdot (6,), per s."""
-        for row, at, rate in zip(ROWS, self.state.at, self.state.rate, strict=True):
-            p[row] += at
-            pdot[row] += rate

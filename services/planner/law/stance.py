@@ -22,10 +22,11 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
+import msgspec
 import numpy as np
 
-from shared.arrays import Array
-from shared.bus.messages import Vector6
+from shared.arrays import Array, vector6
+from shared.bus.messages import AS_CONFIGURED, Vector6
 
 _ROWS: Final = (
     ("ahead of", "behind", "mm"),
@@ -45,52 +46,50 @@ FOLLOW_TOLERANCE: Final = 0.03
 """m or rad; the planner does not engage while adopted and measured stance differ by more."""
 
 
-class Stance:
-    """Stance that the law uses.
+class StanceState(msgspec.Struct):
+    """State of `Stance`."""
 
-    Attributes:
-        taken: (6,) adopted stance of the right foot relative to the left, as deviation from the
-            robot file: x, y, z in m and a rotation vector in rad, world axes.
-        refused: True while the stance is beyond the limits, or the feet have moved and their new
-            stance is not adopted yet.
-    """
+    taken: Vector6 = AS_CONFIGURED
+    """Adopted stance of the right foot relative to the left, as deviation from the robot file:
+    x, y, z in m and a rotation vector in rad, world axes."""
+    refusal: str = ""
+    """Why the stance measured last is refused: it is beyond the limits, or the feet have moved and
+    their new stance is not adopted yet. "" if it is accepted."""
+
+
+class Stance:
+    """Follows the stance of the feet within limits."""
 
     def __init__(self, stance_max: Sequence[float]) -> None:
-        """Start with the feet as configured.
+        """Set the limits.
 
         Args:
             stance_max: `law.stance_max`, m and rad; a zero row is neither adopted nor refused.
         """
         self._stance_max: Array = np.array(stance_max)
-        self.taken: Array = np.zeros(6)
-        self._measured: Array = np.zeros(6)
-        self.refused = False
 
-    def take(self, measured: Array, fraction: float = 1.0) -> None:
+    def advance(self, s: StanceState, measured: Array, fraction: float = 1.0) -> None:
         """Adopt the stance in which the legs agree now.
 
         Args:
+            s: the stance, which changes.
             measured: (6,), m and rad.
             fraction: of the way to it; 1 adopts it at once.
         """
-        self._measured[:] = measured
-        if not np.isfinite(measured).all():  # joint angles that give no stance: nothing to follow
-            self.refused = True
+        if not np.isfinite(measured).all():  # nothing to follow
+            s.refusal = "the joint angles give no stance: check the encoders"
             return
-        checked = self._stance_max > 0.0
+        checked, taken = self._stance_max > 0.0, np.array(s.taken)
         beyond = bool((checked & (np.abs(measured) > self._stance_max)).any())
         wanted = np.where(checked, measured, 0.0)
         if not beyond:  # a refused stance is not followed: it may be a broken encoder
-            self.taken += fraction * (wanted - self.taken)
-        self.refused = beyond or bool((np.abs(wanted - self.taken) > FOLLOW_TOLERANCE).any())
+            taken += fraction * (wanted - taken)
+            s.taken = vector6(taken)
+        moved = bool((np.abs(wanted - taken) > FOLLOW_TOLERANCE).any())
+        s.refusal = self._refusal(measured) if beyond or moved else ""
 
-    def refusal(self) -> str:
-        """Return why the stance measured last is refused, as text; "" if it is accepted."""
-        if not self.refused:
-            return ""
-        if not np.isfinite(self._measured).all():
-            return "the joint angles give no stance: check the encoders"
-        rows = zip(self._measured.tolist(), self._stance_max.tolist(), _ROWS, strict=True)
+    def _refusal(self, measured: Array) -> str:
+        rows = zip(measured.tolist(), self._stance_max.tolist(), _ROWS, strict=True)
         return (
             "; ".join(
                 f"the right foot is {abs(value) * _TO_UNIT[unit]:.0f} {unit} "
@@ -101,12 +100,3 @@ class Stance:
             )
             or "the feet have moved: wait until the planner has adopted the new stance"
         )
-
-    def snapshot(self) -> tuple[Vector6, bool]:
-        """Return the state."""
-        a, b, c, d, e, f = self.taken.tolist()
-        return (a, b, c, d, e, f), self.refused
-
-    def restore(self, state: tuple[Vector6, bool]) -> None:
-        """Continue from a state."""
-        self.taken[:], self.refused = state

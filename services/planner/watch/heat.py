@@ -74,21 +74,21 @@ class HeatWatchState(msgspec.Struct):
     hottest: int = 0
     """Its module; while it rests, the one for which it stood up."""
 
+    @property
+    def moves(self) -> bool:
+        """True while height and pitch are the planner's."""
+        return self.action >= HeatAction.STANDS_UP
+
 
 class HeatWatch:
     """Decides what is done against the heat."""
 
     def __init__(self, config: HeatConfig) -> None:
         self._ease_s, self._stand_s = config.ease_s, config.stand_s
-        self.state = HeatWatchState()
-
-    @property
-    def moves(self) -> bool:
-        """True while height and pitch are the planner's."""
-        return self.state.action >= HeatAction.STANDS_UP
 
     def advance(
         self,
+        s: HeatWatchState,
         now_ns: int,
         states: Sequence[JointState],
         requested: float,
@@ -97,20 +97,20 @@ class HeatWatch:
         """Advance by one tick.
 
         Args:
+            s: this watch's state, which changes.
             now_ns: the planner's clock.
             states: newest of each module.
             requested: assist that the operator requests, N.
             dt: time since the last tick, s.
         """
-        s = self.state
         lifted = s.lifted
         lefts = [state.heat_left_s for state in states]
         known = [left for left in lefts if left >= 0.0]
         s.left_s = min(known, default=-1.0)
-        if known and (not self.moves or s.left_s < self._ease_s):
+        if known and (not s.moves or s.left_s < self._ease_s):
             s.hottest = lefts.index(s.left_s)
-        quiet = lifted is not None and abs(lifted + self._assist(requested)) <= HAND_MAX
-        action = self._next(now_ns, states, quiet=quiet) if known else HeatAction.NONE
+        quiet = lifted is not None and abs(lifted + _assist_left(s, requested)) <= HAND_MAX
+        action = self._next(s, now_ns, states, quiet=quiet) if known else HeatAction.NONE
         if action is not s.action:
             s.action, s.since_ns = action, now_ns
         step = dt / EASE_S
@@ -118,20 +118,12 @@ class HeatWatch:
         rests = 0.0 if lifted is None else -lifted
         s.rests = max(0.0, rests, s.rests - SHED_RATE * dt)
         toward = Toward.PERSON
-        if self.moves:
+        if s.moves:
             toward = Toward.UP if action is HeatAction.STANDS_UP else Toward.REST
-        return HeatDecision(self._assist(requested), toward)
+        return HeatDecision(_assist_left(s, requested), toward)
 
-    def _assist(self, requested: float) -> float:
-        """Return what is left of the requested assist, N."""
-        s = self.state
-        if s.scale >= 1.0:
-            return requested
-        return min(requested, max(s.scale * requested, s.rests - RESTED_ON))
-
-    def describe(self) -> str:
+    def describe(self, s: HeatWatchState) -> str:
         """Return what is done against the heat, in words; "" if nothing."""
-        s = self.state
         if s.action is HeatAction.NONE:
             return ""
         name = MODULES[s.hottest]
@@ -144,8 +136,9 @@ class HeatWatch:
             words = "it stands up by itself; let it"
         return f"{name} is hot, {s.left_s:.0f} s left at this load: {words}"
 
-    def _next(self, now_ns: int, states: Sequence[JointState], *, quiet: bool) -> HeatAction:
-        s = self.state
+    def _next(
+        self, s: HeatWatchState, now_ns: int, states: Sequence[JointState], *, quiet: bool
+    ) -> HeatAction:
         knee = min(states[i].q[1] for i in _KNEES)
         if s.action is HeatAction.RESTS:
             rested = now_ns - s.since_ns >= REST_S * NS_PER_S
@@ -158,3 +151,10 @@ class HeatWatch:
             return HeatAction.STANDS_UP if knee < STRAIGHT else HeatAction.RESTS
         limit = self._ease_s * (ASSIST_AGAIN if s.action is HeatAction.EASES else 1.0)
         return HeatAction.EASES if s.left_s < limit else HeatAction.NONE
+
+
+def _assist_left(s: HeatWatchState, requested: float) -> float:
+    """Return what is left of the requested assist, N."""
+    if s.scale >= 1.0:
+        return requested
+    return min(requested, max(s.scale * requested, s.rests - RESTED_ON))

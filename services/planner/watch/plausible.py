@@ -1,4 +1,4 @@
-"""Refuses measurements that no sensor can have made, and counts them. Pure."""
+"""Refuses measurements that no sensor can have made. Pure."""
 
 from __future__ import annotations
 
@@ -28,8 +28,6 @@ class Plausible:
     """
 
     def __init__(self, config: RobotConfig) -> None:
-        self.refused = 0
-        """Messages refused so far."""
         self._force_max = N_CELLS * config.harness.leg_force_max
         arms = config.harness.base_radius + config.harness.platform_radius + config.harness.height
         self._moment_max = arms * self._force_max
@@ -41,7 +39,7 @@ class Plausible:
         (phi_low, phi_high), (theta_low, theta_high) = self._stops[module]
         phi, theta = state.q
         v_phi, v_theta = state.v
-        return self._counted(
+        return (
             phi_low <= phi <= phi_high
             and theta_low <= theta <= theta_high
             and abs(v_phi) <= SPEED_MAX
@@ -50,20 +48,15 @@ class Plausible:
 
     def is_wrench(self, wrench: Wrench) -> bool:
         """Return True if the load cells together can have measured it."""
-        return self._counted(
-            all(abs(part) <= self._force_max for part in wrench.force)
-            and all(abs(part) <= self._moment_max for part in wrench.moment)
+        return all(abs(part) <= self._force_max for part in wrench.force) and all(
+            abs(part) <= self._moment_max for part in wrench.moment
         )
 
     def is_attitude(self, attitude: Attitude) -> bool:
         """Return True if up is a direction, and the torso can turn so fast."""
         length = math.hypot(*attitude.up)
-        return self._counted(
+        return (
             (not attitude.valid or abs(length - 1.0) <= UNIT_ERROR)
             and length <= 1.0 + UNIT_ERROR
             and all(abs(part) <= TURN_MAX for part in attitude.rate)
         )
-
-    def _counted(self, plausible: bool) -> bool:
-        self.refused += not plausible
-        return plausible

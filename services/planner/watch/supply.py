@@ -45,16 +45,15 @@ class SupplyWatch:
     def __init__(self, config: SupplyConfig) -> None:
         """Take the levels, V; 0: never."""
         self._low_v, self._sit_v = config.low_v, config.sit_v
-        self.state = SupplyState()
 
-    def advance(self, states: Sequence[JointState], dt: float) -> None:
+    def advance(self, s: SupplyState, states: Sequence[JointState], dt: float) -> None:
         """Advance by one tick.
 
         Args:
+            s: this watch's state, which changes.
             states: the newest of each module.
             dt: time since the last tick, s.
         """
-        s = self.state
         known = [(state.supply_v, at) for at, state in enumerate(states) if state.supply_v > 0.0]
         if not known:
             return
@@ -65,9 +64,8 @@ class SupplyWatch:
         s.was_well |= s.volts > self._low_v
         s.sits = s.was_well and s.volts < self._sit_v + (RECOVERED_V if s.sits else 0.0)
 
-    def describe(self) -> str:
+    def describe(self, s: SupplyState) -> str:
         """Return what the person must know; "" if the supplies are well."""
-        s = self.state
         if s.sits:
             return (
                 f"the supply of {s.module} is at {s.volts:.1f} V, below {self._sit_v:g} V: it goes "

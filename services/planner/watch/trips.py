@@ -90,22 +90,18 @@ class PlannerTrips:
         self._limits = [row.limit for row in rows]
         self._after_ns = [round(row.after_ms * NS_PER_MS) for row in rows]
         self._least = [PLANNER_TRIPS[trip].least for trip in _TRIPS]
-        self.state = TripsState()
 
-    def restore(self, state: TripsState) -> None:
-        """Continue from a state, which is the watch's from now on; an old log knows fewer trips."""
-        state.since_ns += (0,) * (len(_TRIPS) - len(state.since_ns))
-        self.state = state
-
-    def advance(self, now_ns: int, values: tuple[float, ...], *, leads: bool) -> None:
+    def advance(
+        self, state: TripsState, now_ns: int, values: tuple[float, ...], *, leads: bool
+    ) -> None:
         """Advance by one tick.
 
         Args:
+            state: of these trips, which changes.
             now_ns: the planner's clock.
             values: values that `values_of` measured; NaN is not known, and never trips.
             leads: the planner is engaged: it trips only then.
         """
-        state = self.state
         loaded = values[_UNLOADED] > LOADED_FACTOR * self._limits[_UNLOADED]
         state.stands = (leads or state.tripped > 0) and (state.stands or loaded)
         beyond = [
@@ -129,14 +125,14 @@ class PlannerTrips:
         if leads and not state.tripped:
             for index, since in enumerate(state.since_ns):
                 if since and now_ns - since >= self._after_ns[index]:
-                    self._trip(index, values[index])
+                    self._trip(state, index, values[index])
                     break
 
-    def _trip(self, index: int, value: float) -> None:
+    def _trip(self, state: TripsState, index: int, value: float) -> None:
         row = PLANNER_TRIPS[_TRIPS[index]]
-        self.state.tripped = _TRIPS[index]
+        state.tripped = _TRIPS[index]
         limit = f"(limit {self._limits[index]:g})"
-        self.state.why = f"{row.measured}: {value:.3g} {row.unit} {limit}"
+        state.why = f"{row.measured}: {value:.3g} {row.unit} {limit}"
 
 
 def values_of(
