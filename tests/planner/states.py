@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
+from typing import Any
 
 import msgspec
 import numpy as np
 
+from services.planner.law.hocca import Hocca, LawInputs, LawOutput, LawState
 from services.planner.law.kinematics import Kinematics
 from services.planner.planner import Planner
 from shared.arrays import Array
@@ -27,6 +29,29 @@ DT = 0.004
 STILL: Array = np.zeros(12)
 WEIGHT: Array = np.array([0.0, 0.0, 731.6, 0.0, 0.0, 0.0])
 """The shipped robot's along p, N and N m."""
+
+
+class Kept:
+    """A part of the planner together with its state: its functions lack their first argument."""
+
+    def __init__(self, part: Any, state: Any) -> None:
+        self.part, self.state = part, state
+
+    def __getattr__(self, name: str) -> Any:
+        return partial(getattr(self.part, name), self.state)
+
+
+class Law:
+    """The shipped law together with its state."""
+
+    def __init__(self, robot: RobotConfig) -> None:
+        self.hocca, self.state = Hocca(robot), LawState()
+
+    def tick(
+        self, q: Array, v: Array = STILL, assist: float = 0.0, dt: float = DT, **more: Any
+    ) -> LawOutput:
+        """Run the law once."""
+        return self.hocca.tick(self.state, LawInputs(q, v, dt, assist=assist, **more))
 
 
 def with_law(robot: RobotConfig, **changes: object) -> RobotConfig:

@@ -18,8 +18,11 @@ from services.planner.law.assist import (
     STILL_RATE_PITCH,
     STILL_RATE_Z,
     AssistLaw,
+    AssistState,
+    EasingState,
     LeadEasing,
     Overload,
+    OverloadState,
     force_up,
     is_still,
 )
@@ -27,7 +30,7 @@ from shared.bus.messages import Wrench
 from shared.clock import NS_PER_MS
 from shared.config.sections import AssistConfig
 from tests.planner import oracle
-from tests.planner.states import DT, shipped, wrench
+from tests.planner.states import DT, Kept, shipped, wrench
 
 FORCE_MAX, RATE_MAX, INTEGRAL_MAX, INTEGRAL_S = 200.0, 100.0, 50.0, 3.0
 ASSIST = AssistConfig(
@@ -35,25 +38,25 @@ ASSIST = AssistConfig(
 )
 
 
-def make_law(wanted: float = 100.0) -> AssistLaw:
+def make_law(wanted: float = 100.0) -> Kept:
     """Return a law that has carried `wanted` for long enough to integrate."""
-    law = AssistLaw(ASSIST)
+    law = Kept(AssistLaw(ASSIST), AssistState())
     run(law, SETTLE_S + 2 * DT, wanted, wanted)
-    assert (law.assist, law.state.integral) == (wanted, 0.0)
+    assert (law.state.assist, law.state.integral) == (wanted, 0.0)
     return law
 
 
 def run(
-    law: AssistLaw, seconds: float, wanted: float, measured: float | None, *, still: bool = True
+    law: Kept, seconds: float, wanted: float, measured: float | None, *, still: bool = True
 ) -> None:
     for _ in range(round(seconds / DT)):
         law.advance(wanted, measured, DT, still=still)
 
 
 def test_the_first_tick_takes_over_what_hold_carries() -> None:
-    law = AssistLaw(ASSIST)
+    law = Kept(AssistLaw(ASSIST), AssistState())
     assert law.advance(150.0, None, DT, still=False) == 0.0
-    assert law.assist == 150.0
+    assert law.state.assist == 150.0
 
 
 @pytest.mark.parametrize("wanted", [-1e4, 1e4])
@@ -61,11 +64,11 @@ def test_the_wish_is_capped_and_rate_limited(wanted: float) -> None:
     law, step = make_law(), RATE_MAX * DT
     target = FORCE_MAX if wanted > 0.0 else 0.0
     for _ in range(600):
-        before = law.assist
+        before = law.state.assist
         rate = law.advance(wanted, None, DT, still=True)
-        assert rate == pytest.approx((law.assist - before) / DT)
-        assert abs(law.assist - before) <= step + 1e-9
-    assert law.assist == target
+        assert rate == pytest.approx((law.state.assist - before) / DT)
+        assert abs(law.state.assist - before) <= step + 1e-9
+    assert law.state.assist == target
 
 
 @pytest.mark.parametrize("error", [30.0, -30.0])
@@ -74,7 +77,7 @@ def test_a_steady_error_is_integrated_beyond_what_friction_hides(error: float) -
     run(law, 1.5, 100.0, 100.0 - error)
     expected = math.copysign(abs(error) - ERROR_MIN, error) * 1.5 / INTEGRAL_S
     assert law.state.integral == pytest.approx(expected)
-    assert law.assist == pytest.approx(100.0 + expected)
+    assert law.state.assist == pytest.approx(100.0 + expected)
 
 
 @pytest.mark.parametrize(
@@ -91,7 +94,7 @@ def test_a_steady_error_is_integrated_beyond_what_friction_hides(error: float) -
 def test_nothing_is_integrated_of(wanted: float, measured: float | None, still: bool) -> None:
     law = make_law(wanted)
     run(law, 60.0, wanted, measured, still=still)
-    assert (law.state.integral, law.assist) == (0.0, wanted)
+    assert (law.state.integral, law.state.assist) == (0.0, wanted)
 
 
 @pytest.mark.parametrize(("measured", "end"), [(-1e3, INTEGRAL_MAX), (1e3, -INTEGRAL_MAX)])
@@ -106,9 +109,9 @@ def test_the_integral_stops_at_its_limit_and_turns_at_once(measured: float, end:
 def test_the_robot_never_pulls_the_operator_down() -> None:
     law = make_law(20.0)
     run(law, 60.0, 20.0, 500.0)
-    assert law.assist == 0.0
+    assert law.state.assist == 0.0
     law.advance(10.0, 500.0, DT, still=True)
-    assert law.assist >= 0.0
+    assert law.state.assist >= 0.0
 
 
 def test_the_integral_freezes_without_a_reading() -> None:
@@ -145,7 +148,7 @@ def test_the_integral_leaks_away_when_nothing_is_wanted() -> None:
     run(law, INTEGRAL_S, 0.0, 300.0)
     assert law.state.integral == pytest.approx(before * math.exp(-1.0), rel=0.01)
     run(law, 10 * INTEGRAL_S, 0.0, 300.0)
-    assert law.assist == pytest.approx(0.0, abs=0.01)
+    assert law.state.assist == pytest.approx(0.0, abs=0.01)
 
 
 @pytest.mark.parametrize("stop", ["request", "lead", "reading"])
@@ -157,8 +160,8 @@ def test_the_assist_makes_no_step_when_the_integral_starts_or_stops(stop: str) -
         measured = None if stop == "reading" and not on else -500.0
         law.advance(wanted, measured, DT, still=on or stop != "lead")
         step_max = (RATE_MAX + 700.0 / INTEGRAL_S) * DT
-        assert abs(law.assist - last) <= step_max + 1e-9
-        last = law.assist
+        assert abs(law.state.assist - last) <= step_max + 1e-9
+        last = law.state.assist
 
 
 @pytest.mark.parametrize("roll", [-0.3, 0.0, 0.2])
@@ -178,29 +181,33 @@ def test_still_is_within_both_rates(share: float) -> None:
     assert is_still(0.0, share * STILL_RATE_PITCH) is still
 
 
-def eased(easing: LeadEasing, up: float | None, moment: float = 0.0, assist: float = 0.0) -> Any:
+def eased(easing: Kept, up: float | None, moment: float = 0.0, assist: float = 0.0) -> Any:
     for _ in range(round(LEAD_FADE_S / DT) + 1):
         result = easing.ease(up, moment, assist, DT)
     return result
 
 
 def test_only_what_exceeds_the_assist_load_is_amplified() -> None:
-    assert eased(LeadEasing(0.5), -200.0, assist=200.0) == (0.0, 0.0)
-    assert eased(LeadEasing(0.5), -180.0, 8.0, assist=200.0) == pytest.approx((10.0, 4.0))
+    assert eased(Kept(LeadEasing(0.5), EasingState()), -200.0, assist=200.0) == (0.0, 0.0)
+    assert eased(Kept(LeadEasing(0.5), EasingState()), -180.0, 8.0, assist=200.0) == pytest.approx(
+        (10.0, 4.0)
+    )
 
 
 def test_alpha_zero_adds_nothing() -> None:
-    assert eased(LeadEasing(0.0), 100.0, 50.0) == (0.0, 0.0)
+    assert eased(Kept(LeadEasing(0.0), EasingState()), 100.0, 50.0) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_no_more_than_a_hand_can_do_is_amplified(sign: float) -> None:
     expected = (sign * 0.5 * LEAD_MAX[0], sign * 0.5 * LEAD_MAX[1])
-    assert eased(LeadEasing(0.5), sign * 1e4, sign * 1e4) == pytest.approx(expected)
+    assert eased(Kept(LeadEasing(0.5), EasingState()), sign * 1e4, sign * 1e4) == pytest.approx(
+        expected
+    )
 
 
 def test_the_easing_fades_out_when_the_wrench_is_lost_and_in_when_it_is_back() -> None:
-    easing, last = LeadEasing(0.5), 50.0
+    easing, last = Kept(LeadEasing(0.5), EasingState()), 50.0
     assert eased(easing, 100.0)[0] == pytest.approx(last)
     for up in (None, 100.0):
         for _ in range(round(LEAD_FADE_S / DT)):
@@ -228,10 +235,10 @@ def at(share: float, kind: str) -> Wrench:
     return wrench(moment=(100.0 * part, 100.0 * part, -100.0 * part))
 
 
-def make_overload(*, holds: bool = False) -> Overload:
+def make_overload(*, holds: bool = False) -> Kept:
     """Return an overload that holds, by a cell that was saturated, or not."""
     robot, _ = shipped()
-    overload = Overload(msgspec.structs.replace(robot.harness, **LIMITS))
+    overload = Kept(Overload(msgspec.structs.replace(robot.harness, **LIMITS)), OverloadState())
     if holds:
         overload.receive(wrench(valid=False, saturated=True), T0)
     return overload

@@ -14,12 +14,13 @@ from services.planner.watch.heat import (
     SHED_RATE,
     HeatDecision,
     HeatWatch,
+    HeatWatchState,
 )
 from shared.bus.messages import HeatAction
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES, N_MODULES
-from tests.planner.states import state
+from tests.planner.states import Kept, state
 
 NONE, EASES, STANDS_UP, RESTS = HeatAction
 SQUATTED, STRAIGHT = -1.2, -0.3
@@ -29,7 +30,7 @@ class Watched:
     """A watch over six modules, in ticks of 0.1 s."""
 
     def __init__(self, robot: RobotConfig) -> None:
-        self.watch = HeatWatch(robot.heat)
+        self.watch = Kept(HeatWatch(robot.heat), HeatWatchState())
         self.now_s = 100.0
 
     def run(

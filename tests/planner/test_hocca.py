@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from services.planner.law import inverse_kinematics, reference
-from services.planner.law.hocca import Hocca, LawOutput
+from services.planner.law.hocca import LawOutput
 from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.kinematics import Kinematics
 from shared.arrays import Array
@@ -16,7 +16,7 @@ from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
 from tests.planner.conftest import Closed, at_pose
 from tests.planner.oracle import LEFT, RIGHT
-from tests.planner.states import DT, STILL, with_law
+from tests.planner.states import DT, STILL, Law, with_law
 
 OPEN = {"z": 2, "pitch": 4}
 
@@ -25,8 +25,8 @@ POSES = ((1.25, 0.0), (1.188, 0.0), (0.948, 0.0), (0.85, 0.6), (0.80, 1.2))
 
 
 @pytest.fixture
-def law(robot: RobotConfig) -> Hocca:
-    return Hocca(robot)
+def law(robot: RobotConfig) -> Law:
+    return Law(robot)
 
 
 @pytest.fixture(params=POSES, ids=lambda p: f"{p[0]:g}m-{p[1]:g}rad")
@@ -45,7 +45,7 @@ def moved(robot: RobotConfig, ik: InverseKinematics, q: Array, index: int, by: f
 
 @pytest.mark.parametrize(("direction", "by"), [("z", -0.01), ("pitch", 0.1)])
 def test_open_directions_are_free(
-    robot: RobotConfig, law: Hocca, ik: InverseKinematics, q: Array, direction: str, by: float
+    robot: RobotConfig, law: Law, ik: InverseKinematics, q: Array, direction: str, by: float
 ) -> None:
     """References follow to the tolerance of the IK, and nothing pulls back.
 
@@ -67,7 +67,7 @@ def test_open_directions_are_free(
 def test_coupled_torques_come_slowly_and_ease_at_once(
     robot: RobotConfig, ik: InverseKinematics, q: Array
 ) -> None:
-    law = Hocca(with_law(robot, push_integral_max=0.0))
+    law = Law(with_law(robot, push_integral_max=0.0))
     law.tick(q, STILL, 0.0, DT, align=True)
     q_moved = moved(robot, ik, q, 1, 0.01)
     first = law.tick(q_moved, STILL, 0.0, DT)
@@ -78,7 +78,7 @@ def test_coupled_torques_come_slowly_and_ease_at_once(
     np.testing.assert_allclose(output.tau_coupled, output.tau_unfiltered, atol=0.02)
 
 
-def test_an_error_that_lasts_is_integrated(law: Hocca, closed: Closed) -> None:
+def test_an_error_that_lasts_is_integrated(law: Law, closed: Closed) -> None:
     centred, off = closed(1.0), closed(1.0, y=0.005)
     law.tick(centred, STILL, 0.0, DT, align=True)
     course = [law.tick(off, STILL, 0.0, DT).tau_coupled for _ in range(500)]
@@ -88,7 +88,7 @@ def test_an_error_that_lasts_is_integrated(law: Hocca, closed: Closed) -> None:
     np.testing.assert_allclose(held.tau_coupled, 0.0, atol=0.1)
 
 
-def test_align_makes_no_step_from_any_pose_before(law: Hocca, closed: Closed) -> None:
+def test_align_makes_no_step_from_any_pose_before(law: Law, closed: Closed) -> None:
     """Off centre, rolled and yawed: in balance nothing but feedforward acts."""
     off_centre = (
         {"height": 1.0, "x": 0.03, "y": -0.02, "roll": 0.05, "pitch": 0.3, "yaw": -0.04},
@@ -104,7 +104,7 @@ def test_align_makes_no_step_from_any_pose_before(law: Hocca, closed: Closed) ->
         np.testing.assert_allclose(torque(output, q), output.tau_ff, atol=1e-3 * scale)
 
 
-def test_the_reference_glides_to_the_centre(robot: RobotConfig, law: Hocca, closed: Closed) -> None:
+def test_the_reference_glides_to_the_centre(robot: RobotConfig, law: Law, closed: Closed) -> None:
     q = closed(1.0, x=0.03, y=-0.02, roll=0.05, yaw=-0.04)
     p = oracle.pose(robot, q)
     shut = [0, 1, 3, 5]
@@ -124,7 +124,7 @@ def test_the_reference_glides_to_the_centre(robot: RobotConfig, law: Hocca, clos
 def test_closed_heights_and_pitches_stay_as_found(robot: RobotConfig, closed: Closed) -> None:
     """They glided to a COM on the floor once: zero is no stand."""
     K_p = (2810.0, 2810.0, 3000.0, 800.0, 300.0, 400.0)
-    closing = Hocca(with_law(robot, S=(0,) * 6, K_p=K_p, split="diagonal"))
+    closing = Law(with_law(robot, S=(0,) * 6, K_p=K_p, split="diagonal"))
     q = closed(1.0, x=0.02, pitch=0.3)
     p = oracle.pose(robot, q)
     closing.tick(q, STILL, 0.0, DT, align=True)
@@ -136,7 +136,7 @@ def test_closed_heights_and_pitches_stay_as_found(robot: RobotConfig, closed: Cl
     np.testing.assert_allclose(closing.tick(q, STILL, 0.0, DT).p_ref[[2, 4]], p[[2, 4]], atol=1e-9)
 
 
-def test_reference_rates_follow_the_person(robot: RobotConfig, law: Hocca, q: Array) -> None:
+def test_reference_rates_follow_the_person(robot: RobotConfig, law: Law, q: Array) -> None:
     """C v_ref = 0 and J v_ref = S J v, p_C resting."""
     law.tick(q, STILL, 0.0, DT, align=True)
     v = 0.3 * np.random.default_rng(6).normal(size=12)
@@ -156,13 +156,13 @@ def test_feedforward_rate_is_the_slope_of_feedforward_along_what_the_robot_can_d
     """Forces between the legs, which D held leaves out, aside."""
     T = oracle.feasible(robot, q)
     pdot = np.array([0.0, 0.0, -0.15, 0.0, 0.3, 0.0])
-    law = Hocca(robot)
+    law = Law(robot)
     law.tick(q, STILL, 0.0, DT, align=True)
     rate = law.tick(q, T @ pdot, 0.0, DT).dtau_ff
 
     def feedforward(seconds: float) -> Array:
         there = at_pose(robot, ik, oracle.pose(robot, q) + seconds * pdot, q)
-        return Hocca(robot).tick(there, STILL, 0.0, DT).tau_ff
+        return Law(robot).tick(there, STILL, 0.0, DT).tau_ff
 
     slope = (feedforward(1e-3) - feedforward(-1e-3)) / 2e-3
     assert np.abs(T.T @ slope).max() > 100.0
@@ -170,17 +170,17 @@ def test_feedforward_rate_is_the_slope_of_feedforward_along_what_the_robot_can_d
 
 
 def test_the_first_tick_takes_the_assist_over_and_the_next_ramp_while_aligning_too(
-    robot: RobotConfig, law: Hocca, closed: Closed
+    robot: RobotConfig, law: Law, closed: Closed
 ) -> None:
     q, most = closed(1.188), robot.assist.force_max
     law.tick(q, STILL, 0.0, DT, align=True)
     ramped = law.tick(q, STILL, most, DT, align=True).assist
     assert ramped == pytest.approx(robot.assist.rate_max * DT)
-    assert Hocca(robot).tick(q, STILL, 1e4, DT, align=True).assist == most
+    assert Law(robot).tick(q, STILL, 1e4, DT, align=True).assist == most
 
 
 def test_references_come_back_after_a_lift_past_the_knees_soft_stop(
-    robot: RobotConfig, law: Hocca, limits: Array, closed: Closed
+    robot: RobotConfig, law: Law, limits: Array, closed: Closed
 ) -> None:
     """The soft stop yields: lifted to knees of -0.10 rad (its limit: -0.2) and set down again."""
     stand = closed(1.188)
@@ -230,7 +230,7 @@ def torque(output: LawOutput, q: Array, v: Array = STILL) -> Array:
     return np.asarray(output.tau_ff + output.tau_unfiltered + spring + damper, float)
 
 
-def settled(law: Hocca, q: Array, assist: float) -> LawOutput:
+def settled(law: Law, q: Array, assist: float) -> LawOutput:
     """Return the law's output at rest at a pose, once all of the assist is given."""
     for _ in range(2000):
         if law.tick(q, STILL, assist, DT, align=True).assist == assist:
@@ -280,7 +280,7 @@ def test_feedforward_is_exact_at_rest_and_the_feet_carry_weight_and_assist(
 
     All six parts of the feet's sum, about the world's origin.
     """
-    output = settled(Hocca(robot), posed, assist)
+    output = settled(Law(robot), posed, assist)
     np.testing.assert_allclose(output.q_ref, posed, atol=1e-6)
     T = oracle.feasible(robot, posed)
     held, wanted = T.T @ output.tau_ff, T.T @ weight_and_load(robot, posed, assist)
@@ -299,14 +299,14 @@ def test_pushed_by_the_operator_the_feet_carry_the_push_too(
     """
     assist, moved = 150.0, np.array([0.002, -0.002, 0.0, 0.002, 0.0, 0.002])
     centre = closed(1.1)
-    law = Hocca(robot)
+    law = Law(robot)
     settled(law, centre, assist)
     pushed = at_pose(robot, ik, oracle.pose(robot, centre) + moved, centre)
     for _ in range(2):  # the second tick's feedforward is that of the moved reference
         output = law.tick(pushed, STILL, assist, 0.0)
     T = oracle.feasible(robot, pushed)
-    K_fail = law.split.certificate.failsafe_stiffness(output.local.D)
-    K_c, _ = law._terms._uncoupled.at(K_fail, (T.T * output.local.D_B) @ T)
+    K_fail = law.hocca.split.certificate.failsafe_stiffness(output.local.D)
+    K_c, _ = law.hocca._terms._uncoupled.at(K_fail, (T.T * output.local.D_B) @ T)
     along_p = (K_fail + K_c) @ moved
     torso_per_p = oracle.leg_jacobian(robot, RIGHT, pushed) @ T[oracle.LEG[RIGHT]]
     operator = np.linalg.solve(torso_per_p.T, along_p)
@@ -318,7 +318,7 @@ def test_pushed_by_the_operator_the_feet_carry_the_push_too(
 
 @pytest.mark.parametrize("assist", [0.0, 200.0])
 def test_each_centre_of_pressure_stays_inside_its_sole(
-    robot: RobotConfig, law: Hocca, closed: Closed, assist: float
+    robot: RobotConfig, law: Law, closed: Closed, assist: float
 ) -> None:
     """Over the whole squat and the whole crawl; and no foot slides."""
     geometry = robot.geometry
@@ -347,7 +347,7 @@ def exact_ik(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(module, "STEP_SURE", 1e-9)
 
 
-def torque_of(law: Hocca) -> Callable[[Array, Array], Array]:
+def torque_of(law: Law) -> Callable[[Array, Array], Array]:
     """Return (q, v) -> total torque (12,) of a tick at standing time, nothing remembered."""
 
     def total(q: Array, v: Array) -> Array:
@@ -359,7 +359,7 @@ def torque_of(law: Hocca) -> Callable[[Array, Array], Array]:
 @pytest.mark.usefixtures("exact_ik")
 def test_it_feels_like_k_p_where_it_balances_or_free(robot: RobotConfig, posed: Array) -> None:
     """With the real S, references moving: -dQ/dp = (K_fail + K_c) S_perp, Q all forces."""
-    law = Hocca(robot)
+    law = Law(robot)
     law.tick(posed, STILL, 0.0, 0.0, align=True)
     total, q_of = torque_of(law), oracle.closed_chain(robot, posed)
 
@@ -373,8 +373,8 @@ def test_it_feels_like_k_p_where_it_balances_or_free(robot: RobotConfig, posed: 
     at_ref = law.tick(posed, STILL, 0.0, 0.0)
     T, D = oracle.feasible(robot, posed), at_ref.local.D
     # T_ref has them at the law's own damping of its inverse
-    K_fail = law.split.certificate.failsafe_stiffness(D)
-    K_c, _ = law._terms._uncoupled.at(K_fail, (T.T * at_ref.local.D_B) @ T)
+    K_fail = law.hocca.split.certificate.failsafe_stiffness(D)
+    K_c, _ = law.hocca._terms._uncoupled.at(K_fail, (T.T * at_ref.local.D_B) @ T)
     wanted = (K_fail + K_c) @ S_perp
     np.testing.assert_allclose(-slope, wanted, rtol=2e-3, atol=3.0)
     closed = np.flatnonzero(np.diag(S_perp))
@@ -384,13 +384,15 @@ def test_it_feels_like_k_p_where_it_balances_or_free(robot: RobotConfig, posed: 
 
 @pytest.mark.usefixtures("exact_ik")
 def test_motion_is_damped_where_it_balances_or_free(robot: RobotConfig, posed: Array) -> None:
-    law = Hocca(robot)
+    law = Law(robot)
     law.tick(posed, STILL, 0.0, 0.0, align=True)
     total, T = torque_of(law), oracle.feasible(robot, posed)
     slope = oracle.derivative(lambda pdot: T.T @ total(posed, T @ pdot), np.zeros(6), 1e-4)
     S_perp = np.diag(1.0 - np.array(robot.law.S))
     local = law.tick(posed, STILL, 0.0, 0.0).local
     B_local = (T.T * local.D_B) @ T
-    _, B_c = law._terms._uncoupled.at(law.split.certificate.failsafe_stiffness(local.D), B_local)
+    _, B_c = law.hocca._terms._uncoupled.at(
+        law.hocca.split.certificate.failsafe_stiffness(local.D), B_local
+    )
     wanted = (B_local + B_c) @ S_perp
     np.testing.assert_allclose(-slope, wanted, rtol=2e-3, atol=0.5)

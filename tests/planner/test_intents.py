@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.planner.intents import Intents, OperatorRequest
-from services.planner.law.shift import ROWS, SHIFT_S, ShiftReference
+from services.planner.law.shift import ROWS, SHIFT_S, ShiftReference, ShiftState
 from shared.arrays import Array
 from shared.bus.messages import STRAIGHT, OperatorIntent, Vector4
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
-from tests.planner.states import DT
+from tests.planner.states import DT, Kept
 
 T0 = 5_000_000_000
 
@@ -92,21 +92,21 @@ LARGEST = (0.03, 0.04, 0.06, 0.12)
 asked = st.tuples(*[st.floats(-1e6, 1e6) | st.floats(-0.15, 0.15)] * 4)
 
 
-def now(follower: ShiftReference) -> tuple[Array, Array]:
+def now(follower: Kept) -> tuple[Array, Array]:
     """Return the shift of p and its rate."""
     p, pdot = np.zeros(6), np.zeros(6)
-    follower.add_to(p, pdot)
+    follower.state.add_to(p, pdot)
     return p, pdot
 
 
-def advanced(follower: ShiftReference, wanted: Vector4, dt: float) -> tuple[Array, Array]:
+def advanced(follower: Kept, wanted: Vector4, dt: float) -> tuple[Array, Array]:
     follower.advance(wanted, dt)
     return now(follower)
 
 
 @given(course=st.lists(st.tuples(asked, st.sampled_from([DT, 2 * DT, 0.02])), max_size=60))
 def test_shift_and_rate_stay_within_their_limits(course: list[tuple[Vector4, float]]) -> None:
-    follower, last = ShiftReference(LARGEST), np.zeros(6)
+    follower, last = Kept(ShiftReference(LARGEST), ShiftState()), np.zeros(6)
     for wanted, dt in course:
         shift, rate = advanced(follower, wanted, dt)
         assert np.all(np.abs(shift[list(ROWS)]) <= np.multiply(LARGEST, 1.0 + 1e-9))
@@ -119,7 +119,7 @@ def test_shift_and_rate_stay_within_their_limits(course: list[tuple[Vector4, flo
 @pytest.mark.parametrize("largest", [LARGEST, STRAIGHT], ids=["limits", "none: it stands straight"])
 @given(wanted=asked)
 def test_it_comes_to_what_is_asked_or_as_near_as_it_may(largest: Vector4, wanted: Vector4) -> None:
-    follower = ShiftReference(largest)
+    follower = Kept(ShiftReference(largest), ShiftState())
     for _ in range(1200):
         shift, rate = advanced(follower, wanted, DT)
     np.testing.assert_allclose(
@@ -129,10 +129,10 @@ def test_it_comes_to_what_is_asked_or_as_near_as_it_may(largest: Vector4, wanted
 
 
 def test_it_rests_where_it_is_while_it_is_not_led() -> None:
-    follower = ShiftReference(LARGEST)
+    follower = Kept(ShiftReference(LARGEST), ShiftState())
     for _ in range(100):
         there, _ = advanced(follower, (0.03, 0.0, 0.0, 0.1), DT)
-    follower.rest()
+    follower.state.rest()
     shift, rate = now(follower)
     np.testing.assert_array_equal(shift, there)
     assert not rate.any()

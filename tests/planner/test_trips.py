@@ -11,14 +11,14 @@ import pytest
 from services.planner.law.hocca import LawOutput
 from services.planner.law.kinematics import Measured
 from services.planner.watch.soles import Soles
-from services.planner.watch.trips import CALM_NS, PlannerTrips, values_of
+from services.planner.watch.trips import CALM_NS, PlannerTrips, TripsState, values_of
 from shared.bus.messages import Pair, Trip
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.robot.trip_table import JOINT_TRIPS, PLANNER_TRIPS
 from tests.planner import oracle
 from tests.planner.conftest import Closed
-from tests.planner.states import TICK_NS
+from tests.planner.states import TICK_NS, Kept
 
 T0 = 5_000_000_000
 
@@ -38,16 +38,14 @@ def beyond(robot: RobotConfig, trip: Trip, by: float = 1.001) -> tuple[float, ..
     return tuple(values)
 
 
-def led(robot: RobotConfig) -> PlannerTrips:
+def led(robot: RobotConfig) -> Kept:
     """Return the trips of a planner that leads a robot which stands."""
-    trips = PlannerTrips(robot)
+    trips = Kept(PlannerTrips(robot), TripsState())
     trips.advance(T0 - TICK_NS, CALM, leads=True)
     return trips
 
 
-def go_on(
-    trips: PlannerTrips, values: tuple[float, ...], ticks: range, *, leads: bool = True
-) -> PlannerTrips:
+def go_on(trips: Kept, values: tuple[float, ...], ticks: range, *, leads: bool = True) -> Kept:
     """Go on with these values; one that has tripped leads no more."""
     for tick in ticks:
         trips.advance(T0 + tick * TICK_NS, values, leads=leads and trips.state.tripped is Trip.NONE)
@@ -87,13 +85,18 @@ def test_at_its_limit_nothing_trips_yet(robot: RobotConfig, trip: Trip) -> None:
 
 @pytest.mark.parametrize("trip", TRIPS)
 def test_a_planner_that_does_not_lead_trips_on_nothing(robot: RobotConfig, trip: Trip) -> None:
-    trips = go_on(PlannerTrips(robot), beyond(robot, trip), range(1000), leads=False)
+    trips = go_on(
+        Kept(PlannerTrips(robot), TripsState()), beyond(robot, trip), range(1000), leads=False
+    )
     assert go_on(trips, beyond(robot, trip), range(1000, 1001)).state.tripped is Trip.NONE
 
 
 def test_what_is_not_known_is_no_reason_nor_a_leg_on_the_hoist(robot: RobotConfig) -> None:
     for values in ((math.nan,) * len(CALM), beyond(robot, Trip.UNLOADED)):
-        assert go_on(PlannerTrips(robot), values, range(1000)).state.tripped is Trip.NONE
+        assert (
+            go_on(Kept(PlannerTrips(robot), TripsState()), values, range(1000)).state.tripped
+            is Trip.NONE
+        )
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["it lasts", "it is not known"])
@@ -187,7 +190,7 @@ def test_sagging_is_the_power_of_a_load_beyond_assist_and_lead_as_it_sinks(
 def test_a_hand_that_was_held_up_may_catch_up(robot: RobotConfig) -> None:
     """It presses from the first tick on; once it has not, the same load is a person who sags."""
     sagging = beyond(robot, Trip.SAGGING)
-    trips = go_on(PlannerTrips(robot), sagging, range(100))
+    trips = go_on(Kept(PlannerTrips(robot), TripsState()), sagging, range(100))
     assert trips.state.tripped is Trip.NONE
     go_on(trips, CALM, range(100, 101))
     assert go_on(trips, sagging, range(101, 200)).state.tripped is Trip.SAGGING
@@ -216,7 +219,7 @@ def test_both_legs_have_borne_it_once_each_bears_three_times_the_least(robot: Ro
     for borne, tripped in ((3.0 * least, Trip.NONE), (3.0 * least + 0.1, Trip.UNLOADED)):
         values = list(CALM)
         values[TRIPS.index(Trip.UNLOADED)] = borne
-        trips = go_on(PlannerTrips(robot), tuple(values), range(1))
+        trips = go_on(Kept(PlannerTrips(robot), TripsState()), tuple(values), range(1))
         assert go_on(trips, beyond(robot, Trip.UNLOADED), range(1, 500)).state.tripped is tripped
 
 
@@ -259,14 +262,14 @@ def test_a_com_that_hold_left_off_its_place_is_brought_back_and_trips_if_it_goes
     robot: RobotConfig,
 ) -> None:
     most = robot.trips.balance.limit
-    trips = PlannerTrips(robot)
+    trips = Kept(PlannerTrips(robot), TripsState())
     assert go_on(trips, off(robot, most + 0.03), range(100)).state.tripped is Trip.NONE
     assert go_on(trips, off(robot, most + 0.049), range(100, 200)).state.tripped is Trip.NONE
     assert go_on(trips, off(robot, 0.01), range(200, 300)).state.tripped is Trip.NONE
     assert go_on(trips, off(robot, most), range(300, 400)).state.tripped is Trip.NONE
     back = msgspec.structs.replace(trips.state)
     assert go_on(trips, off(robot, 1.001 * most), range(400, 500)).state.tripped is Trip.OFF_BALANCE
-    trips.restore(back)
+    trips.state = back
     trips.advance(T0 + 500 * TICK_NS, CALM, leads=False)
     assert go_on(trips, off(robot, 0.2), range(501, 600)).state.tripped is Trip.NONE
     assert go_on(trips, off(robot, 0.221), range(600, 700)).state.tripped is Trip.OFF_BALANCE
@@ -288,16 +291,6 @@ def test_while_the_planner_moves_it_for_heat_nothing_sags_and_nothing_drifts() -
     }
     assert set(apart) == {Trip.SAGGING, Trip.UNATTENDED}
     assert {now for _, now in apart.values()} == {0.0}
-
-
-def test_a_watch_restored_from_before_there_was_a_trip_counts_it_from_now_on(
-    robot: RobotConfig,
-) -> None:
-    trips, old = PlannerTrips(robot), led(robot).state
-    old.since_ns = old.since_ns[:-1]
-    trips.restore(old)
-    assert set(trips.state.since_ns) == {0}
-    assert go_on(trips, beyond(robot, TRIPS[-1]), range(100)).state.tripped is TRIPS[-1]
 
 
 # ---- how far out its soles bear it
