@@ -19,13 +19,12 @@ from services.planner.law.split import LocalGains
 from services.planner.watch.controller_guard import SUPPORT, ControllerGuard, GuardState
 from shared.bus.messages import SplitSource
 from shared.config.files import load
-from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
 from shared.places import DEFAULT_CONFIG
 from shared.robot.frames import capture_point
 from shared.robot.robot_model import stand_pose
 from shared.state import copied
-from tests.planner.states import Kept, with_law
+from tests.planner.states import ROBOT, Kept, with_law
 
 GOOD = """
 class Controller:
@@ -47,11 +46,11 @@ def mine(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("name", ["", ":Controller", ":other"])
-def test_each_planner_gets_one_of_its_own(mine: Path, robot: RobotConfig, name: str) -> None:
+def test_each_planner_gets_one_of_its_own(mine: Path, name: str) -> None:
     mine.write_text(GOOD, encoding="utf-8")
-    make = controller_maker(f"{mine}{name}", robot)
+    make = controller_maker(f"{mine}{name}", ROBOT)
     assert make() is not make()
-    assert make().name == robot.name  # type: ignore[attr-defined]  # of the file
+    assert make().name == ROBOT.name  # type: ignore[attr-defined]  # of the file
 
 
 @pytest.mark.parametrize(
@@ -68,20 +67,20 @@ def test_each_planner_gets_one_of_its_own(mine: Path, robot: RobotConfig, name: 
     ],
 )  # fmt: skip
 def test_a_file_that_cannot_be_used_is_one_clear_line(
-    mine: Path, robot: RobotConfig, text: str, name: str, said: str
+    mine: Path, text: str, name: str, said: str
 ) -> None:
     mine.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError) as caught:
-        controller_maker(f"{mine}{name}", robot)
+        controller_maker(f"{mine}{name}", ROBOT)
     assert said in str(caught.value)
     assert "mine.py" in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("spec", ["absent.py", "absent", "absent.txt", ""])
-def test_a_file_that_is_not_there_is_one_clear_line(spec: str, robot: RobotConfig) -> None:
+def test_a_file_that_is_not_there_is_one_clear_line(spec: str) -> None:
     with pytest.raises(ConfigError, match=r"FILE\.py or FILE\.py:NAME"):
-        controller_maker(spec, robot)
+        controller_maker(spec, ROBOT)
 
 
 def test_a_spec_is_file_and_name() -> None:
@@ -91,33 +90,33 @@ def test_a_spec_is_file_and_name() -> None:
     assert absolute("b.py:LQR") == f"{Path.cwd() / 'b.py'}:LQR"
 
 
-def test_the_one_that_was_looked_at_is_the_first_planners(mine: Path, robot: RobotConfig) -> None:
+def test_the_one_that_was_looked_at_is_the_first_planners(mine: Path) -> None:
     """It may have opened a device, which a second one could not."""
     mine.write_text(GOOD.replace("def __init__", "all = []\n    def __init__"), encoding="utf-8")
-    make = controller_maker(str(mine), robot)
+    make = controller_maker(str(mine), ROBOT)
     first = make()
     assert type(first).made == 1  # type: ignore[attr-defined]  # of the file
     make()
     assert type(first).made == 2  # type: ignore[attr-defined]
 
 
-def test_a_file_beside_it_can_be_imported(mine: Path, robot: RobotConfig) -> None:
+def test_a_file_beside_it_can_be_imported(mine: Path) -> None:
     (mine.parent / "beside_my_controller.py").write_text("GAIN = 3", encoding="utf-8")
     mine.write_text(f"import beside_my_controller\n{GOOD}", encoding="utf-8")
-    controller_maker(str(mine), robot)
+    controller_maker(str(mine), ROBOT)
 
 
 GEOMETRY = load(DEFAULT_CONFIG).geometry
 
 
 @pytest.fixture(scope="module")
-def hocca(robot: RobotConfig) -> Hocca:
-    return Hocca(robot)
+def hocca() -> Hocca:
+    return Hocca(ROBOT)
 
 
 @pytest.fixture(scope="module")
-def seen(robot: RobotConfig, hocca: Hocca) -> Observation:
-    q, v = np.array(stand_pose(robot, 1.1)), np.zeros(12)
+def seen(hocca: Hocca) -> Observation:
+    q, v = np.array(stand_pose(ROBOT, 1.1)), np.zeros(12)
     law = hocca.tick(LawState(), LawInputs(q, v, 0.004))
     J, T = hocca.measured.J.copy(), hocca.reference.T.copy()
     return Observation(
@@ -185,8 +184,6 @@ def raises(_seen: Observation) -> Action:
 
 
 NAN = np.full(12, math.nan)
-
-
 BAD = {
     "None": lambda _: None,
     "a tuple": lambda seen: tuple(Action.of(seen.law)),
@@ -239,8 +236,8 @@ def test_stiffer_gains_that_stand_are_sent(hocca: Hocca, seen: Observation, scal
     assert found.local.margins.service >= seen.law.local.margins.service
 
 
-def test_no_own_gains_without_a_schedule(robot: RobotConfig, seen: Observation) -> None:
-    hocca = Hocca(msgspec.structs.replace(with_law(robot, split="diagonal"), gain_schedule=None))
+def test_no_own_gains_without_a_schedule(seen: Observation) -> None:
+    hocca = Hocca(msgspec.structs.replace(with_law(ROBOT, split="diagonal"), gain_schedule=None))
     hocca.tick(LawState(), LawInputs(seen.q, seen.v, 0.004))
     local: LocalGains = hocca.split.certify(seen.law.local.D)
     assert local.source is SplitSource.UNCERTIFIED

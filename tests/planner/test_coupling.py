@@ -16,18 +16,11 @@ from services.planner.law.coupling import (
     pole_gain,
 )
 from services.planner.law.small_matrices import LuDecomposition, eigenvalue_min, positive_part
-from shared.config.robot_config import RobotConfig
-from tests.planner.states import DT, with_law
+from tests.planner.states import DT, ROBOT, with_law
 
 K_P = np.array([2810.0, 2810.0, 0.0, 800.0, 0.0, 400.0])
-
-
 B_P = np.array([300.0, 300.0, 0.0, 60.0, 0.0, 40.0])
-
-
 S = np.array([0.0, 0.0, 1.0, 0.0, 1.0, 0.0])
-
-
 CLOSED = np.ix_([0, 1, 3, 5], [0, 1, 3, 5])
 
 
@@ -101,24 +94,20 @@ def test_above_its_bandwidth_it_falls_with_the_square() -> None:
 # ---- its integral
 
 
-def integral_of(robot: RobotConfig, **law: object) -> PushIntegral:
-    return PushIntegral(with_law(robot, **law).law)
+def integral_of(**law: object) -> PushIntegral:
+    return PushIntegral(with_law(ROBOT, **law).law)
 
 
-def test_in_its_time_the_integral_grows_to_what_the_body_s_stiffness_gives(
-    robot: RobotConfig,
-) -> None:
-    integral, force = integral_of(robot, push_integral_s=2.0), 0.0
+def test_in_its_time_the_integral_grows_to_what_the_body_s_stiffness_gives() -> None:
+    integral, force = integral_of(push_integral_s=2.0), 0.0
     for _ in range(500):
         force = integral.after(force, 0.01, 0.0, DT)
-    assert force == pytest.approx(robot.law.K_p[1] * 0.01)
+    assert force == pytest.approx(ROBOT.law.K_p[1] * 0.01)
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_at_its_limit_the_integral_stays_and_comes_back_at_once(
-    robot: RobotConfig, sign: float
-) -> None:
-    integral = integral_of(robot, push_integral_max=40.0)
+def test_at_its_limit_the_integral_stays_and_comes_back_at_once(sign: float) -> None:
+    integral = integral_of(push_integral_max=40.0)
     assert integral.after(39.9 * sign, sign, 0.0, DT) == sign * 40.0
     assert abs(integral.after(40.0 * sign, -sign * 1e-3, 0.0, DT)) < 40.0
 
@@ -127,20 +116,20 @@ def test_at_its_limit_the_integral_stays_and_comes_back_at_once(
     ("rate", "share"), [(0.0, 1.0), (0.5, 0.5), (-0.5, 0.5), (1.0, 0.0), (-2.0, 0.0)]
 )
 def test_the_faster_an_error_changes_the_less_of_it_is_integrated(
-    robot: RobotConfig, rate: float, share: float
+    rate: float, share: float
 ) -> None:
-    integral = integral_of(robot, push_integral_s=2.0)
+    integral = integral_of(push_integral_s=2.0)
     force = integral.after(0.0, 0.01, rate * FAST, DT)
-    assert force == pytest.approx(share * 0.002 * robot.law.K_p[1] * 0.01)
+    assert force == pytest.approx(share * 0.002 * ROBOT.law.K_p[1] * 0.01)
 
 
 @pytest.mark.parametrize(
     "law", [{"S": (0, 1, 1, 0, 1, 0)}, {"split": "diagonal"}, {"push_integral_max": 0.0}]
 )
 def test_it_integrates_nothing_that_is_led_the_papers_or_without_a_limit(
-    robot: RobotConfig, law: dict[str, object]
+    law: dict[str, object],
 ) -> None:
-    integral = integral_of(robot, **law)
+    integral = integral_of(**law)
     assert integral.after(0.0, 0.01, 0.0, DT) == integral.most == 0.0
     assert (integral.gain == 0.0) is ("push_integral_max" not in law), "what the certificate takes"
 

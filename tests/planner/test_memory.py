@@ -13,9 +13,7 @@ from services.planner.intents import OperatorRequest
 from services.planner.planner import Planner, PlannerState
 from shared.arrays import Array
 from shared.bus.messages import DriveStatus, Mode
-from shared.config.robot_config import RobotConfig
-from tests.planner.conftest import Closed
-from tests.planner.states import SESSION, START_NS, TICK_NS, receive_all
+from tests.planner.states import ROBOT, SESSION, START_NS, TICK_NS, closed, receive_all
 
 
 def astray(q: Array) -> Array:
@@ -30,11 +28,11 @@ COURSES: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("name", COURSES)
-def test_a_planner_goes_on_bit_for_bit(robot: RobotConfig, closed: Closed, name: str) -> None:
+def test_a_planner_goes_on_bit_for_bit(name: str) -> None:
     """It goes on counting, with the wish, the stance and the rival that it had."""
     changes, q = COURSES[name], closed(1.188, x=0.01, pitch=0.1)
     q = astray(q) if name == "feet astray" else q
-    planner, twin = Planner(robot, SESSION), Planner(robot, SESSION)
+    planner, twin = Planner(ROBOT, SESSION), Planner(ROBOT, SESSION)
     planner.receive_request(OperatorRequest(0.0, (0.01, 0.0, 0.0, 0.02)))
     seen = []
     for tick in range(60):

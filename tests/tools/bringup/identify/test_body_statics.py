@@ -8,7 +8,7 @@ import pytest
 from services.planner.law.kinematics import Kinematics
 from shared.arrays import Array
 from shared.config.robot_config import GRAVITY, RobotConfig
-from tests.planner.conftest import Closed, closed, ik, limits  # noqa: F401 - fixtures
+from tests.planner.states import closed
 from tools.bringup.identify.body_statics import Balance, BodyStatics, rotation_vector
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -20,7 +20,7 @@ POSES = (
 
 
 @pytest.fixture
-def poses(closed: Closed) -> Array:  # noqa: F811 - the fixture
+def poses() -> Array:
     return np.array([closed(**pose) for pose in POSES])
 
 
