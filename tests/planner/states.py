@@ -10,11 +10,10 @@ import msgspec
 import numpy as np
 
 from services.planner.law.certificate import Certificate
-from services.planner.law.gains import GainLaw, JointGains
 from services.planner.law.hocca import Hocca, LawInputs, LawOutput, LawState
 from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.kinematics import Kinematics
-from services.planner.law.split import GainSplit, LocalGains
+from services.planner.law.split import GainLaw, GainSplit, JointGains, LocalGains
 from services.planner.planner import Planner
 from shared.arrays import Array
 from shared.bus.messages import JointCommand, JointState, PlannerMode, PlannerStatus, Wrench

@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 
 from services.joint.differential import motor_from_joint
 from services.planner.law.certificate import DIRECTIONS, UNITS, Certificate, motor_mean
-from services.planner.law.gains import GainLaw
 from services.planner.law.inverse_kinematics import InverseKinematics
-from services.planner.law.split import GainSplit
+from services.planner.law.split import GainLaw, GainSplit
 from shared.arrays import Array
 from shared.robot.robot_model import stand_pose
 from tests.planner.states import ROBOT, Stand, at_pose, closed, p_at, with_law

@@ -11,8 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from services.planner.controller import Action, Observation
-from services.planner.controller_file import absolute, controller_maker, split_spec
+from services.planner.controller import Action, Observation, absolute, controller_maker, split_spec
 from services.planner.intents import OperatorRequest
 from services.planner.law.hocca import Hocca, LawInputs, LawState
 from services.planner.law.split import LocalGains

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.planner.law.height import (
+from services.planner.law.closed_reference import (
     ACCELERATION,
     FADE_RATE,
     FORCE_MAX,

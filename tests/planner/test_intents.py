@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.planner.intents import Intents, OperatorRequest
-from services.planner.law.shift import ROWS, SHIFT_S, ShiftReference, ShiftState
+from services.planner.law.closed_reference import ROWS, SHIFT_S, ShiftReference, ShiftState
 from shared.arrays import Array
 from shared.bus.messages import STRAIGHT, OperatorIntent, Vector4
 from shared.clock import NS_PER_MS

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from services.planner.law.levelling import SLOPE_MAX, Levelling, LevellingState, slope_of, up_of
+from services.planner.law.feet import SLOPE_MAX, Levelling, LevellingState, slope_of, up_of
 from shared.bus.messages import Pair, Vector3
 from shared.config.robot_config import GRAVITY
 from tests.imu.robots import with_imu

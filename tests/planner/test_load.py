@@ -249,8 +249,8 @@ TARE = (
     "changes nothing{}, set mass.payload, then `xrl gains`"
 )
 HANGS = (
-    "it hangs: lower it until its feet bear its weight; or, on its feet, it carries 50 kg less than "
-    "its file says: set mass.payload, then `xrl gains`"
+    "it hangs: lower it until its feet bear its weight; or, on its feet, it carries 50 kg less "
+    "than its file says: set mass.payload, then `xrl gains`"
 )
 LIES = "the load lies too far {}: at most 20 N m are accepted (16 once refused)"
 MORE, LESS = TARE.format("9.0 kg more", ""), TARE.format("9.0 kg less", " and nothing holds it up")

@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.planner.law.certificate import Margins
-from services.planner.law.gains import JointGains
-from services.planner.law.split import GainSplit, ScheduledGains
+from services.planner.law.split import GainSplit, JointGains, ScheduledGains
 from shared.bus.messages import SplitSource
 from shared.config.gain_table import GainSchedule
 from shared.config.robot_config import RobotConfig

@@ -6,8 +6,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from services.planner.law.feet import FOLLOW_S, Stance, StanceState
 from services.planner.law.kinematics import Kinematics, Measured
-from services.planner.law.stance import FOLLOW_S, Stance, StanceState
 from shared.arrays import Array
 from tests.planner import oracle
 from tests.planner.oracle import LEFT, RIGHT

@@ -14,10 +14,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from services.planner.law.gains import GainLaw
 from services.planner.law.inverse_kinematics import TOLERANCE, InverseKinematics
 from services.planner.law.kinematics import Kinematics
-from services.planner.law.split import GainSplit
+from services.planner.law.split import GainLaw, GainSplit
 from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
 from tests.planner import oracle

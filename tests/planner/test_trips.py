@@ -11,8 +11,7 @@ import pytest
 
 from services.planner.law.hocca import LawOutput
 from services.planner.law.kinematics import Measured
-from services.planner.watch.soles import Soles
-from services.planner.watch.trips import CALM_NS, PlannerTrips, TripsState, values_of
+from services.planner.watch.trips import CALM_NS, PlannerTrips, Soles, TripsState, values_of
 from shared.arrays import Array
 from shared.bus.messages import Pair, Trip
 from shared.clock import NS_PER_MS

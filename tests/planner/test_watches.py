@@ -12,24 +12,26 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.joint.failsafe import Failsafe, timing_of
-from services.planner.law.height import Toward
+from services.planner.law.closed_reference import Toward
 from services.planner.law.load import LoadState
 from services.planner.planner import Planner
-from services.planner.watch.harness_trust import AFTER_S, CHANGE_MAX, HarnessTrust
-from services.planner.watch.harness_trust import EASE_S as TRUST_EASE_S
-from services.planner.watch.heat import (
+from services.planner.watch.engagement_fsm import AGAIN_NS, DISARMED_NS, LimpLegWatch, RivalWatch
+from services.planner.watch.plausible import AFTER_S, CHANGE_MAX, HarnessTrust
+from services.planner.watch.plausible import EASE_S as TRUST_EASE_S
+from services.planner.watch.reserves import (
     EASE_S,
     HAND_MAX,
+    POLE_S,
+    RECOVERED_V,
     REST_S,
     RESTED_ON,
     SHED_RATE,
     HeatDecision,
     HeatWatch,
     HeatWatchState,
+    SupplyState,
+    SupplyWatch,
 )
-from services.planner.watch.limp_leg_watch import DISARMED_NS, LimpLegWatch
-from services.planner.watch.rival_watch import AGAIN_NS, RivalWatch
-from services.planner.watch.supply import POLE_S, RECOVERED_V, SupplyState, SupplyWatch
 from shared.arrays import Array
 from shared.bus.messages import (
     DriveStatus,

@@ -33,17 +33,27 @@ from services.planner.law.assist import (
     is_still,
     wrench_in_world,
 )
-from services.planner.law.coupling import CouplingState, PushIntegral, Y, low_passed
-from services.planner.law.gains import GainLaw
-from services.planner.law.height import HeightReference, HeightState, Released, Toward
+from services.planner.law.closed_reference import (
+    HeightReference,
+    HeightState,
+    Released,
+    ShiftReference,
+    ShiftState,
+    Toward,
+)
+from services.planner.law.coupling import CouplingState, LawAtReference, PushIntegral, Y, low_passed
+from services.planner.law.feet import (
+    FOLLOW_S,
+    Levelling,
+    LevellingState,
+    Stance,
+    StanceState,
+    up_of,
+)
 from services.planner.law.kinematics import Measured
-from services.planner.law.law_terms import LawAtReference
-from services.planner.law.levelling import Levelling, LevellingState, up_of
 from services.planner.law.load import Load, LoadState
 from services.planner.law.reference import Reference
-from services.planner.law.shift import ShiftReference, ShiftState
-from services.planner.law.split import GainSplit, LocalGains
-from services.planner.law.stance import FOLLOW_S, Stance, StanceState
+from services.planner.law.split import GainLaw, GainSplit, LocalGains
 from shared.arrays import Array, vector6
 from shared.bus.messages import STRAIGHT, Pair, Vector3, Vector4, Vector6, Wrench
 from shared.config.robot_config import GRAVITY, RobotConfig
@@ -77,7 +87,7 @@ class LawInputs(NamedTuple):
     shift: Vector4 = STRAIGHT
     """Requested x, y (m), roll and yaw (rad) of the shift; limited by the law."""
     toward: Toward = Toward.PERSON
-    """Where the robot goes without a hand (`services.planner.law.height`)."""
+    """Where the robot goes without a hand (`services.planner.law.closed_reference`)."""
     released: Released = (False, False)
     """True if nobody leads the height, the pitch."""
     pitch_drive: float = 0.0

@@ -1,6 +1,6 @@
-"""What the planner does before a motor is too warm (docs/law.md#heat). Pure.
+"""What the planner does before a motor is too warm or a battery is empty. Pure.
 
-Each joint service says how many seconds are left at its present load. By the least of them:
+**Heat** (docs/law.md#heat). Each joint service says how many seconds are left at its present load. By the least of them:
 
     below heat.ease_s     the person is told, and the assist goes, as far as nobody rests on it
     below heat.stand_s    height and pitch are the planner's: it stands up slowly, to nearly
@@ -9,6 +9,17 @@ Each joint service says how many seconds are left at its present load. By the le
                           a hand presses or pulls it: given back, it would follow that at once
 
 Without a planner the modules hold, and only say it.
+
+**Supply.** A battery that runs low is told early:
+
+    low      below `supply.low_v`: the person is told, with the number
+    sits     below `supply.sit_v`: the robot goes down by itself
+             (`services.planner.law.closed_reference`)
+
+A supply without power makes its modules limp, and the robot falls: from its lowest pose as hard as
+from a stand. Down, a stand can be put under the torso; that is what the time is for. The lowest
+of the six counts, low-passed: a step of the load is no empty battery. Both last until the supply is
+`RECOVERED_V` above their level, because a battery recovers as soon as its load is less.
 """
 
 from __future__ import annotations
@@ -18,11 +29,11 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from services.planner.law.height import Toward
+from services.planner.law.closed_reference import Toward
 from shared.bus.messages import HeatAction, JointState
 from shared.clamp import clamp
 from shared.clock import NS_PER_S
-from shared.config.sections import HeatConfig
+from shared.config.sections import HeatConfig, SupplyConfig
 from shared.joints import MODULES, kind_of
 
 EASE_S: Final = 10.0
@@ -158,3 +169,62 @@ def _assist_left(s: HeatWatchState, requested: float) -> float:
     if s.scale >= 1.0:
         return requested
     return min(requested, max(s.scale * requested, s.rests - RESTED_ON))
+
+
+POLE_S: Final = 2.0
+"""Time constant, s."""
+RECOVERED_V: Final = 1.0
+
+
+class SupplyState(msgspec.Struct):
+    """State of `SupplyWatch`."""
+
+    volts: float = 0.0
+    """Lowest supply, low-passed, V; 0: none is known."""
+    module: str = ""
+    """Whose it is."""
+    was_well: bool = False
+    """It was above `supply.low_v`. One that never was is another battery than the file says, and
+    moves nothing."""
+    low: bool = False
+    sits: bool = False
+
+
+class SupplyWatch:
+    """Compares the lowest supply with its levels."""
+
+    def __init__(self, config: SupplyConfig) -> None:
+        """Take the levels, V; 0: never."""
+        self._low_v, self._sit_v = config.low_v, config.sit_v
+
+    def advance(self, s: SupplyState, states: Sequence[JointState], dt: float) -> None:
+        """Advance by one tick.
+
+        Args:
+            s: this watch's state, which changes.
+            states: the newest of each module.
+            dt: time since the last tick, s.
+        """
+        known = [(state.supply_v, at) for at, state in enumerate(states) if state.supply_v > 0.0]
+        if not known:
+            return
+        lowest, at = min(known)
+        s.volts = lowest if s.volts == 0.0 else s.volts + min(1.0, dt / POLE_S) * (lowest - s.volts)
+        s.module = MODULES[at]
+        s.low = s.volts < self._low_v + (RECOVERED_V if s.low else 0.0)
+        s.was_well |= s.volts > self._low_v
+        s.sits = s.was_well and s.volts < self._sit_v + (RECOVERED_V if s.sits else 0.0)
+
+    def describe(self, s: SupplyState) -> str:
+        """Return what the person must know; "" if the supplies are well."""
+        if s.sits:
+            return (
+                f"the supply of {s.module} is at {s.volts:.1f} V, below {self._sit_v:g} V: it goes "
+                "down; hang it, or put a stand under its torso, now"
+            )
+        if s.low:
+            return (
+                f"the supply of {s.module} is at {s.volts:.1f} V, below {self._low_v:g} V: change "
+                f"the battery; at {self._sit_v:g} V it goes down by itself"
+            )
+        return ""
