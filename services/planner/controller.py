@@ -1,10 +1,11 @@
 """A controller of your own: its interface, and how it is loaded from a file.
 
-It takes the place of the shipped law (docs/own-controller.md), and runs inside the planner: in lockstep, live and from the log. Everything around it stays as it is:
-stance, load, assist, engagement and trips of the planner; certificate of the local gains
+It takes the place of the shipped law (docs/own-controller.md), and runs inside the planner: in
+lockstep, live and from the log. Everything around it stays as it is: stance, load, assist,
+engagement and trips of the planner; certificate of the local gains
 (`services.planner.watch.controller_guard`); age rule, envelope and torque limits of the joint
-services. Joints are in the order of `shared.joints`, the pose is p = [COM x y z; torso roll
-pitch yaw].
+services. Joints are in the order of `shared.joints`, the pose is p = [COM x y z; torso roll pitch
+yaw].
 """
 
 from __future__ import annotations

@@ -1,17 +1,18 @@
 """References of the directions that no hand leads: shift, height and pitch. Pure.
 
-**Shift.** By itself the robot keeps its COM over the ankles and its torso upright. The operator may request a
-small offset (`operator/intent`): COM forwards or sideways, torso rolled or yawed. A second-order
-follower with limits follows it without a jump. It takes at least `SHIFT_S` for the whole range and stays within
-`law.shift_max`:
+**Shift.** By itself the robot keeps its COM over the ankles and its torso upright. The operator may
+request a small offset (`operator/intent`): COM forwards or sideways, torso rolled or yawed. A
+second-order follower with limits follows it without a jump. It takes at least `SHIFT_S` for the
+whole range and stays within `law.shift_max`:
 
     r'' = w^2 (wanted - r) - 2 w r',   |r'| <= shift_max / SHIFT_S
 
-**Height and pitch.** Height and torso pitch are open: a hand leads them. To go down (`xrl down`, a low battery) or up
-(`services.planner.watch.reserves`) the law closes both. The height's reference h moves at a bounded
-rate until a knee is at the end of its range; the pitch's stays where it was. When nobody leads
-(`services.planner.watch.unattended`), one of them or both are closed where they are. The reference
-begins at the measured pose, and h at its rate, so nothing steps. z is the measured height.
+**Height and pitch.** Height and torso pitch are open: a hand leads them. To go down (`xrl down`, a
+low battery) or up (`services.planner.watch.reserves`) the law closes both. The height's reference h
+moves at a bounded rate until a knee is at the end of its range; the pitch's stays where it was.
+When nobody leads (`services.planner.watch.unattended`), one of them or both are closed where they
+are. The reference begins at the measured pose, and h at its rate, so nothing steps. z is the
+measured height.
 
     p_ref    = (1 - hold) p_ref    + hold (h, pitch)             hold: of the height, of the pitch
     pdot_ref = (1 - hold) pdot_ref + hold (h', 0)

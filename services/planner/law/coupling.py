@@ -1,8 +1,8 @@
 """The coupled torque, and all of the law's terms at a reference pose. Pure.
 
-The planner adds the coupled torque, low-passed, to the local gains. Alone, the local gains stand with K_fail = T^T D T + K_geo (`services.planner.law.certificate`) and
-damp with T^T D_B T. In the closed rows of p, the rest of the body's K_p and B_p (paper, section IV)
-is
+The planner adds the coupled torque, low-passed, to the local gains. Alone, the local gains stand
+with K_fail = T^T D T + K_geo (`services.planner.law.certificate`) and damp with T^T D_B T. In the
+closed rows of p, the rest of the body's K_p and B_p (paper, section IV) is
 
     K_c = (K_p - K_fail)+        B_c = (c B_p - T^T D_B T)+        c: `coupling_damping`
 

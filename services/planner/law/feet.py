@@ -1,11 +1,11 @@
 """Where the feet stand: their stance, and the slope of the floor. Pure.
 
-**Stance**, relative to the robot file. The law knows its feet by the joints alone. Both legs carry the same torso, so two estimates of one
-torso show a foot that is ahead, turned, or nearer than `geometry.w_base`. Before the planner
-engages, it adopts the stance in which the legs agree. It keeps that stance while engaged. No leg
-then works against the other, and each foot gets a wrench that its own position allows. With the
-feet taken from the file, 0.1 m too wide tipped a sole by 0.18 rad; with the measured stance, by
-0.002 rad.
+**Stance**, relative to the robot file. The law knows its feet by the joints alone. Both legs carry
+the same torso, so two estimates of one torso show a foot that is ahead, turned, or nearer than
+`geometry.w_base`. Before the planner engages, it adopts the stance in which the legs agree. It
+keeps that stance while engaged. No leg then works against the other, and each foot gets a wrench
+that its own position allows. With the feet taken from the file, 0.1 m too wide tipped a sole by
+0.18 rad; with the measured stance, by 0.002 rad.
 
 While the planner is not engaged, the stance follows the joints slowly. Feet that were moved in HOLD
 are found, and a sole that lifts in a sway is not mistaken for one. A planner that has not been
@@ -15,10 +15,10 @@ stance until it disengages again.
 Zero errors of the joints become part of the stance: they look like feet that are slightly off. The
 planner refuses a stance beyond `law.stance_max`: it was not shown to stand, or something is broken.
 
-**Slope**, from IMU and joints, as the direction of up in floor axes. The planner's axes are the floor's: z is the floor's normal (docs/law.md#slopes). On a slope,
-gravity leans in these axes by the slope's angle. A COM above the ankles along the floor's normal is
-then not above them along gravity. At a height of 1 m and 5 degrees it is 87 mm off, and the weight
-pulls it downhill.
+**Slope**, from IMU and joints, as the direction of up in floor axes. The planner's axes are the
+floor's: z is the floor's normal (docs/law.md#slopes). On a slope, gravity leans in these axes by
+the slope's angle. A COM above the ankles along the floor's normal is then not above them along
+gravity. At a height of 1 m and 5 degrees it is 87 mm off, and the weight pulls it downhill.
 
 The IMU gives up in torso axes, and the joints give the torso's orientation on the floor:
 

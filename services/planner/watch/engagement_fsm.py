@@ -1,22 +1,24 @@
 """Decides who leads, when all six modules track, and which of them stiffen. Pure.
 
-**Engagement** (docs/architecture.md#modes). All six modules track or none does. While one module's state is stale, or one module is not in
-TRACK, every command carries `hold`, so that no leg works against the other. Modules report `ready`
-once commands have been fresh for long enough. When all are ready, the planner engages: it lifts
-`hold` for all in the same tick, and they have `GRACE_NS` to report TRACK. An overload at the
-harness and gains that do not stand alone also set `hold`.
+**Engagement** (docs/architecture.md#modes). All six modules track or none does. While one module's
+state is stale, or one module is not in TRACK, every command carries `hold`, so that no leg works
+against the other. Modules report `ready` once commands have been fresh for long enough. When all
+are ready, the planner engages: it lifts `hold` for all in the same tick, and they have `GRACE_NS`
+to report TRACK. An overload at the harness and gains that do not stand alone also set `hold`.
 
 After a drop-out of any module, a trip, or gains that do not stand alone, the planner waits before
 it re-engages; the wait grows with the number of recent drop-outs. Six links that drop out in turn
 would otherwise make the robot flap between TRACK and HOLD.
 
-**Two planners** on one bus, by accident: the one that is followed leads on, the other waits. A module takes another planner's commands once those of the present one are too old. A second
-planner that sends takes one module after the other, each at the first message that comes late. So a
-planner that sees modules follow another one leads none until that one has ended. It makes itself
-known by commands that every module refuses: `xrl status` and the log then tell of both.
+**Two planners** on one bus, by accident: the one that is followed leads on, the other waits. A
+module takes another planner's commands once those of the present one are too old. A second planner
+that sends takes one module after the other, each at the first message that comes late. So a planner
+that sees modules follow another one leads none until that one has ended. It makes itself known by
+commands that every module refuses: `xrl status` and the log then tell of both.
 
-**Limp legs.** Modules are to stiffen when another one may be limp. Joint services on one host detect a limp neighbour without a planner (`services.joint.neighbours`).
-The planner adds modules on other hosts, and a module that restarts and stays DISARMED.
+**Limp legs.** Modules are to stiffen when another one may be limp. Joint services on one host
+detect a limp neighbour without a planner (`services.joint.neighbours`). The planner adds modules on
+other hosts, and a module that restarts and stays DISARMED.
 """
 
 from __future__ import annotations

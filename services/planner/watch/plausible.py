@@ -2,11 +2,12 @@
 
 `Plausible` refuses measurements that no sensor can have made.
 
-`HarnessTrust` decides by the joints' torques whether the harness's wrench is believed. What the joints hold up beyond the robot file and the wrench counts as load
-(`services.planner.law.load`). A load hardly ever changes while a person wears the robot, but a
-sensor can begin to lie: a cell drifts, sticks or changes its sign. Since the planner first led, the
-load must therefore stay within `CHANGE_MAX`. In 40 drawn leads it changed by 1.0 kg and 2.3 N m at
-most, with persons who differ from their assist by 24 N.
+`HarnessTrust` decides by the joints' torques whether the harness's wrench is believed. What the
+joints hold up beyond the robot file and the wrench counts as load (`services.planner.law.load`). A
+load hardly ever changes while a person wears the robot, but a sensor can begin to lie: a cell
+drifts, sticks or changes its sign. Since the planner first led, the load must therefore stay within
+`CHANGE_MAX`. In 40 drawn leads it changed by 1.0 kg and 2.3 N m at most, with persons who differ
+from their assist by 24 N.
 
 A wrench that is not believed is used for nothing: no load is learnt from it, the lead is not eased,
 and the assist, which nobody can check then, fades within `EASE_S`. A new zero (`xrl drive tare`)

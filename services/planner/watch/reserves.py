@@ -1,6 +1,7 @@
 """What the planner does before a motor is too warm or a battery is empty. Pure.
 
-**Heat** (docs/law.md#heat). Each joint service says how many seconds are left at its present load. By the least of them:
+**Heat** (docs/law.md#heat). Each joint service says how many seconds are left at its present load.
+By the least of them:
 
     below heat.ease_s     the person is told, and the assist goes, as far as nobody rests on it
     below heat.stand_s    height and pitch are the planner's: it stands up slowly, to nearly

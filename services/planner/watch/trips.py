@@ -1,11 +1,11 @@
 """What the soles bear, and the planner's trips. Pure.
 
-**Soles**, by the joints' torques. A sole whose centre of pressure reaches its edge tips, and a robot that is led is soft against that:
-leaned on from the side it fell from 50 N on. HOLD is stiffer, and bears 65 N and more if it begins
-while both soles are flat.
+**Soles**, by the joints' torques. A sole whose centre of pressure reaches its edge tips, and a
+robot that is led is soft against that: leaned on from the side it fell from 50 N on. HOLD is
+stiffer, and bears 65 N and more if it begins while both soles are flat.
 
-**Trips.** A trip makes all six modules hold. No single joint service can see these faults (`shared.robot.trip_table`; limits: [trips] of the
-robot file):
+**Trips.** A trip makes all six modules hold. No single joint service can see these faults
+(`shared.robot.trip_table`; limits: [trips] of the robot file):
 
     legs       the two legs' estimates of the torso's position differ: a sole tips, or a zero is off
     reach      the inverse kinematics does not reach the reference pose

@@ -12,11 +12,11 @@ compared with c, the rate at which the hand left, which falls at least by `COAST
     excess'  = rate - c;                           excess = 0 while a hand is felt
     released   if |excess + STOP_S (rate - c)| > RUNAWAY
 
-A released direction is closed (`services.planner.law.closed_reference`) until a hand is back. A hand
-that was there after all, too light to be felt, then feels a resistance and opens it. A pitch that
-stays released for `PROOF_NS` shows that nobody holds the robot: its height is then closed as well,
-and the weight of a person who rests no longer moves it. A hand on the pitch opens both. What moves
-nevertheless is drift, which trips:
+A released direction is closed (`services.planner.law.closed_reference`) until a hand is back. A
+hand that was there after all, too light to be felt, then feels a resistance and opens it. A pitch
+that stays released for `PROOF_NS` shows that nobody holds the robot: its height is then closed as
+well, and the weight of a person who rests no longer moves it. A hand on the pitch opens both. What
+moves nevertheless is drift, which trips:
 
     drift    = max(|z - z0|, ARM |pitch - pitch0|)       z0, pitch0: when the hand was lost
 """
