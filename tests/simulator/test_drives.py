@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from services.simulator.drives.axis_bank import AXIS_NAMES, FAULTS, AxisBank, AxisErrors
+from services.simulator.drives.axis_bank import AxisBank
+from services.simulator.drives.axis_faults import AXIS_NAMES, FAULTS, AxisErrors
 from services.simulator.drives.axis_heat import Heat
 from services.simulator.drives.axis_settings import (
     NAMES,

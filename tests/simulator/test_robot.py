@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.simulator.drives.axis_bank import AXIS_NAMES, AxisBank
-from services.simulator.drives.axis_faults import BOOT_S, TALKS_S
+from services.simulator.drives.axis_bank import AxisBank
+from services.simulator.drives.axis_faults import AXIS_NAMES, BOOT_S, TALKS_S
 from services.simulator.drives.axis_faults import AxisErrors as Registers
 from services.simulator.fronts.cansimple_front import CanSimpleFront
 from services.simulator.loop import SimulatorLoop, SimulatorPorts, granted

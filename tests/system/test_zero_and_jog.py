@@ -14,8 +14,7 @@ import msgspec
 import pytest
 
 from services.joint.__main__ import open_drive
-from services.joint.drivers.base import DriveStatus
-from shared.bus.messages import Mode
+from shared.bus.messages import DriveStatus, Mode
 from shared.can import cansimple
 from shared.can.cansimple import Command
 from shared.config.robot_config import RobotConfig, expand

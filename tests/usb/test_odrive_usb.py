@@ -16,10 +16,11 @@ import odrive
 import pytest
 
 from services.joint.drivers import odrive_usb
-from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.base import DriveReading, MotorTarget
 from services.joint.drivers.odrive_usb import EXCHANGE_HZ, OdriveUsb
 from services.simulator.fronts import fibre_front
 from services.simulator.fronts.fibre_front import endpoints
+from shared.bus.messages import DriveStatus
 from shared.can.cansimple import AxisError, AxisState, ControlMode
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError

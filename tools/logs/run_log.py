@@ -20,7 +20,7 @@ from typing import Any, Final, NamedTuple
 
 import msgspec
 
-from services.planner.controller_file import ATTACHED
+from services.planner.controller import ATTACHED
 from shared.bus import topics
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS, NS_PER_S

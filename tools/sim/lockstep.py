@@ -216,7 +216,7 @@ class Lockstep:
         return FleetMoment(
             self._robot.read_state(self.now_ns, 0),
             {joint.name: copied(joint.manager.state) for joint in self.joints},
-            None if planner is None else (planner.session, planner.snapshot()),
+            None if planner is None else (planner.session, copied(planner.state)),
         )
 
     def resume(self, moment: FleetMoment) -> None:

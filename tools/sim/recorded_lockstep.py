@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from services.planner.controller_file import ATTACHED, controller_maker, split_spec
+from services.planner.controller import ATTACHED, controller_maker, split_spec
 from services.simulator.physics.plant import PlantConfig
 from shared import revision
 from shared.bus import topics

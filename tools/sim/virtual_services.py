@@ -362,7 +362,7 @@ class VirtualPlanner:
         self._session, state = start
         if self.planner is None or self.planner.session != self._session:
             self.planner = self._make(self._session)
-        self.planner.restore(state)
+        self.planner.state = copied(state)
 
 
 class VirtualCan(Generic[S]):
