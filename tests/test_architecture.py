@@ -132,7 +132,7 @@ EDGES = [
     "services/joint/drivers/odrive_usb.py",
     "services/joint/rearm_guard.py",
     "services/network_proxy/*.py",
-    "services/planner/controller_file.py",
+    "services/planner/controller.py",
     "services/recorder/auto_recover.py",
     "services/recorder/host_watch.py",
     "services/ros2_gateway/ros_session.py",
