@@ -15,7 +15,7 @@ from shared.clock import now_ns
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import BusError, FleetError
 from shared.joints import MODULES
-from tools.fleet.led_planner import asker, other_asker
+from tools.live.assist_request import asker, other_asker
 from tools.live.descent import WAYS, Ask, Descent, Phase
 
 LOOK_S: Final = 0.02
