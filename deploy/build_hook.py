@@ -17,7 +17,6 @@ FILES = (
     "hosts.example.toml",
     "scenarios",
     "plants",
-    "foxglove",
     "nftables",
     "sysctl",
     "udev",

@@ -28,7 +28,6 @@ EXTRAS: Final = {
     "foxglove": ("foxglove",),
     "ros2": ("rosbags",),
     "usb": ("odrive",),
-    "parquet": ("pyarrow",),
     "pad": ("sdl2", "sdl2dll"),
     "cluster": ("distributed",),
     "bench": ("cyclonedds", "iceoryx2", "lcm", "zmq"),
@@ -61,7 +60,7 @@ def is_installed(extra: str) -> bool:
 
 
 def _is_there(package: str) -> bool:
-    """Return True for a package; deploy is on the path too, and its folder `foxglove` is none."""
+    """Return True for a package; deploy is on the path too, and its folder `plants` is none."""
     found = importlib.util.find_spec(package)
     if found is None or found.origin is not None:
         return found is not None

@@ -72,7 +72,6 @@ VENDORS = {
     "zenoh": ["shared/bus/session.py", "services/ros2_gateway/ros_session.py"],
     "rosbags": ["services/ros2_gateway/ros_types.py", "tools/export/ros2_bag.py"],
     "shtab": ["tools/verbs/completion.py"],
-    "pyarrow": ["tools/export/tables.py"],
     "mujoco": [
         "services/simulator/physics/world.py",
         "services/simulator/physics/body.py",
@@ -99,7 +98,7 @@ VENDORS = {
     ],
     "odrive": ["services/joint/drivers/odrive_usb.py", "tools/bringup/usb_board.py"],
     "mcap": ["shared/mcap_log/*.py", "tools/logs/reexecution/rewritten.py"],
-    "foxglove": ["tools/judge/reports/foxglove.py", "tools/view/foxglove_server.py"],
+    "foxglove": ["tools/view/foxglove_server.py"],
     "supervisor": ["tools/fleet/*.py"],
     "can": [
         "shared/can/unix_can.py",
@@ -146,15 +145,12 @@ TOOL_LAWS = [
     "shared/can/cansimple*.py",
     "shared/mcap_log/records.py",
     "shared/mcap_log/sequence_stats.py",
-    "tools/bringup/free_leg.py",
     "tools/bringup/hanging_leg.py",
     "tools/bringup/identify.py",
-    "tools/bringup/jog.py",
     "tools/bringup/motion.py",
     "tools/bringup/whole_turns.py",
     "tools/lab/design/*.py",
     "tools/logs/reexecution/compare.py",
-    "tools/logs/reexecution/inputs.py",
     "tools/logs/reexecution/params.py",
 ]
 

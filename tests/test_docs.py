@@ -15,7 +15,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from services.recorder import disk_guard, host_watch, snapshot
+from services.recorder import host_watch, snapshot
 from services.simulator.physics import posture
 from shared.bus.session import peers_of
 from shared.bus.topics import TOPICS
@@ -145,9 +145,9 @@ def test_the_table_of_processes_has_every_topic_that_a_service_writes() -> None:
 @pytest.mark.parametrize(
     ("page", "text"),
     [
-        ("logs.md", f"| below {disk_guard.WARN:g} | warns in its log; again only once"),
-        ("logs.md", f"again only once {disk_guard.CALM:g} were free"),
-        ("logs.md", f"| {disk_guard.RESUME:g} and more, after that |"),
+        ("logs.md", f"| below {host_watch.WARN:g} | warns in its log; again only once"),
+        ("logs.md", f"again only once {host_watch.CALM:g} were free"),
+        ("logs.md", f"| {host_watch.RESUME:g} and more, after that |"),
         ("logs.md", f"the same factors of {host_watch.RUN_DIR_MIN_MIB} MiB"),
         ("logs.md", f"silent for {snapshot.SILENT_NS // NS_PER_S} s"),
         ("logs.md", " or ".join(f"`{row.name}`" for row in snapshot.STEADY[1:])),

@@ -24,8 +24,8 @@ from tools.dev.mutants import (
 )
 from tools.terminal import Console
 
-DIFF = """--- services/joint/torque_limiter.py
-+++ services/joint/torque_limiter.py
+DIFF = """--- services/joint/differential.py
++++ services/joint/differential.py
 @@ -1,5 +1,5 @@
  def _soft_stop(q: float, stops: Pair) -> float:
 -    if q < stops[0]:
@@ -33,7 +33,7 @@ DIFF = """--- services/joint/torque_limiter.py
          return STIFFNESS * (stops[0] - q)
 """
 LIVES = Mutation(
-    "services.joint.torque_limiter.x__soft_stop", "if q < stops[0]:", "if q <= stops[0]:"
+    "services.joint.differential.x__soft_stop", "if q < stops[0]:", "if q <= stops[0]:"
 )
 WHY = "at the stop itself the spring pulls by nothing"
 
@@ -65,7 +65,7 @@ def test_each_mutant_that_may_live_is_of_a_function_that_is_there(told: MutantsF
 
 
 def test_a_mutant_is_known_by_its_function_and_its_lines() -> None:
-    assert _change_of("services.joint.torque_limiter.x__soft_stop__mutmut_1", DIFF) == LIVES
+    assert _change_of("services.joint.differential.x__soft_stop__mutmut_1", DIFF) == LIVES
 
 
 def judged(alive: int, listed: tuple[Mutation, ...], **asked: object) -> tuple[int, str]:

@@ -6,8 +6,7 @@ import os
 from pathlib import Path
 
 from services.harness.filter import WrenchFilter
-from services.harness.loop import HarnessLoop
-from services.harness.zero_file import ZeroFile
+from services.harness.loop import HarnessLoop, ZeroFile
 from shared import process
 from shared.bus import topics
 from shared.bus.messages import TareRequest, Wrench

@@ -9,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from services.harness.filter import WrenchFilter
-from services.harness.loop import HarnessLoop
-from services.harness.zero_file import ZeroFile
+from services.harness.loop import HarnessLoop, ZeroFile
 from shared.bus.codec import encode
 from shared.bus.messages import TareRequest, Vector6, Wrench
 from shared.clock import NS_PER_MS, NS_PER_S

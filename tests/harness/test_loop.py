@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from services.harness.zero_file import ZeroFile, path_of
+from services.harness.loop import ZeroFile, zero_path
 from services.simulator.fronts.sensor_fronts import BIAS_MAX, HarnessFront
 from shared.bus.codec import Decoder
 from shared.bus.messages import Tare, Wrench
@@ -116,7 +116,7 @@ def test_a_zero_that_is_damaged_or_of_an_earlier_boot_is_none(tmp_path: Path) ->
     zero.write(offset)
     assert np.array_equal(ZeroFile(tmp_path).read(), offset)
     assert ZeroFile(tmp_path, b"another boot").read() is None
-    file = path_of(tmp_path)
+    file = zero_path(tmp_path)
     whole = file.read_bytes()
     for at in range(len(whole)):
         file.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])

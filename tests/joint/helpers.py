@@ -8,7 +8,7 @@ from typing import Any, Literal, TypeVar
 
 import msgspec
 
-from services.joint.controller import CycleResult, JointController
+from services.joint.controller import ControllerState, CycleResult, JointController
 from services.joint.differential import joint_torque, motor_from_joint
 from services.joint.drive_manager import DriveAction, DriveCommand, DriveManager
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
@@ -80,7 +80,8 @@ def firmware(
 class BenchJoint:
     """A joint that stays where it is put, and the drive that measures it, in virtual time."""
 
-    controller: JointController
+    law: JointController
+    controller: ControllerState
 
     def __init__(self, robot: RobotConfig, status: DriveStatus) -> None:
         self.gear_ratio = robot.joint.gear_ratio
@@ -118,12 +119,13 @@ class Bench(BenchJoint):
 
     def __init__(self, robot: RobotConfig, module: str = "knee_right") -> None:
         super().__init__(robot, DriveStatus.ARMED)
-        self.controller = JointController(believing(robot), module)
+        self.law = JointController(believing(robot), module)
+        self.controller = self.law.start()
 
     @property
     def is_stiffened(self) -> bool:
         """Return True if the module says that it holds with all it has."""
-        return self.controller.state(self.now_ns).stiffened
+        return self.law.state(self.controller, self.now_ns).stiffened
 
     def fresh(self, **changes: Any) -> JointCommand:
         """Return the next command, echoing the state of the cycle before."""
@@ -142,7 +144,7 @@ class Bench(BenchJoint):
         """Run the next cycle: a period, or `after_ns`, after the one before."""
         self.now_ns += after_ns or self.cycle_ns
         reading = None if stalled else self.reading()
-        return self.controller.step(self.now_ns, reading, sent, estop, near=near)
+        return self.law.step(self.controller, self.now_ns, reading, sent, estop, near=near)
 
     def run(self, cycles: int, *, fresh: bool = False, **changes: Any) -> list[CycleResult]:
         """Run cycles, with a fresh command in each or with none."""
@@ -215,9 +217,14 @@ class ModuleBench(BenchJoint):
         self.torque: Pair = (0.0, 0.0)
 
     @property
-    def controller(self) -> JointController:
+    def law(self) -> JointController:  # type: ignore[override]
         """Return that of the module, which may be another one by now."""
         return self.module.controller
+
+    @property
+    def controller(self) -> ControllerState:  # type: ignore[override]
+        """Return the state of the module's controller."""
+        return self.module.state.controller
 
     def carried(self) -> Pair:
         """Return the joint torques that the drive gives now, N m, by the firmware's law."""

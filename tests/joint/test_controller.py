@@ -12,9 +12,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from services.joint.controller import CycleResult, JointController, row_of
+from services.joint.differential import limits_of
 from services.joint.drivers.base import DriveReading, DriveStatus
 from services.joint.neighbours import SILENT_NS, NeighbourRow, NeighbourView
-from services.joint.torque_limiter import limits_of
 from shared.bus.messages import Cause, JointCommand, Mode, Pair, Refusal
 from shared.clock import NS_PER_MS, NS_PER_S
 from tests.joint.helpers import ROBOT, SESSION, T0, Bench, command, with_service
@@ -157,11 +157,10 @@ def test_hold_freezes_references_and_drops_the_coupled_torque_over_its_ramp(benc
     bench.to_track(**sent)
     before = np.array(bench.controller.tau)
     bench.cycle(bench.fresh(hold=True, **sent))
-    np.testing.assert_allclose(bench.controller.tau, before, atol=1e-9)
-    bench.run(5)
-    np.testing.assert_allclose(bench.controller.tau, before - np.multiply(COUPLED, 0.5), atol=1e-9)
-    bench.run(400)
-    np.testing.assert_allclose(bench.controller.tau, before - np.array(COUPLED), atol=1e-9)
+    for cycles, dropped in ((0, 0.0), (5, 0.5), (400, 1.0)):
+        bench.run(cycles)
+        left = before - dropped * np.array(COUPLED)
+        np.testing.assert_allclose(bench.controller.tau, left, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -187,10 +186,8 @@ def test_a_new_session_in_track_makes_no_step_in_the_torque(bench: Bench) -> Non
     """Two planners run and the first dies: the second one's references are its own."""
     bench.to_track()
     bench.run(24)
-    assert bench.mode is Mode.TRACK
-    assert not bench.controller.failsafe.is_fresh(
-        bench.now_ns + bench.cycle_ns, bench.controller.timing
-    )
+    next_ns, timing = bench.now_ns + bench.cycle_ns, bench.law.timing
+    assert (bench.mode, bench.controller.failsafe.is_fresh(next_ns, timing)) == (Mode.TRACK, False)
     taus = [bench.controller.tau]
     for _ in range(20):
         sent = bench.fresh(session=SESSION + 1, q_ref=(0.02, -0.97))
@@ -200,11 +197,10 @@ def test_a_new_session_in_track_makes_no_step_in_the_torque(bench: Bench) -> Non
 
 def test_late_cycles_are_counted_beyond_twice_the_period(bench: Bench) -> None:
     bench.to_hold()
-    period_ns = bench.cycle_ns
-    late = []
+    period_ns, late = bench.cycle_ns, []
     for after_ns in (period_ns, 2 * period_ns, 2 * period_ns + 1, 1, 10 * period_ns, period_ns):
         bench.cycle(after_ns=after_ns)
-        late.append(bench.controller.state(bench.now_ns).late)
+        late.append(bench.law.state(bench.controller, bench.now_ns).late)
     assert late == [0, 0, 1, 1, 2, 2]
 
 
@@ -215,7 +211,7 @@ def test_a_stalled_drive_tracks_fresh_commands_and_keeps_the_failsafe_going(benc
     assert bench.mode is Mode.TRACK
     events = [bench.cycle(stalled=True).event for _ in range(26)]
     assert [event.cause for event in events if event is not None] == [Cause.COMMAND_STALE]
-    assert bench.controller.samples.q == pytest.approx(bench.q)
+    assert bench.controller.estimate.q == pytest.approx(bench.q)
     event = bench.cycle(stalled=True, estop=True).event
     assert event is not None
     assert (event.mode_before, event.mode_after) == (Mode.HOLD, Mode.DAMP)
@@ -229,23 +225,23 @@ def test_a_reading_that_is_no_number_lets_out_no_torque_that_is_none(
     before = bench.controller.tau
     reading = DriveReading(bench.now_ns, (bad, 0.0), (0.0, bad), DriveStatus.ARMED, 0)
     bench.now_ns += bench.cycle_ns
-    assert bench.controller.step(bench.now_ns, reading, None, False).tau == before
+    assert bench.law.step(bench.controller, bench.now_ns, reading, None, False).tau == before
 
 
 def test_a_state_holds_what_the_cycle_saw_and_did(bench: Bench) -> None:
     bench.to_track()
     bench.v = (0.1, -0.1)
-    heat = bench.controller.heat.state
+    heat = bench.controller.heat
     heat.shown, heat.left_s = (61.5, 48.0), 93.5
     sent = bench.fresh(seq=900, state_phase=1)
     bench.now_ns += bench.cycle_ns
     reading = msgspec.structs.replace(bench.reading(), supply_v=23.7)
-    bench.controller.step(bench.now_ns, reading, sent, estop=False)
-    state = bench.controller.state(bench.now_ns)
+    bench.law.step(bench.controller, bench.now_ns, reading, sent, estop=False)
+    state = bench.law.state(bench.controller, bench.now_ns)
     assert (state.celsius, state.heat_left_s) == ((61.5, 48.0), 93.5)
     assert (state.supply_v, state.state_phase) == (23.7, 1)
     bench.cycle(command(seq=1, echo_t_ns=bench.now_ns))
-    state = bench.controller.state(bench.now_ns)
+    state = bench.law.state(bench.controller, bench.now_ns)
     assert state.t_ns == bench.now_ns
     assert state.q == pytest.approx(bench.q)
     assert state.v == pytest.approx(bench.v)
@@ -261,26 +257,25 @@ def test_a_state_holds_what_the_cycle_saw_and_did(bench: Bench) -> None:
 
 def test_what_the_drive_tells_of_its_heat_is_heard(bench: Bench) -> None:
     bench.to_hold()
-    told = msgspec.structs.replace(
-        bench.reading(), fet_celsius=(71.0, 35.0), motor_celsius=(30.0, 90.0)
-    )
-    heat, before = bench.controller.heat.state, bench.controller.heat.state.winding
-    bench.controller.step(bench.now_ns + bench.cycle_ns, told, None, estop=False)
+    warm = {"fet_celsius": (71.0, 35.0), "motor_celsius": (30.0, 90.0)}
+    told = msgspec.structs.replace(bench.reading(), **warm)
+    heat, before = bench.controller.heat, bench.controller.heat.winding
+    bench.law.step(bench.controller, bench.now_ns + bench.cycle_ns, told, None, estop=False)
     assert heat.stage == (71.0, 35.0)
     assert heat.winding[0] < before[0] == before[1] < heat.winding[1]
 
 
 def test_a_state_before_any_command_is_marked_so_and_states_count_up(bench: Bench) -> None:
-    first = bench.controller.state(bench.now_ns)
+    first = bench.law.state(bench.controller, bench.now_ns)
     assert (first.seq, first.cause, first.stiffened) == (1, 0, False)
     bench.to_hold()
-    state = bench.controller.state(bench.now_ns)
+    state = bench.law.state(bench.controller, bench.now_ns)
     assert (state.age_ns, state.session, state.command_seq) == (-1, 0, -1)
     assert (state.seq, state.cycle, state.ready) == (2, 1, False)
     bench.now_ns += bench.cycle_ns
     failed = msgspec.structs.replace(bench.reading(), status=DriveStatus.ERROR, error=0x40)
-    bench.controller.step(bench.now_ns, failed, None, False)
-    state = bench.controller.state(bench.now_ns)
+    bench.law.step(bench.controller, bench.now_ns, failed, None, False)
+    state = bench.law.state(bench.controller, bench.now_ns)
     assert (state.seq, state.cycle, state.drive_error) == (3, 2, 0x40)
 
 
@@ -289,7 +284,7 @@ def test_a_module_that_cannot_track_does_not_report_ready(bench: Bench, mode: Mo
     """JointState.ready: fresh for long enough to track, were `hold` lifted."""
     bench.to(mode)
     bench.run(100, fresh=True, hold=True)
-    assert (bench.mode, bench.controller.state(bench.now_ns).ready) == (mode, False)
+    assert (bench.mode, bench.law.state(bench.controller, bench.now_ns).ready) == (mode, False)
 
 
 def test_an_event_holds_the_torque_on_both_sides_of_the_change(bench: Bench) -> None:
@@ -308,12 +303,13 @@ def test_an_event_holds_the_torque_on_both_sides_of_the_change(bench: Bench) -> 
 def test_a_joint_is_inside_up_to_its_soft_stop(axis: int) -> None:
     limits = limits_of(ROBOT, "knee_right")
     low, high = (limits.phi, limits.theta)[axis]
-    controller = JointController(ROBOT, "knee_right")
+    law = JointController(ROBOT, "knee_right")
+    controller = law.start()
     for angle, inside in ((low - 1e-6, False), (low, True), (high, True), (high + 1e-6, False)):
         at = [0.5 * sum(limits.phi), 0.5 * sum(limits.theta)]
         at[axis] = angle
-        controller.samples.q = (at[0], at[1])
-        assert controller.inside_limits() is inside
+        controller.estimate.q = (at[0], at[1])
+        assert law.inside_limits(controller) is inside
 
 
 def test_neighbours_are_given_the_joints_position_and_state(bench: Bench) -> None:
@@ -331,8 +327,6 @@ def test_neighbours_are_given_the_joints_position_and_state(bench: Bench) -> Non
 
 
 def test_a_module_that_holds_with_all_it_has_reports_it_from_the_first_cycle(bench: Bench) -> None:
-    taken = bench.controller.snapshot()
     for stiffened_ns, stiffened in ((0, False), (1, True)):
-        law = msgspec.structs.replace(taken.law, stiffened_ns=stiffened_ns)
-        bench.controller.restore(msgspec.structs.replace(taken, law=law))
-        assert bench.controller.state(bench.now_ns).stiffened is stiffened
+        bench.controller.law.stiffened_ns = stiffened_ns
+        assert bench.law.state(bench.controller, bench.now_ns).stiffened is stiffened

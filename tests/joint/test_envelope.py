@@ -338,7 +338,8 @@ class Wary(Bench):
 
     def __init__(self, robot: RobotConfig, module: str = MODULE) -> None:
         super().__init__(robot, module)
-        self.controller = JointController(robot, module)
+        self.law = JointController(robot, module)
+        self.controller = self.law.start()
         self.robot, self.name, self.q = robot, module, Q
 
     def told(self, *, late_ms: float = 0.0, **changes: Any) -> Outside:
@@ -423,11 +424,12 @@ def test_a_controller_remembers_what_the_coupled_torque_has_put_into_its_joint(
 
 def test_a_state_reports_what_is_not_believed() -> None:
     """Until 50 ms have passed in which nothing came: the planner that said it is gone."""
-    controller = JointController(ROBOT, MODULE)
-    controller.step(T0, None, middle(ROBOT, k_p=(0.0, 0.0)), estop=False)
-    limit_ns = controller.timing.max_command_age_ns
-    assert controller.state(T0 + limit_ns).outside == Outside.K_P
-    assert controller.state(T0 + limit_ns + 1).outside == NOTHING
+    law = JointController(ROBOT, MODULE)
+    controller = law.start()
+    law.step(controller, T0, None, middle(ROBOT, k_p=(0.0, 0.0)), estop=False)
+    limit_ns = law.timing.max_command_age_ns
+    assert law.state(controller, T0 + limit_ns).outside == Outside.K_P
+    assert law.state(controller, T0 + limit_ns + 1).outside == NOTHING
 
 
 def test_hold_stiffens_about_the_joint_and_track_about_the_reference() -> None:
@@ -435,9 +437,9 @@ def test_hold_stiffens_about_the_joint_and_track_about_the_reference() -> None:
     bench = Bench(ROBOT)
     soft = {"k_p": (300.0, 300.0), "q_ref": (bench.q[0], bench.q[1] + 0.2)}
     bench.to_track(**soft)
-    assert bench.controller.setpoint.q_ref[1] == pytest.approx(bench.q[1] + 0.2)
+    assert bench.controller.law.current.q_ref[1] == pytest.approx(bench.q[1] + 0.2)
     before = bench.controller.tau
     bench.run(400, hold=True, fresh=True, **soft)
     assert bench.mode is Mode.HOLD
-    assert bench.controller.setpoint.q_ref[1] == pytest.approx(bench.q[1])
+    assert bench.controller.law.current.q_ref[1] == pytest.approx(bench.q[1])
     assert bench.controller.tau == pytest.approx(before, abs=1.0)

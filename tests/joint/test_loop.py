@@ -56,15 +56,16 @@ class FakeDrive:
         self.rig = rig
         self.status = DriveStatus.IDLE
         self.q: Pair = (0.0, -1.0)
-        self.silent = False
-        self.obeys = True
-        self.armed = self.idled = self.cleared = 0
+        self.silent, self.obeys = False, True
         self.comes_back = False
         """Errors are there again as soon as they are cleared."""
+        self.armed = self.idled = self.cleared = 0
         self.told: list[Pair] = []
         """Where the motors were told that they are."""
         self.torques: list[Pair] = []
         self.targets: list[MotorTarget] = []
+        self.set_position = self.told.append
+        self.write_torque, self.write = self.torques.append, self.targets.append
 
     def read(self, _timeout_s: float) -> DriveReading | None:
         if self.silent:
@@ -72,31 +73,17 @@ class FakeDrive:
         pos = motor_from_joint(self.q, self.rig.gear_ratio)
         return DriveReading(self.rig.now_ns, pos, (0.0, 0.0), self.status, 0)
 
-    def write_torque(self, torque: Pair) -> None:
-        self.torques.append(torque)
-
-    def write(self, target: MotorTarget) -> None:
-        self.targets.append(target)
-
     def arm(self, *, onboard: bool) -> None:
         assert onboard is self.rig.onboard
         self.armed += 1
-        if self.obeys:
-            self.status = DriveStatus.ARMED
+        self.status = DriveStatus.ARMED if self.obeys else self.status
 
     def clear_errors(self) -> None:
         self.cleared += 1
-        if not self.comes_back:
-            self.status = DriveStatus.IDLE
+        self.status = self.status if self.comes_back else DriveStatus.IDLE
 
     def idle(self) -> None:
         self.idled += 1
-
-    def set_position(self, turns: Pair) -> None:
-        self.told.append(turns)
-
-    def close(self) -> None:
-        pass
 
 
 class Rig:
@@ -112,7 +99,7 @@ class Rig:
         self.period_ns = round(1e9 / robot.joint_service.rate_hz)
         self.drive = FakeDrive(self)
         module = DriveManager(robot, "knee_right", file.read() if file else LastState.NOTHING)
-        self.controller = module.controller
+        self.law, self.controller = module.controller, module.state.controller
         self.commands, self.estops = Inbox[JointCommand](), Inbox[Estop]()
         self.states, self.events = Outbox[JointState](), Outbox[JointEvent]()
         self.traces = Outbox[JointTrace]()
@@ -154,11 +141,6 @@ class Rig:
 @pytest.fixture(params=["onboard", "service"])
 def rig(request: pytest.FixtureRequest) -> Rig:
     return Rig(with_service(ROBOT, loop=request.param))
-
-
-@pytest.fixture
-def onboard() -> Rig:
-    return Rig(with_service(ROBOT, loop="onboard"))
 
 
 class Stop:
@@ -247,14 +229,13 @@ def test_states_carry_the_stamp_of_the_drives_sample(rig: Rig) -> None:
 
 def test_a_lost_position_idles_the_drive_and_then_makes_it_forget_its_zero(rig: Rig) -> None:
     rig.run(20)
-    q = rig.drive.q
     rig.drive.status = DriveStatus.UNZEROED
     rig.run(1)
     assert (rig.mode, rig.drive.idled, rig.drive.told) == (Mode.FAULT, 1, [])
     rig.run_ns(3 * IDLE_EVERY_NS)
     assert rig.drive.told == [(-rig.zero_mark_turns,) * 2]
     assert rig.drive.armed == 1, "never again by itself"
-    assert rig.states.sent[-1].q == pytest.approx(q)
+    assert rig.states.sent[-1].q == pytest.approx(rig.drive.q)
 
 
 def test_every_cycle_is_traced_and_the_rest_when_the_service_ends(rig: Rig) -> None:
@@ -281,29 +262,29 @@ def test_a_drive_that_starts_after_its_service_is_an_error_only_if_it_lasts(
     assert levels == [logging.INFO] + [logging.ERROR] * errors
 
 
-def test_what_is_no_command_is_counted_and_traced_with_its_cycle(onboard: Rig) -> None:
-    onboard.run(5)
-    onboard.commands.refused = 3
-    onboard.run(20)
-    state = onboard.states.sent[-1]
+def test_what_is_no_command_is_counted_and_traced_with_its_cycle(rig: Rig) -> None:
+    rig.run(5)
+    rig.commands.refused = 3
+    rig.run(20)
+    state = rig.states.sent[-1]
     assert (state.refused, state.refusal, state.refused_session) == (3, Refusal.MALFORMED, 0)
-    cycles = [cycle for trace in onboard.traces.sent for cycle in trace.cycles]
+    cycles = [cycle for trace in rig.traces.sent for cycle in trace.cycles]
     assert [cycle.malformed for cycle in cycles[:8]] == [0, 0, 0, 0, 0, 3, 0, 0]
 
 
-def test_the_end_of_the_planners_process_is_hold_in_that_cycle_and_traced(onboard: Rig) -> None:
-    onboard.run(5)
-    onboard.lead(200)
-    onboard.ended_session = SESSION + 1
-    onboard.lead(20)
-    assert onboard.mode is Mode.TRACK, "somebody else's"
-    cycle = onboard.controller.cycle
-    onboard.ended_session = SESSION
-    onboard.run(1)
-    event = onboard.events.sent[-1]
-    assert (onboard.mode, event.cause) == (Mode.HOLD, Cause.PLANNER_ENDED)
-    assert event.age_ns < onboard.controller.timing.max_command_age_ns, "it was not the age rule"
-    onboard.run(20)
-    cycles = [each for trace in onboard.traces.sent for each in trace.cycles]
+def test_the_end_of_the_planners_process_is_hold_in_that_cycle_and_traced(rig: Rig) -> None:
+    rig.run(5)
+    rig.lead(200)
+    rig.ended_session = SESSION + 1
+    rig.lead(20)
+    assert rig.mode is Mode.TRACK, "somebody else's"
+    cycle = rig.controller.cycle
+    rig.ended_session = SESSION
+    rig.run(1)
+    event = rig.events.sent[-1]
+    assert (rig.mode, event.cause) == (Mode.HOLD, Cause.PLANNER_ENDED)
+    assert event.age_ns < rig.law.timing.max_command_age_ns, "it was not the age rule"
+    rig.run(20)
+    cycles = [each for trace in rig.traces.sent for each in trace.cycles]
     ended = {at: each.ended for at, each in enumerate(cycles, 1) if each.ended}
     assert ended == {cycle - 39: SESSION + 1, cycle + 1: SESSION}

@@ -13,11 +13,11 @@ import pytest
 from services.joint.differential import joint_torque, motor_from_joint
 from services.joint.drive_manager import ARM_EVERY_NS, ArmingInhibit, DriveCommand, DriveManager
 from services.joint.drivers.base import DriveStatus
-from services.joint.pendant import PendantWatch
 from services.joint.rearm_guard import (
     PENDANT,
     LastState,
     Pendant,
+    PendantWatch,
     RearmGuard,
     clear,
     request_stop,
@@ -50,18 +50,18 @@ def orders(service: ModuleBench, lasting_ns: int) -> set[DriveCommand]:
 def test_a_service_that_faults_leaves_that_it_held_or_was_stopped(stopped: bool) -> None:
     service = successor(LastState.NOTHING, DriveStatus.IDLE)
     assert service.cycle().command is DriveCommand.ARM
-    assert service.module.last_state is LastState.NOTHING, "asked for, but it may not come to hold"
+    assert service.module.state.last_state is LastState.NOTHING, "it may not come to hold"
     service.status = DriveStatus.ARMED
     service.cycle()
-    assert service.module.last_state is LastState.HELD
+    assert service.module.state.last_state is LastState.HELD
     service.lead(200)
-    assert (service.mode, service.module.last_state) == (Mode.TRACK, LastState.HELD)
+    assert (service.mode, service.module.state.last_state) == (Mode.TRACK, LastState.HELD)
     last = LastState.DAMP if stopped else LastState.HELD
     service.cycle(estop=stopped)
-    assert service.module.last_state is last
+    assert service.module.state.last_state is last
     service.status = DriveStatus.ERROR
     service.cycle()
-    assert (service.mode, service.module.last_state) == (Mode.FAULT, last)
+    assert (service.mode, service.module.state.last_state) == (Mode.FAULT, last)
 
 
 @pytest.mark.parametrize("status", [DriveStatus.IDLE, DriveStatus.ERROR])
@@ -74,7 +74,7 @@ def test_a_drive_that_held_and_has_let_go_is_not_armed_by_a_service_that_was_not
     service = successor(last_state, status)
     steps = service.lead(2000) if led else service.run(4 * NS_PER_S)
     assert DriveCommand.ARM not in {step.command for step in steps}
-    assert service.module.last_state is last_state, "nor by the next"
+    assert service.module.state.last_state is last_state, "nor by the next"
     if last_state is LastState.HELD:
         assert {step.command for step in steps} == {DriveCommand.NOTHING}
         assert ArmingInhibit.LOST_TORQUE in {step.inhibit for step in steps}
@@ -96,7 +96,7 @@ def test_what_holds_waits_for_a_planner_to_send(
     assert {step.command for step in steps} == {DriveCommand.NOTHING}
     assert {step.inhibit for step in steps} == {ArmingInhibit.NONE, *waits}
     assert service.mode is Mode.DISARMED
-    assert service.controller.state(service.now_ns).drive == DriveStatus.HOLDING
+    assert service.law.state(service.controller, service.now_ns).drive == DriveStatus.HOLDING
     assert service.module.leaves_holding, "should it end before it has taken the drive over"
     if carries is None:
         service.lead(100)
@@ -104,9 +104,9 @@ def test_what_holds_waits_for_a_planner_to_send(
         return
     service.lead(2, hold=True)
     assert service.mode is Mode.HOLD
-    assert service.controller.state(service.now_ns).drive == DriveStatus.ARMED
+    assert service.law.state(service.controller, service.now_ns).drive == DriveStatus.ARMED
     service.lead(hold=True)
-    assert service.module.snapshot().tries == 1, "it counts as asked once"
+    assert service.module.state.tries == 1, "it counts as asked once"
 
 
 @pytest.mark.parametrize("last_state", [LastState.NOTHING, LastState.HELD])
@@ -123,7 +123,7 @@ def test_it_is_taken_over_with_the_commands_gains_and_the_torque_that_it_carries
     assert takes_over.target.torque == pytest.approx(CARRIED)
     at = motor_from_joint(service.q, service.gear_ratio)
     assert takes_over.target.pos_turns == pytest.approx(at)
-    setpoint = service.controller.setpoint
+    setpoint = service.controller.law.current
     assert (setpoint.k_p, setpoint.k_d) == (k_p, told["k_d"])
     assert setpoint.q_ref == pytest.approx(service.q)
     last = joint_torque(CARRIED, service.gear_ratio)
@@ -133,7 +133,7 @@ def test_it_is_taken_over_with_the_commands_gains_and_the_torque_that_it_carries
         tau = service.controller.tau
         assert tau == pytest.approx(last, abs=0.6)
         last = tau
-    risen = service.controller.setpoint
+    risen = service.controller.law.current
     assert risen.k_p[1] == k_p[1], "theta of a knee as soft as the other knee's"
 
 
@@ -159,7 +159,7 @@ def test_after_a_stop_a_drive_that_holds_is_taken_over_and_sinks() -> None:
     assert service.controller.tau == pytest.approx(before, abs=2.0)
     service.run(round(ROBOT.joint_service.damp_fade_s) * NS_PER_S)
     assert service.controller.tau == pytest.approx((before[0], 0.0), abs=1e-6)
-    assert service.module.last_state is LastState.DAMP
+    assert service.module.state.last_state is LastState.DAMP
 
 
 @pytest.mark.parametrize("unknown", ["silent", "LOST", "HOLDING"])
@@ -176,7 +176,7 @@ def test_an_emergency_stop_waits_until_the_drive_is_known(unknown: str) -> None:
     service.run(2 * service.cycle_ns)
     assert service.mode is Mode.DAMP
     controller = service.controller
-    assert controller.setpoint.q_ref == pytest.approx(service.q)
+    assert controller.law.current.q_ref == pytest.approx(service.q)
     assert controller.tau == pytest.approx(joint_torque(CARRIED, service.gear_ratio), abs=2.0)
 
 
@@ -184,7 +184,7 @@ def test_an_emergency_stop_waits_until_the_drive_is_known(unknown: str) -> None:
 def test_a_drive_is_armed_only_once_it_is_zeroed(last_state: LastState) -> None:
     service = successor(last_state, DriveStatus.UNZEROED)
     assert DriveCommand.ARM not in orders(service, NS_PER_S)
-    assert service.controller.state(service.now_ns).drive == DriveStatus.UNZEROED
+    assert service.law.state(service.controller, service.now_ns).drive == DriveStatus.UNZEROED
     service.status = DriveStatus.IDLE
     assert DriveCommand.ARM in orders(service, ARM_EVERY_NS + 10 * NS_PER_MS)
 

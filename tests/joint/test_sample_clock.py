@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.joint.sample_clock import SampleClock
+from services.joint.joint_estimate import SampleClock
 from shared.bus.messages import JointCommand
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
@@ -91,8 +91,10 @@ def sent(
     bench, periods = Bench(robot), []
     for number in range(1, cycles + 1):
         bench.now_ns = T0 + number * PERIOD_NS + (late_ns or {}).get(number, 0)
-        bench.controller.step(bench.now_ns, bench.reading(), commands.get(number), estop=False)
-        if bench.controller.is_state_due:
+        bench.law.step(
+            bench.controller, bench.now_ns, bench.reading(), commands.get(number), estop=False
+        )
+        if bench.law.is_state_due(bench.controller):
             periods.append(number)
     return periods
 

@@ -112,7 +112,10 @@ def test_a_torque_goes_to_the_drive_unchanged_until_the_next_however_long(bench:
     assert bench.torque_of(step) == pytest.approx((5.0, -60.0)), "NaN is not passed on"
     step = bench.passes((1.0, -2.0), age_ns=400 * NS_PER_MS)
     assert bench.torque_of(step) == pytest.approx((1.0, -2.0))
-    assert bench.module.controller.state(bench.now_ns).age_ns == 400 * NS_PER_MS
+    assert (
+        bench.module.controller.state(bench.module.state.controller, bench.now_ns).age_ns
+        == 400 * NS_PER_MS
+    )
     for asked, given in (((0.0, -500.0), (0.0, -115.6)), ((80.0, 80.0), (57.8, 57.8))):
         assert bench.torque_of(bench.passes(asked)) == pytest.approx(given)
 

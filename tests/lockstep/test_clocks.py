@@ -139,7 +139,7 @@ def test_after_one_comparison_all_are_in_step(skewed: tuple[int, ...]) -> None:
     restarted = {"kill": kill(0.2), "restart": restart(0.5), "push": ()}
     fleet = Lockstep(ROBOT, variant("stand", duration=1.5, **restarted), record=record)
     for index, joint in enumerate(fleet.joints):
-        clock = joint.manager.controller._state.clock
+        clock = joint.manager.state.controller.clock
         clock.count, clock.at_ns = 2 - (index in skewed), fleet.now_ns - 2_000_000
     begin_ns, spreads = fleet.now_ns, {}
     for row in fleet.run():

@@ -74,22 +74,23 @@ def test_a_frozen_planner_goes_on_in_its_session() -> None:
 # ---- no joint service: the drives' own loops hold
 
 
-@pytest.mark.parametrize("at", [1.25, 2.5, 3.3])
-def test_all_six_dead_in_a_squat_stand_through_pushes(at: float) -> None:
-    pushes = (push(at + 0.3, 30.0, 0.0, 0.0), push(at + 1.3, 0.0, 30.0, 0.0))
-    squat = variant("squat", duration=at + 3.0, kill=kill(at, *MODULES), push=pushes)
-    result = run(ROBOT, squat)
-    assert result.stood
-    assert np.abs(result.com_mm[result.t > at, :2]).max() < 80.0
+IN_STEP = (push(0.354, -24.5, 31.6, 0.0), push(2.074, -2.3, 39.9, 0.0))
+"""With TRACK's gains left on the drives sway was hardly damped: 7 of 26 such pairs fell."""
 
 
-def test_all_six_dead_stand_through_two_pushes_in_step_with_the_sway() -> None:
-    """With TRACK's gains left on the drives sway was hardly damped: 7 of 26 such pairs fell."""
-    pushes = (push(0.354, -24.5, 31.6, 0.0), push(2.074, -2.3, 39.9, 0.0))
-    dead = kill(0.313, "planner", *MODULES)
-    result = run(ROBOT, variant("squat", duration=4.5, kill=dead, push=pushes))
+@pytest.mark.parametrize(
+    ("at", "pushes", "most_mm"),
+    [(1.25, (), 80.0), (2.5, (), 80.0), (3.3, (), 80.0), (0.313, IN_STEP, 45.0)],
+)
+def test_all_six_dead_in_a_squat_stand_through_pushes(
+    at: float, pushes: tuple[Push, ...], most_mm: float
+) -> None:
+    """The last pair in step with the sway, and without a planner."""
+    dead = kill(at, *(("planner", *MODULES) if pushes else MODULES))
+    pushes = pushes or (push(at + 0.3, 30.0, 0.0, 0.0), push(at + 1.3, 0.0, 30.0, 0.0))
+    result = run(ROBOT, variant("squat", duration=max(4.5, at + 3.0), kill=dead, push=pushes))
     assert result.stood
-    assert abs(result.com_mm[:, :2]).max() < 45.0
+    assert np.abs(result.com_mm[result.t > at, :2]).max() < most_mm
 
 
 @pytest.mark.parametrize("module", ["ankle_left", "knee_right", "hip_left"])
@@ -124,14 +125,11 @@ def test_a_dead_services_successor_leads_again(module: str) -> None:
     ("back", "away", "pushes"),
     [
         (("knee_left", 2.221, 2.271), ("ankle_right", 2.432), (push(3.575, 39.7, 5.0, 0.0),)),
-        (
-            ("hip_right", 2.047, 2.347),
-            ("planner", 2.027),
-            (push(2.072, 0.9, 40.0, 0.0), push(3.509, -33.5, 21.9, 0.0)),
-        ),
+        (("hip_right", 2.047, 2.347), ("planner", 2.027),
+         (push(2.072, 0.9, 40.0, 0.0), push(3.509, -33.5, 21.9, 0.0))),
     ],
     ids=["one stays dead", "no planner"],
-)
+)  # fmt: skip
 def test_a_service_that_comes_back_while_all_hold_is_no_stiffer_than_they_are(
     back: tuple[str, float, float], away: tuple[str, float], pushes: tuple[Push, ...]
 ) -> None:

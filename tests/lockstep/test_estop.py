@@ -139,7 +139,7 @@ def test_a_stop_that_not_all_hear_tips_nothing(
         if truth.scenario_s >= STOP_S:
             fleet.world.let_go()
             for joint in fleet.joints:
-                joint.manager._state.estop = joint.name != "knee_left"
+                joint.manager.state.estop = joint.name != "knee_left"
 
     scenario = msgspec.structs.replace(led(1.0, 0.0), duration=STOP_S + 6.0)
     assert run(heavy, scenario, start=led_to(1.0), each=stop_five).stood
@@ -268,7 +268,7 @@ def test_a_knee_silent_for_a_moment_on_the_way_down_stops_with_the_others(
         is_silent = STOP_S + 0.7 <= truth.scenario_s < STOP_S + 0.75
         (silent.update if is_silent else silent.difference_update)(axes)
         if truth.scenario_s >= STOP_S + 1.0:
-            seen.append([each.samples.q[1] for each in fleet.controllers])
+            seen.append([each.estimate.q[1] for each in fleet.controllers])
 
     seen: list[list[float]] = []
     scenario = msgspec.structs.replace(led(1.0, 0.0), duration=STOP_S + 3.0)

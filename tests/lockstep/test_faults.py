@@ -25,6 +25,7 @@ CLOSED = AxisState.CLOSED_LOOP_CONTROL
 MODULE = "hip_left"
 INDEX = MODULE_INDEX[MODULE]
 AXES = slice(2 * INDEX, 2 * INDEX + 2)
+assert set(DRIVE_FAULTS) == set(FAULT_KINDS), "every kind of fault has a row"
 AT, OVER, RESTARTED = 0.5, 1.1, 2.0
 """s; a fault that lasts is over by `OVER`."""
 LATE, AT_REST = 1.09, 1.99
@@ -79,16 +80,16 @@ def faulted(request: pytest.FixtureRequest) -> Faulted:
     return Faulted(kind, DRIVE_FAULTS[kind], run(ROBOT, scenario, each=look), modes, armed)
 
 
-def test_every_kind_of_fault_has_a_row() -> None:
-    assert set(DRIVE_FAULTS) == set(FAULT_KINDS)
-
-
 def test_a_module_goes_to_fault_for_its_rows_cause_and_five_hold(faulted: Faulted) -> None:
+    """And stays in it, though the fault is over, without a request."""
     ((module, cause, at),) = into_fault(faulted.run)
     assert (module, cause) == (MODULE, faulted.row.cause)
     later_s = {"encoder": BLIND_S, "over_temperature": 0.5}.get(faulted.kind, 0.0)
     assert AT <= at <= AT + later_s + (0.15 if cause == Cause.DRIVE_LOST else 0.005)
-    assert faulted.modes[LATE].count(Mode.HOLD) == 5
+    for modes in (faulted.modes[LATE], faulted.modes[AT_REST]):
+        assert modes.count(Mode.HOLD) == 5
+    assert faulted.modes[AT_REST][INDEX] is Mode.FAULT
+    assert faulted.run.stood, "on one hip"
 
 
 def test_both_axes_of_a_module_are_limp_or_neither_is_by_its_row(faulted: Faulted) -> None:
@@ -98,18 +99,11 @@ def test_both_axes_of_a_module_are_limp_or_neither_is_by_its_row(faulted: Faulte
         assert np.delete(armed, [AXES.start, AXES.start + 1]).all()
 
 
-def test_a_fault_that_is_over_is_not_left_without_a_request(faulted: Faulted) -> None:
-    modes = faulted.modes[AT_REST]
-    assert modes[INDEX] is Mode.FAULT
-    assert modes.count(Mode.HOLD) == 5
-    assert faulted.run.stood, "on one hip"
-
-
 def test_a_restart_arms_again_unless_the_zero_is_lost(faulted: Faulted) -> None:
     fleet = faulted.run.lockstep
     if faulted.row.zero_lost:
         assert faulted.run.modes[INDEX] is Mode.DISARMED
-        assert fleet.controllers[INDEX].samples.status is DriveStatus.UNZEROED
+        assert fleet.controllers[INDEX].estimate.status is DriveStatus.UNZEROED
         assert not fleet.bank.torque[AXES].any()
     else:
         assert faulted.run.modes == [Mode.TRACK] * 6
@@ -120,7 +114,7 @@ def test_what_a_lost_encoder_reports_is_never_taken_for_the_joint() -> None:
     scenario = still(AT + BLIND_S + 0.02, fault=fault("encoder", "knee_left", AT))
     thetas = []
     outcome = run(
-        ROBOT, scenario, each=lambda fleet, _: thetas.append(fleet.controllers[knee].samples.q[1])
+        ROBOT, scenario, each=lambda fleet, _: thetas.append(fleet.controllers[knee].estimate.q[1])
     )
     assert thetas[-1] == pytest.approx(thetas[-4], abs=0.02), "as before the fault"
     held = outcome.steps_nm("knee_left", after=Mode.HOLD)
@@ -157,7 +151,7 @@ def test_a_power_cut_of_all_buses_in_a_squat_brings_no_old_frame(lasts: float) -
     told_s = set()
 
     def look(fleet: Lockstep, row: SimTruth) -> None:
-        statuses = {each.samples.status for each in fleet.controllers}
+        statuses = {each.estimate.status for each in fleet.controllers}
         if statuses == {DriveStatus.UNACKNOWLEDGED}:
             told_s.add(row.scenario_s - 1.5)
 
@@ -264,8 +258,8 @@ def test_pushed_beside_a_limp_ankle_it_stands(x: float, led: bool) -> None:
 @pytest.mark.parametrize(("height", "pitch"), [(1.1, 0.5), (0.95, 0.9)])
 def test_a_turned_torso_stays_turned(height: float, pitch: float) -> None:
     """Six such robots without a planner: pulled upright against the hand, two fell."""
-    turned = (Keyframe(at=0.0, height=height), Keyframe(at=2.0, height=height, pitch=pitch))
     happens = {"kill": kill(0.5), "fault": fault("disarmed", "knee_left", 2.5)}
+    turned = (Keyframe(at=0.0, height=height), Keyframe(at=2.0, height=height, pitch=pitch))
     outcome = run(ROBOT, variant("stand", duration=5.0, keyframe=turned, **happens))
     assert outcome.stood
     before, after = outcome.angles[outcome.t < 2.5][-1, 1], outcome.angles[-1, 1]

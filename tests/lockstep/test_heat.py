@@ -43,7 +43,7 @@ def hold(
             fleet.world.let_go()
         if skips and row.scenario_s > HELD_S:
             skips = False
-            while min(law.heat.state.left_s for law in fleet.controllers) > 33.0:
+            while min(law.heat.left_s for law in fleet.controllers) > 33.0:
                 fleet.skip_heat(1.0)
         actions.append(status_of(fleet).heat)
         derating = min(derating, fleet.bank.heat.derating)
@@ -64,7 +64,7 @@ def test_a_robot_too_hot_for_its_squat_stands_up_by_itself_and_derates_nowhere(h
     assert status.mode == PlannerMode.LEADING
     assert status.heat_left_s > 60.0
     assert max(abs(1e3 * row.com[0]) for row in held.rows) < 15.0
-    assert max(law.heat.state.winding[0] for law in held.fleet.controllers) < 100.0
+    assert max(law.heat.winding[0] for law in held.fleet.controllers) < 100.0
 
 
 def test_without_an_estimate_nothing_is_said_and_nothing_done() -> None:

@@ -11,16 +11,16 @@ from __future__ import annotations
 
 import math
 import os
-import random
-import struct
-from collections.abc import Callable, Collection, Iterator
-from typing import Final, NamedTuple
+from collections.abc import Callable, Iterator
+from typing import Any, Final, NamedTuple
 
 import msgspec
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from services.planner.planner import Planner
-from shared.bus.messages import JointCommand, Mode, Outside, Pair
+from shared.bus.messages import JointCommand, Mode, Outside
 from shared.bus.traces import SimTruth
 from shared.config.gain_schedule import believing
 from shared.config.robot_config import RobotConfig
@@ -29,10 +29,20 @@ from tests.lockstep.runs import moment_of, push, run, variant
 from tests.robots import ROBOT
 from tools.sim.lockstep import FleetMoment, Lockstep
 
-Commands = list[JointCommand]
-Fault = Callable[[Commands, int], Commands]
-"""Commands of a tick as they should be, and the tick's number -> as they are sent."""
+Values = dict[str, Any]
+"""Fields of the six commands of a tick: a 6 x 2 array for a pair."""
 
+
+class Tick(NamedTuple):
+    """A tick's commands as they should be, its number, and those of all ticks until this one."""
+
+    values: Values
+    number: int
+    past: list[Values]
+
+
+Fault = Callable[[Tick], Values]
+"""Returns the fields that are sent otherwise."""
 PAIRS: Final = ("q_ref", "v_ref", "tau_ff", "dtau_ff", "tau_coupled", "k_p", "k_d")
 SCALES: Final = {
     "negative": -1.0,
@@ -51,7 +61,6 @@ DELAYS: Final = (10, 25, 75)
 """Ticks by which the states used are old, told as if they were new."""
 BITS: Final = (0, 40, 50, 51, 52, 55, 60, 62, 63)
 """Which bit of a float64 flips: from what nobody notices to the sign."""
-
 CONSPIRACIES: Final = (
     (0, 0, 0, 1, 0, 1), (0, 0, 0, -1, 0, -1), (0, 0, 0, 1, 0, -1), (1, -1, -1, -1, -1, -1),
     (-1, 0, 1, 0, 0, 1), (1, 1, -1, 0, 1, 1), (0, -1, -1, -1, 1, 0),
@@ -60,220 +69,162 @@ CONSPIRACIES: Final = (
 one inside its bound; before `Outside.COUPLED_WORK` 13 of 30 drawn ones made the robot fall."""
 
 
-def faults() -> dict[str, Fault]:
-    """Return every wrong planner by its name."""
-    return dict(_all())
-
-
-def _all() -> Iterator[tuple[str, Fault]]:
+def faults() -> Iterator[tuple[str, Fault]]:
+    """Yield every wrong planner with its name."""
     for name in PAIRS:
         for words, factor in SCALES.items():
-            yield f"{name} of all {words}", _scaled(name, factor, range(N_MODULES))
+            yield f"{name} of all {words}", scaled(name, factor)
             for index in (0, 4):  # a right ankle, a left knee
-                yield f"{name} of {MODULES[index]} {words}", _scaled(name, factor, [index])
-    yield (
-        "k_p and k_d zero",
-        _both(_scaled("k_p", 0.0, range(N_MODULES)), _scaled("k_d", 0.0, range(N_MODULES))),
-    )
+                yield f"{name} of {MODULES[index]} {words}", scaled(name, factor, index)
+    yield "k_p and k_d zero", both(scaled("k_p", 0.0), scaled("k_d", 0.0))
     for index, module in enumerate(MODULES):
         for axis, joint in enumerate(("phi", "theta")):
             for offset in OFFSETS if index < N_MODULES // 2 else OFFSETS[1::2]:
-                yield f"q_ref of {module} {joint} off by {offset:g} rad", _off(index, axis, offset)
-            yield f"q_ref of {module} {joint} drifts", _drifting(index, axis, 0.3)
-    for rate in (0.1, -0.1):
-        yield f"q_ref of ankle_right theta drifts and says so, {rate:+g} rad/s", _told(0, 1, rate)
+                yield (
+                    f"q_ref of {module} {joint} off by {offset:g} rad",
+                    drifting(index, axis, math.inf, offset),
+                )
+            yield f"q_ref of {module} {joint} drifts", drifting(index, axis, 0.3)
+    for rate in (0.1, -0.1):  # it tells the rate
+        away = drifting(0, 1, abs(rate), math.copysign(2.0, rate))
+        said = changed("v_ref", lambda v_ref, _tick, rate=rate: v_ref + one(0, 1, rate))
+        yield f"q_ref of ankle_right theta drifts and says so, {rate:+g} rad/s", both(away, said)
     for a, b in ((0, 3), (1, 4), (2, 5), (0, 1), (1, 2), (0, 2)):
-        yield f"{MODULES[a]} and {MODULES[b]} swapped", _swapped(a, b)
-    yield "legs swapped", lambda commands, _tick: [*commands[3:], *commands[:3]]
+        order = [{a: b, b: a}.get(index, index) for index in range(N_MODULES)]
+        yield f"{MODULES[a]} and {MODULES[b]} swapped", reordered(order)
+    yield "legs swapped", reordered([3, 4, 5, 0, 1, 2])
     for name in PAIRS:
-        yield f"phi and theta of {name} swapped", _axes_swapped(name)
-        yield f"{name} stuck", _stuck(name)
-    yield "all stuck", _stuck(*PAIRS)
+        yield f"phi and theta of {name} swapped", changed(name, lambda pairs, _tick: pairs[:, ::-1])
+        yield f"{name} stuck", late(1 << 30, name)
+    yield "all stuck", late(1 << 30, *PAIRS)
     for ticks in DELAYS:
-        yield f"states {4 * ticks} ms old", _late(ticks)
+        yield f"states {4 * ticks} ms old", late(ticks, *PAIRS)
     for name in PAIRS:
         for bit in BITS:
-            yield f"bit {bit} of {name} flips", _flipped(name, bit)
+            yield f"bit {bit} of {name} flips", flipped(name, bit)
     for name in ("q_ref", "k_p", "tau_ff"):
-        yield f"{name} negative in one tick of 25", _every(25, _scaled(name, -1.0, range(6)))
-        yield f"{name} zero in every other tick", _every(2, _scaled(name, 0.0, range(6)))
+        yield f"{name} negative in one tick of 25", every(25, scaled(name, -1.0))
+        yield f"{name} zero in every other tick", every(2, scaled(name, 0.0))
     for name, size in (("q_ref", 0.02), ("tau_ff", 20.0), ("tau_coupled", 40.0), ("v_ref", 3.0)):
-        yield f"{name} noisy", _noisy(name, size)
+        yield f"{name} noisy", noisy(name, size)
     for signs in CONSPIRACIES:
         for ramp_s in (0.3, 1.0, 3.0):
             words = " ".join(f"{axis:+d}" for axis in signs)
-            yield f"tau_coupled of all ramps up in {ramp_s:g} s, {words}", _ramped(signs, ramp_s)
-    ramp = _ramped((0, 0, 0, 1, 0, -1), 0.3)
-    yield "stamps stand still, tau_coupled ramps up in 0.3 s", _both(ramp, _stamped(0.0))
-    yield "stamps at half speed, tau_coupled ramps up in 0.3 s", _both(ramp, _stamped(0.5))
+            yield f"tau_coupled of all ramps up in {ramp_s:g} s, {words}", ramped(signs, ramp_s)
+    ramp = ramped((0, 0, 0, 1, 0, -1), 0.3)
+    yield "stamps stand still, tau_coupled ramps up in 0.3 s", both(ramp, stamped(0.0))
+    yield "stamps at half speed, tau_coupled ramps up in 0.3 s", both(ramp, stamped(0.5))
     for margin in (0.0, -1.0, math.nan):
-        yield f"margin {margin:g}", _told_margin(margin)
+        values = {"margin": [margin] * N_MODULES, "margin_onboard": [margin] * N_MODULES}
+        yield f"margin {margin:g}", lambda _tick, values=values: values
+
+
+def changed(name: str, change: Callable[..., NDArray[np.float64]]) -> Fault:
+    """Change a field by what it is and by the tick's number."""
+    return lambda tick: {name: change(tick.values[name], tick.number)}
+
+
+def one(module: int, axis: int, value: float) -> NDArray[np.float64]:
+    """Return zeros with a value at one axis of one module."""
+    found = np.zeros((N_MODULES, 2))
+    found[module, axis] = value
+    return found
+
+
+def scaled(name: str, factor: float, index: int | None = None) -> Fault:
+    which = np.arange(N_MODULES)[:, None]
+    applies = which == index if index is not None else which >= 0
+    return changed(name, lambda pairs, _tick: np.where(applies, factor * pairs, pairs))
+
+
+def drifting(module: int, axis: int, rate: float, most: float = 2.0) -> Fault:
+    """Move a reference away at a rate, rad/s, or at once."""
+
+    def away(tick: int) -> float:
+        return math.copysign(min(abs(most), rate * 0.004 * tick), most)
+
+    return changed("q_ref", lambda q_ref, tick: q_ref + one(module, axis, away(tick)))
+
+
+def reordered(order: list[int]) -> Fault:
+    return lambda tick: {name: tick.values[name][order] for name in PAIRS}
+
+
+def late(ticks: int, *names: str) -> Fault:
+    """Send fields of some ticks ago, or of the first tick."""
+    return lambda tick: {name: tick.past[max(0, tick.number - 1 - ticks)][name] for name in names}
+
+
+def flipped(name: str, bit: int) -> Fault:
+    def change(pairs: NDArray[np.float64], tick: int) -> NDArray[np.float64]:
+        bits = pairs.copy().view(np.uint64)
+        bits[tick // 5 % N_MODULES, tick // 30 % 2] ^= np.uint64(1 << bit)
+        return bits.view(np.float64)
+
+    return changed(name, change)
+
+
+def ramped(signs: tuple[int, ...], ramp_s: float, most: float = 57.0) -> Fault:
+    way = most * np.tile(np.reshape(signs, (3, 2)), (2, 1))
+    return changed(
+        "tau_coupled",
+        lambda pairs, tick: np.clip(pairs + way * min(1.0, 0.004 * tick / ramp_s), -most, most),
+    )
+
+
+def both(first: Fault, second: Fault) -> Fault:
+    return lambda tick: first(tick) | second(tick)
+
+
+def every(ticks: int, inner: Fault) -> Fault:
+    return lambda tick: {} if tick.number % ticks else inner(tick)
+
+
+def noisy(name: str, size: float) -> Fault:
+    dice = np.random.default_rng(len(name))
+    return changed(name, lambda pairs, _tick: pairs + dice.normal(0.0, size, (N_MODULES, 2)))
+
+
+def stamped(speed: float) -> Fault:
+    """Let the commands' own time go by at another speed."""
+
+    def fault(tick: Tick) -> Values:
+        first = tick.past[0]["t_ns"][0]
+        return {"t_ns": [first + round(speed * (t_ns - first)) for t_ns in tick.values["t_ns"]]}
+
+    return fault
 
 
 def wrong(fault: Fault) -> type[Planner]:
-    """Return a planner that sends what the fault makes of its commands."""
+    """Return a planner that sends what the fault makes of its commands, from its first tick on."""
 
     class Wrong(Planner):
-        """A planner that is wrong from its first tick on."""
-
-        ticks = 0
+        past: list[Values]
 
         def tick(self, now_ns: int) -> list[JointCommand]:
             commands = super().tick(now_ns)
             if not commands:
                 return commands
-            self.ticks += 1
-            return fault(commands, self.ticks)
+            self.past = getattr(self, "past", [])
+            values: Values = {n: np.array([getattr(c, n) for c in commands]) for n in PAIRS}
+            values["t_ns"] = [command.t_ns for command in commands]
+            self.past.append(values)
+            told = fault(Tick(values, len(self.past), self.past))
+            sent = {name: np.asarray(column).tolist() for name, column in told.items()}
+            return [
+                msgspec.structs.replace(
+                    each, **{n: tuple(v[i]) if n in PAIRS else v[i] for n, v in sent.items()}
+                )
+                for i, each in enumerate(commands)
+            ]
 
     return Wrong
 
 
-def _each(name: str, change: Callable[[int, Pair, int], Pair]) -> Fault:
-    """Change a field of each command, by its module's index, what it is, and the tick's number."""
-    return lambda commands, tick: [
-        msgspec.structs.replace(c, **{name: change(index, getattr(c, name), tick)})
-        for index, c in enumerate(commands)
-    ]
-
-
-def _scaled(name: str, factor: float, indices: Collection[int]) -> Fault:
-    def change(index: int, pair: Pair, _tick: int) -> Pair:
-        return (factor * pair[0], factor * pair[1]) if index in indices else pair
-
-    return _each(name, change)
-
-
-def _off(index: int, axis: int, offset: float) -> Fault:
-    return _drifting(index, axis, math.inf, offset)
-
-
-def _drifting(module: int, axis: int, rate: float, most: float = 2.0) -> Fault:
-    """Move a reference away at a rate, rad/s, or at once."""
-
-    def change(index: int, pair: Pair, tick: int) -> Pair:
-        away = math.copysign(min(abs(most), rate * 0.004 * tick), most)
-        if index != module:
-            return pair
-        return (pair[0], pair[1] + away) if axis else (pair[0] + away, pair[1])
-
-    return _each("q_ref", change)
-
-
-def _told(module: int, axis: int, rate: float) -> Fault:
-    """Move a reference away, and add the rate to that of the command."""
-
-    def change(index: int, pair: Pair, _tick: int) -> Pair:
-        if index != module:
-            return pair
-        return (pair[0], pair[1] + rate) if axis else (pair[0] + rate, pair[1])
-
-    away = _drifting(module, axis, abs(rate), math.copysign(2.0, rate))
-    return _both(away, _each("v_ref", change))
-
-
-def _swapped(a: int, b: int) -> Fault:
-    def fault(commands: Commands, _tick: int) -> Commands:
-        rows = list(commands)
-        rows[a], rows[b] = _rows_of(rows[b], rows[a]), _rows_of(rows[a], rows[b])
-        return rows
-
-    return fault
-
-
-def _rows_of(
-    source: JointCommand, onto: JointCommand, names: Collection[str] = PAIRS
-) -> JointCommand:
-    return msgspec.structs.replace(onto, **{name: getattr(source, name) for name in names})
-
-
-def _axes_swapped(name: str) -> Fault:
-    return _each(name, lambda _index, pair, _tick: (pair[1], pair[0]))
-
-
-def _stuck(*names: str) -> Fault:
-    kept: Commands = []
-
-    def fault(commands: Commands, _tick: int) -> Commands:
-        if not kept:
-            kept.extend(commands)
-        return [_rows_of(*both, names) for both in zip(kept, commands, strict=True)]
-
-    return fault
-
-
-def _late(ticks: int) -> Fault:
-    past: list[Commands] = []
-
-    def fault(commands: Commands, _tick: int) -> Commands:
-        past.append(commands)
-        old = past[max(0, len(past) - 1 - ticks)]
-        return [_rows_of(then, now) for then, now in zip(old, commands, strict=True)]
-
-    return fault
-
-
-def _flipped(name: str, bit: int) -> Fault:
-    def change(index: int, pair: Pair, tick: int) -> Pair:
-        if index != tick // 5 % N_MODULES:
-            return pair
-        values, axis = list(pair), tick // 30 % 2
-        (whole,) = struct.unpack("<Q", struct.pack("<d", values[axis]))
-        (values[axis],) = struct.unpack("<d", struct.pack("<Q", whole ^ (1 << bit)))
-        return values[0], values[1]
-
-    return _each(name, change)
-
-
-def _ramped(signs: tuple[int, ...], ramp_s: float, most: float = 57.0) -> Fault:
-    def change(index: int, pair: Pair, tick: int) -> Pair:
-        size = most * min(1.0, 0.004 * tick / ramp_s)
-        at = 2 * (index % (N_MODULES // 2))
-        phi, theta = pair[0] + signs[at] * size, pair[1] + signs[at + 1] * size
-        return max(-most, min(most, phi)), max(-most, min(most, theta))
-
-    return _each("tau_coupled", change)
-
-
-def _both(first: Fault, second: Fault) -> Fault:
-    return lambda commands, tick: second(first(commands, tick), tick)
-
-
-def _every(ticks: int, inner: Fault) -> Fault:
-    return lambda commands, tick: commands if tick % ticks else inner(commands, tick)
-
-
-def _noisy(name: str, size: float) -> Fault:
-    dice = random.Random(name)
-
-    def change(_index: int, pair: Pair, _tick: int) -> Pair:
-        return pair[0] + dice.gauss(0.0, size), pair[1] + dice.gauss(0.0, size)
-
-    return _each(name, change)
-
-
-def _stamped(speed: float) -> Fault:
-    """Let the commands' own time go by at another speed."""
-    first: list[int] = []
-
-    def fault(commands: Commands, _tick: int) -> Commands:
-        first.extend(command.t_ns for command in commands[: 1 - len(first)])
-        return [
-            msgspec.structs.replace(c, t_ns=first[0] + round(speed * (c.t_ns - first[0])))
-            for c in commands
-        ]
-
-    return fault
-
-
-def _told_margin(margin: float) -> Fault:
-    return lambda commands, _tick: [
-        msgspec.structs.replace(c, margin=margin, margin_onboard=margin) for c in commands
-    ]
-
-
 # ---- the runs
 
-NAMES: Final = tuple(faults())
+FAULTS: Final = dict(faults())
+NAMES: Final = tuple(FAULTS)
 assert len(NAMES) >= 300
 EVERY: Final = 1 if os.environ.get("XRL_ALL_WRONG") else 47
 MOMENTS: Final = (("squat", 1.0), ("stand", 0.5), ("crawl", 3.0))
@@ -310,14 +261,14 @@ def begins() -> list[Begin]:
 
 def begin(robot: RobotConfig, name: str, at: float) -> Begin:
     scenario = variant(name, duration=20.0, kill=(), push=())
-    return Begin(name, at, moment_of(robot, scenario, at, stands=False))
+    return Begin(name, at, moment_of(robot, scenario, at))
 
 
 def end(robot: RobotConfig, begin: Begin, name: str, lasts_s: float = WRONG_S) -> End:
     """Be wrong for two seconds, or less, pushed from the side after 0.8 s."""
 
     class Fleet(Lockstep):
-        planner_type = wrong(faults()[name])
+        planner_type = wrong(FAULTS[name])
 
     at = begin.at
     pushed = (push(at + 0.8, 0.0, 30.0, 0.0),)

@@ -240,7 +240,6 @@ def test_a_refusal_names_which_foot_is_where(row: int, value: float, words: str)
 
 
 def test_without_limits_the_feet_are_where_the_robot_file_has_them() -> None:
-    """So are those of logs from before there was a stance."""
     held = Stance((0.0,) * 6)
     held.take(np.full(6, 0.5))
     assert not held.refused

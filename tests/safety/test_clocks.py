@@ -97,6 +97,6 @@ def test_what_cannot_be_a_planners_is_refused_counted_and_moves_nothing(
         bench.seq = twin.seq
         forged, left_alone = bench.cycle(wild), twin.cycle()
         assert forged == left_alone
-        assert bench.controller.state(bench.now_ns).refused == before + n
+        assert bench.law.state(bench.controller, bench.now_ns).refused == before + n
     assert bench.mode is mode
     assert bench.controller.failsafe.command == twin.controller.failsafe.command

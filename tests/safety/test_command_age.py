@@ -10,11 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.joint.controller import JointController
 from services.joint.failsafe import RETIRED_SESSIONS_KEPT, Event, Failsafe, Timing, timing_of
 from shared.bus.messages import Cause, Mode, Refusal
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config.gain_schedule import believing
 from tests.joint.helpers import SESSION, T0, TIMING, Bench, command
 from tests.robots import ROBOT
 
@@ -244,15 +242,14 @@ def test_commands_from_before_the_drive_was_armed_do_not_count() -> None:
 def test_a_drive_is_taken_over_on_the_commands_gains_only_while_the_command_is_usable(
     age_ms: int, *, taken: bool
 ) -> None:
-    controller = JointController(believing(ROBOT), "knee_right")
     bench = Bench(ROBOT)
     told = command(hold=True, k_p=(600.0, 12.0), k_d=(40.0, 3.0), echo_t_ns=T0)
-    controller.failsafe.offer(told, T0, controller.timing)
+    bench.controller.failsafe.offer(told, T0, bench.law.timing)
     bench.now_ns = T0 + age_ms * NS_PER_MS
     reading = msgspec.structs.replace(bench.reading(), torque=(1.0, -1.0))
-    controller.step(bench.now_ns, reading, None, estop=False)
-    assert controller.failsafe.mode is Mode.HOLD
-    assert (controller.setpoint.k_p == told.k_p) is taken
+    bench.law.step(bench.controller, bench.now_ns, reading, None, estop=False)
+    assert bench.mode is Mode.HOLD
+    assert (bench.controller.law.current.k_p == told.k_p) is taken
 
 
 def test_the_failsafes_times_and_limits_are_the_robot_files() -> None:

@@ -110,7 +110,7 @@ def test_in_damp_the_rest_comes_to_the_stand_gains(module: str) -> None:
     bench.to_track(**soft)
     bench.cycle(estop=True)
     bench.run(FADED)
-    setpoint, stand = bench.controller.setpoint, ROBOT.stand_gains(module)
+    setpoint, stand = bench.controller.law.current, ROBOT.stand_gains(module)
     sinks = kind_of(module) in ROBOT.joint_service.damp_sinks
     for axis in (0,) if sinks else (0, 1):
         assert setpoint.k_p[axis] == pytest.approx(max(stand.k_p[axis], soft["k_p"][axis]))
@@ -122,7 +122,7 @@ def test_what_a_drive_carried_in_a_gap_goes_on_within_the_motors_limits(
     bench: Bench, carried: tuple[float, float]
 ) -> None:
     bench.to_hold()
-    phi, theta = bench.controller.resume(bench.now_ns, carried)
+    phi, theta = bench.law.resume(bench.controller, bench.now_ns, carried)
     most = ROBOT.joint.tau_module_max + 1e-9
     assert abs(phi + theta) <= most
     assert abs(theta - phi) <= most

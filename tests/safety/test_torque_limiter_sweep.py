@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.joint.torque_limiter import TorqueLimits, limit_differential, limit_torque, limits_of
+from services.joint.differential import TorqueLimits, limit_differential, limit_torque, limits_of
 from shared.bus.messages import Pair
 from shared.joints import KINDS
 from tests.robots import ROBOT

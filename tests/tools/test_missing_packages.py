@@ -12,7 +12,7 @@ from shared.config.files import load_without_schedule
 from shared.extras import EXTRAS
 from shared.places import CHECKOUT, DEFAULT_CONFIG
 from tools import cli
-from tools.bringup import survey
+from tools.verbs import doctor
 
 
 @pytest.mark.parametrize(
@@ -35,9 +35,7 @@ from tools.bringup import survey
         ("up --run-dir run --out o --no-sim --ros2", "ros2"),
         ("up --view", "view"),
         ("log export OUT --gif a.gif", "plot"),
-        ("log export OUT --scene", "foxglove"),
         ("log export OUT --ros2bag bag", "ros2"),
-        ("log export OUT --parquet t", "parquet"),
         ("ros2 check", "ros2"),
     ],
 )
@@ -89,6 +87,6 @@ def test_doctor_tells_in_a_row_that_no_settings_are_read_without_the_package_for
     file.write_text(text.replace('interface = "xrl_unix"', 'interface = "socketcan"'), "utf-8")
     robot = load_without_schedule(file)
     monkeypatch.setitem(sys.modules, "odrive", None)
-    (row,) = survey._Usb(robot, {}, services_up=False).rows(tmp_path)
+    (row,) = doctor._Usb(robot, {}, services_up=False).rows(tmp_path)
     assert row.found == "odrive is not installed"
     assert row.fix.startswith("the extra `usb` brings it: ")

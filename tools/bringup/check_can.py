@@ -12,7 +12,7 @@ from shared.config.robot_config import RobotConfig
 from tools.bringup.boards import describe_firmware
 from tools.bringup.can_monitor import BusTraffic, NodeTraffic, SensorTraffic, mean_ms, period_ms
 from tools.bringup.check_board import FIND_CAUSE, describe_flags, state_row
-from tools.bringup.check_socketcan import up_command
+from tools.bringup.check_host import up_command
 from tools.bringup.findings import Finding, advised, judged, warning, wrong
 from tools.fleet.process_table import SIMULATED_CAN
 

@@ -57,7 +57,7 @@ class Mutation(Section, frozen=True, order=True):
     """What a mutant is."""
 
     function: str
-    """As mutmut names it, such as `services.joint.torque_limiter.x_limit_torque`."""
+    """As mutmut names it, such as `services.joint.differential.x_limit_torque`."""
     was: str
     """The lines of code, stripped and joined by a space."""
     becomes: str

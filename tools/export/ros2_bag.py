@@ -53,7 +53,7 @@ def write_bag(
         raise RunError(
             f"{index.path}: its times, {clock_time(index.began_ns)} to "
             f"{clock_time(index.ended_ns)}, are beyond those of ROS 2, which end on 2038-01-19; "
-            "take --csv or --parquet"
+            "take --csv"
         )
     rates = {"joint_states_hz": rate_hz, "tf_hz": rate_hz, "wrench_hz": rate_hz}
     ros2 = msgspec.structs.replace(robot.ros2, **rates)

@@ -1,4 +1,4 @@
-"""A run as tables, CSV or Parquet: each key with all of its messages, or all on one time grid.
+"""A run as CSV tables: each key with all of its messages, or all on one time grid.
 
 A column is a field, or an element of one: `tau_ff[1]`, as viewers of the log name it. In a table of
 one key, `time_s` is the sender's stamp on the report's axis (`stamped`).
@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from operator import attrgetter, itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, get_args, get_origin
+from typing import Any, Final, TypeAlias, get_args, get_origin
 
 import msgspec
 
@@ -20,24 +20,16 @@ from shared.bus import topics
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_S
 from shared.exceptions import RunError
-from shared.extras import late
 from tools.judge.run_parts import zero_ns
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import SEE_INFO, NewestAt, RunLog, RunPart, parts_of
 from tools.topic_keys import TopicKey
 
-if TYPE_CHECKING:
-    import pyarrow as pa
-    from pyarrow import parquet as pq
-else:
-    pa = late("pyarrow")
-    pq = late("pyarrow.parquet")
-
 _CLOCK_NS: Final = NS_PER_S
 """A stamp that is further from its reception is of another clock."""
 TIME: Final = "time_s"
-GRID_NAME: Final = "run"
-"""File of the table on a grid, without its suffix."""
+GRID_NAME: Final = "run.csv"
+"""File of the table on a grid."""
 HELD_S: Final = 0.5
 """Newest messages that are older leave a grid's cells empty: their sender is silent."""
 
@@ -49,28 +41,17 @@ Columns = Mapping[str, Sequence[Any]]
 """Values by name, all of one length; None: an empty cell."""
 
 
-class Column(NamedTuple):
-    """How a column is read from a message."""
-
-    read: Callable[[Any], Any]
-    kind: type
-    """int, float, bool or str."""
-
-
-Kinds = Mapping[str, type]
-"""Type of each column, by its name."""
+Reader: TypeAlias = Callable[[Any], Any]
+"""Returns a column's value in a message: an int, a float, a bool or a str."""
 
 
 class CsvFile:
     """A CSV file."""
 
-    suffix = ".csv"
-
-    def __init__(self, path: Path, kinds: Kinds) -> None:
-        path = path.with_name(path.name + self.suffix)
+    def __init__(self, path: Path, columns: Iterable[str]) -> None:
         self._file = path.open("w", newline="", encoding="utf-8")
         self._writer = csv.writer(self._file)
-        self._writer.writerow(kinds)
+        self._writer.writerow(columns)
 
     def add(self, columns: Columns) -> None:
         """Append rows."""
@@ -79,29 +60,6 @@ class CsvFile:
     def close(self) -> None:
         """Finish it."""
         self._file.close()
-
-
-class ParquetFile:
-    """A Parquet file; each part of the run is a row group."""
-
-    suffix: Final = ".parquet"
-
-    def __init__(self, path: Path, kinds: Kinds) -> None:
-        types = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string()}
-        self._schema = pa.schema([(name, types[kind]) for name, kind in kinds.items()])
-        path = path.with_name(path.name + self.suffix)
-        self._writer: Any = pq.ParquetWriter(path, self._schema)
-
-    def add(self, columns: Columns) -> None:
-        """Append rows."""
-        self._writer.write_table(pa.table(dict(columns), schema=self._schema))
-
-    def close(self) -> None:
-        """Finish it."""
-        self._writer.close()
-
-
-TableKind: TypeAlias = type[CsvFile] | type[ParquetFile]
 
 
 def stamped(
@@ -120,9 +78,9 @@ def stamped(
             yield (message.t_ns if alike else at_ns), message
 
 
-def columns_of(kind: type[msgspec.Struct]) -> dict[str, Column]:
+def columns_of(kind: type[msgspec.Struct]) -> dict[str, Reader]:
     """Return the columns of a message type, by name."""
-    found: dict[str, Column] = {}
+    found: dict[str, Reader] = {}
     fields = msgspec.structs.fields(kind)
     for field in sorted(fields, key=lambda field: field.name not in _HEAD):
         _add_column(found, field.name, field.type, attrgetter(field.name))
@@ -134,15 +92,14 @@ def write_tables(
     part: RunPart,
     keys: Sequence[TopicKey],
     folder: Path,
-    make: TableKind,
     done: Callable[[float], None],
 ) -> dict[str, int]:
     """Write a file for each key that has messages; return the rows of each file.
 
-    `make` begins a file at a path without suffix; `done` takes the s that are written.
+    `done` takes the s that are written.
     """
     zero = zero_ns(index)
-    open_files: dict[str, CsvFile | ParquetFile] = {}
+    open_files: dict[str, CsvFile] = {}
     rows: dict[str, int] = {}
     readers = {key.topic: columns_of(key.topic.type) for key in keys}
     with contextlib.ExitStack() as stack:
@@ -154,13 +111,12 @@ def write_tables(
                 getters = readers[key.topic]
                 name = key.name.replace("/", ".")
                 if name not in open_files:
-                    kinds = {column: row.kind for column, row in getters.items()}
-                    file = contextlib.closing(make(folder / name, {TIME: float, **kinds}))
-                    open_files[name] = stack.enter_context(file)
+                    file = CsvFile(folder / f"{name}.csv", (TIME, *getters))
+                    open_files[name] = stack.enter_context(contextlib.closing(file))
                 times = [(at_ns - zero) / NS_PER_S for at_ns, _ in held]
                 cells = {
-                    column: [row.read(message) for _, message in held]
-                    for column, row in getters.items()
+                    column: [read(message) for _, message in held]
+                    for column, read in getters.items()
                 }
                 open_files[name].add({TIME: times, **cells})
                 rows[name] = rows.get(name, 0) + len(held)
@@ -173,7 +129,6 @@ def write_grid(
     keys: Sequence[TopicKey],
     rate_hz: float,
     path: Path,
-    make: TableKind,
     done: Callable[[float], None],
 ) -> int:
     """Write one table on a grid of time: at each time the newest message of each key.
@@ -184,11 +139,9 @@ def write_grid(
     if not steady:
         raise RunError("--rate: none of these topics has a rate; leave it out for their events")
     readers = {key.topic: columns_of(key.topic.type) for key in steady}
-    kinds = {
-        f"{key.name}.{name}": row.kind for key in steady for name, row in readers[key.topic].items()
-    }
+    names = [f"{key.name}.{name}" for key in steady for name in readers[key.topic]]
     zero, step_ns, count, heard = zero_ns(index), NS_PER_S / rate_hz, 0, False
-    with contextlib.closing(make(path, {TIME: float, **kinds})) as file:
+    with contextlib.closing(CsvFile(path, (TIME, *names))) as file:
         for log in parts_of(index, part, done=done):
             first = math.ceil((log.begin_ns - zero) / step_ns)
             last = math.ceil((log.end_ns - zero) / step_ns)
@@ -197,9 +150,9 @@ def write_grid(
             for key in steady:
                 newest = _newest_at(log, key, grid)
                 heard = heard or any(message is not None for message in newest)
-                for name, row in readers[key.topic].items():
+                for name, read in readers[key.topic].items():
                     cells[f"{key.name}.{name}"] = [
-                        None if message is None else row.read(message) for message in newest
+                        None if message is None else read(message) for message in newest
                     ]
             if grid:
                 file.add(cells)
@@ -220,17 +173,17 @@ def _newest_at(log: RunLog, key: TopicKey, grid: Iterable[int]) -> list[Any | No
     return found
 
 
-def _add_column(found: dict[str, Column], name: str, kind: Any, read: Callable[[Any], Any]) -> None:
+def _add_column(found: dict[str, Reader], name: str, kind: Any, read: Reader) -> None:
     """Add a field's column, or those of its elements; any other value becomes JSON."""
     elements = get_args(kind)
     if kind in (int, float, bool, str):
-        found[name] = Column(read, kind)
+        found[name] = read
     elif get_origin(kind) is tuple and elements[-1] is not Ellipsis:
         for number, element in enumerate(elements):
             _add_column(found, f"{name}[{number}]", element, _element(read, number))
     else:
-        found[name] = Column(lambda message: msgspec.json.encode(read(message)).decode(), str)
+        found[name] = lambda message: msgspec.json.encode(read(message)).decode()
 
 
-def _element(read: Callable[[Any], Any], number: int) -> Callable[[Any], Any]:
+def _element(read: Reader, number: int) -> Reader:
     return lambda message: read(message)[number]

@@ -18,7 +18,7 @@ from shared.config.robot_config import RobotConfig
 from shared.config.sections import BusSecurityConfig
 from shared.joints import MODULES
 from shared.places import FILES
-from tools.bringup.check_socketcan import setup_commands
+from tools.bringup.check_host import setup_commands
 from tools.hosts.hosts_file import Host, Hosts, ports
 
 ROBOT_FILE: Final = "robot.toml"

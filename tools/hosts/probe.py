@@ -13,8 +13,7 @@ from typing import Final
 
 import msgspec
 
-from services.recorder.disk_guard import MIB
-from services.recorder.loop import free_bytes_at
+from services.recorder.host_watch import MIB, free_bytes_at
 from shared import scheduling
 from shared.arguments import FlagParser
 from shared.bus.credentials import NAMES, keys_folder

@@ -19,11 +19,10 @@ from typing import Any, Final
 import msgspec
 
 from services.joint import pd_law
-from services.joint.differential import motor_torque
+from services.joint.differential import limit_differential, motor_torque
 from services.joint.drive_manager import ArmingInhibit, DriveAction, DriveCommand, DriveManager
 from services.joint.drivers.base import DriveReading, DriveStatus
 from services.joint.neighbours import UNKNOWN, NeighbourView
-from services.joint.torque_limiter import limit_differential
 from services.planner.planner import Planner
 from services.planner.watch.engagement_fsm import Engagement
 from shared.bus.messages import JointCommand, JointState, Mode, PlannerMode, PlannerStatus
@@ -118,10 +117,10 @@ class PassThrough(DriveManager):
                 tracks = step.event.mode_after == Mode.TRACK
                 self._tracks_since_ns = now_ns if tracks else None
             return step
-        controller = self.controller
+        controller = self.state.controller
         controller.cycle += 1
         if reading is not None:
-            controller.samples.take(reading, armed=True)
+            controller.estimate.take(reading, armed=True)
         if command is not None and all(map(math.isfinite, command.tau_ff)):
             controller.failsafe.command = command  # its age goes into the states
             controller.tau = limit_differential(command.tau_ff, self._tau_module_max)

@@ -13,8 +13,9 @@ from typing import ClassVar
 
 import msgspec
 
-from services.joint.controller import JointController
+from services.joint.controller import ControllerState
 from services.joint.drive_manager import DriveManager, DriveManagerState
+from services.joint.heat import report
 from services.planner.controller import Controller
 from services.planner.intents import OperatorRequest
 from services.planner.planner import Planner, PlannerState
@@ -32,6 +33,7 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import SCENARIO, Kill, Push, Restart, Scenario
 from shared.exceptions import RunError
 from shared.joints import MODULE_INDEX, MODULES
+from shared.state import copied
 from tools.logs.hand_path import HandRow
 from tools.sim.network import BASE, VirtualNetwork
 from tools.sim.virtual_drive import VirtualBus
@@ -201,16 +203,16 @@ class Lockstep:
         self._planner.planner = planner
 
     @property
-    def controllers(self) -> list[JointController]:
-        """Each module's control law."""
-        return [joint.manager.controller for joint in self.joints]
+    def controllers(self) -> list[ControllerState]:
+        """State of each module's control law."""
+        return [joint.manager.state.controller for joint in self.joints]
 
     def moment(self) -> FleetMoment:
         """Return what world and services are now, for `resume`; it shares what still changes."""
         planner = self.planner
         return FleetMoment(
             self._robot.read_state(self.now_ns, 0),
-            {joint.name: joint.manager.snapshot() for joint in self.joints},
+            {joint.name: copied(joint.manager.state) for joint in self.joints},
             None if planner is None else (planner.session, planner.snapshot()),
         )
 
@@ -303,8 +305,9 @@ class Lockstep:
             step_s = min(1.0, seconds)
             heat.skip(heat.load, step_s)
             for joint in self.joints:
-                joint.manager.controller.heat.skip(step_s)
-                joint.manager.controller.heat.report(*joint.drive.thermistors())
+                estimate, state = joint.manager.controller.heat, joint.manager.state.controller.heat
+                estimate.skip(state, step_s)
+                report(state, *joint.drive.thermistors())
             seconds -= step_s
 
     def act(self, row: Happening) -> None:

@@ -29,6 +29,7 @@ from shared.can.frame_group import FrameGroup
 from shared.can.imu_can import ImuSample
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
+from shared.state import copied
 from tools.sim.network import VirtualNetwork
 from tools.sim.virtual_drive import VirtualBus, VirtualDrive
 from tools.sim.virtual_time import HostClock, LinkInbox, Record, RecordOutbox, VirtualTime
@@ -161,7 +162,10 @@ class VirtualJoint:
             neighbours=self._place,
             clock=self._clock,
         )
-        self._place.write(row_of(manager.controller, self._clock()))
+        self._write_row()
+
+    def _write_row(self, *, is_dead: bool = False) -> None:
+        self._place.write(row_of(self.manager.state.controller, self._clock()), is_dead=is_dead)
 
     def cycle(self) -> DriveAction:
         """Run one cycle."""
@@ -170,7 +174,9 @@ class VirtualJoint:
     def kill(self, *, for_good: bool) -> None:
         """Freeze the service; `for_good`: it is dead, and a restart makes a new one."""
         self.frozen, self._is_dead = True, self._is_dead or for_good
-        self._place.write(row_of(self.manager.controller, self._clock()), is_dead=self._is_dead)
+        self._place.write(
+            row_of(self.manager.state.controller, self._clock()), is_dead=self._is_dead
+        )
 
     def restart(self) -> None:
         """Continue a frozen service; a dead one is replaced, and takes over its armed drive."""
@@ -185,8 +191,8 @@ class VirtualJoint:
         if state is None:
             self.kill(for_good=True)
         else:
-            self.manager.restore(state)
-            self._place.write(row_of(self.manager.controller, self._clock()))
+            self.manager.state = copied(state)
+            self._write_row()
         self.drive.assume_heard()
 
 

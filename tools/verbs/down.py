@@ -8,7 +8,7 @@ from typing import Annotated, Final
 
 from shared.exceptions import FleetError
 from shared.joints import MODULES
-from tools.bringup.resuming import rests_after_down
+from tools.bringup.zero_record import rests_after_down
 from tools.flags import Arg, Duration, RunDirFlags
 from tools.fleet import procfs
 from tools.fleet.supervise import SupervisedFleet

@@ -158,6 +158,6 @@ class CoupledTorque:
         return (*self._first.tolist(), *self._second.tolist(), self.integral.force)
 
     def restore(self, state: tuple[float, ...]) -> None:
-        """Continue from a state that `snapshot` returned; an old log knows no F_I."""
+        """Continue from a state that `snapshot` returned."""
         self._first[:], self._second[:] = state[:N_JOINTS], state[N_JOINTS : 2 * N_JOINTS]
-        self.integral.force = sum(state[2 * N_JOINTS :])
+        self.integral.force = state[2 * N_JOINTS]

@@ -93,8 +93,7 @@ class PlannerTrips:
         self.state = TripsState()
 
     def restore(self, state: TripsState) -> None:
-        """Continue from a state, which is the watch's from now on; an old log knows fewer trips."""
-        state.since_ns += (0,) * (len(_TRIPS) - len(state.since_ns))
+        """Continue from a state, which is the watch's from now on."""
         self.state = state
 
     def advance(self, now_ns: int, values: tuple[float, ...], *, leads: bool) -> None:

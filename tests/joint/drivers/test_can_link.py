@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import struct
 import time
 from collections.abc import Callable, Iterator
 
@@ -98,13 +97,6 @@ def test_a_bus_that_is_back_at_once_is_gone_on_with_before_the_next_heartbeat(be
     assert (reading.status, bench.driver.dialect) == (DriveStatus.ARMED, "0.5")
 
 
-@pytest.mark.parametrize("data", [b"", b"\x02", bytes(7)])
-def test_a_foreign_request_for_a_version_is_no_version(bench: Bench, data: bytes) -> None:
-    bench.bus.waiting.append(frame(NODES[0], Command06.GET_VERSION, data))
-    bench.after(1)
-    assert bench.driver.dialect == ""
-
-
 def test_trouble_on_the_wire_that_leaves_the_controller_on_it_is_counted_only(bench: Bench) -> None:
     bench.armed()
     passive = error_frame(0x04, bytes((0, 0x20, 0, 0, 0, 0, 0, 0)))
@@ -115,7 +107,14 @@ def test_trouble_on_the_wire_that_leaves_the_controller_on_it_is_counted_only(be
 
 
 def test_frames_that_only_have_the_number_of_a_nodes_are_not_taken_for_it(bench: Bench) -> None:
-    """An error frame of class 0x80 has that of node 4's version; others are extended or remote."""
+    """An error frame of class 0x80 has that of node 4's version; others are extended or remote.
+
+    A foreign request for a version is none.
+    """
+    for data in (b"", b"\x02", bytes(7)):
+        bench.bus.waiting.append(frame(NODES[0], Command06.GET_VERSION, data))
+        bench.after(1)
+        assert bench.driver.dialect == ""
     bench.receive()
     bench.bus.waiting.append(error_frame(arbitration_id(NODES[0], 0)))
     for node in NODES:
@@ -178,20 +177,16 @@ def test_writing_to_a_deaf_hub_never_blocks_or_raises(rig: Rig, driver: OdriveCa
     assert list(rig.bank.input_torque[[4, 5]]) == [1.0, 2.0]
 
 
-def test_unknown_interface_is_refused_at_the_start() -> None:
+def test_driver_runs_on_a_bus_with_nothing_but_the_api_of_python_can() -> None:
+    """One that python-can does not know is refused at the start."""
     with pytest.raises(DriveError, match="no_such_bus"):
         OdriveCan(CanConfig(interface="no_such_bus", channel="x"), NODES, DRIVE)
-
-
-def test_driver_runs_on_a_bus_with_nothing_but_the_api_of_python_can() -> None:
     driver = OdriveCan(CanConfig(interface="virtual", channel="test_odrive_can"), NODES, DRIVE)
     with can.Bus(interface="virtual", channel="test_odrive_can", ignore_config=True) as drive_side:
         for node, pos in zip(NODES, (1.0, 2.0), strict=True):
-            idle = struct.pack("<IBBBB", 0, 1, 0, 0, 0x80)
-            drive_side.send(frame(node, Command.HEARTBEAT, idle))
-            drive_side.send(
-                frame(node, Command.GET_ENCODER_ESTIMATES, struct.pack("<ff", pos, -pos))
-            )
+            drive_side.send(frame(node, Command.HEARTBEAT, bytes((0, 0, 0, 0, 1, 0, 0, 0x80))))
+            estimate = pack_two_floats(pos, -pos)
+            drive_side.send(frame(node, Command.GET_ENCODER_ESTIMATES, estimate))
         reading = read(driver)
         driver.write_torque((0.5, -0.5))
         sent = [drive_side.recv(0.5) for _ in range(4)]

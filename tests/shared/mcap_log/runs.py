@@ -7,6 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from mcap.reader import SeekingReader, make_reader
+from mcap.stream_reader import StreamReader
+
 from shared.bus import codec, topics
 from shared.bus.messages import JointState
 from shared.bus.topics import Topic
@@ -135,3 +138,30 @@ def killed_file(
 def few_topics() -> dict[str, Topic]:
     """Return a small table, for small files."""
     return {STATE_KEY: topics.JOINT_STATE, topics.WRENCH.key(ROBOT): topics.WRENCH}
+
+
+def by_the_package(path: Path) -> list[int]:
+    """Return the sequence numbers that the mcap package finds in a consistent file.
+
+    Its CRCs are right, each chunk has its index, and the summary counts what is in the file and
+    describes every channel.
+    """
+    with path.open("rb") as file:
+        assert list(StreamReader(file, validate_crcs=True).records)
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert isinstance(reader, SeekingReader)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        found = list(reader.iter_messages())
+        assert summary.statistics.message_count == len(found)
+        assert len(summary.chunk_indexes) == summary.statistics.chunk_count
+        assert summary.statistics.attachment_count == len(list(reader.iter_attachments()))
+        assert summary.statistics.metadata_count == len(list(reader.iter_metadata()))
+        assert {channel.id for _, channel, _ in found} <= set(summary.channels)
+        times = [message.log_time for _, _, message in found]
+        if times:
+            span = summary.statistics.message_start_time, summary.statistics.message_end_time
+            assert span == (min(times), max(times))
+    return [message.sequence for _, _, message in found]

@@ -8,8 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from mcap.reader import SeekingReader, make_reader
-from mcap.stream_reader import StreamReader
+from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from services.recorder import auto_recover
@@ -18,31 +17,13 @@ from shared.exceptions import RunError
 from shared.mcap_log import recover
 from shared.mcap_log.recover import Interrupted
 from tests.shared.mcap_log import runs
-from tests.shared.mcap_log.runs import ATTACHMENTS, Queue, item
+from tests.shared.mcap_log.runs import ATTACHMENTS, Queue, by_the_package, item
 from tools.logs.run_log import read_run
 
 LOGGER = logging.getLogger("test")
 
 
 pytestmark = pytest.mark.usefixtures("no_wait_for_the_disk")
-
-
-def by_the_package(path: Path) -> list[int]:
-    """Return the sequence numbers that the mcap package's seeking reader finds."""
-    with path.open("rb") as file:
-        reader = make_reader(file, validate_crcs=True)
-        assert isinstance(reader, SeekingReader)
-        summary = reader.get_summary()
-        assert summary is not None
-        assert summary.statistics is not None
-        found = [message.sequence for _, _, message in reader.iter_messages()]
-        assert summary.statistics.message_count == len(found)
-        assert len(summary.chunk_indexes) == summary.statistics.chunk_count
-        assert summary.statistics.attachment_count == len(list(reader.iter_attachments()))
-        assert summary.statistics.metadata_count == len(list(reader.iter_metadata()))
-    with path.open("rb") as file:
-        assert list(StreamReader(file, validate_crcs=True).records)
-    return found
 
 
 def test_a_killed_file_comes_back_whole(tmp_path: Path) -> None:

@@ -57,7 +57,7 @@ def test_schema_has_no_references_and_no_arrays_in_arrays(topic: Topic) -> None:
 
 @each_recorded
 def test_encoded_message_fits_its_schema_and_a_damaged_one_does_not(topic: Topic) -> None:
-    """A field with a default may be missing: logs from before there was one are still read."""
+    """A field with a default may be missing."""
     fields = msgspec.structs.fields(topic.type)
     newer = {field.name for field in fields if field.default is not msgspec.NODEFAULT}
     assert len(newer) < 2 * len(fields) / 3

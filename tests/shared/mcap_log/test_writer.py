@@ -1,8 +1,9 @@
 from __future__ import annotations
 
-import itertools
 import json
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from mcap.reader import make_reader
@@ -12,8 +13,16 @@ from mcap.stream_reader import StreamReader
 from shared.bus import codec, topics
 from shared.exceptions import RunError
 from shared.mcap_log import files
+from tests.messages import sample
 from tests.shared.mcap_log import runs
-from tests.shared.mcap_log.runs import ATTACHMENTS, OFFSET_NS, STATE_KEY, Queue, item
+from tests.shared.mcap_log.runs import (
+    ATTACHMENTS,
+    OFFSET_NS,
+    STATE_KEY,
+    Queue,
+    by_the_package,
+    item,
+)
 from tools.logs.run_log import read_run
 
 
@@ -46,9 +55,30 @@ def test_metadata_and_attachments_come_before_the_first_chunk(tmp_path: Path) ->
     assert topics_described == set(runs.recorded_topics())
 
 
-def read_by_the_package(path: Path) -> list[bytes]:
+def leaves(value: Any) -> Iterator[Any]:
+    if isinstance(value, dict | list) and value:
+        for entry in value.values() if isinstance(value, dict) else value:
+            yield from leaves(entry)
+    else:
+        yield value
+
+
+def test_a_plotter_gets_every_value_of_every_topic(tmp_path: Path) -> None:
+    """PlotJuggler drops null and empty arrays, cuts long ones, and makes doubles of integers."""
+    rows = [
+        (key, codec.encode(sample(topic.type, seq=seq, t_ns=seq)), seq)
+        for seq in range(3)
+        for key, topic in runs.recorded_topics().items()
+    ]
+    path = runs.write(tmp_path, rows)
+    assert len(by_the_package(path)) == len(rows)
     with path.open("rb") as file:
-        return [m.data for _, _, m in make_reader(file, validate_crcs=True).iter_messages()]
+        for described, channel, message in make_reader(file).iter_messages():
+            assert described is not None
+            values = list(leaves(json.loads(message.data)))
+            assert not any(value in (None, [], {}) for value in values), channel.topic
+            assert len(values) <= 500
+            assert all(abs(value) <= 1 << 53 for value in values if isinstance(value, int))
 
 
 def test_times_are_mapped_to_the_wall_clock_by_one_offset(tmp_path: Path) -> None:
@@ -138,9 +168,9 @@ def test_a_split_run_is_one_file_after_the_other_and_each_stands_for_itself(tmp_
     paths = runs.write_in_parts(runs.writer(tmp_path), items)
     assert [path.name for path in paths] == ["run.mcap", "run_1.mcap", "run_2.mcap"]
     assert sorted(tmp_path.iterdir()) == sorted(paths)
-    payloads = [read_by_the_package(path) for path in paths]
-    assert [len(found) for found in payloads] == [10, 10, 10]
-    assert list(itertools.chain(*payloads)) == [payload for _, payload, _ in items]
+    assert [by_the_package(path) for path in paths] == [
+        list(range(first, first + 10)) for first in (0, 10, 20)
+    ]
     logs = [read_run(path) for path in paths]
     assert all(log.complete and log.attachments == ATTACHMENTS for log in logs)
     assert len({log.metadata["split"]["run"] for log in logs}) == 1

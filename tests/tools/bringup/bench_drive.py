@@ -10,9 +10,9 @@ from services.joint.drivers.base import Drive, DriveReading, DriveStatus, MotorT
 from shared.bus.messages import Pair
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
-from tools.bringup.jog import JogPlan, ThereAndBack
 from tools.bringup.motion import AnyPlan, Sample
 from tools.bringup.motion_runner import Interrupts, MotionResult, run_motion
+from tools.verbs.drive.jog import JogPlan, ThereAndBack
 
 START: Pair = (0.03, -1.0)
 STEP_NS = NS_PER_S // 1000

@@ -105,5 +105,5 @@ def test_a_run_after_2038_is_refused_as_a_bag_and_has_its_other_exports(
     assert cli.main(["log", "export", str(path), "--ros2bag", str(bag)]) == 2
     assert "are beyond those of ROS 2, which end on 2038-01-19" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == [path]
-    words = ["--scene", "--csv", str(tmp_path / "tables")]
+    words = ["--csv", str(tmp_path / "tables")]
     assert cli.main(["log", "export", str(path), *words]) == 0

@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.harness.zero_file import ZeroFile
-from services.harness.zero_file import path_of as zero_of
+from services.harness.loop import ZeroFile
+from services.harness.loop import zero_path as zero_of
 from services.joint.rearm_guard import LastState, RearmGuard, request_stop, stop_source
 from shared.exceptions import FleetError
 from shared.joints import MODULES

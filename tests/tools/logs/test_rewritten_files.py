@@ -12,7 +12,6 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from shared.bus import topics
 from shared.mcap_log import recover
-from shared.mcap_log.log_copy import NewChannel, NewMessage, write_extended
 from shared.mcap_log.writer import COUNTS
 from tests.shared.mcap_log import runs
 from tests.shared.mcap_log.runs import ATTACHMENTS, STATE_KEY, item
@@ -124,19 +123,6 @@ def test_the_index_that_a_file_lacks_is_made_by_recover(
     assert copy.exists() == lacks
     if lacks:
         assert raw_of(read_run(copy)) == raw_of(read_run(recorded))
-
-
-def test_a_scene_goes_between_messages_without_chunks(tmp_path: Path, recorded: Path) -> None:
-    path = rewrite(recorded, tmp_path / "run.mcap", use_chunking=False)
-    start = read_run(path).index.began_ns
-    added = [NewMessage(0, start + n * 10_000_000, b"{}") for n in range(300)]
-    channel = NewChannel("/scene", "scene", "jsonschema", b"{}", "json", {})
-    out = tmp_path / "out.mcap"
-    assert write_extended(path, out, [channel], added) == COUNT + 300
-    assert raw_of(read_run(out)) == raw_of(read_run(recorded))
-    with out.open("rb") as file:
-        found = [m.log_time for _, _, m in make_reader(file).iter_messages(["/scene"])]
-    assert found == [message.log_ns for message in added]
 
 
 def test_the_recorders_counts_of_a_filtered_file_are_not_believed(

@@ -282,7 +282,7 @@ def _drive_is_worse(before: JointState, after: JointState) -> bool:
 
 def _planner(row: PlannerStatus) -> str:
     trip = f", {name_of(Trip, row.trip)}" if row.mode == PlannerMode.TRIPPED else ""
-    waits = ", backs off after drop-outs or trips" if row.wait_s > 0.0 else ""
+    waits = " (waits after drop-outs or trips)" if row.wait_s > 0.0 else ""
     return name_of(PlannerMode, row.mode) + trip + waits
 
 

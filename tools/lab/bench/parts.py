@@ -140,7 +140,7 @@ def joint_cycle(recorded: Recorded, _stack: ExitStack) -> Repeated:
         command = decoder.decode(payload) if payload else None
         manager.step(now_ns, reading, command, estop, *near)
         if next(count) % 2 == 0:
-            encode(manager.controller.state(now_ns))
+            encode(manager.controller.state(manager.state.controller, now_ns))
 
     return Repeated(once)
 

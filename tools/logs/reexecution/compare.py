@@ -8,12 +8,15 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, Final, TypeAlias
+from typing import Any, Final, TypeAlias, TypeVar
 
 import msgspec
 
 from shared.bus.messages import Message
+from shared.exceptions import RunError
 from shared.revision import UNKNOWN
+
+State = TypeVar("State")
 
 _F64: Final = struct.Struct("<d")
 _I64: Final = struct.Struct("<q")
@@ -146,6 +149,17 @@ class ReexecutionResult:
         return self.ticks > 0 and not self.differs
 
 
+def memory_of(text: str, kind: type[State]) -> State:
+    """Return a recorded memory."""
+    try:
+        return msgspec.json.decode(text, type=kind)
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise RunError(
+            f"a service's memory in the log is no {kind.__name__}: {error}; execute it again with "
+            "the checkout that wrote it (`xrl log info` tells its commit)"
+        ) from None
+
+
 def size(row: Difference) -> float:
     """Return how far apart the two values are; infinite where they are no numbers."""
     a, b = row.recorded, row.recomputed
@@ -189,19 +203,12 @@ def _walk(name: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
     if isinstance(a, dict) and isinstance(b, dict):
         for field, value in a.items():
             yield from _walk(f"{name}.{field}" if name else field, value, b.get(field))
-    elif (
-        isinstance(a, list | tuple)
-        and isinstance(b, list | tuple)
-        and (len(a) == len(b) or (name in _RECORDS and len(a) < len(b)))
-    ):
-        for index, (one, other) in enumerate(zip(a, b, strict=False)):
+    elif isinstance(a, list | tuple) and isinstance(b, list | tuple) and len(a) == len(b):
+        for index, (one, other) in enumerate(zip(a, b, strict=True)):
             yield from _walk(f"{name}[{index}]", one, other)
     else:
         yield name, a, b
 
-
-_RECORDS: Final = ("snapshot.request",)
-"""Fields written as a list: an older log has fewer of them, as a struct has that grew."""
 
 Origin: TypeAlias = Mapping[str, Mapping[str, str]]
 """Metadata of a log (`shared.mcap_log.provenance`): `run` and `packages`."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from bisect import bisect_right
+from collections.abc import Callable, Iterable, Iterator
 from typing import Final, Generic, TypeVar
 
 import msgspec
@@ -16,12 +17,27 @@ from shared.bus.messages import Attitude, JointCommand, Message, PlannerStatus, 
 from shared.bus.traces import PlannerCheckpoint
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
-from tools.logs.reexecution.compare import ReexecutionResult
-from tools.logs.reexecution.inputs import BySeq, memory_of
+from tools.logs.reexecution.compare import ReexecutionResult, memory_of
 from tools.logs.run_log import RunLog
 
 M = TypeVar("M", bound=Message)
 _encode: Final = msgspec.json.Encoder().encode
+
+
+class BySeq(Generic[M]):
+    """Finds a sender's message by its number; a restarted sender counts from the start again."""
+
+    def __init__(self, messages: Iterable[M]) -> None:
+        self._rows: dict[int, list[M]] = {}
+        for message in messages:
+            self._rows.setdefault(message.seq, []).append(message)
+
+    def at(self, seq: int, by_ns: int) -> M | None:
+        """Return the newest message of this number that was made by a time; None if none was."""
+        rows = self._rows.get(seq)
+        if not rows:
+            return None
+        return rows[max(0, bisect_right(rows, by_ns, key=lambda row: row.t_ns) - 1)]
 
 
 class _LoggedInbox(Generic[M]):

@@ -15,7 +15,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
 from shared.joints import AXES, MODULES
 from shared.toml_file import Range
-from tools.bringup import module_motion
+from tools.bringup import motion_runner
 from tools.bringup.drive_access import drives_to_ourselves, robot_file
 from tools.bringup.hanging_leg import hanging_joint
 from tools.bringup.identify import (
@@ -27,8 +27,7 @@ from tools.bringup.identify import (
     fit_sines,
     plan_for,
 )
-from tools.bringup.module_motion import Stopped, exit_if_interrupted
-from tools.bringup.motion_runner import Interrupts
+from tools.bringup.motion_runner import Interrupts, Stopped, exit_if_interrupted
 from tools.flags import FINITE_MAX, Arg, MotionFlags, positional
 from tools.terminal import Console
 
@@ -83,9 +82,9 @@ def run(flags: IdentifyFlags) -> int:
     results: list[JointResult] = []
     stopped: Stopped | None = None
     interrupts = Interrupts()
-    module_motion.refuse_services(robot, flags.modules, flags.run_dir)
+    motion_runner.refuse_services(robot, flags.modules, flags.run_dir)
     with drives_to_ourselves(
-        robot, path, flags.run_dir, console.print, lifted=module_motion.LIFTED
+        robot, path, flags.run_dir, console.print, lifted=motion_runner.LIFTED
     ):
         for joint in ((module, axis) for module in flags.modules for axis in flags.axes):
             try:
@@ -101,7 +100,7 @@ def run(flags: IdentifyFlags) -> int:
                 results.append(found)
     if results:
         report(estimates_of(results, robot), console)
-    code = 0 if stopped is None else module_motion.tell_stopped(stopped, console)
+    code = 0 if stopped is None else motion_runner.tell_stopped(stopped, console)
     exit_if_interrupted(interrupts)
     return code
 
@@ -152,8 +151,8 @@ def _measure(
         console.print(_described(name, plan))
         return plan
 
-    moved = module_motion.ask_and_move(flags, robot, joint, plan_of, interrupts, console)
-    if not isinstance(moved, module_motion.Moved):
+    moved = motion_runner.ask_and_move(flags, robot, joint, plan_of, interrupts, console)
+    if not isinstance(moved, motion_runner.Moved):
         return moved
     fit = fit_sines(moved.samples, moved.plan)
     if fit is None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import copy
 import fnmatch
@@ -22,7 +21,6 @@ from shared.bus import topics
 from shared.clock import NS_PER_S
 from tests.shared.mcap_log.runs import Queue, writer_like
 from tools import cli
-from tools.judge.reports.page_model import PageModel, Panel
 from tools.judge.reports.run_data import RunData
 from tools.logs.run_log import RunLog, Series, read_run
 
@@ -133,32 +131,11 @@ def data_of(page: str) -> dict[str, Any]:
     return json.loads(found[1])
 
 
-def drawn(log: RunLog, *makes: Callable[[RunData], Iterable[Panel]]) -> dict[str, Any]:
-    """Return the data of some panels of a page."""
-    run = RunData(log)
-    model = PageModel(run.span)
-    for make in makes:
-        for one in make(run):
-            model.add(one)
-    return model.as_data([])[0]
-
-
 def panel(data: dict[str, Any], title: str) -> dict[str, Any]:
     return next(panel for panel in data["panels"] if panel["title"] == title)
 
 
-def decode_signal(signal: dict[str, Any], grid: dict[str, float]) -> tuple[Array, Array]:
-    """Return times and values as the page's script decodes them; NaN where the line breaks."""
-    codes = np.frombuffer(base64.b64decode(signal["d"]), "<i2").astype(np.int64)
-    assert signal["first"] + len(codes) <= grid["count"]
-    t = grid["begin"] + (signal["first"] + np.arange(len(codes)) + 0.5) * grid["step"]
-    values = signal["lo"] + (codes + 32766) * signal["step"]
-    values[codes == -32767] = np.nan
-    present = codes != -32768
-    return t[present], values[present]
-
-
 def line(data: dict[str, Any], title: str, label: str) -> tuple[Array, Array]:
-    lines = panel(data, title)["lines"]
-    index = next(line for line in lines if line["label"] == label)["signal"]
-    return decode_signal(data["signals"][index], data["grid"])
+    """Return times and values of a line; NaN where it breaks."""
+    found = next(line for line in panel(data, title)["lines"] if line["label"] == label)
+    return np.array(found["t"]), np.array(found["v"], dtype=np.float64)

@@ -14,7 +14,6 @@ from shared.joints import SIDES
 from shared.robot.robot_model import ankle_positions
 from tests.tools.judge.reports.runs import Made
 from tools import cli
-from tools.judge.reports import scene
 from tools.judge.reports.moving_picture import (
     FRAMES_S,
     HAND_INK,
@@ -24,6 +23,7 @@ from tools.judge.reports.moving_picture import (
     WIDTH,
     world_frames,
 )
+from tools.judge.reports.robot_pose import poses
 from tools.logs.run_log import RunLog
 
 
@@ -36,7 +36,7 @@ def drawn(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_drawn_ankles_stand_where_the_robots_do(log: RunLog, robot: RobotConfig) -> None:
     """Through the legs' chains from the torso: joints' flexibility and play stay below 10 mm."""
-    *_, last = scene.poses(log, robot)
+    *_, last = poses(log, robot, FRAMES_S)
     frames = world_frames(robot, last)
     for side, wanted in zip(SIDES, ankle_positions(robot), strict=True):
         np.testing.assert_allclose(frames[f"ankle_{side}"][0], wanted, atol=0.01)

@@ -1,30 +1,25 @@
-"""A run that is read in parts has the page, the verdict and the scene of the whole."""
+"""A run that is read in parts has the page and the verdict of the whole."""
 
 from __future__ import annotations
 
 import re
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from tools.judge.reports.page_model import Line, PageModel, PageWindow, Plot
-from tools.judge.reports.signals import Span
 
 from shared.bus import topics
-from shared.bus.messages import DriveStatus
 from shared.exceptions import RunError
 from tests.tools.judge.reports import runs
 from tests.tools.judge.reports.runs import Made
 from tools import cli
 from tools.judge import verdict
-from tools.judge.reports import scene
 from tools.judge.reports.page import render, render_parts
 from tools.judge.run_parts import zero_ns
 from tools.judge.verdict import summarise_parts
 from tools.logs.run_index import RunIndex
-from tools.logs.run_log import RunLog, RunPart, parts_of, read_part, robot_of
+from tools.logs.run_log import RunLog, RunPart, parts_of, read_part
 
 PART_S = 0.9
 
@@ -76,11 +71,11 @@ def test_panels_and_lines_are_those_of_the_whole(page: str, in_parts: str) -> No
 
 
 def test_the_bars_are_those_of_the_whole(page: str, in_parts: str) -> None:
-    title = "Modes of the six services"
-    whole, parts = (runs.panel(runs.data_of(one), title) for one in (page, in_parts))
-    for row, row_all in zip(parts["rows"], whole["rows"], strict=True):
-        assert [span[2] for span in row["spans"]] == [span[2] for span in row_all["spans"]]
-        edges, edges_all = (np.array([span[:2] for span in r["spans"]]) for r in (row, row_all))
+    whole, parts = (runs.panel(runs.data_of(one), "Modes")["rows"] for one in (page, in_parts))
+    for (label, row), (label_all, row_all) in zip(parts, whole, strict=True):
+        assert label == label_all
+        assert [bar[2] for bar in row] == [bar[2] for bar in row_all]
+        edges, edges_all = (np.array([bar[:2] for bar in one]) for one in (row, row_all))
         np.testing.assert_allclose(edges, edges_all, atol=0.005)
 
 
@@ -100,18 +95,6 @@ def test_the_verdict_is_that_of_the_whole(log: RunLog, monkeypatch: pytest.Monke
 def test_a_part_before_the_scenario_is_no_reason_not_to_judge_the_run(log: RunLog) -> None:
     found = summarise_parts(log.index, 1.0)
     assert found.stood
-
-
-def test_the_scene_of_the_parts_is_that_of_the_whole(log: RunLog) -> None:
-    robot = robot_of(log)
-    whole = [m for m in scene.messages([log], robot) if m.channel == scene.STATE]
-    parts = [
-        m for m in scene.messages(parts_of(log.index, part_s=PART_S), robot)
-        if m.channel == scene.STATE
-    ]  # fmt: skip
-    assert abs(len(parts) - len(whole)) <= 1 + log.index.length_s / PART_S
-    times = [m.log_ns for m in parts]
-    assert times == sorted(set(times))
 
 
 def test_a_part_of_a_run_has_the_time_of_the_whole_and_all_events(
@@ -152,46 +135,6 @@ def test_events_are_in_every_part_and_all_other_messages_in_one(log: RunLog) -> 
 
 def test_time_zero_is_that_of_the_scenario(log: RunLog) -> None:
     assert zero_ns(log.index) == verdict.course(log).zero_ns
-
-
-def test_a_panel_without_data_in_the_first_part_has_its_unit_and_note_from_a_later_one() -> None:
-    model = PageModel(Span(0.0, 2.0))
-    model.add(Plot("Age", if_empty="nothing yet", lines=[]))
-    assert model.as_data([])[1] == [("Age", "nothing yet")]
-    line = Line("x", np.array([1.2, 1.4]), np.array([0.0, 3.0]), 0)
-    model.add(Plot("Age", "ms", "how old", "none", lines=[line]))
-    data, left_out = model.as_data([])
-    assert left_out == []
-    (panel,) = data["panels"]
-    assert (panel["unit"], panel["note"]) == ("ms", "how old")
-
-
-def test_a_counter_goes_on_from_where_the_part_before_it_ended() -> None:
-    """Each part counts from its margin on, which is the end of the part before."""
-    model = PageModel(Span(0.0, 2.0))
-    parts = (
-        (PageWindow(0.0, 1.0), [0.0, 0.5, 0.9, 1.1], [0.0, 1.0, 3.0, 4.0]),
-        (PageWindow(1.0, 2.0), [0.9, 1.1, 1.5, 1.9], [0.0, 1.0, 1.0, 6.0]),
-    )
-    for window, t, values in parts:
-        model.window = window
-        line = Line("late", np.array(t), np.array(values), 0, counts_up=True)
-        model.add(Plot("Late", "count", lines=[line], needs_count=True))
-    data, _ = model.as_data([])
-    _, seen = runs.line(data, "Late", "late")
-    assert seen[-1] == pytest.approx(9.0, abs=1e-3), "3 in the first part, 6 in the second"
-    assert (np.diff(seen) >= 0.0).all()
-
-
-def test_before_the_drives_are_armed_no_soft_stop_is_passed(log: RunLog, tmp_path: Path) -> None:
-    """A robot that hangs unarmed has its joints anywhere."""
-
-    def hanging(t: float, state: dict[str, Any]) -> None:
-        if t <= -1.0:
-            state |= {"q": (9.0, 9.0), "drive": int(DriveStatus.IDLE)}
-
-    hung = runs.written(runs.changed(log, {"joint/*/state": hanging}), tmp_path)
-    assert "beyond a soft stop" not in render_parts(hung.index, part_s=PART_S)
 
 
 def test_a_change_across_a_silence_at_the_edge_of_a_part_has_its_row(

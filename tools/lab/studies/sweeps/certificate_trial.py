@@ -19,8 +19,8 @@ import msgspec
 import numpy as np
 
 from services.joint import differential
+from services.joint.differential import limit_torque, limits_of
 from services.joint.pd_law import ZERO, Setpoint, torque
-from services.joint.torque_limiter import limit_torque, limits_of
 from services.planner.law.certificate import Certificate, Weakest
 from services.planner.law.gains import GainLaw
 from services.planner.law.inverse_kinematics import InverseKinematics
