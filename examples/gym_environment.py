@@ -18,8 +18,7 @@ from shared.arrays import Array
 from shared.config.files import load
 from shared.config.scenarios import load as load_scenario
 from shared.places import DEFAULT_CONFIG, SCENARIOS
-from tools.sim.lockstep import Lockstep
-from tools.sim.standing_start import begin_standing
+from tools.sim.lockstep import Lockstep, begin_standing
 
 OFFSET, TORQUE = 0.01, 20.0  # rad and N m; what an action of 1 adds
 LIMIT, FALL = 50.0, -100.0  # of each observation; reward of a fall

@@ -169,13 +169,10 @@ def test_a_page_has_the_codes_figure(page: str, text: str) -> None:
     assert text in (DOCS / page).read_text(encoding="utf-8")
 
 
-def test_readme_links_every_page() -> None:
+def test_every_page_is_linked_and_every_file_and_anchor_on_it_exists() -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     pages = {path.name for path in DOCS.glob("*.md")} - {"index.md"}
     assert {page for page in pages if f"(docs/{page}" not in readme} == set()
-
-
-def test_every_reference_to_a_page_leads_to_a_page_and_an_anchor() -> None:
     broken = []
     for path, text in _texts(".py", ".md", ".toml", ".sh"):
         for page, anchor in _PAGE.findall(text):
@@ -183,6 +180,13 @@ def test_every_reference_to_a_page_leads_to_a_page_and_an_anchor() -> None:
             if not target.exists() or (anchor and anchor not in _anchors(target)):
                 broken.append(f"{path.relative_to(ROOT)}: docs/{page}#{anchor}")
     assert broken == []
+    missing = [
+        f"{page.relative_to(ROOT)}: {name}"
+        for page, text in _pages()
+        for name in _PATH.findall(text)
+        if not (ROOT / name).exists()
+    ]
+    assert missing == []
 
 
 def _functions_in_code() -> dict[str, set[int]]:
@@ -219,16 +223,6 @@ def test_each_equation_of_the_law_names_its_function_and_that_function_names_it(
         assert callable(pkgutil.resolve_name(function)), function
         named.setdefault(function, set()).add(int(number))
     assert _functions_in_code() == named
-
-
-def test_every_file_that_a_page_names_exists() -> None:
-    missing = [
-        f"{page.relative_to(ROOT)}: {name}"
-        for page, text in _pages()
-        for name in _PATH.findall(text)
-        if not (ROOT / name).exists()
-    ]
-    assert missing == []
 
 
 _STRINGS = re.compile(
@@ -292,7 +286,7 @@ TEXT = (ROOT / "docs" / "hazards.md").read_text(encoding="utf-8")
 CITED = sorted(set(re.findall(r"`(tests/[^`]+)`", TEXT)))
 
 
-def test_every_kind_of_hazard_is_reported() -> None:
+def test_hazards_name_tests_only_where_they_are_closed() -> None:
     kinds = re.findall(r"^## (.+)$", TEXT, flags=re.MULTILINE)
     assert [kind.split(",")[0] for kind in kinds] == [
         "It falls",
@@ -301,6 +295,9 @@ def test_every_kind_of_hazard_is_reported() -> None:
         "It pinches",
         "It cannot be stopped",
     ]
+    rows = [line.split("|") for line in TEXT.splitlines() if "**Open**" in line]
+    assert rows
+    assert all("tests/" not in row[3] for row in rows)
 
 
 @pytest.mark.parametrize("cited", CITED)
@@ -308,9 +305,3 @@ def test_a_test_that_is_named_is_there(cited: str) -> None:
     file, _, name = cited.partition("::")
     assert (ROOT / file).is_file()
     assert not name or f"def {name}(" in (ROOT / file).read_text(encoding="utf-8")
-
-
-def test_what_is_open_names_no_test_as_if_it_were_shown() -> None:
-    rows = [line.split("|") for line in TEXT.splitlines() if "**Open**" in line]
-    assert rows
-    assert all("tests/" not in row[3] for row in rows)

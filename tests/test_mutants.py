@@ -81,20 +81,14 @@ def judged(alive: int, listed: tuple[Mutation, ...], **asked: object) -> tuple[i
     return code, console.export_text()
 
 
-def test_one_that_lives_for_no_reason_is_an_error_and_shown() -> None:
+def test_a_mutant_lives_only_for_a_reason_and_at_most_one_in_twenty_do() -> None:
     code, text = judged(1, ())
     assert code == 3
     assert "if q <= stops[0]:" in text
     assert "99 of 100 mutants fail a test (99.0%)" in text
-
-
-def test_those_with_a_reason_may_live_up_to_one_in_twenty() -> None:
     assert judged(5, (LIVES,))[0] == 0
     code, text = judged(6, (LIVES,))
     assert (code, "at least 95%" in text) == (3, True)
-
-
-def test_a_listed_mutant_that_dies_is_reported_when_all_ran() -> None:
     code, text = judged(0, (LIVES,))
     assert (code, "listed, and does not live" in text) == (3, True)
     assert judged(0, (LIVES,), sample=True)[0] == 0

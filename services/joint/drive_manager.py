@@ -15,10 +15,10 @@ import msgspec
 from services.joint.controller import ControllerState, CycleResult, JointController
 from services.joint.differential import motor_torque
 from services.joint.drive_setpoint import DriveFallback, DriveGains, DriveSetpointLaw
-from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.base import DriveReading, MotorTarget
 from services.joint.neighbours import UNKNOWN, NeighbourView
 from services.joint.rearm_guard import LastState
-from shared.bus.messages import LOST_DRIVE, Cause, JointCommand, JointEvent, Mode, Pair
+from shared.bus.messages import LOST_DRIVE, Cause, DriveStatus, JointCommand, JointEvent, Mode, Pair
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 

@@ -18,10 +18,10 @@ from typing import Final
 import msgspec
 
 from services.joint.differential import joint_from_motor
-from services.joint.drivers.base import DriveReading, DriveStatus
+from services.joint.drivers.base import DriveReading
 from services.joint.failsafe import Event
 from services.joint.turn_watch import UNKNOWN, TurnWatch
-from shared.bus.messages import Pair
+from shared.bus.messages import DriveStatus, Pair
 from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_S
 

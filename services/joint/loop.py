@@ -20,13 +20,21 @@ from services.joint.drive_manager import (
     DriveCommand,
     DriveManager,
 )
-from services.joint.drivers.base import Drive, DriveStatus
+from services.joint.drivers.base import Drive
 from services.joint.heat import HeatFile
 from services.joint.neighbours import UNKNOWN, NeighbourRow, NeighbourView
 from services.joint.rearm_guard import PENDANT, LastState, PendantWatch, RearmGuard
 from services.joint.tracer import Tracer
 from shared import log
-from shared.bus.messages import Cause, Estop, JointCommand, JointEvent, JointState, Mode
+from shared.bus.messages import (
+    Cause,
+    DriveStatus,
+    Estop,
+    JointCommand,
+    JointEvent,
+    JointState,
+    Mode,
+)
 from shared.bus.ports import CountingInbox, Inbox, Outbox
 from shared.bus.traces import JointTrace
 from shared.clock import NS_PER_S, now_ns

@@ -59,7 +59,7 @@ class Splitter:
 def carries_messages(batch: bytes) -> bool:
     """Return True for a batch of the application's messages, which a network may lose.
 
-    What cannot be read is none: it is late, but never lost.
+    A batch that cannot be parsed is not one: it may be late, but is never lost.
     """
     try:
         if batch[2] & _ID != _FRAME:
@@ -102,7 +102,7 @@ class Waiting(NamedTuple):
     batch: bytes
     """Empty: the end, seen on the other side as late as all else."""
     counted: Impairer | None = None
-    """Who said that it passes; None: nobody, or it is the second of two."""
+    """Impairer that counted it as passed; None if none did, or for the second of a pair."""
 
     def count_lost(self) -> None:
         """It never comes out, for its connection is gone: it is lost, and has not passed."""

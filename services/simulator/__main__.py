@@ -1,4 +1,4 @@
-"""`python -m services.simulator`: the robot, where there is none."""
+"""`python -m services.simulator`: a simulated robot in place of a real one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The simulator's loop: drives, world and sensors in real time; it waits for nobody."""
+"""The simulator's loop: drives, world and sensors in real time; it waits for no service."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Pace(msgspec.Struct):
 
 
 def granted(asked: OperatorIntent, assist_max: float, shift_max: Vector4) -> tuple[float, Vector4]:
-    """Return the assist, N, and the shift that the planner would grant: the person rests no more.
+    """Return the assist, N, and the shift, clamped to what the planner would grant.
 
     Asked for 1e9 N, the simulated person rested 1e9 N on the robot.
     """
@@ -63,7 +63,8 @@ class SimulatorLoop:
     torque between frames; with a loop of their own they step with the world.
 
     Attributes:
-        autostart_s: start the scenario by itself, so long after the hoist is down; None: do not.
+        autostart_s: delay from hoist down to the start of the scenario, s; None: a message
+            starts it.
     """
 
     def __init__(

@@ -16,7 +16,7 @@ from services.simulator.drives.axis_heat import OVER_TEMP_MARGIN
 from services.simulator.drives.dc_bus import SUPPLY_VOLTAGE
 from services.simulator.fronts.sensor_fronts import FrameHub, HarnessFront, ImuFront
 from services.simulator.physics.body import body_of
-from services.simulator.physics.led_hand import LedHand
+from services.simulator.physics.operator import LedHand
 from services.simulator.physics.plant import PlantConfig
 from services.simulator.physics.world import World
 from shared.bus.topics import SIM_STATE

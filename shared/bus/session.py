@@ -291,7 +291,7 @@ class Session:
         """Declare a subscriber that keeps every sample, up to `capacity` per expression.
 
         Expressions are full keys, or with wildcards such as `xrl/lab/joint/*/state`; a key that
-        fits two of them comes twice. Raises BusError for one that is none.
+        fits two of them comes twice. Raises BusError for a malformed one.
         """
         try:
             return Stream([_ring(self._session, key, capacity) for key in key_expressions])

@@ -17,7 +17,7 @@ from services.harness.filter import (
     start_tare,
 )
 from shared.bus.messages import Tare
-from shared.can.loadcell_can import as_sent
+from shared.can.sensor_frames import as_sent
 from shared.clock import NS_PER_MS, NS_PER_S
 from tests.harness.helpers import (
     HARNESS,

@@ -13,7 +13,7 @@ from services.simulator.fronts.sensor_fronts import BIAS_MAX, HarnessFront
 from shared.bus.codec import Decoder
 from shared.bus.messages import Tare, Wrench
 from shared.can.can_sensor import sensor_of
-from shared.can.loadcell_can import SampleAssembler
+from shared.can.sensor_frames import SampleAssembler
 from shared.clock import NS_PER_MS
 from shared.config.sections import CanConfig
 from tests.harness.helpers import (

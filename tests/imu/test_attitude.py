@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from services.imu.attitude import FROZEN_NS, AttitudeLaw, up_in_sensor
 from services.imu.loop import ImuLoop
 from shared.bus.messages import Attitude, Vector4
-from shared.can.imu_can import ImuSample
+from shared.can.sensor_frames import ImuSample
 from shared.clock import NS_PER_MS
 from shared.config.sections import ImuConfig
 

@@ -11,12 +11,12 @@ import msgspec
 from services.joint.controller import ControllerState, CycleResult, JointController
 from services.joint.differential import joint_torque, motor_from_joint
 from services.joint.drive_manager import DriveAction, DriveCommand, DriveManager
-from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.base import DriveReading, MotorTarget
 from services.joint.failsafe import timing_of
 from services.joint.neighbours import UNKNOWN, NeighbourView
 from services.joint.pd_law import Setpoint
 from services.joint.rearm_guard import LastState
-from shared.bus.messages import JointCommand, Mode, Pair
+from shared.bus.messages import DriveStatus, JointCommand, Mode, Pair
 from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_S
 from shared.config.gain_schedule import believing

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from services.joint.controller import CycleResult, JointController, row_of
 from services.joint.differential import limits_of
-from services.joint.drivers.base import DriveReading, DriveStatus
+from services.joint.drivers.base import DriveReading
 from services.joint.neighbours import SILENT_NS, NeighbourRow, NeighbourView
-from shared.bus.messages import Cause, JointCommand, Mode, Pair, Refusal
+from shared.bus.messages import Cause, DriveStatus, JointCommand, Mode, Pair, Refusal
 from shared.clock import NS_PER_MS, NS_PER_S
 from tests.joint.helpers import ROBOT, SESSION, T0, Bench, command, with_service
 

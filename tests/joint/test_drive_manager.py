@@ -21,10 +21,9 @@ from services.joint.drive_manager import (
     DriveManagerState,
 )
 from services.joint.drive_setpoint import INPUT_TORQUE_SHARE
-from services.joint.drivers.base import DriveStatus
 from services.joint.neighbours import NeighbourView
 from services.joint.sinking import DOUBT_NS
-from shared.bus.messages import Mode, Pair
+from shared.bus.messages import DriveStatus, Mode, Pair
 from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.state import copied

@@ -11,11 +11,12 @@ import pytest
 
 from services.joint.differential import motor_from_joint
 from services.joint.drive_manager import ARM_EVERY_NS, IDLE_EVERY_NS, DriveManager
-from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.base import DriveReading, MotorTarget
 from services.joint.loop import JointLoop, JointPorts
 from services.joint.rearm_guard import LastState, RearmGuard
 from shared.bus.messages import (
     Cause,
+    DriveStatus,
     Estop,
     JointCommand,
     JointEvent,

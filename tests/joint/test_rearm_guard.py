@@ -12,7 +12,6 @@ import pytest
 
 from services.joint.differential import joint_torque, motor_from_joint
 from services.joint.drive_manager import ARM_EVERY_NS, ArmingInhibit, DriveCommand, DriveManager
-from services.joint.drivers.base import DriveStatus
 from services.joint.rearm_guard import (
     PENDANT,
     LastState,
@@ -23,7 +22,7 @@ from services.joint.rearm_guard import (
     request_stop,
     stop_source,
 )
-from shared.bus.messages import Estop, Mode, Pair
+from shared.bus.messages import DriveStatus, Estop, Mode, Pair
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.joints import MODULES
 from tests.joint.helpers import ROBOT, ModuleBench

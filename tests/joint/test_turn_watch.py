@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.joint.differential import joint_from_motor
-from services.joint.drivers.base import DriveReading, DriveStatus
+from services.joint.drivers.base import DriveReading
 from services.joint.failsafe import Event
 from services.joint.joint_estimate import (
     JUMP_SPEED,
@@ -28,7 +28,7 @@ from services.joint.turn_watch import (
     STILL_NS,
     TurnWatch,
 )
-from shared.bus.messages import Pair
+from shared.bus.messages import DriveStatus, Pair
 from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_MS, NS_PER_S
 

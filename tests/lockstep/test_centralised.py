@@ -12,10 +12,9 @@ import pytest
 from services.joint import pd_law
 from services.joint.differential import joint_torque
 from services.joint.drive_manager import DriveAction, DriveCommand
-from services.joint.drivers.base import DriveStatus
 from services.planner.planner import Planner
 from services.simulator.physics.plant import IDEAL, PlantConfig
-from shared.bus.messages import JointState, Mode, Pair, PlannerMode
+from shared.bus.messages import DriveStatus, JointState, Mode, Pair, PlannerMode
 from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig

@@ -25,7 +25,7 @@ from tests.lockstep import runs
 from tests.lockstep.runs import kill, led_to, push, restart, variant
 from tests.robots import ROBOT
 from tools.sim.lockstep import Lockstep
-from tools.sim.virtual_time import HostClock
+from tools.sim.virtual_services import HostClock
 
 HOUR_NS = 3600 * NS_PER_S
 

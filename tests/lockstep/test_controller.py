@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.planner.controller import Action, Observation
-from services.planner.controller_file import controller_maker
+from services.planner.controller import Action, Observation, controller_maker
 from services.planner.law.hocca import LawOutput
 from services.simulator.physics.plant import PlantConfig, changed
 from shared.bus import topics

@@ -22,8 +22,7 @@ from tests.lockstep.runs import at_rest, kill, moment_of, restart, run, standing
 from tests.planner.states import with_law
 from tests.robots import ROBOT
 from tools.lab.studies.sweeps import plants
-from tools.sim.lockstep import FleetMoment, Lockstep
-from tools.sim.standing_start import begin_standing
+from tools.sim.lockstep import FleetMoment, Lockstep, begin_standing
 
 
 @pytest.mark.parametrize(("name", "at"), [("squat", 0.6), ("squat", 1.5), ("crawl", 1.0)])

@@ -9,14 +9,15 @@ import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from services.simulator.drives.odd_encoder import Words
 
 from services.joint.differential import motor_from_joint
 from services.joint.drive_manager import DriveCommand, DriveManager
-from services.joint.drivers.base import DriveReading, DriveStatus
+from services.joint.drivers.base import DriveReading
 from services.joint.drivers.wired_drive import MotorFrame, WiredDrive
 from services.joint.rearm_guard import LastState
 from services.simulator.drives.axis_bank import AxisBank
+from services.simulator.drives.axis_encoders import Words
+from shared.bus.messages import DriveStatus
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.joints import MODULES, kind_of
 from tests.robots import ROBOT

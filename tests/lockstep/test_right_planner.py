@@ -15,7 +15,7 @@ import pytest
 
 from services.joint.envelope import Envelope
 from services.joint.failsafe import Failsafe
-from services.planner.watch.trips import PlannerTrips
+from services.planner.watch.trips import PlannerTrips, TripsState
 from services.simulator.physics.plant import PlantConfig
 from shared.bus.messages import Cause, Mode, Outside, PlannerMode, Trip
 from shared.bus.traces import SimTruth
@@ -48,10 +48,10 @@ class Judged:
                 self.outside[found.name] += 1
             return found
 
-        def watching(own: PlannerTrips, *rest: Any, **more: Any) -> None:
-            advance(own, *rest, **more)
-            if own.state.tripped and own.state.tripped not in (Trip.EDGE, Trip.TIPPING):
-                self.tripped.append(own.state.why)
+        def watching(own: PlannerTrips, state: TripsState, *rest: Any, **more: Any) -> None:
+            advance(own, state, *rest, **more)
+            if state.tripped and state.tripped not in (Trip.EDGE, Trip.TIPPING):
+                self.tripped.append(state.why)
 
         def hearing(own: Failsafe, *rest: Any, **more: Any) -> Cause | None:
             cause = seen(own, *rest, **more)

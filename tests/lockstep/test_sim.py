@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from services.simulator.physics.led_hand import HEIGHT_MAX_RATE
+from services.simulator.physics.operator import HEIGHT_MAX_RATE
 from shared.bus import topics
 from shared.bus.messages import HandLead, Mode, PlannerStatus
 from shared.bus.traces import SimTruth
@@ -25,9 +25,8 @@ from tools import cli
 from tools.logs.hand_path import HandRow, hand_path
 from tools.logs.run_log import read_run
 from tools.sim import lockstep, recorded_lockstep
-from tools.sim.lockstep import FleetMoment, Lockstep
+from tools.sim.lockstep import FleetMoment, Lockstep, begin_standing
 from tools.sim.network import BASE
-from tools.sim.standing_start import begin_standing
 
 NOT_HERE = (topics.ATTITUDE, topics.OPERATOR_INTENT, topics.TOOLS)
 """Periodic topics that a run in virtual time does not have: no IMU is fitted, the scenario requests

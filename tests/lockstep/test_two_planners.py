@@ -16,8 +16,7 @@ from shared.config.scenarios import Inject, Kill
 from shared.joints import MODULE_INDEX
 from tests.lockstep.runs import kill, led_to, modes_of, restart
 from tests.robots import ROBOT
-from tools.sim.lockstep import Lockstep
-from tools.sim.standing_start import begin_standing
+from tools.sim.lockstep import Lockstep, begin_standing
 
 SECOND = 99
 

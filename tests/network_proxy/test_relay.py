@@ -340,7 +340,7 @@ def test_an_end_that_is_slow_but_reads_is_not_given_up(rig: Rig) -> None:
         assert len(knee.recv(20_000)) == 20_000
 
 
-def test_a_slow_or_idle_or_cut_link_is_not_given_up(rig: Rig) -> None:
+def test_a_slow_idle_or_cut_link_is_not_given_up(rig: Rig) -> None:
     planner, knee = rig.link()
     rig.there.begin(1, CUT_STREAM)
     rig.say(planner, 1)

@@ -18,9 +18,8 @@ from zenoh_ros2_sdk.qos import QosDurability, QosProfile, QosReliability
 from zenoh_ros2_sdk.utils import ros2_to_dds_type
 
 from services.ros2_gateway import conversions, rmw
-from services.ros2_gateway.conversions import Conversions
+from services.ros2_gateway.conversions import Conversions, RosTypes
 from services.ros2_gateway.rmw import Qos, RosNode, RosTopic
-from services.ros2_gateway.ros_types import RosTypes
 from shared.bus.messages import Cause, DriveStatus, Mode, PlannerMode, Trip
 from shared.config.robot_config import RobotConfig
 from shared.joints import JOINTS, MODULES

@@ -11,7 +11,7 @@ from typing import Any, cast
 import msgspec
 import pytest
 
-from services.ros2_gateway.conversions import Conversions
+from services.ros2_gateway.conversions import Conversions, RosTypes
 from services.ros2_gateway.gateway import STALE_NS, Gateway, topics_of
 from services.ros2_gateway.inbound import (
     GIVE_UP_NS,
@@ -24,7 +24,6 @@ from services.ros2_gateway.inbound import (
 from services.ros2_gateway.loop import PERIOD_NS, GatewayLoop
 from services.ros2_gateway.rmw import RosTopic
 from services.ros2_gateway.ros_session import RosLink
-from services.ros2_gateway.ros_types import RosTypes
 from shared.bus import topics
 from shared.bus.messages import JointState, Mode
 from shared.clock import NS_PER_MS, NS_PER_S
@@ -183,13 +182,20 @@ def said(data: object) -> SimpleNamespace:
     return SimpleNamespace(data=data)
 
 
-def test_an_intent_is_passed_on_once_with_its_force(robot: RobotConfig) -> None:
+def test_an_intent_is_passed_on_once_and_a_namespace_keeps_other_robots_requests_apart(
+    robot: RobotConfig,
+) -> None:
     inbound = Inbound(robot)
     inbound.receive(INTENT, said(80.0), T0)
     intent = inbound.intent(T0, 3, None)
     assert intent is not None
     assert (intent.assist_n, intent.seq, intent.source) == (80.0, 3, SOURCE)
     assert inbound.intent(T0, 4, None) is None
+    ros2 = msgspec.structs.replace(robot.ros2, namespace="a")
+    inbound = Inbound(msgspec.structs.replace(robot, ros2=ros2))
+    assert inbound_topics("a").estop.name == "/a/xrl/estop"
+    inbound.receive(inbound_topics("a").estop, said(True), T0)
+    assert inbound.stop_due(T0, heard(T0, *[Mode.TRACK] * 6), 6)
 
 
 @pytest.mark.parametrize("past", [-1e-9, math.nan, math.inf, -math.inf, 1e308])
@@ -269,14 +275,6 @@ def test_a_module_that_is_silent_has_not_stopped_and_giving_up_is_told(robot: Ro
     assert inbound.not_stopped
     inbound.receive(ESTOP, said(True), T0)
     assert not inbound.not_stopped, "until it is asked for again"
-
-
-def test_in_a_namespace_another_robots_requests_are_not_this_ones(robot: RobotConfig) -> None:
-    ros2 = msgspec.structs.replace(robot.ros2, namespace="a")
-    inbound = Inbound(msgspec.structs.replace(robot, ros2=ros2))
-    assert inbound_topics("a").estop.name == "/a/xrl/estop"
-    inbound.receive(inbound_topics("a").estop, said(True), T0)
-    assert inbound.stop_due(T0, heard(T0, *[Mode.TRACK] * 6), 6)
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from services.joint.controller import CycleResult
-from services.joint.drivers.base import DriveStatus
-from shared.bus.messages import Mode
+from shared.bus.messages import DriveStatus, Mode
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.joints import kind_of
 from tests.joint.helpers import Bench

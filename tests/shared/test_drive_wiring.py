@@ -219,13 +219,19 @@ def standing(seed: int = 1) -> list[tuple[int, bytes]]:
     return frames
 
 
-def test_the_usual_frame_length_is_that_of_the_robots_own_frames() -> None:
+def test_the_usual_frame_length_and_the_loads_are_those_of_the_design() -> None:
     alternating = bytes([0x55] * 8)
     assert 111 <= bits_on_the_wire(0x2AA, alternating) <= 114
     assert bits_on_the_wire(0, bytes(8)) > 111 + 14
     frames = standing()
     real = sum(bits_on_the_wire(*each) for each in frames) / len(frames)
     assert frame_bits(8) == pytest.approx(real, rel=0.03)
+    assert design(2).share(1000.0) == pytest.approx(0.40, abs=0.02)
+    assert design(12).share(1000.0 / 3.0) == pytest.approx(0.8, abs=0.03)
+    assert design(12).share(1000.0 / 3.0) < LOAD_MAX < design(12).share(500.0)
+    load = bus_load(2, onboard=True, heartbeat_period_ms=20, loadcell_rate_hz=5000.0)
+    assert load.rate_max_hz() == 0.0
+    assert load.axes_max(500.0) == 0
 
 
 @pytest.mark.parametrize("count", range(9))
@@ -238,15 +244,6 @@ def test_the_usual_length_lies_between_the_shortest_and_the_longest_frame(count:
 def design(axes: int) -> BusLoad:
     """Return the load of torques alone, with heartbeats as the drives are shipped."""
     return bus_load(axes, onboard=False, heartbeat_period_ms=100)
-
-
-def test_the_loads_are_those_of_the_design_and_a_full_bus_carries_no_more() -> None:
-    assert design(2).share(1000.0) == pytest.approx(0.40, abs=0.02)
-    assert design(12).share(1000.0 / 3.0) == pytest.approx(0.8, abs=0.03)
-    assert design(12).share(1000.0 / 3.0) < LOAD_MAX < design(12).share(500.0)
-    load = bus_load(2, onboard=True, heartbeat_period_ms=20, loadcell_rate_hz=5000.0)
-    assert load.rate_max_hz() == 0.0
-    assert load.axes_max(500.0) == 0
 
 
 def test_the_stated_capacity_loads_a_bus_to_the_limit() -> None:
@@ -298,7 +295,7 @@ def on_buses(*names: str) -> Callable[[Table], None]:
 RIGHT, LEFT = "hip_right", "hip_left"
 
 
-def test_a_bus_for_each_leg_carries_three_modules_at_500_hz_and_over_usb_it_carries_none(
+def test_a_bus_for_each_leg_carries_three_modules_a_sensor_counts_and_usb_loads_none(
     tmp_path: Path,
 ) -> None:
     robot = load_changed(tmp_path, on_buses(*[RIGHT] * 3, *[LEFT] * 3))
@@ -311,6 +308,14 @@ def test_a_bus_for_each_leg_carries_three_modules_at_500_hz_and_over_usb_it_carr
             module["serial_number"] = f"3A000000000{index}"
 
     load_changed(tmp_path, change)
+
+    def change(raw: Table) -> None:
+        on_buses(*[RIGHT] * 3, *[LEFT] * 3)(raw)
+        raw["harness"]["bus"] = RIGHT
+        raw["harness"]["rate_hz"] = 500.0
+
+    with pytest.raises(ConfigError, match=r"can\.hip_right"):
+        load_changed(tmp_path, change)
 
 
 def test_one_bus_for_all_six_is_refused_with_what_it_would_carry_and_that_is_accepted(
@@ -331,13 +336,3 @@ def test_one_bus_for_all_six_is_refused_with_what_it_would_carry_and_that_is_acc
         raw["drive"]["encoder_period_ms"] = 5
 
     assert load_changed(tmp_path, change).joint_service.rate_hz == 200.0
-
-
-def test_the_sensor_counts_on_the_bus_that_it_is_on(tmp_path: Path) -> None:
-    def change(raw: Table) -> None:
-        on_buses(*[RIGHT] * 3, *[LEFT] * 3)(raw)
-        raw["harness"]["bus"] = RIGHT
-        raw["harness"]["rate_hz"] = 500.0
-
-    with pytest.raises(ConfigError, match=r"can\.hip_right"):
-        load_changed(tmp_path, change)

@@ -22,8 +22,8 @@ from shared import revision
 from shared.atomic_file import atomic_file, replace_file
 from shared.config import files, gain_schedule, scenarios
 from shared.exceptions import ConfigError, XrlError
-from shared.text_file import decoded
-from shared.user import in_home, user_name
+from shared.places import in_home, user_name
+from shared.toml_file import decoded
 from tests.conftest import ROBOT_FILE
 from tools.fleet import process_table
 
@@ -180,11 +180,17 @@ def checkout(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_checkout_has_a_commit_and_is_dirty_once_a_file_is_changed(checkout: Path) -> None:
+def test_a_checkout_or_a_wheel_says_what_it_was_built_from(checkout: Path) -> None:
     found = revision.code(checkout)
     assert (len(found["git_commit"]), found["git_dirty"]) == (40, "false")
     (checkout / "file").write_text("two")
     assert revision.code(checkout)["git_dirty"] == "true"
+    found = {"git_commit": 40 * "a", "git_dirty": "true"}
+    note = checkout / revision.BUILT_FROM
+    note.parent.mkdir(parents=True)
+    note.write_text(json.dumps(found))
+    assert revision.code(checkout) == found
+    assert revision.in_words(found) == "commit aaaaaaaaaaaa with changes"
 
 
 def test_inside_another_checkout_without_a_commit_or_without_git_it_is_unknown(
@@ -198,15 +204,6 @@ def test_inside_another_checkout_without_a_commit_or_without_git_it_is_unknown(
     assert revision.in_words(unknown) == "commit unknown"
     monkeypatch.setenv("PATH", "")
     assert revision.code(checkout) == unknown
-
-
-def test_a_wheel_says_what_it_was_built_from_wherever_it_is_installed(checkout: Path) -> None:
-    found = {"git_commit": 40 * "a", "git_dirty": "true"}
-    note = checkout / revision.BUILT_FROM
-    note.parent.mkdir(parents=True)
-    note.write_text(json.dumps(found))
-    assert revision.code(checkout) == found
-    assert revision.in_words(found) == "commit aaaaaaaaaaaa with changes"
 
 
 @pytest.mark.parametrize("error", [KeyError("uid not found: 12345"), OSError(), ImportError()])

@@ -34,15 +34,12 @@ def test_each_steady_time_forgets_one_drop_out() -> None:
         assert advance(dropouts, T0 + after_ns) == left, after_ns
 
 
-def test_a_drop_out_restarts_the_steady_time() -> None:
+def test_a_drop_out_restarts_the_steady_time_and_counts_only_while_engaged() -> None:
     dropouts = Dropouts(count=1, steady_since_ns=T0)
     assert advance(dropouts, T0 + FORGET_NS - 1, dropped=True) == 2
     assert dropouts.last_ns == T0 + FORGET_NS - 1
     assert advance(dropouts, T0 + 2 * FORGET_NS - 2) == 2
     assert advance(dropouts, T0 + 2 * FORGET_NS - 1) == 1
-
-
-def test_no_drop_out_is_counted_while_not_engaged() -> None:
     dropouts = Dropouts()
     assert advance(dropouts, T0, engaged=False, dropped=True) == 0
     assert dropouts.last_ns == 0

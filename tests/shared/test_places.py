@@ -208,14 +208,6 @@ def test_a_directory_that_others_could_replace_is_refused(there: bool, tmp_path:
     check_own(run_dir)
 
 
-@AS_ROOT
-def test_a_live_directory_or_parent_of_a_strangers_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "theirs" / "run").mkdir(parents=True)
-    os.chown(tmp_path / "theirs", 12345, 12345)
-    with pytest.raises(FleetError, match="theirs belongs to another user, who can replace it"):
-        check_own(tmp_path / "theirs" / "run")
-
-
 def test_a_service_by_hand_is_refused_there_and_a_successor_is_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -265,10 +257,14 @@ def test_a_live_directory_that_others_may_write_to_is_refused(tmp_path: Path, mo
 
 @AS_ROOT
 @IN_MEMORY
-def test_a_strangers_live_directory_is_refused(tmp_path: Path) -> None:
+def test_a_strangers_live_directory_is_refused_and_a_strangers_parent_too(tmp_path: Path) -> None:
     os.chown(make_live_dir(tmp_path), 12345, 12345)
     with pytest.raises(FleetError, match="belongs to another user"):
         check_own(tmp_path, alone=False)
+    (tmp_path / "theirs" / "run").mkdir(parents=True)
+    os.chown(tmp_path / "theirs", 12345, 12345)
+    with pytest.raises(FleetError, match="theirs belongs to another user, who can replace it"):
+        check_own(tmp_path / "theirs" / "run")
 
 
 def test_memory_that_a_read_only_disk_refuses_is_an_error_that_names_file_and_remedy(

@@ -70,11 +70,19 @@ def test_the_halves_are_the_legs_and_no_processor_is_left_out(count: int) -> Non
     assert half_of(processors, "simulator") == half_of(processors, "harness") == right
 
 
-def test_two_threads_of_a_core_stay_in_one_half(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_of_a_core_stay_in_one_half_and_the_shipped_setting_is_the_doctors(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Processors i and i + 4 are the threads of core i."""
     monkeypatch.setattr(scheduling, "_core_of", lambda processor: (0, processor % 4, processor))
     assert half_of(range(8), "harness") == {0, 4, 1, 5}
     assert half_of(range(8), "planner") == {2, 6, 3, 7}
+    lines = (FILES / "sysctl/90-xrl.conf").read_text(encoding="utf-8").splitlines()
+    assert [line.replace(" ", "") for line in lines if not line.startswith("#")] == [
+        scheduling.NO_PAUSE
+    ]
+    assert scheduling.has_real_time(os.getpid()) is False
+    assert scheduling.has_real_time(2**22 + 1) is None
 
 
 @pytest.mark.parametrize(
@@ -162,15 +170,6 @@ def test_how_long_the_kernel_stops_what_fills_a_processor_is_read(
     assert scheduling.real_time_pause_ms(tmp_path) == pause_ms
 
 
-def test_the_shipped_setting_is_the_doctors_and_real_time_is_seen() -> None:
-    lines = (FILES / "sysctl/90-xrl.conf").read_text(encoding="utf-8").splitlines()
-    assert [line.replace(" ", "") for line in lines if not line.startswith("#")] == [
-        scheduling.NO_PAUSE
-    ]
-    assert scheduling.has_real_time(os.getpid()) is False
-    assert scheduling.has_real_time(2**22 + 1) is None
-
-
 pytestmark = [pytest.mark.system]
 
 PLANNER = """
@@ -209,7 +208,9 @@ def told(life: PlannerLife) -> int:
     return session
 
 
-def test_each_service_is_told_once_of_a_process_that_was_killed(short_dir: Path) -> None:
+def test_each_service_hears_once_of_a_killed_process_and_does_without_shared_memory(
+    short_dir: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     first, second = PlannerLife(short_dir), PlannerLife(short_dir)
     assert first.ended() == 0, "there is no planner"
     with planner(short_dir, 7) as process:
@@ -217,6 +218,12 @@ def test_each_service_is_told_once_of_a_process_that_was_killed(short_dir: Path)
         process.kill()
         assert (told(first), told(second)) == (7, 7)
         assert (first.ended(), second.ended()) == (0, 0)
+    for end in (OwnLife, PlannerLife):
+        assert if_possible(end, short_dir) is not None
+    path_of(short_dir / "other").mkdir(parents=True)  # in the way
+    for end in (OwnLife, PlannerLife):
+        assert if_possible(end, short_dir / "other") is None
+    assert caplog.text.count("a planner's end is seen by the age of its commands") == 2
 
 
 def test_a_planner_that_hangs_is_left_to_the_age_rule_and_one_that_is_gone_is_reported(
@@ -248,14 +255,3 @@ def test_the_next_planner_and_another_session_take_its_place(short_dir: Path) ->
     assert life.ended() == 0
     own.announce(11)
     assert life.ended() == 0, "the process goes on in another session"
-
-
-def test_without_shared_memory_a_service_does_without(
-    short_dir: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    for end in (OwnLife, PlannerLife):
-        assert if_possible(end, short_dir) is not None
-    path_of(short_dir / "other").mkdir(parents=True)  # in the way
-    for end in (OwnLife, PlannerLife):
-        assert if_possible(end, short_dir / "other") is None
-    assert caplog.text.count("a planner's end is seen by the age of its commands") == 2

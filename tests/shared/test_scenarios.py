@@ -166,7 +166,7 @@ def test_squat_and_crawl_are_those_of_the_reference() -> None:
     assert lead(crawl, 15.0).height == pytest.approx(1.188)
 
 
-def test_lead_waits_at_the_first_keyframe_and_stays_at_the_last() -> None:
+def test_lead_waits_at_the_first_keyframe_stays_at_the_last_and_holds_sideways_if_asked() -> None:
     frames = (Keyframe(at=1.0, height=1.1), Keyframe(at=3.0, height=0.9, pitch=0.4))
     two = Scenario(name="two", about="", duration=10.0, keyframe=frames)
     for t in (-5.0, 0.0, 1.0):
@@ -175,9 +175,6 @@ def test_lead_waits_at_the_first_keyframe_and_stays_at_the_last() -> None:
         assert lead(two, t)[:5] == (0.9, 0.0, 0.4, 0.0, 0.0)
     stand = Scenario(name="one", about="", duration=1.0, keyframe=frames[:1])
     assert {lead(stand, t).height for t in (-1.0, 0.0, 1.5, 2.0)} == {1.1}
-
-
-def test_sideways_it_is_held_between_keyframes_that_say_where_and_else_left_free() -> None:
     sides = (None, 0.02, -0.04, None)
     frames = tuple(Keyframe(at=float(at), height=1.1, side=side) for at, side in enumerate(sides))
     leaned = Scenario(name="leaned", about="", duration=10.0, keyframe=frames)

@@ -23,11 +23,19 @@ from services.simulator.fronts.unix_can_hub import UnixCanHub
 from shared.bus import topics
 from shared.bus.messages import Attitude, Tare, TareRequest, Vector6, Wrench
 from shared.bus.session import open_session
-from shared.can import imu_can, loadcell_can, sensor_service
+from shared.can import sensor_service
 from shared.can.can_sensor import DRAIN_MAX, RETRY_NS, CanSensor
-from shared.can.frame_group import FrameGroup
-from shared.can.imu_can import ImuAssembler, ImuSample
-from shared.can.loadcell_can import FRAME_IDS, SampleAssembler, as_sent
+from shared.can.sensor_frames import (
+    IMU_IDS,
+    LOADCELL_IDS,
+    FrameGroup,
+    ImuAssembler,
+    ImuSample,
+    SampleAssembler,
+    as_sent,
+    pack_forces,
+    pack_imu,
+)
 from shared.can.sensor_service import next_deadline, run
 from shared.clock import NS_PER_MS, NS_PER_S, now_ns
 from shared.config.files import load, to_toml
@@ -58,13 +66,11 @@ class Kind(NamedTuple):
 
 
 KINDS = {
-    "load cells": Kind(
-        SampleAssembler, loadcell_can.pack(ONE), loadcell_can.pack(TWO), ((1, 2, 3), (2, 3, 4))
-    ),
+    "load cells": Kind(SampleAssembler, pack_forces(ONE), pack_forces(TWO), ((1, 2, 3), (2, 3, 4))),
     "IMU": Kind(
         ImuAssembler,
-        imu_can.pack((0.5, 0.5, 0.5, 0.5), (1.0, 2.0, 3.0), valid=True),
-        imu_can.pack((0.5, -0.5, 0.5, -0.5), (3.0, 2.0, 1.0), valid=False),
+        pack_imu((0.5, 0.5, 0.5, 0.5), (1.0, 2.0, 3.0), valid=True),
+        pack_imu((0.5, -0.5, 0.5, -0.5), (3.0, 2.0, 1.0), valid=False),
         ((1, 2, 3), (2, 3, 4)),
     ),
 }
@@ -81,12 +87,12 @@ def test_the_layouts_are_those_of_the_protocols() -> None:
         (can_id, struct.pack("<ff", *ONE[2 * n : 2 * n + 2]))
         for n, can_id in enumerate((0x300, 0x301, 0x302))
     ]
-    assert imu_can.pack(LEVEL, (1.0, 0.0, -1.0), valid=True) == [
+    assert pack_imu(LEVEL, (1.0, 0.0, -1.0), valid=True) == [
         (0x11, bytes.fromhex("00000003")),
         (0x21, bytes.fromhex("7FFF000000000000")),
         (0x32, bytes.fromhex("02000000FE00")),
     ]
-    assert imu_can.IDS == (0x11, 0x21, 0x32)
+    assert IMU_IDS == (0x11, 0x21, 0x32)
 
 
 @given(st.tuples(*[float32] * 6), st.floats(-1e5, 1e5))
@@ -94,8 +100,8 @@ def test_forces_come_out_of_the_frames_as_they_went_in(
     forces: tuple[float, ...], any_force: float
 ) -> None:
     assembler = SampleAssembler()
-    assert added(assembler, loadcell_can.pack(forces)) == [None, None, forces]
-    sent = added(assembler, loadcell_can.pack((any_force,) * 6))[2]
+    assert added(assembler, pack_forces(forces)) == [None, None, forces]
+    sent = added(assembler, pack_forces((any_force,) * 6))[2]
     assert sent == (as_sent(any_force),) * 6
     assert assembler.malformed == 0
 
@@ -104,16 +110,16 @@ def test_forces_come_out_of_the_frames_as_they_went_in(
 def test_an_attitude_comes_back_as_it_was_sent_but_for_rounding(
     quaternion: tuple[float, ...], rate: tuple[float, ...], valid: bool
 ) -> None:
-    sample: ImuSample = added(ImuAssembler(), imu_can.pack(quaternion, rate, valid=valid))[2]
+    sample: ImuSample = added(ImuAssembler(), pack_imu(quaternion, rate, valid=valid))[2]
     assert sample.quaternion == pytest.approx(quaternion, abs=2.0**-15)
     assert sample.rate == pytest.approx(rate, abs=2.0**-10)
     assert sample.valid is valid
 
 
 def test_what_is_out_of_range_is_clipped_and_a_nan_is_carried() -> None:
-    sample = added(ImuAssembler(), imu_can.pack(LEVEL, (1e3, -1e3, math.pi), valid=True))[2]
+    sample = added(ImuAssembler(), pack_imu(LEVEL, (1e3, -1e3, math.pi), valid=True))[2]
     assert sample.rate == pytest.approx((64.0, -64.0, math.pi), abs=2.0**-8)
-    assert math.isnan(added(SampleAssembler(), loadcell_can.pack((math.nan, *ONE[1:])))[2][0])
+    assert math.isnan(added(SampleAssembler(), pack_forces((math.nan, *ONE[1:])))[2][0])
 
 
 @each_kind
@@ -137,7 +143,7 @@ def test_a_frame_of_the_wrong_length_ends_the_sample_and_no_other_makes_it_good(
 
 
 @each_kind
-@pytest.mark.parametrize("foreign", [0, FRAME_IDS[0] - 1, FRAME_IDS[2] + 1, 0x7FF])
+@pytest.mark.parametrize("foreign", [0, LOADCELL_IDS[0] - 1, LOADCELL_IDS[2] + 1, 0x7FF])
 def test_foreign_frames_are_ignored_between_those_of_a_sample(kind: Kind, foreign: int) -> None:
     assembler = kind.assembler()
     came = added(assembler, [f for own in kind.one for f in ((foreign, bytes(8)), own)])
@@ -164,7 +170,7 @@ class Link(NamedTuple):
 
     def send_forces(self, *samples: Vector6) -> None:
         for forces in samples:
-            self.send(loadcell_can.pack(forces))
+            self.send(pack_forces(forces))
 
 
 @pytest.fixture
@@ -186,7 +192,7 @@ def test_the_newest_waiting_sample_is_returned_once_however_its_frames_come(link
     link.send_forces(ONE, TWO)
     assert link.sensor.newest(T0 + PERIOD_NS) == TWO
     assert link.sensor.newest(T0 + 2 * PERIOD_NS) is None
-    frames = loadcell_can.pack(ONE)
+    frames = pack_forces(ONE)
     link.send(frames[:2])
     assert link.sensor.newest(T0 + PERIOD_NS) is None
     link.send(frames[2:])
@@ -232,7 +238,7 @@ def test_a_link_that_goes_away_comes_back_by_itself(path: Path) -> None:
             assert sensor.newest(now_ns) is None
             assert (sensor.connected, sensor.opened) == (True, times)
             hub.poll()
-            hub.broadcast(loadcell_can.pack(ONE))
+            hub.broadcast(pack_forces(ONE))
             now_ns += PERIOD_NS
             assert sensor.newest(now_ns) == ONE
         now_ns += PERIOD_NS
@@ -260,7 +266,7 @@ def test_the_link_is_not_tried_more_often_than_every_fifth_of_a_second(
 
 
 def test_a_partial_sample_does_not_outlive_its_link(path: Path) -> None:
-    frames, sensor = loadcell_can.pack(ONE), sensor_on("xrl_unix", str(path))
+    frames, sensor = pack_forces(ONE), sensor_on("xrl_unix", str(path))
     with UnixCanHub(path) as hub:
         sensor.newest(T0)
         hub.poll()
@@ -404,7 +410,7 @@ def test_the_imu_publishes_which_way_is_up_and_invalid_once_the_sensor_is_silent
 
         while not look():
             hub.poll()
-            hub.broadcast(imu_can.pack(tilted, (0.0, 0.0, 0.0), valid=True))
+            hub.broadcast(pack_imu(tilted, (0.0, 0.0, 0.0), valid=True))
         attitude = taken[-1]
         while look():
             pass

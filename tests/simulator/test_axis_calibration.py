@@ -10,8 +10,8 @@ import math
 import numpy as np
 import pytest
 
-from services.simulator.drives.axis_bank import AxisErrors
 from services.simulator.drives.axis_calibration import INDUCTANCE_S, LOCK_S, RESISTANCE_S
+from services.simulator.drives.axis_faults import AxisErrors
 from services.simulator.drives.axis_settings import PHASE_INDUCTANCE, PHASE_RESISTANCE, POLE_PAIRS
 from shared.can.cansimple import AxisError, AxisState, ControlMode, EncoderError, MotorError
 from tests.simulator.banks import CPR, DT, FreeRotors, make_bank

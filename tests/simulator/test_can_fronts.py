@@ -31,7 +31,7 @@ from shared.bus.messages import Vector3
 from shared.can import cansimple, cansimple_06
 from shared.can.cansimple import AxisState, Command, arbitration_id, pack_float, pack_u32
 from shared.can.cansimple_06 import Command06, DriveError06, ProcedureResult, SdoOpcode
-from shared.can.imu_can import ImuAssembler
+from shared.can.sensor_frames import ImuAssembler
 from shared.can.unix_can import REMOTE_FLAG, UnixCanBus
 from shared.config.robot_config import RobotConfig
 from tests.imu.robots import with_imu
@@ -164,7 +164,7 @@ def test_only_its_own_node_changes_a_drive_and_a_current_has_the_calibrated_sign
     old.client.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
     old.front.receive()
     assert not old.bank.input_torque.any()
-    # CAN of 0.5 has no way to ask for it; `test_axis_settings.py` has the rule.
+    # CAN of 0.5 has no way to ask for it; `test_drives.py` has the rule.
     old.bank.input_torque[AXIS] = 0.0827
     old.bank.settings.set(AXIS // 2, "axis1.encoder.config.direction", -1)
     old.step()
@@ -174,7 +174,9 @@ def test_only_its_own_node_changes_a_drive_and_a_current_has_the_calibrated_sign
 # ---- dialects
 
 
-def test_a_fault_has_each_dialects_own_bits(old: Bench, new: Bench) -> None:
+def test_each_dialect_has_its_own_bits_and_a_heartbeat_of_0_6_its_result(
+    old: Bench, new: Bench
+) -> None:
     for each in (old, new):
         each.bank.inject("knee_right.axis1", "WATCHDOG")
     heartbeat = cansimple.unpack_heartbeat(old.heartbeat())
@@ -183,21 +185,21 @@ def test_a_fault_has_each_dialects_own_bits(old: Bench, new: Bench) -> None:
     assert (heartbeat_06.axis_error, heartbeat_06.axis_state) == (0x0100_0000, AxisState.IDLE)
     assert heartbeat_06.procedure_result == ProcedureResult.DISARMED
     assert new.ask(Command06.GET_ERROR) == struct.pack("<II", 0x0100_0000, 0x0100_0000)
-
-
-@pytest.mark.parametrize("name", [*FAULTS, *BUS_FAULTS])
-def test_every_fault_but_the_silent_one_has_a_bit_in_0_6(name: str) -> None:
-    errors = errors_06({**FAULTS, **BUS_FAULTS}[name])
-    assert (errors == DriveError06.NONE) == (name == "DISARM")
-
-
-def test_a_heartbeat_of_0_6_is_busy_in_closed_loop_and_a_success_in_idle(new: Bench) -> None:
+    new.bank.clear_errors(AXIS)
+    new.bank.request_state(AXIS, AxisState.CLOSED_LOOP_CONTROL)
+    new.step(0.2)
     assert cansimple_06.unpack_heartbeat(new.heartbeat()).procedure_result == ProcedureResult.BUSY
     new.bank.request_state(AXIS, AxisState.IDLE)
     new.step(0.2)
     heartbeat = cansimple_06.unpack_heartbeat(new.heartbeat())
     assert heartbeat.procedure_result == ProcedureResult.SUCCESS
     assert heartbeat.trajectory_done
+
+
+@pytest.mark.parametrize("name", [*FAULTS, *BUS_FAULTS])
+def test_every_fault_but_the_silent_one_has_a_bit_in_0_6(name: str) -> None:
+    errors = errors_06({**FAULTS, **BUS_FAULTS}[name])
+    assert (errors == DriveError06.NONE) == (name == "DISARM")
 
 
 @pytest.mark.parametrize(

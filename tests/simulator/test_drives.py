@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from services.simulator.drives.axis_bank import AXIS_NAMES, FAULTS, AxisBank, AxisErrors
+from services.simulator.drives.axis_bank import AxisBank
+from services.simulator.drives.axis_faults import AXIS_NAMES, FAULTS, AxisErrors
 from services.simulator.drives.axis_heat import Heat
 from services.simulator.drives.axis_settings import (
     NAMES,
@@ -69,12 +70,19 @@ def test_overspeed_disarms_an_axis_and_marks_an_idle_one_that_has_been_armed() -
     assert slower.state == [CLOSED_LOOP] * 12
 
 
-def test_a_position_mode_set_again_takes_the_present_position_as_target() -> None:
+def test_a_position_mode_or_closed_loop_set_again_takes_the_present_position() -> None:
     bank = make_bank(ControlMode.POSITION, turns=2.0)
     bank.input_pos[:] = 5.0
     bank.set_modes(1, ControlMode.POSITION, InputMode.PASSTHROUGH)
     bank.set_modes(2, ControlMode.VELOCITY, InputMode.PASSTHROUGH)
     assert list(bank.input_pos[:3]) == [5.0, 2.0, 5.0]
+    bank = make_bank(ControlMode.POSITION, torque=1.0)
+    step_for(bank, DT)
+    bank.input_pos[4] = 3.0
+    bank.request_state(4, CLOSED_LOOP)
+    assert bank.input_pos[4] == 0.0
+    assert step_for(bank, DT)[4:6] == pytest.approx((0.75, 1.0))
+    assert step_for(bank, DT)[4] == 1.0
 
 
 def test_closed_loop_with_an_error_lasts_1_ms_without_torque_and_moves_the_target() -> None:
@@ -91,16 +99,6 @@ def test_closed_loop_with_an_error_lasts_1_ms_without_torque_and_moves_the_targe
     bank.input_pos[3] = 1.0
     assert step_for(bank, 10 * DT, at)[3] != 0.0
     assert bank.state[3] == CLOSED_LOOP
-
-
-def test_closed_loop_requested_twice_drops_the_torque_for_a_quarter_of_a_millisecond() -> None:
-    bank = make_bank(ControlMode.POSITION, torque=1.0)
-    step_for(bank, DT)
-    bank.input_pos[4] = 3.0
-    bank.request_state(4, CLOSED_LOOP)
-    assert bank.input_pos[4] == 0.0
-    assert step_for(bank, DT)[4:6] == pytest.approx((0.75, 1.0))
-    assert step_for(bank, DT)[4] == 1.0
 
 
 @pytest.mark.parametrize(
@@ -268,11 +266,16 @@ def test_the_current_that_an_emf_drives_is_that_of_the_loop_at_its_own_rate() ->
 # ---- encoders and restarts
 
 
-def test_the_position_estimate_settles_on_the_count_below_the_true_position() -> None:
+def test_the_estimate_settles_on_the_count_below_and_goes_on_from_one_that_was_set() -> None:
     bank = make_bank()
     step_for(bank, 0.04, pos=np.full(12, 0.70001))
     assert bank.pos_estimate * CPR == pytest.approx(math.floor(0.70001 * CPR), abs=1e-6)
     assert bank.encoder_turns * CPR == pytest.approx(math.floor(0.70001 * CPR))
+    bank = idle_bank()
+    bank.set_count(3, 64.5 * CPR)
+    step_for(bank, 0.2, vel=np.full(12, 1.0))
+    assert bank.pos_estimate[3] == pytest.approx(64.5 + 0.2, abs=2e-3)
+    assert bank.vel_estimate[3] == pytest.approx(bank.vel_estimate[2])
 
 
 @pytest.mark.parametrize("turns", [5.75, -9.3, 9.2])
@@ -286,14 +289,6 @@ def test_a_drive_counts_from_its_mark_and_after_a_restart_by_its_encoders_own_an
     own = turns + bank.encoder_mount[[4, 5]] / CPR
     assert bank.pos_estimate[[4, 5]] == pytest.approx(own - np.round(own), abs=1e-4)
     assert np.delete(bank.pos_estimate, [4, 5]) == pytest.approx([64.0 + turns] * 10, abs=1e-4)
-
-
-def test_a_count_that_was_set_is_counted_on_from_without_a_jump_in_velocity() -> None:
-    bank = idle_bank()
-    bank.set_count(3, 64.5 * CPR)
-    step_for(bank, 0.2, vel=np.full(12, 1.0))
-    assert bank.pos_estimate[3] == pytest.approx(64.5 + 0.2, abs=2e-3)
-    assert bank.vel_estimate[3] == pytest.approx(bank.vel_estimate[2])
 
 
 def test_a_reboot_restarts_both_axes_of_one_odrive_with_what_was_saved() -> None:
@@ -382,12 +377,19 @@ def loaded_bank(heat: Heat | None = None) -> AxisBank:
     return bank
 
 
-def test_a_stage_near_its_limit_has_less_current() -> None:
+def test_a_hot_stage_has_less_current_and_a_warm_winding_draws_more_power() -> None:
     bank = loaded_bank()
     bank.heat.force(3, 110.0)  # halfway from 100 to 120
     torque = step_for(bank, 1.5)
     assert torque[3] == pytest.approx(HALF, rel=0.01)
     assert torque[2] == pytest.approx(60.0 * KT)
+    powers = []
+    for warm in (0.0, 60.0):
+        bank = loaded_bank(Heat(warm=warm))
+        bank.input_torque[:] = 1.0
+        step_for(bank, 0.05)
+        powers.append(bank.bus.powers(0)[0])
+    assert powers[1] / powers[0] == pytest.approx(1.0 + 60.0 * 0.00393, rel=1e-3)
 
 
 def test_a_stage_heated_at_once_derates_and_disarms_half_a_second_later() -> None:
@@ -436,16 +438,6 @@ def test_temperatures_end_where_loss_and_resistances_say_however_time_passes() -
     step_for(stepped, 20.0)
     skipped.heat.skip(square, 20.0)
     assert stepped.heat.numbers() == pytest.approx(skipped.heat.numbers(), abs=0.2)
-
-
-def test_a_warm_winding_draws_more_power_for_the_same_torque() -> None:
-    powers = []
-    for warm in (0.0, 60.0):
-        bank = loaded_bank(Heat(warm=warm))
-        bank.input_torque[:] = 1.0
-        step_for(bank, 0.05)
-        powers.append(bank.bus.powers(0)[0])
-    assert powers[1] / powers[0] == pytest.approx(1.0 + 60.0 * 0.00393, rel=1e-3)
 
 
 # ---- the supply

@@ -9,9 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.simulator.physics import led_hand
-from services.simulator.physics.led_hand import BANDWIDTH, LedHand, follow
-from services.simulator.physics.operator import Operator, Wearer
+from services.simulator.physics import operator as hands
+from services.simulator.physics.operator import BANDWIDTH, LedHand, Operator, Wearer, follow
 from services.simulator.physics.plant import IDEAL, Person
 from shared.bus.messages import HandLead
 from shared.config.robot_config import RobotConfig
@@ -38,12 +37,12 @@ def test_it_never_jumps_and_never_leaves_its_limits(places: list[tuple[float, fl
         for _ in range(20):
             hand.advance(DT)
             now = hand.over(NOW)
-            assert abs(now.height - before.height) <= led_hand.HEIGHT_MAX_RATE * DT + 1e-12
-            assert abs(now.pitch - before.pitch) <= led_hand.PITCH_MAX_RATE * DT + 1e-12
+            assert abs(now.height - before.height) <= hands.HEIGHT_MAX_RATE * DT + 1e-12
+            assert abs(now.pitch - before.pitch) <= hands.PITCH_MAX_RATE * DT + 1e-12
             before = now
     for _ in range(400):
         hand.advance(50 * DT)
-    low, high = led_hand.HEIGHTS
+    low, high = hands.HEIGHTS
     assert low - 1e-6 <= hand.over(NOW).height <= high + 1e-6
     assert hand.over(NOW).assist == NOW.assist, "the assist stays the scenario's"
 
@@ -57,9 +56,9 @@ def test_a_hand_stays_where_it_was_led_and_its_push_expires() -> None:
     assert hand.over(NOW).pitch == pytest.approx(0.3, abs=1e-4)
     hand = LedHand()
     hand.ask(asked(leads=False, push=(0.0, 1e6, -3.0)), NOW)
-    assert hand.push == (0.0, led_hand.PUSH_MAX, -3.0)
+    assert hand.push == (0.0, hands.PUSH_MAX, -3.0)
     assert hand.over(NOW) == NOW
-    for _ in range(math.ceil(led_hand.PUSH_EXPIRES_S / DT) + 1):
+    for _ in range(math.ceil(hands.PUSH_EXPIRES_S / DT) + 1):
         hand.advance(DT)
     assert hand.push is None
 
@@ -194,15 +193,12 @@ def worn(person: Person, force: float, assist: float = 0.0, seconds: float = 5.0
     return wearer
 
 
-def test_a_person_gives_way_to_the_hand_by_weight_on_springs() -> None:
+def test_the_wearer_gives_way_by_weight_on_springs_and_rests_later_and_less_than_asked() -> None:
     person = Person(mass=80.0, leg_frequency_hz=2.5)
     stiffness = 80.0 * (2.0 * math.pi * 2.5) ** 2
     assert worn(person, -60.0).above == pytest.approx(60.0 / stiffness, rel=1e-3)
     assert worn(person, 0.0).above == 0.0
     assert worn(IDEAL.person, 150.0).above == 0.0
-
-
-def test_weight_comes_later_and_less_than_what_was_asked_for() -> None:
     person = Person(load_scale=0.9, load_lag_s=0.2)
     assert worn(person, 0.0, 200.0, 0.2).load_n == pytest.approx(0.9 * 200.0 * 0.632, rel=0.01)
     assert worn(person, 0.0, 200.0).load_n == pytest.approx(180.0, rel=1e-3)

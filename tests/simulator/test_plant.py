@@ -73,15 +73,6 @@ def test_what_is_no_plant_is_refused_with_what_would_be_right(word: str, said: s
         plant_from([word])
 
 
-def test_the_world_keeps_nothing_of_the_robot_file(robot: RobotConfig) -> None:
-    """What is true and what is believed share no configuration object."""
-    world = World(body_of(robot, PlantConfig()), variant("stand"))
-    objects = (world, world.actuation, world.outside, world.placement)
-    parts = [part for each in objects for part in vars(each).values()]
-    assert len(parts) > 40
-    assert not any(isinstance(part, RobotConfig) for part in parts)
-
-
 def test_no_controller_sees_the_plant(robot: RobotConfig) -> None:
     """Planner and joint services are made of the robot file alone, whatever the plant."""
     right, wrong = (
@@ -107,22 +98,27 @@ def test_errors_change_the_true_robot_and_not_the_file(robot: RobotConfig) -> No
     assert np.linalg.norm(true.model.opt.gravity) == pytest.approx(9.81)
 
 
-def test_wrong_zeros_show_in_what_the_encoders_report(robot: RobotConfig) -> None:
+def test_errors_show_in_encoders_and_feet_and_the_world_keeps_nothing_of_the_file(
+    robot: RobotConfig,
+) -> None:
     errors = np.linspace(-0.01, 0.01, 12)
     plant = changed(IDEAL, {"encoder.zero_errors": errors.tolist()})
     wrong, right = (World(body_of(robot, one), variant("stand")) for one in (plant, IDEAL))
     shown = wrong.motor_turns()[0] - right.motor_turns()[0]
     joints = np.linalg.solve(body_of(robot, IDEAL).motor_from_joint, shown)
     np.testing.assert_allclose(joints, errors, atol=1e-9)
-
-
-def test_a_foot_on_a_step_stands_flat_on_it(robot: RobotConfig) -> None:
     for step in (0.01, -0.01):
         world = World(body_of(robot, changed(IDEAL, {"floor.step": step})), variant("stand"))
         truth = world.truth(0, 1.0, 0.0)
         assert max(truth.foot_right_tilt, truth.foot_left_tilt) < 2e-3
         right, left = (world.data.body(f"foot_{side}").xpos[2] for side in ("right", "left"))
         assert right - left == pytest.approx(step, abs=1e-3)
+    # What is true and what is believed share no configuration object.
+    world = World(body_of(robot, PlantConfig()), variant("stand"))
+    objects = (world, world.actuation, world.outside, world.placement)
+    parts = [part for each in objects for part in vars(each).values()]
+    assert len(parts) > 40
+    assert not any(isinstance(part, RobotConfig) for part in parts)
 
 
 def test_drawn_plants_stay_in_their_ranges_repeat_and_widen_about_the_middle() -> None:

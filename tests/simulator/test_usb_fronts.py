@@ -348,14 +348,6 @@ def test_the_stand_in_compiles_without_a_warning_and_is_rebuilt_for_a_newer_sour
     subprocess.run([*command, "-o", tmp_path / "o", usb_standin.SOURCE], check=True)
 
 
-def test_without_a_compiler_the_fix_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(FleetError, match="no C compiler `cc` is on PATH; install one"):
-        usb_standin.build(tmp_path / "lib")
-
-
 def test_what_a_compiler_complains_of_is_shown_and_nothing_is_left(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -368,10 +360,16 @@ def test_what_a_compiler_complains_of_is_shown_and_nothing_is_left(
     assert list((tmp_path / "lib").iterdir()) == []
 
 
-def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+def test_without_a_compiler_or_a_writable_folder_the_fix_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "lib").write_text("a file")
     with pytest.raises(FleetError, match="a folder that can be written"):
         usb_standin.build(tmp_path / "lib")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(FleetError, match="no C compiler `cc` is on PATH; install one"):
+        usb_standin.build(tmp_path / "other")
 
 
 def test_it_prepares_paths_of_its_own_and_clears_them_but_nothing_else(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import resource
 import signal
 import statistics
 import subprocess
@@ -171,8 +169,6 @@ pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
 
 BESIDE = ATTITUDES
 """A link that no test impairs: what is told of it comes after all that was told before."""
-SPARE = 12
-"""Descriptors beyond those of the links that are up; each dial takes two."""
 
 
 @pytest.fixture(scope="module")
@@ -208,10 +204,6 @@ def numbers(rows: Heard) -> list[int]:
     return [number for number, _ in rows]
 
 
-def descriptors(rig: Proxied) -> int:
-    return len(list(Path(f"/proc/{rig.proxy.pid}/fd").iterdir()))
-
-
 def test_unimpaired_nothing_is_lost_and_with_a_delay_it_comes_so_much_later(rig: Proxied) -> None:
     near = list(rig.send_to_the_last(200))
     assert len(near) == 200
@@ -222,21 +214,6 @@ def test_unimpaired_nothing_is_lost_and_with_a_delay_it_comes_so_much_later(rig:
     assert min(delay for _, delay in far) >= 25.0
     added = statistics.median(d for _, d in far) - statistics.median(d for _, d in near)
     assert 20.0 < added < 35.0
-
-
-def test_the_requested_fraction_is_lost_and_reported(rig: Proxied) -> None:
-    """Those that are sent at once travel as one: counted is what travels."""
-    inject(rig, loss=0.3)
-    rig.send(500)
-    rig.client.clear("all")
-    ended = rig.ended()
-    counted = ended.lost + ended.passed
-    assert 100 < counted <= 500
-    assert abs(ended.lost / counted - 0.3) < 4.5 * math.sqrt(0.3 * 0.7 / counted)
-    heard = rig.heard[rig.first]
-    rig.wait(lambda: len(heard) >= ended.passed)
-    assert len(heard) <= 500 - ended.lost
-    assert len(rig.send_to_the_last(100)) == 100
 
 
 def test_a_duplicate_is_received_once_an_overtaken_message_never_and_a_stream_keeps_order(
@@ -274,24 +251,6 @@ def test_a_partition_is_total_and_once_it_is_over_the_link_is_whole_again(
     assert ended.lost > 50
     rig.wait(rig.linked)
     assert len(rig.send_to_the_last(100)) == 100
-
-
-def test_a_partition_may_last_though_all_dial_again_and_again(own: Proxied) -> None:
-    """Both ways, with few descriptors, for many dials: it neither ends early nor kills."""
-    full = descriptors(own) + SPARE
-    resource.prlimit(own.proxy.pid, resource.RLIMIT_NOFILE, (full, full))
-    begun = time.monotonic()
-    own.client.begin(Inject(link="all", at=0.0, duration=12.0, partition=True))
-    most = 0
-    while time.monotonic() < begun + 10.0:
-        arrived = list(own.send(100))
-        assert not arrived or time.monotonic() > begun + 12.0
-        most = max(most, descriptors(own))
-    assert most < full, "none was turned away for want of one"
-    assert own.proxy.poll() is None
-    own.wait(own.linked)
-    assert time.monotonic() > begun + 12.0
-    assert len(own.send_to_the_last(100)) == 100
 
 
 def test_a_killed_injector_links_anew_and_a_stopped_one_reports_its_counts(own: Proxied) -> None:

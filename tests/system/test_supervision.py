@@ -328,12 +328,15 @@ def test_a_start_without_room_says_so(
         start()
 
 
-def test_a_service_that_ends_at_once_fails_the_start_with_its_log(
+def test_a_service_that_ends_at_once_or_never_listens_fails_the_start(
     start: Start, run_dir: Path
 ) -> None:
     with pytest.raises(FleetError, match=r"planner ended at once \(exit status 3\)") as failure:
         start({"harness": SLEEPER, "planner": FAILING})
     assert "no drive on can0" in str(failure.value)
+    assert_nothing_left(run_dir, [])
+    with pytest.raises(FleetError, match="not up, and no progress for 2 s: planner"):
+        start({"planner": SLEEPER}, ready="endpoint", timeout_s=2.0)
     assert_nothing_left(run_dir, [])
 
 
@@ -360,12 +363,6 @@ def test_a_start_that_nobody_asked_for_ends_nothing_when_a_service_fails_and_sta
     assert (code, "planner is in a crash loop: it ended" in said) == (3, True), said
     assert "exit status 3: no drive on can0" in said
     assert "runs already" not in said
-
-
-def test_a_service_that_never_listens_fails_the_start(start: Start, run_dir: Path) -> None:
-    with pytest.raises(FleetError, match="not up, and no progress for 2 s: planner"):
-        start({"planner": SLEEPER}, ready="endpoint", timeout_s=2.0)
-    assert_nothing_left(run_dir, [])
 
 
 def test_a_start_that_goes_on_takes_as_long_as_the_machine_needs(start: Start) -> None:

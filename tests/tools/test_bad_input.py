@@ -17,12 +17,12 @@ from mcap.writer import CompressionType, Writer
 
 from shared.exceptions import RunError
 from tests.tools.exit_codes import exit_code
-from tests.tools.logs.reexecution.test_golden import NEWEST
+from tests.tools.logs.reexecution.test_golden import GOLDEN
 from tools import cli
 from tools.logs.run_log import RunLog, read_run
 from tools.output import write_atomically
 
-RUN = str(NEWEST)
+RUN = str(GOLDEN)
 LONG = "x" * 5000
 READERS = ("info", "report", "explain", "resim", "play", "recover")
 
@@ -95,7 +95,7 @@ def test_a_robot_file_that_is_none_is_refused(
 
 @cache
 def newest() -> RunLog:
-    return read_run(NEWEST)
+    return read_run(GOLDEN)
 
 
 def made_up(
@@ -195,7 +195,7 @@ def test_300_000_false_marks_of_chunks_are_passed_in_time(
     """Each claims 50 MB; the reader searched all of them for every mark."""
     mark = b"\x06" + struct.pack("<Q", 50 << 20) + b"\0" * 28 + b"\x04\0\0\0zstd"
     path = tmp_path / "marks.mcap"
-    path.write_bytes(NEWEST.read_bytes()[:20_000] + mark * 300_000)
+    path.write_bytes(GOLDEN.read_bytes()[:20_000] + mark * 300_000)
     assert cli.main(["log", "info", str(path)]) == 0
     assert "not finished" in capsys.readouterr().out
 
@@ -211,7 +211,7 @@ def test_300_000_false_marks_of_chunks_are_passed_in_time(
 def test_no_damage_ends_a_reader_without_words(
     places: list[tuple[float, int]], kept: float, tmp_path: Path
 ) -> None:
-    data = bytearray(NEWEST.read_bytes())
+    data = bytearray(GOLDEN.read_bytes())
     for place, byte in places:
         data[int(place * (len(data) - 1))] = byte
     path = tmp_path / "damaged.mcap"

@@ -16,10 +16,11 @@ import odrive
 import pytest
 
 from services.joint.drivers import odrive_usb
-from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.base import DriveReading, MotorTarget
 from services.joint.drivers.odrive_usb import EXCHANGE_HZ, OdriveUsb
 from services.simulator.fronts import fibre_front
 from services.simulator.fronts.fibre_front import endpoints
+from shared.bus.messages import DriveStatus
 from shared.can.cansimple import AxisError, AxisState, ControlMode
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
@@ -90,12 +91,6 @@ def test_the_genuine_package_writes_a_setting_and_saves_it_over_a_restart(usb: U
     assert board.axis0.config.can.encoder_rate_ms != 7
 
 
-def test_the_drive_is_found_by_its_serial_number_among_six(usb: UsbRobot, control: Control) -> None:
-    with usb.lock:
-        usb.pos[:] = np.arange(12) / 4
-    assert eventually(lambda: control.pos == (1.0, 1.25))
-
-
 def test_arming_writes_the_limits_and_a_target_runs_the_drives_own_loop_until_idle(
     usb: UsbRobot, armed: Control, config: RobotConfig
 ) -> None:
@@ -149,10 +144,19 @@ def test_a_bad_target_is_not_sent_and_a_missing_drive_is_lost_without_an_excepti
     drive.close()
 
 
-def test_samples_come_at_the_exchange_rate_and_not_faster(control: Control) -> None:
+def test_samples_come_at_the_exchange_rate_and_a_written_position_is_taken(
+    control: Control, usb: UsbRobot
+) -> None:
+    with usb.lock:
+        usb.pos[:] = np.arange(12) / 4
+    assert eventually(lambda: control.pos == (1.0, 1.25)), "by its serial number"
     before = control.samples
     time.sleep(1.0)
     assert 0.25 * EXCHANGE_HZ < control.samples - before < 1.1 * EXCHANGE_HZ
+    control.drive.set_position((64.25, -3.5))
+    assert eventually(lambda: control.pos == (64.25, -3.5))
+    with usb.lock:
+        assert usb.pos[AXES].tolist() == [1.0, 1.25]
 
 
 def test_an_axis_that_disarms_is_an_error_with_or_without_an_error_bit_until_it_is_armed_again(
@@ -214,13 +218,6 @@ def test_no_reading_after_arm_reports_the_error_before(
     assert eventually(usb.stalled.is_set)
     assert is_status(drive.read(0.0), DriveStatus.IDLE)
     usb.stalled.clear()
-
-
-def test_the_drive_takes_a_position_that_is_written(usb: UsbRobot, control: Control) -> None:
-    control.drive.set_position((64.25, -3.5))
-    assert eventually(lambda: control.pos == (64.25, -3.5))
-    with usb.lock:
-        assert usb.pos[AXES].tolist() == [0.0, 0.0]
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 1e39])

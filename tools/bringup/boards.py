@@ -21,7 +21,7 @@ from shared.can.cansimple import AxisError, AxisState, ControllerError, EncoderE
 from shared.can.drive_settings import AXES, WantedSetting, describe_value
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
-from shared.text_file import read_text
+from shared.toml_file import read_text
 
 Value = bool | int | float | str | None
 """A value of any endpoint; text: the name of another endpoint, or none at all."""

@@ -23,9 +23,7 @@ from shared.can import cansimple
 from shared.can.can_sensor import is_data_frame
 from shared.can.cansimple import Command, Heartbeat
 from shared.can.cansimple_06 import Command06, Version, unpack_version
-from shared.can.imu_can import IDS as IMU_IDS
-from shared.can.imu_can import ImuAssembler, ImuSample
-from shared.can.loadcell_can import FRAME_IDS, SampleAssembler
+from shared.can.sensor_frames import IMU_IDS, LOADCELL_IDS, ImuAssembler, ImuSample, SampleAssembler
 from shared.clock import keep_pace, machine_s, pace
 from shared.config.robot_config import RobotConfig, expand
 from shared.config.sections import CanConfig
@@ -190,7 +188,7 @@ def _receive(
             traffic.error_frames += 1
         elif is_data_frame(message):
             traffic.frames += 1
-            if cells and message.arbitration_id in FRAME_IDS:
+            if cells and message.arbitration_id in LOADCELL_IDS:
                 _add(traffic.cells, assembler.add(message.arbitration_id, message.data), message)
             elif imu and message.arbitration_id in IMU_IDS:
                 _add(traffic.imu, orientation.add(message.arbitration_id, message.data), message)

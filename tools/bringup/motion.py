@@ -15,8 +15,8 @@ import msgspec
 from services.joint import pd_law
 from services.joint.differential import TorqueLimits, joint_from_motor, limit_torque, limits_of
 from services.joint.drive_setpoint import DriveGains, DriveSetpointLaw
-from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
-from shared.bus.messages import Pair
+from services.joint.drivers.base import DriveReading, MotorTarget
+from shared.bus.messages import DriveStatus, Pair
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError

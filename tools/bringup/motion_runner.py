@@ -21,10 +21,10 @@ from rich.text import Text
 
 from services.joint.__main__ import open_drive
 from services.joint.differential import joint_from_motor
-from services.joint.drivers.base import Drive, DriveReading, DriveStatus
+from services.joint.drivers.base import Drive, DriveReading
 from services.joint.drivers.can_link import CanLink
 from services.joint.drivers.odrive_frames import messages_of
-from shared.bus.messages import LOST_DRIVE, Pair
+from shared.bus.messages import LOST_DRIVE, DriveStatus, Pair
 from shared.can import cansimple, drive_settings
 from shared.can.cansimple import Command
 from shared.clock import NS_PER_S, now_ns

@@ -23,13 +23,13 @@ from services.joint.drivers.wired_drive import Signs
 from shared.atomic_file import atomic_file
 from shared.bus.messages import Pair
 from shared.can.can_sensor import sensor_of
-from shared.can.imu_can import ImuAssembler
+from shared.can.sensor_frames import ImuAssembler
 from shared.clock import now_ns
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError, XrlError
 from shared.joints import MODULES
-from shared.text_file import read_text
+from shared.toml_file import read_text
 from tools.bringup.boards import Value, equal
 from tools.bringup.drive_access import boards_on_usb
 from tools.bringup.hanging_leg import Upright

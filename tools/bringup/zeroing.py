@@ -12,9 +12,9 @@ from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple
 
 from services.joint.differential import joint_from_motor, motor_from_joint
-from services.joint.drivers.base import Drive, DriveStatus
+from services.joint.drivers.base import Drive
 from services.joint.drivers.wired_drive import MotorFrame
-from shared.bus.messages import LOST_DRIVE, Pair
+from shared.bus.messages import LOST_DRIVE, DriveStatus, Pair
 from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_S, now_ns
 from shared.config.robot_config import RobotConfig

@@ -22,7 +22,7 @@ from shared.config import gain_schedule
 from shared.exceptions import XrlError
 from shared.places import CHECKOUT, IS_CHECKOUT
 from shared.revision import UNKNOWN, code
-from tools.bringup.check_machine import CLOCK_FIX, clock_is_synchronised
+from tools.bringup.check_host import CLOCK_FIX, clock_is_synchronised
 from tools.fleet.run_dir import SUPERVISOR_PID
 from tools.keys.authority import held_files
 from tools.keys.inspection import inspect_keys

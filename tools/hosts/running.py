@@ -12,8 +12,7 @@ from typing import Final
 
 import msgspec
 
-from services.joint.drivers.base import DriveStatus
-from shared.bus.messages import Mode
+from shared.bus.messages import DriveStatus, Mode
 from shared.bus.topics import OPERATOR
 from shared.exceptions import FleetError, RunError
 from shared.joints import MODULES

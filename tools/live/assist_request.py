@@ -16,7 +16,7 @@ from shared.clock import now_ns
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import SCENARIO
 from shared.exceptions import FleetError
-from shared.user import user_name
+from shared.places import user_name
 
 REPEAT_S: Final = 0.02
 HEARD_S: Final = 3.0

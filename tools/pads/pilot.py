@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-from services.simulator.physics.led_hand import HEIGHTS, PITCHES
+from services.simulator.physics.operator import HEIGHTS, PITCHES
 from shared.clamp import clamp
 
 HEIGHT_RATE: Final = 0.15

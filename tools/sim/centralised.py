@@ -21,11 +21,18 @@ import msgspec
 from services.joint import pd_law
 from services.joint.differential import limit_differential, motor_torque
 from services.joint.drive_manager import ArmingInhibit, DriveAction, DriveCommand, DriveManager
-from services.joint.drivers.base import DriveReading, DriveStatus
+from services.joint.drivers.base import DriveReading
 from services.joint.neighbours import UNKNOWN, NeighbourView
 from services.planner.planner import Planner
 from services.planner.watch.engagement_fsm import Engagement
-from shared.bus.messages import JointCommand, JointState, Mode, PlannerMode, PlannerStatus
+from shared.bus.messages import (
+    DriveStatus,
+    JointCommand,
+    JointState,
+    Mode,
+    PlannerMode,
+    PlannerStatus,
+)
 from shared.clock import NS_PER_MS
 from shared.config.gain_schedule import believing
 from shared.config.robot_config import RobotConfig
@@ -56,12 +63,12 @@ class CentralPlanner(Planner):
     def __init__(self, config: RobotConfig, session: int) -> None:
         """Take the robot and the session, as the shipped planner does."""
         super().__init__(config, session)
-        self._state.engagement = LeadsOn()
+        self.state.engagement = LeadsOn()
 
     def tick(self, now_ns: int) -> list[JointCommand]:
         """Run the law; return six commands, `tau_ff` of which is all of a joint's torque."""
         commands = super().tick(now_ns)
-        states: Sequence[JointState] = [state for state in self._state.states if state is not None]
+        states: Sequence[JointState] = [state for state in self.state.states if state is not None]
         return [_whole(*pair) for pair in zip(commands, states, strict=True)] if commands else []
 
     def status(self, now_ns: int, tick_us: float) -> PlannerStatus:

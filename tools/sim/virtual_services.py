@@ -23,16 +23,94 @@ from services.planner.planner import Planner, PlannerState
 from services.simulator.drives.axis_bank import AxisBank
 from services.simulator.robot import SimulatedRobot
 from shared.bus import topics
-from shared.bus.messages import Estop, TareRequest, Vector6
+from shared.bus.messages import Estop, Message, TareRequest, Vector6
+from shared.bus.topics import Topic
 from shared.bus.traces import PlannerCheckpoint
-from shared.can.frame_group import FrameGroup
-from shared.can.imu_can import ImuSample
+from shared.can.sensor_frames import FrameGroup, ImuSample
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
 from shared.state import copied
-from tools.sim.network import VirtualNetwork
+from tools.sim.network import VirtualLink, VirtualNetwork
 from tools.sim.virtual_drive import VirtualBus, VirtualDrive
-from tools.sim.virtual_time import HostClock, LinkInbox, Record, RecordOutbox, VirtualTime
+
+M = TypeVar("M", bound=Message)
+
+Record = Callable[[Topic, str, Message], None]
+"""Takes what live would be on the bus: topic, module or "", message."""
+
+
+class HostClock:
+    """The monotonic clock of one host.
+
+    It cannot step, whatever is done to the time of day, but no two hosts agree on it: an age is
+    measured on one clock only (docs/architecture.md#age-rule).
+    """
+
+    def __init__(self, offset_ns: int = 0, drift_ppm: float = 0.0) -> None:
+        """Begin.
+
+        Args:
+            offset_ns: ahead of virtual time at its zero.
+            drift_ppm: so much too fast, in millionths.
+        """
+        self.offset_ns = offset_ns
+        self.drift_ppm = drift_ppm
+
+    def read(self, now_ns: int) -> int:
+        """Return the host's time at a virtual time, ns."""
+        drift_ns = round(now_ns * self.drift_ppm * 1e-6) if self.drift_ppm else 0
+        return now_ns + self.offset_ns + drift_ns
+
+    def step(self, by_ns: int) -> None:
+        """Step the clock, which a monotonic clock never does."""
+        self.offset_ns += by_ns
+
+
+class VirtualTime:
+    """The time of a run, which all its processes share and none of them knows."""
+
+    def __init__(self, now_ns: int) -> None:
+        self.now_ns = now_ns
+
+    def on(self, clock: HostClock) -> Callable[[], int]:
+        """Return a host's clock, to be read now."""
+        return lambda: clock.read(self.now_ns)
+
+
+class LinkInbox(Generic[M]):
+    """The receiving end of a link: an `Inbox`."""
+
+    refused = 0
+
+    def __init__(self, link: VirtualLink[M], time: VirtualTime) -> None:
+        self._link, self._time = link, time
+
+    def take(self) -> M | None:
+        """Return the newest message that has arrived and was not taken before."""
+        return self._link.take(self._time.now_ns)
+
+
+class RecordOutbox(Generic[M]):
+    """The sending end of a link, if anybody listens, and of the record: an `Outbox`."""
+
+    def __init__(
+        self,
+        record: Record,
+        topic: Topic,
+        module: str = "",
+        link: VirtualLink[M] | None = None,
+        time: VirtualTime | None = None,
+    ) -> None:
+        self._record, self._topic, self._module = record, topic, module
+        self._link, self._time = link, time
+
+    def put(self, message: M, /) -> bool:
+        """Send and record."""
+        if self._link is not None and self._time is not None:
+            self._link.put(self._time.now_ns, message)
+        self._record(self._topic, self._module, message)
+        return True
+
 
 S = TypeVar("S")
 
@@ -43,7 +121,7 @@ class SharedMemory:
     Attributes:
         estop: set it to stop every module.
         rows: as each service wrote its own last, in virtual time.
-        planner: session of the planner's process on this host; 0: there is none.
+        planner: session of the planner's process on this host; 0 without one.
         ended: session of the one that ended last.
     """
 
@@ -284,7 +362,7 @@ class VirtualPlanner:
         self._session, state = start
         if self.planner is None or self.planner.session != self._session:
             self.planner = self._make(self._session)
-        self.planner.restore(state)
+        self.planner.state = copied(state)
 
 
 class VirtualCan(Generic[S]):
@@ -296,7 +374,7 @@ class VirtualCan(Generic[S]):
         self._newest: S | None = None
 
     def poll(self) -> None:
-        """Do nothing: nobody has to be let in."""
+        """Do nothing: no client has to be admitted."""
 
     def broadcast(self, frames: list[tuple[int, bytes]]) -> None:
         """Take the frames of one sample."""

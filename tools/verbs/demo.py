@@ -11,7 +11,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Annotated, Final
 
-from services.planner.controller_file import controller_maker
+from services.planner.controller import controller_maker
 from services.simulator.physics.plant import plant_from
 from shared.bus import topics
 from shared.bus.messages import PlannerStatus

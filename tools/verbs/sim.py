@@ -8,7 +8,7 @@ from typing import Annotated, Final
 
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from services.planner.controller_file import controller_maker
+from services.planner.controller import controller_maker
 from services.simulator.physics.plant import plant_from
 from shared.bus import topics
 from shared.bus.traces import SimTruth

@@ -222,7 +222,7 @@ class AxisBank:
         self._control.hold_here(axis)
 
     def set_count(self, axis: int, count: float) -> None:
-        """Tell an axis that its encoder reads so many counts here; `input_pos` stays."""
+        """Set an axis's count at its present position; `input_pos` stays."""
         self._encoders.set_count(axis, count)
 
     def clear_errors(self, axis: int) -> None:

@@ -120,7 +120,7 @@ BUS_FAULTS: Final[Mapping[str, AxisErrors]] = {
 TALKS_S: Final = 0.02
 """s from power to the first frame."""
 BOOT_S: Final = 1.54
-"""s from power to the start of the axes: so long the currents' zeros are measured."""
+"""s from power to the start of the axes; the firmware measures the currents' zeros meanwhile."""
 
 
 class Conditions:

@@ -11,10 +11,11 @@ import can
 import pytest
 
 from services.joint.drivers import can_link, odrive_can
-from services.joint.drivers.base import DriveReading, DriveStatus
+from services.joint.drivers.base import DriveReading
 from services.joint.drivers.can_link import BUS_OFF
 from services.joint.drivers.frame_times import ARM_GRACE_MS
 from services.joint.drivers.odrive_can import OdriveCan
+from shared.bus.messages import DriveStatus
 from shared.can.cansimple import (
     AxisState,
     Command,

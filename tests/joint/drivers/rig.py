@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 from services.joint.drivers import can_link, odrive_can
-from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.base import DriveReading, MotorTarget
 from services.joint.drivers.frame_times import ARM_GRACE_MS
 from services.joint.drivers.odrive_can import OdriveCan
 from services.simulator.drives.axis_bank import AxisBank
 from services.simulator.fronts.cansimple_dialects import DialectName
 from services.simulator.fronts.cansimple_front import CanSimpleFront
 from services.simulator.fronts.unix_can_hub import UnixCanHub
+from shared.bus.messages import DriveStatus
 from shared.can.cansimple import AxisState
 from shared.can.unix_can import Frame, UnixCanBus
 from shared.clock import NS_PER_MS

@@ -9,7 +9,7 @@ from pathlib import Path
 import can
 import pytest
 
-from services.joint.drivers.base import DriveStatus, MotorTarget
+from services.joint.drivers.base import MotorTarget
 from services.joint.drivers.bus_watch import (
     BLOCKED_MS,
     PROBE_MS,
@@ -20,6 +20,7 @@ from services.joint.drivers.bus_watch import (
     BusWatch,
 )
 from services.simulator.fronts.unix_can_hub import UnixCanHub
+from shared.bus.messages import DriveStatus
 from shared.can.cansimple import AxisState, Command, split_id
 from shared.can.cansimple_06 import Command06
 from shared.can.unix_can import Frame, UnixCanBus

@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterator
 import can
 import pytest
 
-from services.joint.drivers.base import DriveStatus
 from services.joint.drivers.can_link import ECHOED, FRAMES_PER_READ, HEARD, RETRY_MS, receiver
 from services.joint.drivers.odrive_can import OdriveCan
+from shared.bus.messages import DriveStatus
 from shared.can.cansimple import AxisState, Command, arbitration_id, pack_two_floats
 from shared.can.cansimple_06 import Command06
 from shared.clock import NS_PER_MS

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from services.joint.drivers.base import DriveStatus
 from services.joint.drivers.firmware import (
     OTHER_ERROR,
     UNANSWERED,
@@ -15,6 +14,7 @@ from services.joint.drivers.firmware import (
     judged,
 )
 from services.joint.drivers.odrive_v3 import AxesStatus
+from shared.bus.messages import DriveStatus
 from shared.can import cansimple, cansimple_06
 from shared.can.cansimple import AxisError, AxisState, Heartbeat
 from shared.can.cansimple_06 import DriveError06, Heartbeat06, ProcedureResult

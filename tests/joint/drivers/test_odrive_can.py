@@ -12,10 +12,11 @@ import pytest
 
 from services.joint.differential import joint_torque, motor_from_joint
 from services.joint.drive_setpoint import DriveSetpointLaw
-from services.joint.drivers.base import DriveStatus, MotorTarget
+from services.joint.drivers.base import MotorTarget
 from services.joint.drivers.frame_times import ARM_GRACE_MS, INSIST_MS, REBOOT_MS
 from services.joint.drivers.odrive_can import OdriveCan
 from services.joint.pd_law import Setpoint
+from shared.bus.messages import DriveStatus
 from shared.can.cansimple import AxisState, Command, ControlMode, arbitration_id, pack_two_floats
 from tests.joint.drivers.can_bench import Bench
 from tests.joint.drivers.rig import AXES, DRIVE, MS, NODES, TARGET, Rig, Shed, arm, read

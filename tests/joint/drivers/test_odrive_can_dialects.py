@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from services.joint.drivers import odrive_can
-from services.joint.drivers.base import DriveStatus
 from services.joint.drivers.can_link import RETRY_MS
 from services.joint.drivers.frame_times import REBOOT_MS
 from services.joint.drivers.odrive_can import OdriveCan
 from services.simulator.fronts.cansimple_dialects import DialectName
+from shared.bus.messages import DriveStatus
 from shared.can.cansimple import AxisError, AxisState
 from shared.clock import NS_PER_MS
 from shared.exceptions import DriveError

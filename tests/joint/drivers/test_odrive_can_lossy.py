@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.joint.drivers.base import DriveStatus, MotorTarget
+from services.joint.drivers.base import MotorTarget
 from services.simulator.fronts.unix_can_hub import UnixCanHub
+from shared.bus.messages import DriveStatus
 from shared.can.cansimple import AxisState, ControlMode
 from shared.can.unix_can import Frame
 from tests.joint.drivers.rig import AXES, DRIVE, TARGET, Line, Shed

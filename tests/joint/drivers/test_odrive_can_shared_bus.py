@@ -7,8 +7,9 @@ import time
 import numpy as np
 import pytest
 
-from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.base import DriveReading, MotorTarget
 from services.joint.drivers.frame_times import ARM_GRACE_MS
+from shared.bus.messages import DriveStatus
 from shared.can.cansimple import AxisState, Command, arbitration_id, pack_two_floats
 from tests.joint.drivers.rig import DRIVE, MS, Rig, Shed, read
 

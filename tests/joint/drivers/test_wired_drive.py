@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.joint.drivers.base import Drive, DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.base import Drive, DriveReading, MotorTarget
 from services.joint.drivers.wired_drive import MotorFrame, Signs, WiredDrive
-from shared.bus.messages import Pair
+from shared.bus.messages import DriveStatus, Pair
 
 MARK = 64.0
 

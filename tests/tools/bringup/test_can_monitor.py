@@ -14,9 +14,10 @@ import can
 import pytest
 
 from services.simulator.fronts.unix_can_hub import UnixCanHub
-from shared.can import cansimple, imu_can, loadcell_can
+from shared.can import cansimple
 from shared.can.cansimple import AxisState, Command, Heartbeat, arbitration_id
 from shared.can.cansimple_06 import Command06, Version, pack_version
+from shared.can.sensor_frames import pack_forces, pack_imu
 from shared.can.unix_can import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, Frame
 from shared.clock import PACE_FILE, keep_pace
 from shared.config.robot_config import RobotConfig
@@ -36,7 +37,7 @@ SPOKEN: tuple[Frame, ...] = (
     (arbitration_id(NODE, Command.HEARTBEAT), BEAT),
     (arbitration_id(STRANGER, Command.HEARTBEAT), BEAT),
     (arbitration_id(NODE, Command.GET_ENCODER_ESTIMATES), cansimple.pack_two_floats(64.5, 0.0)),
-    *loadcell_can.pack([1.0, 2.0, 3.0, 4.0, 5.0, -6.0]),
+    *pack_forces([1.0, 2.0, 3.0, 4.0, 5.0, -6.0]),
 )
 """An axis, a stranger and the load cells."""
 ANSWERS: tuple[Frame, ...] = (
@@ -85,7 +86,7 @@ def test_all_that_speaks_is_taken_in_and_nothing_is_sent(short_dir: Path) -> Non
 
 
 def test_an_imu_is_received_where_there_is_one(short_dir: Path) -> None:
-    frames = tuple(imu_can.pack([1.0, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0], valid=True))
+    frames = tuple(pack_imu([1.0, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0], valid=True))
     with bus(short_dir, frames) as (config, _):
         traffic = listen(config, (), poll_nodes=False, imu=True)
     assert traffic.imu.samples[0].rate == (0.0, 0.5, 0.0)

@@ -15,7 +15,7 @@ import pytest
 from shared.can.cansimple import AxisError, AxisState, Heartbeat, MotorError
 from shared.can.cansimple_06 import Version
 from shared.can.drive_settings import AXES, of_module
-from shared.can.imu_can import ImuSample
+from shared.can.sensor_frames import ImuSample
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import CanConfig
 from shared.joints import MODULES

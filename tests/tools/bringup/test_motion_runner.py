@@ -12,8 +12,9 @@ from pathlib import Path
 import can
 import pytest
 
-from services.joint.drivers.base import DriveReading, DriveStatus
+from services.joint.drivers.base import DriveReading
 from services.simulator.physics.plant import PlantConfig
+from shared.bus.messages import DriveStatus
 from shared.can import cansimple
 from shared.can.cansimple import AxisState, Command
 from shared.clock import NS_PER_S

@@ -12,8 +12,8 @@ import msgspec
 import pytest
 
 from services.joint.differential import joint_from_motor, motor_from_joint
-from services.joint.drivers.base import DriveReading, DriveStatus
-from shared.bus.messages import Pair
+from services.joint.drivers.base import DriveReading
+from shared.bus.messages import DriveStatus, Pair
 from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig

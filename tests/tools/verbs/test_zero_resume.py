@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 
 from services.joint.differential import joint_from_motor
-from services.joint.drivers.base import Drive, DriveStatus
+from services.joint.drivers.base import Drive
 from services.joint.drivers.wired_drive import MotorFrame
 from services.simulator.physics.plant import PlantConfig, changed
+from shared.bus.messages import DriveStatus
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, DriveError
 from shared.joints import MODULES

@@ -30,9 +30,8 @@ from shared.config.sections import CanConfig
 from shared.joints import MODULES
 from shared.mcap_log.writer import RunWriter
 from tools.lab.bench.timing import Repeated
-from tools.sim.lockstep import Lockstep, forget
+from tools.sim.lockstep import Lockstep, begin_standing, forget
 from tools.sim.recorded_lockstep import DRAIN_EVERY, RecordedMessages
-from tools.sim.standing_start import begin_standing
 
 SECONDS: Final = 3.0
 """Recorded of the squat: on the way down and up."""

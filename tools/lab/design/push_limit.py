@@ -28,8 +28,8 @@ import numpy as np
 
 from services.planner.law.certificate import motor_mean
 from services.planner.law.coupling import PushIntegral, UncoupledGains, Y
-from services.planner.law.gains import GainLaw
 from services.planner.law.kinematics import Kinematics
+from services.planner.law.split import GainLaw
 from shared.arrays import Array
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.extras import late

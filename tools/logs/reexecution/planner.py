@@ -17,6 +17,7 @@ from shared.bus.messages import Attitude, JointCommand, Message, PlannerStatus, 
 from shared.bus.traces import PlannerCheckpoint
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
+from shared.state import copied
 from tools.logs.reexecution.compare import ReexecutionResult, memory_of
 from tools.logs.run_log import RunLog
 
@@ -134,7 +135,7 @@ class PlannerExecution:
         """Return the planner's session and present state; None while it cannot be executed."""
         if self._loop is None:
             return None
-        return self._loop.planner.session, self._loop.planner.snapshot()
+        return self._loop.planner.session, copied(self._loop.planner.state)
 
     def _begin(self, status: PlannerStatus) -> None:
         """Go on from the memory after this tick, if the log has it."""
@@ -144,13 +145,13 @@ class PlannerExecution:
         known = memory_of(snapshot.snapshot, PlannerState)
         controller = self._controller() if self._controller is not None else None
         planner = Planner(self._robot, status.session, controller)
-        planner.restore(known)
+        planner.state = known
         self._tick = tick = _Tick()
         self._loop = PlannerLoop(self._robot, planner, tick.ports, lambda: tick.t_ns)
         self._taken = (
             [-1 if state is None else state.seq for state in known.states],
-            known.wrench_seq,
-            known.attitude_seq,
+            -1 if known.wrench is None else known.wrench.seq,
+            -1 if known.attitude is None else known.attitude.seq,
         )
         self.outcome.starts += 1
 
@@ -203,7 +204,7 @@ class PlannerExecution:
         yield topics.PLANNER_STATUS.key(self._log_robot), computed
         snapshot = self._snapshots.get((status.session, status.t_ns))
         if snapshot is not None and outcome.exact:
-            text = _encode(loop.planner.snapshot()).decode()
+            text = _encode(loop.planner.state).decode()
             mine_then = msgspec.structs.replace(snapshot, snapshot=text)
             compare("planner/checkpoint", status.seq, snapshot, mine_then)
 

@@ -15,9 +15,9 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from services.joint.differential import motor_from_joint
-from services.joint.drivers.base import Drive, DriveStatus
+from services.joint.drivers.base import Drive
 from shared.bus import topics
-from shared.bus.messages import JointState, Mode, Pair
+from shared.bus.messages import DriveStatus, JointState, Mode, Pair
 from shared.bus.session import open_session
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig

@@ -11,10 +11,10 @@ from typing import Annotated, Final, NamedTuple
 import msgspec
 
 from services.ros2_gateway import rmw
+from services.ros2_gateway.conversions import RosTypes
 from services.ros2_gateway.gateway import RosTopics, topics_of
 from services.ros2_gateway.rmw import RosTopic, SeenEndpoint
 from services.ros2_gateway.ros_session import NODE, RosSession
-from services.ros2_gateway.ros_types import RosTypes
 from shared.config import checks
 from shared.config.files import load
 from shared.config.robot_config import RobotConfig

@@ -1,10 +1,18 @@
-"""Reference of a height and a pitch that no hand leads. Pure.
+"""References of the directions that no hand leads: shift, height and pitch. Pure.
 
-Height and torso pitch are open: a hand leads them. To go down (`xrl down`, a low battery) or up
-(`services.planner.watch.heat`) the law closes both. The height's reference h moves at a bounded
-rate until a knee is at the end of its range; the pitch's stays where it was. When nobody leads
-(`services.planner.watch.unattended`), one of them or both are closed where they are. The reference
-begins at the measured pose, and h at its rate, so nothing steps. z is the measured height.
+**Shift.** By itself the robot keeps its COM over the ankles and its torso upright. The operator may
+request a small offset (`operator/intent`): COM forwards or sideways, torso rolled or yawed. A
+second-order follower with limits follows it without a jump. It takes at least `SHIFT_S` for the
+whole range and stays within `law.shift_max`:
+
+    r'' = w^2 (wanted - r) - 2 w r',   |r'| <= shift_max / SHIFT_S
+
+**Height and pitch.** Height and torso pitch are open: a hand leads them. To go down (`xrl down`, a
+low battery) or up (`services.planner.watch.reserves`) the law closes both. The height's reference h
+moves at a bounded rate until a knee is at the end of its range; the pitch's stays where it was.
+When nobody leads (`services.planner.watch.unattended`), one of them or both are closed where they
+are. The reference begins at the measured pose, and h at its rate, so nothing steps. z is the
+measured height.
 
     p_ref    = (1 - hold) p_ref    + hold (h, pitch)             hold: of the height, of the pitch
     pdot_ref = (1 - hold) pdot_ref + hold (h', 0)
@@ -21,15 +29,65 @@ the pitch axis, it would turn a torso that nobody holds.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import IntEnum
 from typing import Final
 
 import msgspec
-import numpy as np
 
 from shared.arrays import Array
-from shared.bus.messages import Pair
+from shared.bus.messages import Pair, Vector4
 from shared.clamp import clamp
+
+ROWS: Final = (0, 1, 3, 5)
+"""Rows of p that the shift moves: x, y, roll, yaw."""
+SHIFT_S: Final = 1.0
+"""Shortest time from the middle to the end of the range, s."""
+OMEGA: Final = 6.0
+"""w, rad/s; the follower is critically damped."""
+
+
+class ShiftState(msgspec.Struct):
+    """State of `ShiftReference`: x, y in m, roll, yaw in rad, and their rates."""
+
+    at: list[float] = msgspec.field(default_factory=lambda: [0.0] * len(ROWS))
+    rate: list[float] = msgspec.field(default_factory=lambda: [0.0] * len(ROWS))
+
+    def rest(self) -> None:
+        """Stop at the current shift while the planner is not engaged."""
+        self.rate = [0.0] * len(ROWS)
+
+    def add_to(self, p: Array, pdot: Array) -> None:
+        """Add the shift to a pose p (6,), m and rad, and its rate to pdot (6,), per s."""
+        for row, at, rate in zip(ROWS, self.at, self.rate, strict=True):
+            p[row] += at
+            pdot[row] += rate
+
+
+class ShiftReference:
+    """Reference (x, y, roll, yaw) that follows the requested shift.
+
+    It uses plain floats: for four values, NumPy's calls cost more than the arithmetic.
+    """
+
+    def __init__(self, shift_max: Sequence[float]) -> None:
+        """Set the largest shift each way: m, m, rad, rad."""
+        self._shift_max = tuple(shift_max)
+
+    def advance(self, s: ShiftState, wanted: Vector4, dt: float) -> None:
+        """Follow for dt seconds.
+
+        Args:
+            s: the shift, which changes.
+            wanted: x, y in m, roll, yaw in rad; clipped to the limits.
+            dt: time since the last tick, s.
+        """
+        at, rate = s.at, s.rate
+        for i, limit in enumerate(self._shift_max):
+            target, rate_max = clamp(wanted[i], -limit, limit), limit / SHIFT_S
+            rate_next = rate[i] + dt * OMEGA * (OMEGA * (target - at[i]) - 2.0 * rate[i])
+            rate[i] = clamp(rate_next, -rate_max, rate_max)
+            at[i] += dt * rate[i]
 
 
 class Toward(IntEnum):
@@ -104,6 +162,26 @@ class HeightState(msgspec.Struct, array_like=True):
     """F_lift, N, upwards at the COM."""
     moment: float = 0.0
     """M, N m, about the torso's pitch."""
+    T_z: float = 0.0
+    """Largest joint rate per unit of the height at the last reference, rad/m."""
+
+    @property
+    def is_active(self) -> bool:
+        """True while height and pitch are not wholly the person's, or a force or moment is left."""
+        return any(self.hold) or self.force > 0.0 or self.moment != 0.0
+
+    def apply(self, p_ref: Array, pdot_ref: Array) -> None:
+        """Close height and pitch in a reference p_ref (6,) and its rate pdot_ref (6,)."""
+        for row, hold, at, rate in zip(
+            _ROWS, self.hold, (self.height, self.pitch), (self.rate, 0.0), strict=True
+        ):
+            if hold > 0.0:
+                p_ref[row] += hold * (at - p_ref[row])
+                pdot_ref[row] += hold * (rate - pdot_ref[row])
+
+    def reset(self) -> None:
+        """End at once: the planner does not lead."""
+        self.hold, self.rate, self.force, self.moment = (0.0, 0.0), 0.0, 0.0, 0.0
 
 
 class HeightReference:
@@ -112,39 +190,32 @@ class HeightReference:
     def __init__(self, knees: Pair) -> None:
         """Take the ends of the knees' way, theta in rad: the lowest pose, the highest."""
         self._knees = knees
-        self.state = HeightState()
-
-    @property
-    def is_active(self) -> bool:
-        """True while height and pitch are not wholly the person's, or a force or moment is left."""
-        s = self.state
-        return any(s.hold) or s.force > 0.0 or s.moment != 0.0
 
     def advance(
         self,
+        s: HeightState,
         toward: Toward,
         released: Released,
         drive: float,
         p: Array,
         pdot: Array,
-        T_z: Array,
         knees: Pair,
         dt: float,
     ) -> Pair:
         """Advance by one tick; return the force, N, and the moment about pitch, N m.
 
         Args:
+            s: state of the closed directions, which changes.
             toward: where to.
             released: nobody leads the height, the pitch: closed where they are, if the robot goes
                 nowhere by itself.
             drive: moment that turns a torso which nobody leads, N m.
             p: measured pose (6,), m and rad.
             pdot: its rate (6,).
-            T_z: joint rates per unit of the height (12,), rad/m.
             knees: theta of both, rad.
             dt: time since the last tick, s.
         """
-        s, z, pitch = self.state, float(p[2]), float(p[4])
+        z, pitch = float(p[2]), float(p[4])
         wanted = 0.0
         closed = released
         if toward is not _PERSON:
@@ -166,7 +237,7 @@ class HeightReference:
             clamp(held_z + (step if closed[0] else -step), 0.0, 1.0),
             clamp(held_pitch + (step if closed[1] else -step), 0.0, 1.0),
         )
-        lead = min(LEAD_MAX, LEAD_ANGLE / max(float(np.abs(T_z).max()), 1.0))
+        lead = min(LEAD_MAX, LEAD_ANGLE / max(s.T_z, 1.0))
         if s.hold[0] > 0.0:
             step = dt * (STOPPING if toward is _PERSON else ACCELERATION)
             s.rate += clamp(wanted - s.rate, -step, step)
@@ -184,18 +255,3 @@ class HeightReference:
             fade = MOMENT_FADE_RATE * dt
             s.moment -= clamp(s.moment, -fade, fade)
         return s.force, s.moment
-
-    def apply(self, p_ref: Array, pdot_ref: Array) -> None:
-        """Close height and pitch in a reference p_ref (6,) and its rate pdot_ref (6,)."""
-        s = self.state
-        for row, hold, at, rate in zip(
-            _ROWS, s.hold, (s.height, s.pitch), (s.rate, 0.0), strict=True
-        ):
-            if hold > 0.0:
-                p_ref[row] += hold * (at - p_ref[row])
-                pdot_ref[row] += hold * (rate - pdot_ref[row])
-
-    def reset(self) -> None:
-        """End at once: the planner does not lead."""
-        s = self.state
-        s.hold, s.rate, s.force, s.moment = (0.0, 0.0), 0.0, 0.0, 0.0
