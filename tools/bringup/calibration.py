@@ -253,6 +253,7 @@ def _run(
 ) -> str:
     """Run one calibration; return why it failed, "" if it did not."""
     begun_s = clock()
+    progress(axis, procedure, 0.0)
     board.write({f"{axis}.requested_state": int(procedure.state)})
     while True:
         if interrupts.number:
@@ -479,4 +480,7 @@ def tell(console: Console, robot: RobotConfig, module: str, result: BoardResult)
 
 
 def _show(status: Status, module: str, axis: str, procedure: Procedure, passed_s: float) -> None:
-    status.update(f"{module}.{axis}: {procedure.what}, {passed_s:.1f} of {procedure.seconds:.1f} s")
+    what = f"{module}.{axis}: {procedure.what}"
+    if passed_s == 0.0:
+        status.console.print(f"{what}, {procedure.seconds:.3g} s")
+    status.update(f"{what}, {passed_s:.1f} of {procedure.seconds:.1f} s")
