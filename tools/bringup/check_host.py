@@ -50,7 +50,6 @@ LIMIT_FIX: Final = (
 RTPRIO_FIX: Final = LIMIT_FIX.format("rtprio", 40, "RTPRIO", 40)
 MEMLOCK_FIX: Final = LIMIT_FIX.format("memlock", "unlimited", "MEMLOCK", "infinity")
 
-
 Links = Mapping[str, Mapping[str, Any]]
 """By interface: what `ip` says of it."""
 
@@ -63,7 +62,6 @@ _IFF_UP = 1
 _CAP_NET_ADMIN = 12
 _WELL: Final = "ERROR-ACTIVE"
 _OFF: Final = ("BUS-OFF", "STOPPED", "SLEEPING")
-
 
 FILE: Final = "robot file"
 

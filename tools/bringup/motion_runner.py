@@ -78,7 +78,6 @@ STILL_WAIT_S: Final = 60.0
 Clock = Callable[[], int]
 Progress = Callable[[Sample], None]
 
-
 LIFTED: Final = 0.2
 """m; the emulated robot is hung this much higher for a leg's motion, feet clear of the floor."""
 LIMITS_TIMES: Final = 3

@@ -44,7 +44,6 @@ SETTLED_S: Final = 0.1
 ATTEMPTS: Final = 4
 _READ_S: Final = 0.05
 
-
 HOW: Final = (
     "push the foot of each leg forward and to its right, so that knee and hip move, and let go: "
     "it has to swing back past where it rests by itself, and to come to rest"
