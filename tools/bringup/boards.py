@@ -52,20 +52,17 @@ STATUS: Final = (
 )
 """A board's state, besides its settings."""
 
-
+ABSOLUTE: Final = 0x100
+"""Bit of `encoder.config.mode`: an absolute encoder."""
+DIRECTION: Final = "encoder.config.direction"
 _NOT_JSON: Final = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
 """Numbers that JSON does not have, as they stand in the file."""
-
 
 CALIBRATE: Final = "hang the leg, `xrl drive configure --apply --calibrate`"
 _CALIBRATED = {"motor.config.pre_calibrated": "motor.is_calibrated",
                "encoder.config.pre_calibrated": "encoder.is_ready"}  # fmt: skip
 """Settings that a drive takes only once it is calibrated."""
-_FOUND = (
-    "encoder.config.direction",
-    "encoder.config.phase_offset",
-    "encoder.config.phase_offset_float",
-)
+_FOUND = (DIRECTION, "encoder.config.phase_offset", "encoder.config.phase_offset_float")
 """Results of the encoder's calibration with the present wiring. With other values the motor has no
 torque, or runs away.
 """

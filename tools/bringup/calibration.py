@@ -26,7 +26,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, DriveError
 from shared.joints import MODULES
 from tools.bringup import can_monitor, drive_access
-from tools.bringup.boards import AXIS_ERRORS, Board, FoundBoards, Value, number
+from tools.bringup.boards import ABSOLUTE, AXIS_ERRORS, DIRECTION, Board, FoundBoards, Value, number
 from tools.bringup.check_board import describe_flags, direction_rows, trip_levels_of
 from tools.bringup.findings import FindingKind
 from tools.bringup.hanging_leg import leg_of, why_resting
@@ -51,9 +51,6 @@ SHARE_MIN: Final = 0.98
 POLES_WITHIN: Final = 0.04
 """How near a response must be to that of another number of pole pairs to be put down to it."""
 
-_ABSOLUTE: Final = 0x100
-"""Bit of `encoder.config.mode`."""
-_DIRECTION: Final = "encoder.config.direction"
 _WATCHDOG: Final = "config.enable_watchdog"
 MARKS: Final = ("motor.config.pre_calibrated", "encoder.config.pre_calibrated")
 _READY: Final = ("motor.is_calibrated", "encoder.is_ready")
@@ -164,7 +161,7 @@ def refuse_unfit(
         faults.append(f"its supply has {volts:.1f} V, outside of {low:g} to {high:g} V")
     for axis in axes:
         mode = int(number(values, f"{axis}.encoder.config.mode"))
-        if not mode & _ABSOLUTE:
+        if not mode & ABSOLUTE:
             faults.append(
                 f"{axis}.encoder.config.mode is {mode}: no absolute encoder; 257 is right for AMS "
                 "over SPI (docs/bring-up.md, section 5)"
@@ -253,6 +250,7 @@ def _run(
 ) -> str:
     """Run one calibration; return why it failed, "" if it did not."""
     begun_s = clock()
+    progress(axis, procedure, 0.0)
     board.write({f"{axis}.requested_state": int(procedure.state)})
     while True:
         if interrupts.number:
@@ -312,7 +310,7 @@ def _mismatch(board: Board, axis: str) -> str:
 
 
 def _found(board: Board, axis: str) -> Found:
-    below = ("motor.config.phase_resistance", "motor.config.phase_inductance", _DIRECTION)
+    below = ("motor.config.phase_resistance", "motor.config.phase_inductance", DIRECTION)
     names = [f"{axis}.{name}" for name in below]
     values = board.read(names)
     ohm, henry, direction = (number(values, name) for name in names)
@@ -468,7 +466,7 @@ def tell(console: Console, robot: RobotConfig, module: str, result: BoardResult)
             )
         return False
     values = {f"{axis}.encoder.is_ready": True for axis in result.found} | {
-        f"{axis}.{_DIRECTION}": each.direction for axis, each in result.found.items()
+        f"{axis}.{DIRECTION}": each.direction for axis, each in result.found.items()
     }
     rows = direction_rows(module, values, robot)
     wrong = [row for row in rows if row.verdict is FindingKind.WRONG]
@@ -479,4 +477,7 @@ def tell(console: Console, robot: RobotConfig, module: str, result: BoardResult)
 
 
 def _show(status: Status, module: str, axis: str, procedure: Procedure, passed_s: float) -> None:
-    status.update(f"{module}.{axis}: {procedure.what}, {passed_s:.1f} of {procedure.seconds:.1f} s")
+    what = f"{module}.{axis}: {procedure.what}"
+    if passed_s == 0.0:
+        status.console.print(f"{what}, {procedure.seconds:.3g} s")
+    status.update(f"{what}, {passed_s:.1f} of {procedure.seconds:.1f} s")

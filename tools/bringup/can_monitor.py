@@ -98,7 +98,11 @@ def listen(
         with _bus(config) as bus:
             for node in nodes if poll_nodes else ():
                 for command in QUESTIONS:
-                    bus.send(_question(node, command), timeout=_WAIT_S)
+                    question = can.Message(
+                        arbitration_id=cansimple.arbitration_id(node, command),
+                        is_remote_frame=True, dlc=_FRAME_BYTES, is_extended_id=False,
+                    )  # fmt: skip
+                    bus.send(question, timeout=_WAIT_S)
             _receive(bus, traffic, seconds, cells=cells, imu=imu)
     except DriveError as error:
         traffic.trouble = str(error)
@@ -143,13 +147,6 @@ def _bus(config: CanConfig) -> Iterator[can.BusABC]:
             yield bus
     except (can.CanError, OSError, ValueError, NotImplementedError) as error:
         raise DriveError(str(error) or type(error).__name__) from None
-
-
-def _question(node: int, command: Command | Command06) -> can.Message:
-    return can.Message(
-        arbitration_id=cansimple.arbitration_id(node, command),
-        is_remote_frame=True, dlc=_FRAME_BYTES, is_extended_id=False,
-    )  # fmt: skip
 
 
 def long_enough(heartbeat_period_ms: int) -> float:

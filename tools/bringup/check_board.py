@@ -18,6 +18,7 @@ from shared.joints import MODULE_INDEX
 from tools.bringup.boards import (
     AXIS_ERRORS,
     CALIBRATE,
+    DIRECTION,
     FIRMWARE,
     Value,
     describe_firmware,
@@ -33,10 +34,8 @@ OVERVOLTAGE_SHARE: Final = 0.95
 
 TEMPERATURES: Final = (-10.0, 70.0)
 """C; of an output stage that is idle."""
-_DIRECTION: Final = "encoder.config.direction"
 
 FIND_CAUSE: Final = "find the cause; arming by `xrl up` clears it, and so does power off and on"
-
 
 Boards = Mapping[str, Mapping[str, Value]]
 """By module: a board's settings and readings."""
@@ -113,13 +112,13 @@ def direction_rows(module: str, values: Values, robot: RobotConfig) -> list[Find
     why = "CAN does not report it: a service that takes the drive over would reverse its torque"
     rows = []
     for axis in AXES:
-        value = values.get(f"{axis}.{_DIRECTION}")
+        value = values.get(f"{axis}.{DIRECTION}")
         if isinstance(value, int | float) and values.get(f"{axis}.encoder.is_ready"):
             wanted = "1" if over_can else "1 or -1"
             subject, found = f"{module}.{axis}", describe_value(value)
             good = value == 1 or (not over_can and value == -1)
             by_hand = fix if value == -1 else CALIBRATE
-            rows.append(judged(good, subject, _DIRECTION, found, wanted, by_hand, why))
+            rows.append(judged(good, subject, DIRECTION, found, wanted, by_hand, why))
     return rows
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import json
 import os
+import re
 import resource
 import shlex
 import subprocess
@@ -27,7 +29,7 @@ from tools.bringup.findings import Finding, advised, judged, ok, warning, wrong
 from tools.fleet import process_table
 from tools.fleet.process_table import ListenPoint, is_simulated
 from tools.graph_libraries import command, graphs_of
-from tools.keys.inspection import KeyRow, inspect_keys
+from tools.keys.inspection import inspect_keys
 
 MACHINE: Final = "machine"
 CPUS_MIN: Final = 2
@@ -68,7 +70,6 @@ _CAP_NET_ADMIN = 12
 _WELL: Final = "ERROR-ACTIVE"
 _OFF: Final = ("BUS-OFF", "STOPPED", "SLEEPING")
 
-
 FILE: Final = "robot file"
 
 
@@ -106,17 +107,14 @@ def usb_node_rows(root: Path) -> list[Finding]:
 
 
 def _cpus() -> Finding:
-    cpus = os.sched_getaffinity(0)
-    if len(cpus) < CPUS_MIN:
-        fix = "another computer, or more of this one's processors (taskset, container)"
-        return warning(MACHINE, "processors", str(len(cpus)), f">= {CPUS_MIN}", fix)
-    wanted = f">= {CPUS_MIN}; {CPUS_FOR_1_KHZ} for 1 kHz"
+    cpus, fix = os.sched_getaffinity(0), "another computer, or more processors (taskset, container)"
     right, left = (
         ",".join(map(str, sorted(scheduling.half_of(cpus, kind))))
         for kind in ("harness", "planner")
     )
     found = f"{len(cpus)}: right leg {right} | {left} left leg, planner"
-    return ok(MACHINE, "processors", found, wanted)
+    wanted = f">= {CPUS_MIN}; {CPUS_FOR_1_KHZ} for 1 kHz"
+    return advised(len(cpus) >= CPUS_MIN, MACHINE, "processors", found, wanted, fix)
 
 
 def _delays(root: Path, *, emulated: bool) -> list[Finding]:
@@ -158,7 +156,10 @@ def clock_is_synchronised() -> bool:
 
 def _real_time(*, emulated: bool) -> Finding:
     what, wanted = "real-time priority", "SCHED_FIFO"
-    if _may_be_fifo():
+    # try it and go back: limits, capabilities and control groups all have their say
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(scheduling.TABLE["joint"].fifo))
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         return ok(MACHINE, what, "SCHED_FIFO allowed", wanted)
     fallback = scheduling.short_slice()
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
@@ -168,16 +169,6 @@ def _real_time(*, emulated: bool) -> Finding:
     elif emulated:
         return ok(MACHINE, what, f"refused; instead: {fallback}", wanted)
     return warning(MACHINE, what, f"refused, RTPRIO {limit}", wanted, RTPRIO_FIX, why)
-
-
-def _may_be_fifo() -> bool:
-    """Try it and go back: limits, capabilities and control groups all have their say."""
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(scheduling.TABLE["joint"].fifo))
-    except OSError:
-        return False
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    return True
 
 
 def _libusb() -> Finding:
@@ -210,12 +201,12 @@ def socketcan_rows(robot: RobotConfig, root: Path, links: Links) -> list[Finding
     """Check every interface that the robot uses, by the file system and by `query_ip`."""
     rows = []
     for name in interfaces_of(robot):
-        flags = _flags(root, name)
-        if flags is None:
+        flags = _text(root / "sys/class/net" / name / "flags")
+        if not flags:
             fix = "plug the adapter in; `ip link` lists what is there"
             rows.append(wrong(name, "interface", "not there", "up", fix))
             continue
-        up = bool(flags & _IFF_UP)
+        up = bool(int(flags, 16) & _IFF_UP)
         rows.append(judged(up, name, "interface", "up" if up else "down", "up", up_command(name)))
         if up and name in links:
             rows += _details(root, name, links[name])
@@ -248,13 +239,22 @@ def _details(root: Path, name: str, link: Mapping[str, Any]) -> list[Finding]:
     data = link.get("linkinfo", {}).get("info_data", {})
     again = f"`sudo ip link set {name} down`, then {up_command(name)}"
     rows = []
-    bitrate = data.get("bittiming", {}).get("bitrate")
+    bitrate, state = data.get("bittiming", {}).get("bitrate"), data.get("state")
     if bitrate is not None:
         good = abs(bitrate / CAN_BAUD_RATE - 1.0) < 1e-3
         why = "not one frame gets through, and every node reports errors"
         rows.append(judged(good, name, "bit rate", str(bitrate), str(CAN_BAUD_RATE), again, why))
-    if "state" in data:
-        rows.append(_state(name, str(data["state"]), data.get("berr_counter", {}), again))
+    if state is not None:
+        errors, wanted = data.get("berr_counter", {}), _WELL.lower()
+        counted = f" (errors sent {errors.get('tx', 0)}, received {errors.get('rx', 0)})"
+        found = state.lower() + (counted if any(errors.values()) else "")
+        fix = "120 ohm at both ends and nowhere else, ground wired along, one bit rate, short stubs"
+        why = "frames are resent and arrive late, or the bus goes off"
+        row = advised(state == _WELL, name, "controller", found, wanted, fix, why)
+        if state in _OFF:
+            why = "it takes no part in the bus"
+            row = wrong(name, "controller", found, wanted, again, why)
+        rows.append(row)
     if "LISTEN-ONLY" in data.get("ctrlmode", ()):
         fix = f"`sudo ip link set {name} down`, then with `listen-only off`"
         rows.append(wrong(name, "mode", "listen-only", "normal", fix, "nothing can be sent"))
@@ -275,49 +275,21 @@ def _details(root: Path, name: str, link: Mapping[str, Any]) -> list[Finding]:
 
 def _restart_rows(root: Path, name: str) -> list[Finding]:
     """Judge whether the joint services, or else this process, may restart an interface."""
-    services = [path.parent for path in root.glob("proc/[0-9]*/cmdline") if _is_service(path)]
-    allowed = [_may_restart(folder) for folder in services or [root / "proc/self"]]
-    if None in allowed:
-        return []
+    services = [
+        path.parent for path in root.glob("proc/[0-9]*/cmdline") if "services.joint" in _text(path)
+    ]
+    capabilities = [
+        re.search(r"CapEff:\s*(\w+)", _text(folder / "status"))
+        for folder in services or [root / "proc/self"]
+    ]
+    allowed = [int(one[1], 16) >> _CAP_NET_ADMIN & 1 for one in capabilities if one is not None]
+    if len(allowed) < len(capabilities):
+        return []  # a process is gone, or this is no Linux
     fix = "run them by the unit of `xrl hosts`, or grant CAP_NET_ADMIN (docs/drives.md)"
     why = "a dozen frames stay in the queue through a power cut, and reach the drive after it"
     found = "allowed" if all(allowed) else "not allowed"
     what = "restart by the services"
     return [advised(all(allowed), name, what, found, "allowed", fix, why)]
-
-
-def _is_service(cmdline: Path) -> bool:
-    try:
-        return b"services.joint" in cmdline.read_bytes()
-    except OSError:
-        return False
-
-
-def _may_restart(process: Path) -> bool | None:
-    """Return True if a process has CAP_NET_ADMIN; None: it is gone, or this is no Linux."""
-    try:
-        status = (process / "status").read_text(encoding="ascii")
-        capabilities = status.split("CapEff:")[1].split()[0]
-        return bool(int(capabilities, 16) >> _CAP_NET_ADMIN & 1)
-    except (OSError, IndexError, ValueError):
-        return None
-
-
-def _state(name: str, state: str, errors: Mapping[str, Any], again: str) -> Finding:
-    counted = f" (errors sent {errors.get('tx', 0)}, received {errors.get('rx', 0)})"
-    found = state.lower() + (counted if any(errors.values()) else "")
-    if state in _OFF:
-        return wrong(name, "controller", found, _WELL.lower(), again, "it takes no part in the bus")
-    wires = "120 ohm at both ends and nowhere else, ground wired along, one bit rate, short stubs"
-    why = "frames are resent and arrive late, or the bus goes off"
-    return advised(state == _WELL, name, "controller", found, _WELL.lower(), wires, why)
-
-
-def _flags(root: Path, name: str) -> int | None:
-    try:
-        return int((root / "sys/class/net" / name / "flags").read_text(encoding="utf-8"), 16)
-    except (OSError, ValueError):
-        return None
 
 
 def robot_rows(robot: RobotConfig, path: Path) -> list[Finding]:
@@ -389,16 +361,17 @@ def security_rows(robot: RobotConfig) -> list[Finding]:
     if mode == "local":
         return [ok("bus", "security", mode, "only this user may link")]
     try:
-        return [_key_row(row) for row in inspect_keys(keys_folder(robot), robot)]
+        keys = inspect_keys(keys_folder(robot), robot)
     except XrlError as error:
         return [wrong("bus", "keys", str(error), "this host's own", "`xrl keys pack`")]
-
-
-def _key_row(row: KeyRow) -> Finding:
-    what, wanted = f"key of {row.name}", "valid"
-    if row.wrong:
-        return wrong("bus", what, row.wrong, wanted, "`xrl keys check`", "no link")
-    if row.warning:
-        why = "then no new links; existing links stay"
-        return warning("bus", what, row.warning, wanted, "`xrl keys renew`", why)
-    return ok("bus", what, f"from {row.begins} until {row.expires}", wanted)
+    rows = []
+    for key in keys:
+        what, until = f"key of {key.name}", f"from {key.begins} until {key.expires}"
+        if key.wrong:
+            row = wrong("bus", what, key.wrong, "valid", "`xrl keys check`", "no link")
+        else:
+            why = "then no new links; existing links stay"
+            found = key.warning or until
+            row = advised(not key.warning, "bus", what, found, "valid", "`xrl keys renew`", why)
+        rows.append(row)
+    return rows

@@ -29,7 +29,6 @@ RESTS_FROM: Final = 15.0
 BIAS_TORQUE: Final = 1.3
 """Times what gravity takes at the bias, by the robot file."""
 
-
 FRICTION: Final = 1.0
 """N m of dry friction and cogging that may hold a joint off its balance; the simulated robot has
 0.5. The thigh is short: a newton metre at hip and knee holds a knee 0.055 rad off."""

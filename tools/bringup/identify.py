@@ -19,8 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from enum import StrEnum
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -224,17 +223,9 @@ def _steady(
     return rows[moving], tau[moving], cycle[moving], way[moving]
 
 
-class Verdict(StrEnum):
-    """What an estimate says of the robot file's value."""
-
-    CHANGE = "change"
-    """It lies outside the interval."""
-    AGREES = "agrees"
-    """It lies inside."""
-    MEASURED = "measured"
-    """The file has no such value."""
-    UNKNOWN = "not shown"
-    """The interval is too wide to say anything."""
+Verdict = Literal["change", "agrees", "measured", "not shown"]
+"""The robot file's value lies outside the interval, or inside; the file has no such value; the
+interval is too wide to say anything."""
 
 
 class Estimate(NamedTuple):
@@ -267,38 +258,32 @@ class JointResult(NamedTuple):
     leg_inertia: float
     """Inertia of what hangs on it by the robot file, without its rotor, kg m^2."""
 
-    @property
-    def rotor(self) -> tuple[float, float]:
-        """Reflected inertia of the rotors and its standard deviation, kg m^2."""
-        total, sd = self.fit.inertia
-        return total - self.leg_inertia, math.hypot(sd, MASS_SD * self.leg_inertia)
-
 
 def estimates_of(results: Sequence[JointResult], robot: RobotConfig) -> list[Estimate]:
     """Return what the sines say; the last row is the rotors' inertia, one for all joints.
 
     It is not shown if its interval is wider than half of the robot file's value.
     """
-    armature, rows = robot.joint.armature, []
+    armature, rows, rotors = robot.joint.armature, [], []
     for joint, fit, leg_inertia in results:
         inertia = fit.inertia[0], math.hypot(fit.inertia[1], MASS_SD * leg_inertia)
+        rotors.append((inertia[0] - leg_inertia, inertia[1]))
         rows += [
             _estimate(f"dry friction {joint}", "N m", fit.dry),
             _estimate(f"viscous friction {joint}", "N m s/rad", fit.viscous),
             _estimate(f"inertia {joint}", "kg m^2", inertia, leg_inertia + armature),
         ]
-    rotors = [result.rotor for result in results]
     weight = sum(1.0 / sd**2 for _, sd in rotors)
     mean = sum(value / sd**2 for value, sd in rotors) / weight
     sd = max(weight**-0.5, YIELDS * armature)
     last = _estimate("reflected inertia", "kg m^2", (mean, sd), armature)
     known = HALF_WIDTH * sd < 0.5 * armature
-    return [*rows, last if known else last._replace(verdict=Verdict.UNKNOWN)]
+    return [*rows, last if known else last._replace(verdict="not shown")]
 
 
 def _estimate(what: str, unit: str, of: tuple[float, float], file: float | None = None) -> Estimate:
     value, half_width = of[0], HALF_WIDTH * of[1]
-    verdict = Verdict.MEASURED
+    verdict: Verdict = "measured"
     if file is not None:
-        verdict = Verdict.AGREES if abs(value - file) <= half_width else Verdict.CHANGE
+        verdict = "agrees" if abs(value - file) <= half_width else "change"
     return Estimate(what, unit, file, value, half_width, verdict)

@@ -78,7 +78,6 @@ STILL_WAIT_S: Final = 60.0
 Clock = Callable[[], int]
 Progress = Callable[[Sample], None]
 
-
 LIFTED: Final = 0.2
 """m; the emulated robot is hung this much higher for a leg's motion, feet clear of the floor."""
 LIMITS_TIMES: Final = 3
@@ -438,11 +437,12 @@ def ask_and_move(
     with (
         open_drives(limited, modules, flags.run_dir) as drives,
         interrupts.kept(),
-        Live(console=console, refresh_per_second=4, transient=True) as shown,
+        Live(console=console, refresh_per_second=4, transient=True) as live,
     ):
+        show = console.print if alone else live.update
         result = run_motion(
             drives, limited, module, plan, q_seen=q[module], interrupts=interrupts,
-            progress=lambda sample: shown.update(_line(sample, plan, name)),
+            progress=lambda sample: show(_line(sample, plan, name)),
         )  # fmt: skip
     for one in modules:
         # only to drives that say that they are idle: full limits are nothing for an armed one

@@ -101,8 +101,11 @@ class _Candidates(NamedTuple):
     """(n, 2): phi, theta, rad."""
     own: Decision | None
     """What its own evidence decides: a pose, or to refuse; None: gravity is left."""
-    unmoved: bool
-    """Its pose is that of its rest, which is not to speak against gravity."""
+
+    @property
+    def unmoved(self) -> bool:
+        """True if its pose is that of its rest, which is not to speak against gravity."""
+        return self.own is not None and self.own.by == "unmoved"
 
     @property
     def q(self) -> Array:
@@ -118,13 +121,9 @@ def poses_of(evidence: ModuleEvidence, robot: RobotConfig, module: str) -> Array
     (phi_low, phi_high), (theta_low, theta_high) = limit.phi, limit.theta
     half = math.pi / robot.joint.gear_ratio
     first = [a + b for a, b in zip(evidence.offsets, evidence.angles, strict=True)]
-    spans = [
-        (theta_low - BEYOND + sign * phi, theta_high + BEYOND + sign * other)
-        for sign, phi, other in (
-            (1.0, phi_low - BEYOND, phi_high + BEYOND),
-            (-1.0, phi_high + BEYOND, phi_low - BEYOND),
-        )
-    ]  # of theta + phi and theta - phi, which are the motors'
+    low, high = theta_low - 2.0 * BEYOND, theta_high + 2.0 * BEYOND
+    # of theta + phi and theta - phi, which are the motors'
+    spans = ((low + phi_low, high + phi_high), (low - phi_high, high - phi_low))
     turns = [
         start + np.arange(math.ceil(low / (2.0 * half) - start), high / (2.0 * half) - start + 1e-9)
         for start, (low, high) in zip(first, spans, strict=True)
@@ -186,8 +185,7 @@ def _candidates(
     leg = [evidence.get(f"{kind}_{side_of(module)}") for kind in KINDS]
     rests = all(other is not None and _moved(other, UNMOVED) is None for other in leg)
     within = UNMOVED if rests else BESIDE_MOVED * UNMOVED
-    own = _own(one, poses, robot.joint.gear_ratio, within)
-    return _Candidates(poses, own, own is not None and own.by == "unmoved")
+    return _Candidates(poses, _own(one, poses, robot.joint.gear_ratio, within))
 
 
 def _own(
@@ -269,11 +267,8 @@ def _leg(
             f"{_words(q_hip[second[1]])}, takes only {times:.1f} times what friction and errors "
             f"of the robot file explain, {CLEAR:g} are wanted; {ROUGHLY}"
         )
-    knee_away, hip_away = (
-        float(np.linalg.norm(q[one] - q[other]))
-        for q, one, other in zip((q_knee, q_hip), best, second, strict=True)
-    )
-    away = math.hypot(knee_away, hip_away)
+    steps = [q[one] - q[o] for q, one, o in zip((q_knee, q_hip), best, second, strict=True)]
+    away = float(np.linalg.norm(steps))
     result: dict[str, Decision] = {}
     for name, q, index in zip(names, (q_knee, q_hip), best, strict=True):
         mine = own[name]
@@ -317,13 +312,12 @@ def _measured(about: Pair, poses: Array) -> Decision:
             f"{off[best]:.2f} rad from what was measured, {MEASURED:g} are allowed: measure again; "
             f"if it stays so, its zero is another's: {PROTRACTOR}"
         )
-    others = np.delete(off, best)
     phi, theta = map(float, poses[best])
-    second = int(np.argmin(others)) if len(others) else None
-    if second is None:
+    if len(poses) == 1:
         return Decision((phi, theta), "measured", math.inf, math.inf, "")
-    away = float(np.linalg.norm(np.delete(poses, best, axis=0)[second] - poses[best]))
-    return Decision((phi, theta), "measured", away, float(others[second]) / MEASURED, "")
+    second = int(np.argsort(off)[1])
+    away = float(np.linalg.norm(poses[second] - poses[best]))
+    return Decision((phi, theta), "measured", away, float(off[second]) / MEASURED, "")
 
 
 def _moved(evidence: ModuleEvidence, unmoved: float) -> str | None:

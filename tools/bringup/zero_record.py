@@ -30,7 +30,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError, XrlError
 from shared.joints import MODULES
 from shared.toml_file import read_text
-from tools.bringup.boards import Value, equal
+from tools.bringup.boards import ABSOLUTE, Value, equal
 from tools.bringup.drive_access import boards_on_usb
 from tools.bringup.hanging_leg import Upright
 from tools.bringup.motion_runner import open_drives
@@ -47,7 +47,6 @@ IDENTITY: Final = tuple(
 )
 """Settings that an encoder's calibration finds anew, or that tell which encoder it is."""
 
-
 IMU_WITHIN: Final = 0.02
 """rad of an IMU's error, its mounting's included."""
 LEVEL_WITHIN: Final = 0.035
@@ -57,8 +56,6 @@ REST_WAIT_S: Final = 20.0
 """Longest wait until legs that were let go have swung out."""
 ROUND_S: Final = 0.8
 """From one look to the next: not half a swing of a leg, which takes 1 s."""
-ABSOLUTE: Final = 0x100
-"""Bit of `encoder.config.mode`: an absolute encoder."""
 
 Progress = Callable[[str], None]
 

@@ -11,6 +11,8 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple
 
+import numpy as np
+
 from services.joint.differential import joint_from_motor, motor_from_joint
 from services.joint.drivers.base import Drive
 from services.joint.drivers.wired_drive import MotorFrame
@@ -41,7 +43,6 @@ SETTLED_S: Final = 0.1
 """s of reading before a position is written."""
 ATTEMPTS: Final = 4
 _READ_S: Final = 0.05
-
 
 HOW: Final = (
     "push the foot of each leg forward and to its right, so that knee and hip move, and let go: "
@@ -188,28 +189,24 @@ def is_right(back: Back | None, q: Pair) -> bool:
     return all(abs(a - b) <= within for a, b in zip(back.q, q, strict=True))
 
 
-class _Track(NamedTuple):
+class _Track:
     """Where a joint has been, by the drive's own count, rad."""
 
-    now: Pair
-    low: Pair
-    high: Pair
-    still_at: Pair
-    still_since: float
+    def __init__(self, q: Pair, now_s: float) -> None:
+        self._now = self._low = self._high = self._still_at = np.array(q)
+        self.still_since = now_s
 
-    def moved_to(self, q: Pair, now_s: float) -> _Track:
-        """Return the track with another position."""
-        low = (min(q[0], self.low[0]), min(q[1], self.low[1]))
-        high = (max(q[0], self.high[0]), max(q[1], self.high[1]))
-        if max(abs(q[0] - self.still_at[0]), abs(q[1] - self.still_at[1])) > STILL:
-            return _Track(q, low, high, q, now_s)
-        return _Track(q, low, high, self.still_at, self.still_since)
+    def move_to(self, q: Pair, now_s: float) -> None:
+        self._now = np.array(q)
+        self._low, self._high = np.minimum(self._low, q), np.maximum(self._high, q)
+        if np.abs(self._now - self._still_at).max() > STILL:
+            self._still_at, self.still_since = self._now, now_s
 
     @property
     def swing(self) -> Swing:
-        """What came of it, from where it is now."""
-        (a, b), (low_a, low_b), (high_a, high_b) = self.now, self.low, self.high
-        return (low_a - a, low_b - b), (high_a - a, high_b - b)
+        """Lowest and highest (phi, theta), from where it is now."""
+        low, high = (self._low - self._now).tolist(), (self._high - self._now).tolist()
+        return (low[0], low[1]), (high[0], high[1])
 
 
 def watch(
@@ -239,8 +236,7 @@ def watch(
             if reading.status in (DriveStatus.LOST, DriveStatus.ARMED):
                 raise DriveError(f"{module}: {reading.status.name} while its leg swings")
             q, now = joint_from_motor(reading.pos_turns, gear_ratio), clock()
-            track = tracks.get(module) or _Track(q, q, q, q, now)
-            tracks[module] = track.moved_to(q, now)
+            tracks.setdefault(module, _Track(q, now)).move_to(q, now)
         missing = _missing(tracks, clock())
         if len(tracks) == len(drives) and not missing:
             break

@@ -37,7 +37,6 @@ xrl doctor --json | jq '.groups[][] | select(.verdict == "wrong")'
 xrl doctor --plant knee_left.axis0.controller.config.vel_limit=2
 """
 
-
 Progress = Callable[[str], None]
 
 COMPUTER: Final = "this computer"

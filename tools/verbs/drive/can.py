@@ -32,7 +32,6 @@ from tools.terminal import Console, marked
 COMMAND_S: Final = 10.0
 SILENT: Final = Text("silent", "red")
 
-
 EXAMPLES: Final = """
 xrl drive can setup --config lab.toml             # prints the commands
 sudo xrl drive can setup --config lab.toml --apply

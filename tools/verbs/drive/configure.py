@@ -50,7 +50,6 @@ from tools.terminal import Console, marked
 
 BACKUPS: Final = Path("out") / "drive-backups"
 
-
 EXAMPLES: Final = """
 xrl drive configure                          # shows what it would change, writes nothing
 xrl drive configure --apply

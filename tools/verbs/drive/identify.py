@@ -22,7 +22,6 @@ from tools.bringup.identify import (
     Estimate,
     JointResult,
     SinePlan,
-    Verdict,
     estimates_of,
     fit_sines,
     plan_for,
@@ -36,12 +35,7 @@ xrl drive identify ankle_left --dry-run          # hanging, the fleet down
 xrl drive identify ankle_left ankle_right
 xrl drive identify --all --axis theta
 """
-STYLES: Final = {
-    Verdict.CHANGE: "bold yellow",
-    Verdict.AGREES: "green",
-    Verdict.MEASURED: "",
-    Verdict.UNKNOWN: "dim",
-}
+STYLES: Final = {"change": "bold yellow", "agrees": "green", "measured": "", "not shown": "dim"}
 
 
 class IdentifyFlags(MotionFlags):
@@ -125,12 +119,12 @@ def report(estimates: Sequence[Estimate], console: Console) -> None:
         )
     console.print(table)
     rotor = estimates[-1]
-    if rotor.verdict is Verdict.CHANGE:
+    if rotor.verdict == "change":
         console.print(
             f"write into the robot file, section [joint]: armature = {rotor.value:.{rotor.digits}f}"
             "; then `xrl gains`, because the gain schedule depends on it"
         )
-    if rotor.verdict is not Verdict.UNKNOWN:
+    if rotor.verdict != "not shown":
         console.print("joint.armature is measured now: remove it from `assumed`", style="dim")
 
 

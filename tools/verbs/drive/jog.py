@@ -39,13 +39,11 @@ BY_MAX: Final = 0.5
 PERIOD_MIN_S: Final = 0.5
 CYCLES_MAX: Final = 100
 
-
 EXAMPLES: Final = """
 xrl drive jog knee_left
 xrl drive jog hip_right --axis phi --by -0.1 --period 4
 xrl drive jog knee_left --torque-limit 30     # if its load needs more
 """
-
 
 TRAVEL_SHARE: Final = 0.25
 """Fraction of the requested travel by which the travel may differ."""

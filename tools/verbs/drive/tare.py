@@ -25,7 +25,6 @@ HEARD_S: Final = 3.0
 """Longest wait for the first wrench."""
 GIVE_UP_S: Final = 10.0
 
-
 EXAMPLES: Final = """
 xrl drive tare
 xrl drive tare --anyway

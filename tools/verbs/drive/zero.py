@@ -53,7 +53,6 @@ DEGREES_FROM: Final = 7.0
 HEARD_S: Final = 2.0
 """Longest wait for the states of joint services that are up."""
 
-
 EXAMPLES: Final = """
 xrl drive zero knee_left --at 0,-0.5          # by a protractor: phi, theta in rad
 xrl drive zero ankle_right --at -0.02,0.14
@@ -62,7 +61,6 @@ xrl drive zero --all --resume                 # after a loss of power, hanging: 
 xrl drive zero --all --resume --untouched --swing --level     # knees and hips that have moved
 xrl drive zero ankle_left --resume --untouched --at 0.1,0.3   # roughly, to 0.08 rad
 """
-
 
 _PAIR: Final = numbers(2, "phi and theta in rad, such as 0,-0.5")
 
