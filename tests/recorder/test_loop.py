@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from services.recorder import __main__ as recorder
 from services.recorder.host_watch import MIB, free_bytes_at
 from services.recorder.loop import Recorder
 from services.recorder.snapshot import SnapshotRing
@@ -263,3 +264,6 @@ def test_a_folder_that_is_removed_at_the_end_is_told_too(
     run.finish()
     assert run.recording.removed_files == 1
     assert "was removed while it was written, with" in caplog.text
+    logger = logging.getLogger("test")
+    assert recorder._tell_end(run.writer, run.recording, "", logger) == 2, "the exit code"
+    assert "1 of 1 files were removed while they were written" in caplog.text

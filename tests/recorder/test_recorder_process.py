@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import math
 import resource
-import shutil
 import signal
 import subprocess
 import sys
@@ -203,18 +202,6 @@ def test_what_makes_no_sense_is_one_line_before_anything_starts(tmp_path: Path) 
     assert "absent: (file): cannot be read" in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert not (tmp_path / "out").exists()
-
-
-def test_a_folder_removed_under_a_recorder_is_told_and_the_exit_code_is_2(rig: Rig) -> None:
-    shutil.rmtree(rig.out)
-    wait_for(lambda: rig.hears("run_1.mcap"), doing=lambda: rig.send(20))
-    output = rig.stop(signal.SIGTERM)
-    assert rig.process.returncode == 2, output
-    assert "run.mcap was removed while it was written" in output
-    assert "1 of 2 files were removed while they were written" in output
-    log = rig.read("run_1.mcap")
-    assert log is not None
-    assert log.complete
 
 
 def test_a_write_error_ends_with_exit_code_2_and_one_line(rig: Rig) -> None:

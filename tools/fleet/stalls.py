@@ -141,6 +141,7 @@ class StallWatch:
         """Return the stalls since the last call, by the fleet's clock."""
         rate, gaps = pace(), [self._gaps.popleft() for _ in range(len(self._gaps))]
         found = [Stall(int(rate * begin_ns), int(rate * end_ns)) for begin_ns, end_ns in gaps]
+        found = [stall for stall in found if stall.end_ns - stall.begin_ns > GAP_NS]
         self.newest = found[-1] if found else self.newest
         return found
 

@@ -362,7 +362,7 @@ class ScenarioRunner:
     def _stall_words(self) -> str:
         """Return what to show of the newest stall; empty if it was a while ago."""
         newest = self._stalls.newest
-        if newest is None or now_ns() - newest.end_ns > STALL_SHOWN_NS:
+        if newest is None or now_ns() - newest.end_ns > STALL_SHOWN_NS or self._note == STARTING:
             return ""
         held = list(self._modes.values()).count(Mode.HOLD)
         who = "all six" if held == len(MODULES) else held

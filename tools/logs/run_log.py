@@ -284,8 +284,9 @@ def on_recorders_clock(sent_ns: Sequence[int], received_ns: Sequence[int]) -> li
 
     A monotonic clock counts from its host's start, so two of them are hours apart. The fastest
     message is taken to have no delay: times are late by its delay, up to some milliseconds, and by
-    what the clocks drift apart in the part that is read (50 ppm are 1.5 ms in 30 s). A host that
-    restarts has another clock from then on. Messages that a cut link held up keep their times.
+    what the clocks drift apart in the part that is read (50 ppm are 1.5 ms in 30 s; of topics of
+    events the whole run is read). A host that restarts has another clock from then on. Messages
+    that a cut link held up keep their times.
     """
     late_ns = [got - sent for sent, got in zip(sent_ns, received_ns, strict=True)]
     restarts = [n for n, (a, b) in enumerate(pairwise(late_ns), 1) if abs(b - a) > RESTART_NS]

@@ -26,7 +26,7 @@ from tools.fleet import stalls
 from tools.fleet.stalls import APART_NS, Disturbance, Stall, StallWatch, disturbances, stalls_of
 from tools.judge import verdict, verdict_table
 from tools.judge.standing import LIMITS
-from tools.live.scenario_runner import ScenarioRunner, describe_machine
+from tools.live.scenario_runner import STARTING, ScenarioRunner, describe_machine
 from tools.logs.run_log import RunLog, RunPart
 
 WATCH = """
@@ -66,7 +66,7 @@ def test_in_slow_motion_a_stall_is_as_long_as_the_fleets_clock_says(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     watch = StallWatch()
-    watch._gaps.append((ms(920), ms(1000)))
+    watch._gaps += [(ms(920), ms(1000)), (ms(1100), ms(1130))]  # the second is of 15 ms
     monkeypatch.setattr(stalls, "pace", lambda: 0.5)
     assert watch.take() == [Stall(ms(460), ms(500))]
     assert watch.take() == []
@@ -75,7 +75,7 @@ def test_in_slow_motion_a_stall_is_as_long_as_the_fleets_clock_says(
 def test_the_live_line_marks_a_stall_and_forgets_it_after_moments() -> None:
     runner = object.__new__(ScenarioRunner)
     runner._stalls, runner._killed = StallWatch(), False
-    runner._modes = dict.fromkeys(MODULES, Mode.HOLD)
+    runner._modes, runner._note = dict.fromkeys(MODULES, Mode.HOLD), ""
     assert runner._stall_words() == ""
     now = now_ns()
     runner._stalls.newest = Stall(now - ms(63), now)
@@ -83,6 +83,9 @@ def test_the_live_line_marks_a_stall_and_forgets_it_after_moments() -> None:
     assert runner._stall_words() == f"{words}: all six hold"
     runner._killed = True
     assert runner._stall_words() == words, "they hold for another reason"
+    runner._note = STARTING
+    assert runner._stall_words() == "", "services that start take the machine's time"
+    runner._note = ""
     runner._stalls.newest = Stall(now - 3 * NS_PER_S, now - round(2.5 * NS_PER_S))
     assert runner._stall_words() == ""
 

@@ -1,1 +1,1 @@
-"""Tests of the reports, the re-execution and the playback of logs."""
+"""Tests of the reports, the verdict and the export of logs."""
