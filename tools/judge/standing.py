@@ -54,7 +54,7 @@ LIMITS: Final = (
 """Live targets. Only `stood` decides the exit code: to the end, standing then
 (`tools.judge.standing`), and soundly all the way (`SOUND`). `led`: all six modules track, before
 any kill; `held`: after a kill, or in HOLD by an impaired network. What a stall of the machine made
-of a run counts as neither (`tools.judge.stalls`)."""
+of a run counts as neither (`tools.fleet.stalls`)."""
 
 BY_KEY: Final = {row.key: row for row in LIMITS}
 

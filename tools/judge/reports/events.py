@@ -58,7 +58,8 @@ class Events:
 
     def __init__(self) -> None:
         self._found: list[Event] = []
-        self._last: dict[tuple[_Watched, str], Any] = {}
+        self._last: dict[tuple[_Watched, str], tuple[Any, str]] = {}
+        """Newest message of each state and its words."""
         self._last_heard: dict[str, float] = {}
         self._silences: list[tuple[float, str, float]] = []
         self._violations: dict[tuple[str, str, Beyond], tuple[float, float]] = {}
@@ -93,15 +94,15 @@ class Events:
         """Yield the changes of a state, also one across the edge of two parts."""
         changes: list[tuple[float, str, Any, Any]] = []
         for module in MODULES if watched.topic.per_module else ("",):
-            before = self._last.get((watched, module))
+            before, known = self._last.get((watched, module), (None, ""))
+            times = run.times(watched.topic, module)
             messages = run.log.messages(watched.topic, module)
-            for t, after in zip(run.times(watched.topic, module).tolist(), messages, strict=True):
-                if not run.inside(t):
-                    continue
-                if before is not None and watched.words(before) != watched.words(after):
-                    changes.append((t, module, before, after))
-                before = after
-            self._last[watched, module] = before
+            for t, is_in, after in zip(times, run.inside(times), messages, strict=True):
+                words = watched.words(after) if is_in else known
+                if before is not None and words != known:
+                    changes.append((float(t), module, before, after))
+                before, known = (after, words) if is_in else (before, known)
+            self._last[watched, module] = before, known
         changes.sort(key=lambda row: row[0])
         for group in _together(changes, lambda row: tuple(map(watched.words, row[2:]))):
             t, _, before, after = group[0]
@@ -139,7 +140,7 @@ class Events:
         for line in panel.lines:
             steps = np.append(np.diff(line.t), 0.0)
             usual = float(np.median(steps[:-1])) if len(steps) > 1 else 0.0
-            for limit, where in line.beyond.items():
+            for limit, where in line.beyond:
                 beyond = where & run.inside(line.t)
                 if beyond.any():
                     key = panel.title, line.label, limit

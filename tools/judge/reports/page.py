@@ -15,7 +15,7 @@ from shared.clock import NS_PER_S
 from shared.exceptions import RunError
 from tools.judge.reports.events import Event, Events
 from tools.judge.reports.panels import COLOURS, GAP_S, Bar, Line, Panel, panels_of
-from tools.judge.reports.run_data import RunData, Span, TimeAxis
+from tools.judge.reports.run_data import RunData, Span
 from tools.judge.reports.summary import Judge, MessageLosses, inputs, verdict_and_facts
 from tools.judge.run_parts import zero_ns
 from tools.logs.run_index import RunIndex
@@ -114,8 +114,8 @@ def with_gaps(t: Array, values: Array) -> tuple[Array, Array]:
 class Page:
     """The page of a run, whose parts are taken one after the other."""
 
-    def __init__(self, axis: TimeAxis | None = None) -> None:
-        self._axis = axis
+    def __init__(self, zero_ns: int | None = None, span: Span | None = None) -> None:
+        self._zero_ns, self._span = zero_ns, span
         self._about: RunData | None = None
         self._has_first = self._has_last = False
         self._panels: dict[str, _PanelData] = {}
@@ -125,7 +125,7 @@ class Page:
 
     def add(self, log: RunLog) -> None:
         """Add a run, or the next part of it."""
-        run = RunData(log, self._axis)
+        run = RunData(log, self._zero_ns, self._span)
         self._has_first |= log.is_first
         self._has_last |= log.is_last
         if self._about is None or (self._about.course is None and run.course is not None):
@@ -183,7 +183,7 @@ def render_parts(
     zero = zero_ns(index)
     offset_s = (index.span_ns[0] - zero) / NS_PER_S
     begin_s, end_s = max(part.begin_s, 0.0), min(part.end_s, index.length_s)
-    page = Page(TimeAxis(zero, Span(begin_s + offset_s, end_s + offset_s)))
+    page = Page(zero, Span(begin_s + offset_s, end_s + offset_s))
     heard = False
     for log in parts_of(index, part, part_s=part_s, done=done):
         heard = heard or bool(log.keys())
