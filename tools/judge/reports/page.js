@@ -247,7 +247,7 @@ function listenToPage() {
       rows.forEach((other) => other.setAttribute("aria-current", String(other === row)));
       if (!view.panels.length) return;
       const { plot } = view.panels[0];
-      plot.setCursor({ left: plot.valToPos(t, "x"), top: 0 });
+      plot.setCursor({ left: plot.valToPos(t, "x"), top: 0 }, true, true);
       view.panels[0].stage.scrollIntoView({ block: "nearest" });
     });
   }

@@ -32,9 +32,8 @@ a plot shows every extreme, and a page of an hour has 2 MB."""
 BEFORE_S: Final = {"fall": 3.0}
 """A click on an event shows this time before it; else half a second."""
 HELP: Final = (
-    "Drag in a plot to zoom all plots; double-click to show the whole run. Ctrl and wheel zoom at "
-    "the cursor. The legends show the values at the cursor; click a name to hide or show its line. "
-    "Dotted red lines are limits."
+    "Drag in a plot to zoom all plots; double-click to show the whole run. The legends show the "
+    "values at the cursor; click a name to hide or show its line. Dotted red lines are limits."
 )
 POLICY: Final = (
     "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
